@@ -1,244 +1,76 @@
-"""Subscription of one topic: connections to all its publishers."""
+"""Subscription of one topic: a ZeroMQ SUB socket, connected to all its publishers (docs/wire.md)."""
 
 from __future__ import annotations
 
-import contextlib
-import functools
+import errno
 import logging
-import os
-import socket
-import struct
 import threading
 import time
 import weakref
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
+import zmq
 
 from instant_ic.bus import registry
-from instant_ic.bus.frame import (
-    BUFFER_ID,
-    DATA,
-    GREETING,
-    HEADER,
-    HELLO,
-    MAGIC,
-    SHARED,
-    SHARED_BODY,
-    VERSION,
-    FrameError,
-    Hello,
-    check_kind,
-    type_digest,
-)
+from instant_ic.bus.frame import KEY_COPY, KEY_INLINE, REFERENCE, SHARED, FrameError, Header, type_digest, unpack_header
+from instant_ic.bus.host import Host
 from instant_ic.bus.qos import QoS
-from instant_ic.bus.shm import SharedMapping
+from instant_ic.bus.shm import ProgressPage, SlotMapping
 from instant_ic.bus.transport import Received, Stats
 
-if TYPE_CHECKING:
-    from instant_ic.bus.local_transport import LocalTransport
-
 VIEWS_HELD = 4
-"""How many views into shared memory one reader keeps. Further messages are copied, so that a queue, or a node that
-collects messages, cannot use up the publisher's buffers."""
+"""How many views into shared memory one reader keeps of a publisher. Further messages are copied, so that a queue, or
+a node that collects messages, cannot use up the publisher's slots."""
 
-RECEIVE_BYTES = 100_000  # fits any message that does not go through shared memory
-_LEAST_ROOM = 4096
-_VIEW_FROM_BYTES = 16_384
-_FDS_SPACE = socket.CMSG_SPACE(4 * 8)
+_QUEUE = 256  # messages that ZeroMQ keeps in this process; the publisher keeps more
+_LARGE_FROM_BYTES = 64 << 10
+_RECONNECT_MS = 20
+_GRACE_S = 2.0  # the last messages of a publisher that has left the registry may still be on the way
 _FULL_LOOK_S = 1.0
+_MOST_UNKNOWN = 64
+_NOBLOCK = int(zmq.NOBLOCK)
 _new = tuple.__new__  # what Received(...) calls in the end, without a Python call in between
 
 log = logging.getLogger(__name__)
 
 
-class Inlet:
-    """Connection to one publisher: reads frames, maps its buffers, returns them."""
+class _Source:
+    """One publisher of the topic."""
 
-    def __init__(self, subscription: LocalSubscription, path: str) -> None:
-        self.subscription = subscription
-        self.hello: Hello | None = None
+    def __init__(self, info: registry.PublisherInfo) -> None:
+        self.info = info
+        self.node, self.type_name = info.node, info.type_name
         self.refused = False
-        self.node = self.type_name = ""
         self.expected = 0  # sequence of the next message; 0 before the first
-        self._deliver = subscription.deliver
-        self._rest = b""  # the start of an incomplete frame
-        self._header = (0, 0, 0, 0, 0)
-        self._body: memoryview | None = None  # a large body that arrives in pieces
-        self._got = 0
-        self._room = _LEAST_ROOM
-        self._fds: deque[int] = deque()
-        self._mappings: dict[int, SharedMapping] = {}
-        self._views: dict[int, weakref.ref[Any]] = {}
-        self._closing = False
-        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
-        self._receive = self.socket.recvmsg
-        try:
-            self.socket.connect(path)
-            self.socket.send(GREETING.pack(MAGIC, VERSION, subscription.shared, subscription.qos.depth))
-        except OSError:
-            self.socket.close()
-            raise
-
-    def read(self) -> bool:
-        """Read what waits on the socket; False when the publisher is gone.
-
-        Raises:
-            FrameError: the data is not of this version of the bus.
-        """
-        while True:
-            if self._body is not None:
-                try:
-                    count = self.socket.recv_into(self._body[self._got :])
-                except BlockingIOError:
-                    return True
-                except OSError:
-                    return False
-                self._got += count
-                if self._got == len(self._body):
-                    body, self._body = self._body.toreadonly(), None
-                    self._frame(*self._header, body)
-                elif not count:
-                    return False
-                continue
-            try:
-                data, ancillary, flags, _ = self._receive(self._room, _FDS_SPACE, socket.MSG_CMSG_CLOEXEC)
-            except BlockingIOError:
-                return True
-            except OSError:  # ECONNRESET: the publisher died before it read our data
-                return False
-            if ancillary:
-                for _level, _kind, fds in ancillary:
-                    self._fds.extend(fd for (fd,) in struct.iter_unpack("@i", fds[: len(fds) // 4 * 4]))
-                if flags & socket.MSG_CTRUNC:
-                    self._without_shared_memory("too many open files")
-            count = len(data)
-            if not count:
-                return False
-            full = count == self._room
-            # Room for as much as came last: a much larger buffer would cost more than the rest of this loop.
-            self._room = min(2 * count, RECEIVE_BYTES) if full else max(count + 256, _LEAST_ROOM)
-            if self._rest:
-                data, self._rest = self._rest + data, b""
-            elif count >= HEADER.size and not full:
-                kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(data)
-                if kind == DATA and size + HEADER.size == count:  # one complete message, the usual case
-                    payload = data[HEADER.size :] if size < _VIEW_FROM_BYTES else memoryview(data)[HEADER.size :]
-                    self._deliver(self, sequence, skipped, publish_ns, payload)
-                    return True
-            self._parse(data)
-            if not full and self._body is None and not ancillary:
-                return True  # everything has been read
-
-    def _parse(self, data: bytes) -> None:
-        at, end = 0, len(data)
-        while end - at >= HEADER.size:
-            kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(data, at)
-            body_at = at + HEADER.size
-            at = body_at + size
-            if at > end:
-                check_kind(kind)
-                at = body_at - HEADER.size
-                if size > RECEIVE_BYTES:  # arrives in pieces, received straight into its final place
-                    self._header = (kind, skipped, size, sequence, publish_ns)
-                    self._body, self._got = memoryview(np.empty(size, np.uint8).data), end - body_at
-                    self._body[: self._got] = memoryview(data)[body_at:]
-                    return
-                break
-            # A view keeps everything alive that came with it; use one only where the copy would cost more.
-            body = data[body_at:at] if size < _VIEW_FROM_BYTES else memoryview(data)[body_at:at]
-            if kind == DATA:
-                self._deliver(self, sequence, skipped, publish_ns, body)
-            elif kind == SHARED:
-                self._deliver(self, sequence, skipped, publish_ns, self._shared(bytes(body), sequence))
-            else:
-                self._frame(kind, skipped, size, sequence, publish_ns, body)
-        if at < end:
-            self._rest = data[at:]
-
-    def _frame(self, kind: int, skipped: int, _: int, sequence: int, publish_ns: int, body: bytes | memoryview) -> None:
-        check_kind(kind)
-        if kind == DATA:
-            self.subscription.deliver(self, sequence, skipped, publish_ns, body)
-        elif kind == SHARED:
-            self.subscription.deliver(self, sequence, skipped, publish_ns, self._shared(bytes(body), sequence))
-        elif kind == HELLO:
-            self.hello = Hello.unpack(bytes(body))
-            self.subscription.met(self)
-        elif len(body) == BUFFER_ID.size:  # RETIRED
-            self._mappings.pop(BUFFER_ID.unpack(body)[0], None)
-
-    def _shared(self, body: bytes, sequence: int) -> memoryview | None:
-        """The message in shared memory; None when the buffer does not hold the announced message."""
-        if len(body) != SHARED_BODY.size:
-            raise FrameError(f"shared-memory frame with a body of {len(body)} bytes")
-        number, new, size = SHARED_BODY.unpack(body)
-        if new:
-            if not self._fds:
-                raise FrameError("new buffer without its file descriptor")
-            try:
-                self._mappings[number] = SharedMapping(self._fds.popleft())
-            except OSError as error:
-                self._without_shared_memory(error.strerror or str(error))
-        mapping = self._mappings.get(number)
-        if mapping is None or not mapping.fits(size):
-            raise FrameError(f"a message of {size} bytes in buffer {number}, which is unknown or too small")
-        if mapping.sequence != sequence:
-            self._give_back(number)
-            return None  # the publisher has overwritten a buffer that it lent
-        if len(self._views) >= VIEWS_HELD or self.refused:
-            copy = memoryview(b"" if self.refused else bytes(mapping.view(size)))
-            torn = mapping.sequence != sequence
-            self._give_back(number)
-            return None if torn else copy
-        array = np.frombuffer(mapping.view(size), np.uint8)
-        # Everything derived from the message refers to this array: when it is freed, nothing reads the buffer any more.
-        self._views[number] = weakref.ref(array, functools.partial(self._done, number, sequence, mapping))
-        return array.data
-
-    def _without_shared_memory(self, why: str) -> NoReturn:
-        self.subscription.shared = False
-        raise FrameError(f"shared memory cannot be used ({why}); reconnecting without it, which is slower")
-
-    def _done(self, number: int, sequence: int, mapping: SharedMapping, _: object) -> None:
-        """Return a buffer when its last view is gone; may run in any thread."""
-        if mapping.sequence != sequence:
-            self.subscription.tell_torn(self)
-        self._views.pop(number, None)
-        self._give_back(number)
-        if self._closing and not self._views:
-            self.socket.close()
-
-    def _give_back(self, number: int) -> None:
-        with contextlib.suppress(OSError):  # the publisher is gone, and its buffers with it
-            self.socket.send(BUFFER_ID.pack(number), socket.MSG_NOSIGNAL)
-
-    def close(self) -> None:
-        """Stop receiving. While the node still holds a view, the publisher must not overwrite that buffer, so the
-        connection stays open until the last view is gone.
-        """
-        while self._fds:
-            os.close(self._fds.popleft())
-        self._closing = True
-        if self._views:
-            with contextlib.suppress(OSError):  # the publisher closed first
-                self.socket.shutdown(socket.SHUT_RD)
-            if self._views:
-                return
-        self.socket.close()
+        self.slots: dict[int, SlotMapping] = {}
+        self.mapped = False  # a slot could be opened once, so that others can be
+        self.views = 0
 
 
 class LocalSubscription:
     """Subscription of one topic, for all its publishers.
 
+    Args:
+        host: the node's transport.
+        topic, type_name, qos: what it reads; ``type_name`` None accepts any type.
+        on_ready: called when messages have arrived.
+        on_close: called once when the subscription is closed.
+
     Raises:
-        RegistryError: the topic's name is invalid.
+        RegistryError: the topic's name is invalid, or its folder cannot be used.
     """
 
     def __init__(
-        self, transport: LocalTransport, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]
+        self,
+        host: Host,
+        topic: str,
+        type_name: str | None,
+        qos: QoS,
+        on_ready: Callable[[], None],
+        on_close: Callable[[LocalSubscription], None],
     ) -> None:
         self.topic = registry.check_topic(topic)
         self.type_name = type_name
@@ -247,21 +79,31 @@ class LocalSubscription:
         self.on_ready = on_ready
         self.waker: object = None  # its `set` is `on_ready`, which the thread waiting on it need not call
         self.fresh = False
-        self.shared = True  # until this process proves unable to map memory
         self.publishers: list[registry.PublisherInfo] = []
-        self._transport = transport
+        self._host = host
+        self._on_close = on_close
+        self._name = self.topic.encode()
         self._digest = type_digest(type_name) if type_name else None
-        self._expected: dict[str, int] = {}  # next sequence, by publisher whose connection was lost
-        self._told: set[str] = set()
         self._lock = threading.Lock()
         self._queue: deque[Received] = deque()
         self._depth = qos.depth
-        self._now_ns, self._steady_ns, self._next_order = transport.now_ns, transport.steady_ns, transport.next_order
-        self._folder = registry.topic_dir(transport.run_dir, topic)
+        self._now_ns, self._steady_ns, self._next_order = host.now_ns, host.steady_ns, host.next_order
+        self._folder = registry.topic_dir(host.run_dir, topic)
         registry.own_folder(self._folder)
         self._seen_mtime = -1
         self._next_full_look = 0.0
-        self._inlets: dict[str, tuple[str, Inlet]] = {}  # by the publisher's identity: path of its socket, connection
+        self._sources: dict[bytes, _Source] = {}
+        self._connected: dict[str, float] = {}  # path of a publisher's socket: when it was last seen in the registry
+        self._looked_up: dict[bytes, float] = {}  # identities that are not in the registry: when they were looked up
+        self._told: set[object] = set()
+        self._socket = host.context.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
+        self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+        self._page = ProgressPage(newest_only=qos.depth == 1)
+        self._socket.setsockopt(zmq.SUBSCRIBE, self._page.announcement)
+        self._socket.setsockopt(zmq.SUBSCRIBE, self._name)
+        self.fd = int(self._socket.getsockopt(zmq.FD))
 
     # -- on the reading thread, under the transport's read lock ------------------------------------
 
@@ -276,65 +118,90 @@ class LocalSubscription:
         if mtime == self._seen_mtime and now < self._next_full_look:
             return
         self._seen_mtime, self._next_full_look = mtime, now + _FULL_LOOK_S
-        self.publishers = registry.topic_publishers(self._transport.run_dir, self.topic)
-        wanted = {info.id: str(info.socket) for info in self.publishers}
-        for identity in [i for i in self._inlets if i not in wanted]:
-            # Its registration is removed before its socket: its last messages may still be on the way.
-            inlet = self._inlets[identity][1]
-            self._transport.read_inlet(inlet)
-            if identity in self._inlets:  # not yet removed by the read above
-                self.lose_inlet(inlet)
-        for identity, path in wanted.items():
-            if identity not in self._inlets:
+        self._look_up(now)
+        for path in [path for path, seen_s in self._connected.items() if now - seen_s > _GRACE_S]:
+            self.read()
+            self._socket.disconnect(f"ipc://{path}")
+            del self._connected[path]
+        present = {bytes.fromhex(info.id) for info in self.publishers}
+        for identity, source in list(self._sources.items()):
+            if identity not in present and str(source.info.socket) not in self._connected:
+                self._forget(identity)
+        self.read()  # an event may have been taken from `fd` here
+
+    def _look_up(self, now: float) -> None:
+        """Read the registry, and connect to publishers that are new in it."""
+        self.publishers = registry.topic_publishers(self._host.run_dir, self.topic)
+        for info in self.publishers:
+            path = str(info.socket)
+            if path not in self._connected:
                 try:
-                    inlet = Inlet(self, path)
-                except OSError:  # it is starting up or shutting down: try again at the next look
-                    self._next_full_look = now
+                    self._socket.connect(f"ipc://{path}")
+                except zmq.ZMQError as error:
+                    self._complain(path, f"{path} cannot be connected: {error}")
                     continue
-                self._inlets[identity] = (path, inlet)
-                self._transport.add_inlet(inlet)
+            self._connected[path] = now
 
-    def lose_inlet(self, inlet: Inlet) -> None:
-        """Close a connection; a publisher that is still alive is found again."""
-        for identity, (_, other) in list(self._inlets.items()):
-            if other is inlet:
-                del self._inlets[identity]
-                self._expected[identity] = inlet.expected
-        self._next_full_look = 0.0
-        self._transport.remove_inlet(inlet)
-        inlet.close()
+    def read_rest(self) -> None:
+        """Read what :meth:`read` of one message has left; usually nothing."""
+        if int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            self.read()
 
-    def met(self, inlet: Inlet) -> None:
-        """Handle a publisher's greeting."""
-        hello = inlet.hello
-        assert hello is not None
-        if hello.topic != self.topic:
-            raise FrameError(f"connected to a publisher of {hello.topic}")
-        inlet.refused = self._digest is not None and hello.digest != self._digest
-        inlet.node, inlet.type_name = hello.node, self.type_name or hello.type_name
-        inlet.expected = self._expected.get(hello.publisher, 0)
-
-    def deliver(
-        self, inlet: Inlet, sequence: int, skipped: int, publish_ns: int, payload: bytes | memoryview | None
-    ) -> None:
-        """Handle one message."""
-        node = inlet.node
-        if sequence != inlet.expected + skipped:
-            if not inlet.expected:
-                if inlet.hello is None:
-                    raise FrameError("message before the publisher's greeting")
-            elif sequence < inlet.expected:  # a latched value, sent again over a new connection
+    def read(self, one: bool = False) -> None:
+        """Read all messages that have arrived, or only one: then :meth:`read_rest` must follow before a wait."""
+        socket = self._socket
+        receive = socket.recv
+        while True:
+            try:
+                key = receive(_NOBLOCK)
+            except zmq.Again:
                 return
-            else:
-                self.stats.lose(node, sequence - inlet.expected - skipped)
-        inlet.expected = sequence + 1
-        if payload is None or inlet.refused:
-            self._refuse(inlet)
+            try:
+                if not key.startswith(self._name):
+                    raise FrameError(f"message with the key {key[:40]!r}")
+                # A missing part shows as the next message's key, or as none: neither is a header.
+                header = unpack_header(receive(_NOBLOCK))
+                if header[0] == SHARED or header[5] < _LARGE_FROM_BYTES:
+                    self._message(header, receive(_NOBLOCK))
+                else:
+                    self._message(header, receive(_NOBLOCK, copy=False).buffer.toreadonly())
+            except (FrameError, zmq.Again) as error:
+                while socket.getsockopt(zmq.RCVMORE):
+                    receive(_NOBLOCK)
+                self.stats.rejected += 1
+                self._complain(str(error)[:40], f"{str(error) or 'message in parts'}; the message is dropped")
+            if one or not int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+                return
+
+    def _message(self, header: Header, body: bytes | memoryview) -> None:
+        kind, sequence, publish_ns, publisher, digest, size = header
+        source = self._sources.get(publisher) or self._met(publisher)
+        gap = sequence - source.expected if source.expected else 0
+        if gap < 0:  # a latched value, sent again
             return
-        steady = self._steady_ns()
+        if self._digest is not None and digest != self._digest:
+            self._refuse(source)
+            return
+        payload: bytes | memoryview | None = body
+        if kind == SHARED:
+            payload = self._shared(source, header, body)
+            gap += payload is None
+        elif len(body) != size:
+            raise FrameError(f"message of {len(body)} bytes, {size} announced")
+        source.expected = sequence + 1
+        if gap and self._depth == 1:
+            self.stats.skipped += gap  # a newest-only reader needs only the newest
+        elif gap:
+            self.stats.lose(source.node, gap)
+        if size >= _LARGE_FROM_BYTES:
+            self._page.store(publisher, sequence)
+        if payload is None:
+            return
+        node, steady = source.node, self._steady_ns()
+        # A publisher's type is that of the subscription, or what the registry says.
         message = _new(
             Received,
-            (self.topic, inlet.type_name, payload, publish_ns, self._now_ns(), self._next_order(), node, steady),
+            (self.topic, source.type_name, payload, publish_ns, self._now_ns(), self._next_order(), node, steady),
         )
         with self._lock:
             queue = self._queue
@@ -347,33 +214,97 @@ class LocalSubscription:
                 elif len(queue) >= self._depth:
                     self.stats.lose(queue.popleft().publisher, 1)
             queue.append(message)
-        self.stats.add(steady, len(payload))
+        self.stats.add(steady, size)
         self.fresh = True
 
-    def tell_torn(self, inlet: Inlet) -> None:
-        """Count and log that a publisher overwrote a buffer it had lent, which is a fault of the publisher."""
-        self.stats.torn += 1
-        node = inlet.hello.node if inlet.hello else "?"
-        log.error("%s: %s overwrote a message that was still in use", self.topic, node)
+    def _met(self, publisher: bytes) -> _Source:
+        """The publisher of a first message.
 
-    def _refuse(self, inlet: Inlet) -> None:
-        hello = inlet.hello
-        assert hello is not None
-        if not inlet.refused:
-            self.stats.lose(hello.node, 1)
-            self.tell_torn(inlet)
-            return
+        Raises:
+            FrameError: the registry does not name it.
+        """
+        now = time.monotonic()
+        if now >= self._looked_up.get(publisher, 0.0):
+            self._look_up(now)
+            for info in self.publishers:
+                if bytes.fromhex(info.id) == publisher:
+                    self._sources[publisher] = source = _Source(info)
+                    return source
+            if len(self._looked_up) < _MOST_UNKNOWN:
+                self._looked_up[publisher] = now + _FULL_LOOK_S
+        raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")
+
+    def _forget(self, publisher: bytes) -> None:
+        del self._sources[publisher]
+        self._page.forget(publisher)
+
+    def _shared(self, source: _Source, header: Header, body: bytes | memoryview) -> memoryview | None:
+        """The message in shared memory; None when its slot holds another message by now."""
+        if len(body) != REFERENCE.size:
+            raise FrameError(f"reference of {len(body)} bytes; it has {REFERENCE.size}")
+        pid, fd, number, oldest = REFERENCE.unpack(body)
+        _, sequence, _, publisher, _, size = header
+        for retired in [n for n in source.slots if n < oldest]:
+            del source.slots[retired]
+        slot = source.slots.get(number)
+        if slot is None:
+            try:
+                slot = source.slots[number] = SlotMapping(pid, fd, publisher)
+                source.mapped = True
+            except OSError as error:
+                if source.mapped and error.errno == errno.ENOENT:
+                    return None
+                self._without_shared_memory(source, sequence, error)
+        if not slot.lease(sequence, size):
+            return None
+        if source.views >= VIEWS_HELD:
+            copy = memoryview(bytes(slot.view(size)))
+            slot.release()
+            return copy
+        array = np.frombuffer(slot.view(size), np.uint8)
+        source.views += 1
+        # Everything derived from the message refers to this array: when it is freed, nothing reads the slot any more.
+        weakref.finalize(array, self._done, source, slot, sequence).atexit = False
+        return array.data
+
+    def _done(self, source: _Source, slot: SlotMapping, sequence: int) -> None:
+        """Unlock a slot when its last view is gone; may run in any thread."""
+        if slot.sequence != sequence:
+            self.stats.torn += 1
+            log.error("%s: %s overwrote a message that was still in use", self.topic, source.node)
+        source.views -= 1
+        slot.release()
+
+    def _without_shared_memory(self, source: _Source, sequence: int, error: OSError) -> NoReturn:
+        """Replace the subscription by one to inline messages only."""
+        source.expected = source.expected or sequence  # the last value comes again
+        self._socket.setsockopt(zmq.SUBSCRIBE, self._name + KEY_INLINE)
+        self._socket.setsockopt(zmq.SUBSCRIBE, self._name + KEY_COPY)
+        if self._name not in self._told:
+            self._told.add(self._name)
+            self._socket.setsockopt(zmq.UNSUBSCRIBE, self._name)
+            self._socket.setsockopt(zmq.UNSUBSCRIBE, self._page.announcement)
+        raise FrameError(
+            f"shared memory of {source.node} cannot be used ({error.strerror or error}); asking for large messages "
+            "through the socket, which is slower"
+        )
+
+    def _refuse(self, source: _Source) -> None:
         self.stats.rejected += 1
-        if hello.publisher not in self._told:
-            self._told.add(hello.publisher)
-            same = hello.type_name == self.type_name
-            why = f"{hello.type_name} with other fields" if same else f"{hello.type_name}, {self.type_name} expected"
-            log.error("%s: node %s sends %s; its messages are refused and counted", self.topic, hello.node, why)
+        same = source.type_name == self.type_name
+        why = f"{source.type_name} with other fields" if same else f"{source.type_name}, {self.type_name} expected"
+        self._complain(source.info.id, f"node {source.node} sends {why}; its messages are refused and counted")
+
+    def _complain(self, what: object, text: str) -> None:
+        """Log an error once."""
+        if what not in self._told and len(self._told) < _MOST_UNKNOWN:
+            self._told.add(what)
+            log.error("%s: %s", self.topic, text)
 
     def shut(self) -> None:
-        """Close every connection."""
-        for _, inlet in list(self._inlets.values()):
-            self.lose_inlet(inlet)
+        """Close the socket; views of messages stay valid."""
+        self._socket.close()
+        self._page.close()
 
     # -- on the node's thread --------------------------------------------------------------------
 
@@ -388,4 +319,4 @@ class LocalSubscription:
 
     def close(self) -> None:
         """End the subscription."""
-        self._transport.forget(self)
+        self._on_close(self)

@@ -1,14 +1,16 @@
-"""Topics of one node on one machine: Unix sockets found through the registry; no broker, no master.
+"""Topics of one node on one machine: ZeroMQ sockets found through the registry; no broker, no master.
 
 Which thread reads: while the node's thread waits in :meth:`Waker.wait`, it reads its own sockets, so a message wakes
 only that thread. During a long callback the bus thread reads instead, so that the newest message does not grow old in
-a queue. The bus thread also accepts readers, sends what a slow reader has not taken yet, and looks for publishers.
+a queue. The bus thread also serves new subscriptions and looks for publishers.
+
+Both wait on the sockets' file descriptors and touch a socket only under a lock, since ZeroMQ's are not thread-safe.
+A thread that touches one must read all it has: its descriptor does not report an event twice.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import logging
 import os
 import select
@@ -18,13 +20,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from instant_ic.bus import registry
-from instant_ic.bus.frame import FrameError
-from instant_ic.bus.local_publisher import LocalPublisher
-from instant_ic.bus.local_subscription import Inlet, LocalSubscription
+from instant_ic.bus.host import Host
+from instant_ic.bus.local_publisher import LINGER_S, LocalPublisher
+from instant_ic.bus.local_subscription import LocalSubscription
 from instant_ic.bus.qos import QoS
 
 _DISCOVERY_S = 0.1
-_IDLE_S = 5.0
+_IDLE_S = 1.0
 _BUSY_S = 0.015  # during a longer callback the bus thread reads instead
 _SLOW_FOR_S = 10.0  # how long after a slow callback the bus thread keeps checking at that interval
 _CLOSE_S = 5.0
@@ -89,21 +91,19 @@ class LocalTransport:
         now_ns: Callable[[], int],
         steady_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.run_dir = registry.prepare(run_dir)
-        self.node = registry.check_node_name(node)
-        self.now_ns = now_ns
-        self.steady_ns = steady_ns
+        self._host = Host(run_dir, node, now_ns, steady_ns)
+        self.run_dir = self._host.run_dir
+        self.node = node
         self.driver: int | None = None
-        self.next_order: Callable[[], int] = itertools.count().__next__  # a message's position in order of arrival
         self._lock = threading.Lock()
         self._read_lock = threading.RLock()
         self._publishers: list[LocalPublisher] = []
         self._subscriptions: list[LocalSubscription] = []
-        self._inlets: dict[int, Inlet] = {}
+        self._readers: dict[int, LocalSubscription] = {}
         self._stop = threading.Event()
         self._inputs = select.epoll()
         self._events = select.epoll()
-        self._handlers: dict[int, Callable[[int], None]] = {}
+        self._writers: dict[int, LocalPublisher] = {}
         self._poke = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._events.register(self._poke, select.EPOLLIN)
         self._waiting = False
@@ -113,6 +113,7 @@ class LocalTransport:
         self._events.register(self._inputs.fileno(), select.EPOLLIN)
         self._waker: Waker | None = None
         self._look_now = False
+        self._unread: list[LocalSubscription] = []  # may have more, which their descriptors do not show
         self._thread = threading.Thread(target=self._run, name="bus", daemon=True)
         self._thread.start()
 
@@ -129,90 +130,67 @@ class LocalTransport:
         Raises:
             RegistryError: the node already publishes the topic, or the path is too long.
         """
-        publisher = LocalPublisher(self, registry.check_topic(topic), type_name, qos)
+        publisher = LocalPublisher(self._host, registry.check_topic(topic), type_name, qos, self._forget_publisher)
         with self._lock:
             self._publishers.append(publisher)
+            self._writers[publisher.fd] = publisher
+            self._events.register(publisher.fd, select.EPOLLIN)
         return publisher
 
     def subscribe(self, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]) -> LocalSubscription:
         """Subscribe to all present and future publishers; ``type_name`` None accepts any type."""
-        subscription = LocalSubscription(self, topic, type_name, qos, on_ready)
-        if self._waker is not None and on_ready == self._waker.set:
-            subscription.waker = self._waker
+        with self._read_lock:
+            subscription = LocalSubscription(self._host, topic, type_name, qos, on_ready, self._forget_subscription)
+            if self._waker is not None and on_ready == self._waker.set:
+                subscription.waker = self._waker
+            self._readers[subscription.fd] = subscription
+            self._inputs.register(subscription.fd, select.EPOLLIN)
         with self._lock:
             self._subscriptions.append(subscription)
             self._look_now = True
         os.eventfd_write(self._poke, 1)
         return subscription
 
-    def forget(self, item: LocalPublisher | LocalSubscription) -> None:
-        """Remove a closed publisher or subscription."""
+    def _forget_publisher(self, publisher: LocalPublisher) -> None:
+        """Stop serving a publisher; its socket closes next."""
         with self._lock:
-            if isinstance(item, LocalPublisher):
-                if item in self._publishers:
-                    self._publishers.remove(item)
+            if publisher in self._publishers:
+                self._publishers.remove(publisher)
+                del self._writers[publisher.fd]
+                self._events.unregister(publisher.fd)
+
+    def _forget_subscription(self, subscription: LocalSubscription) -> None:
+        """Stop reading a subscription and close its socket."""
+        with self._lock:
+            if subscription not in self._subscriptions:
                 return
-            if item not in self._subscriptions:
-                return
-            self._subscriptions.remove(item)
+            self._subscriptions.remove(subscription)
         with self._read_lock:
-            item.shut()
+            del self._readers[subscription.fd]
+            self._inputs.unregister(subscription.fd)
+            subscription.shut()
 
     def close(self) -> None:
         """Close everything; the last messages get up to 0.2 s to leave."""
         if self._stop.is_set():
             return
-        for publisher in list(self._publishers):
-            publisher.close()
         self._stop.set()
         os.eventfd_write(self._poke, 1)
         self._thread.join(timeout=_CLOSE_S)
         for subscription in list(self._subscriptions):
             subscription.close()
+        for publisher in list(self._publishers):
+            publisher.close()
         with self._read_lock:
             if self._waker is not None:
                 self._waker.close()
             self._inputs.close()
             self._events.close()
             os.close(self._poke)
-
-    # -- for publishers: sockets served by the bus thread --------------------------------------------
-
-    def watch(self, fd: int, events: int, handler: Callable[[int], None]) -> None:
-        """Call ``handler(events)`` on the bus thread when the file descriptor has one of these events."""
-        self._handlers[fd] = handler
-        self._events.register(fd, events)
-
-    def rewatch(self, fd: int, events: int) -> None:
-        """Change the events to wait for."""
-        self._events.modify(fd, events)
-
-    def unwatch(self, fd: int) -> None:
-        """Stop watching; call this before the file descriptor is closed."""
-        if self._handlers.pop(fd, None) is not None:
-            self._events.unregister(fd)
-
-    # -- for subscriptions, under the read lock --------------------------------------------------
-
-    def add_inlet(self, inlet: Inlet) -> None:
-        """Start reading a connection."""
-        self._inlets[inlet.socket.fileno()] = inlet
-        self._inputs.register(inlet.socket.fileno(), select.EPOLLIN)
-
-    def remove_inlet(self, inlet: Inlet) -> None:
-        """Stop reading a connection."""
-        if self._inlets.pop(inlet.socket.fileno(), None) is not None:
-            self._inputs.unregister(inlet.socket.fileno())
-
-    def read_inlet(self, inlet: Inlet) -> None:
-        """Read what has arrived over one connection."""
-        try:
-            alive = inlet.read()
-        except (FrameError, OSError) as error:
-            log.error("%s: %s; the connection is closed", inlet.subscription.topic, error)
-            alive = False
-        if not alive:
-            inlet.subscription.lose_inlet(inlet)
+        started_s = time.monotonic()
+        self._host.context.term()
+        if time.monotonic() - started_s > LINGER_S / 2:  # no later message will reveal the gap to the readers
+            log.warning("%s closed: its last messages are lost, a reader was too slow to take them", self.node)
 
     # -- reading ---------------------------------------------------------------------------------
 
@@ -228,19 +206,36 @@ class LocalTransport:
             if now > self._slow_until_s:
                 os.eventfd_write(self._poke, 1)
             self._slow_until_s = now + _SLOW_FOR_S
-        self._drain(self._inputs.poll(timeout, 16), self._waker)
+        if not (self._unread and self._read_rest()):
+            self._drain(self._inputs.poll(timeout, 16), self._waker)
         self._left_s = time.monotonic()
         self._waiting = False
+
+    def _read_rest(self) -> bool:
+        """Read what was left of sockets of which one message was read; True if there was any."""
+        fresh: list[LocalSubscription] = []
+        with self._read_lock:
+            unread, self._unread = self._unread, []
+            for subscription in unread:
+                if subscription.fd in self._readers:
+                    subscription.read_rest()
+                    if subscription.fresh:
+                        subscription.fresh = False
+                        fresh.append(subscription)
+        for subscription in fresh:
+            subscription.on_ready()
+        return bool(fresh)
 
     def _drain(self, events: list[tuple[int, int]], reader: Waker | None) -> None:
         """Read what waits, and notify every subscription that ``reader`` does not serve."""
         others: list[LocalSubscription] = []
         with self._read_lock:
             for fd, _ in events:
-                inlet = self._inlets.get(fd)
-                if inlet is not None:
-                    self.read_inlet(inlet)
-                    subscription = inlet.subscription
+                subscription = self._readers.get(fd)
+                if subscription is not None:
+                    subscription.read(one=reader is not None)  # looking for more would delay this one
+                    if reader is not None:
+                        self._unread.append(subscription)
                     if subscription.fresh:
                         subscription.fresh = False
                         if reader is None or subscription.waker is not reader:
@@ -259,17 +254,18 @@ class LocalTransport:
             if not self._waiting and not self._bus_reads and now - self._left_s > _BUSY_S:
                 self._bus_reads = True
                 self._events.modify(inputs, select.EPOLLIN)
+                self._read_rest()
             timeout = min(_IDLE_S, next_look - now) if self._subscriptions else _IDLE_S
             if now < self._slow_until_s:
                 timeout = min(timeout, _BUSY_S)
             try:
-                for fd, events in self._events.poll(max(0.0, timeout), 64):
+                for fd, _ in self._events.poll(max(0.0, timeout), 64):
                     if fd == inputs:
                         self._drain(self._inputs.poll(0, 64), None)
                     elif fd == self._poke:
                         os.eventfd_read(fd)
-                    elif (handler := self._handlers.get(fd)) is not None:
-                        handler(events)
+                    elif (publisher := self._writers.get(fd)) is not None:
+                        publisher.serve()
             except Exception:  # one bad event must not stop the bus
                 log.exception("%s: fault on the bus thread", self.node)
                 self._stop.wait(_BUSY_S)
@@ -277,8 +273,12 @@ class LocalTransport:
     def _look(self) -> bool:
         """Look for publishers; False when the run directory is gone."""
         fine = True
+        for publisher in list(self._writers.values()):
+            publisher.serve()
         for subscription in list(self._subscriptions):
             with self._read_lock:
+                if subscription.fd not in self._readers:  # just closed
+                    continue
                 try:
                     subscription.discover()
                 except OSError as error:

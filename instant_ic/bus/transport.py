@@ -59,6 +59,8 @@ class Stats:
     def __init__(self) -> None:
         self.count = 0
         self.lost_by: dict[str, int] = {}
+        self.skipped = 0
+        """Messages that a newest-only reader did not need to look at."""
         self.rejected = 0
         self.torn = 0
         self.bytes = 0

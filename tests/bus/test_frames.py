@@ -1,148 +1,125 @@
-"""What a reader does with bytes from its socket, whole, in pieces and wrong; the buffers behind them."""
+"""What a reader does with messages from outside, whole and wrong; the slots behind large ones."""
 
-import json
+import mmap
 import os
 import socket
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from local_bus import BYTES, LARGE, Bus, number, numbered, wait_for, whole
 
-from instant_ic.bus import RELIABLE, SENSOR
-from instant_ic.bus.frame import DATA, GREETING, HEADER, HELLO, MAGIC, VERSION, FrameError, Hello, type_digest
-from instant_ic.bus.local_subscription import RECEIVE_BYTES, Inlet
-from instant_ic.bus.shm import BufferPool, SharedBuffer, SharedMapping
+from instant_ic.bus import SENSOR
+from instant_ic.bus.frame import (
+    HEADER,
+    INLINE,
+    MAGIC,
+    REFERENCE,
+    SHARED,
+    VERSION,
+    FrameError,
+    type_digest,
+    unpack_header,
+)
+from instant_ic.bus.shm import PeerProgress, ProgressPage, Slot, SlotMapping, SlotPool
 
-HELLO_FRAME = Hello("sender", "/x", BYTES, type_digest(BYTES), "00" * 8).pack()
+ID = b"publishr"
 
 
-class Listener:
-    """A publisher of which every byte is the test's; keeps what the reader takes."""
+class Stranger:
+    """A publisher of which every part is the test's, beside a good one; both on /x."""
 
-    shared = True
-    qos = RELIABLE
-    topic = "/x"
+    def __init__(self, bus: Bus) -> None:
+        self.out, self.reader = bus.publisher(), bus.reader()
+        wait_for(lambda: self.out.subscriber_count == 1)
+        raw = self.reader.raw
+        with self.reader.transport._read_lock:
+            self._socket = raw._host.context.socket(zmq.PUB)
+            self._socket.bind("inproc://stranger")
+            raw._socket.connect("inproc://stranger")
+            raw.read()
 
-    def __init__(self, folder: Path) -> None:
-        self.taken: list[tuple[int, int, int, bytes]] = []
-        self.hello: Hello | None = None
-        path = folder / f"{os.urandom(4).hex()}.sock"
-        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        server.bind(str(path))
-        server.listen()
-        self.inlet = Inlet(self, str(path))
-        self.socket, _ = server.accept()
-        server.close()
-        assert self.socket.recv(GREETING.size) == GREETING.pack(MAGIC, VERSION, True, RELIABLE.depth)
-        self.socket.setblocking(False)  # both ends are this thread's
-
-    def met(self, inlet: Inlet) -> None:
-        self.hello = inlet.hello
-
-    def deliver(self, _: Inlet, sequence: int, skipped: int, publish_ns: int, payload: bytes) -> None:
-        self.taken.append((sequence, skipped, publish_ns, bytes(payload)))
-
-    def tell_torn(self, _: Inlet) -> None:
-        raise AssertionError("nothing shared here")
+    def send(self, *parts: bytes) -> None:
+        with self.reader.transport._read_lock:
+            self._socket.send_multipart(parts)
+            self.reader.raw.read()
 
     def close(self) -> None:
-        self.inlet.close()
-        self.socket.close()
+        self._socket.close(0)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("f")
+@pytest.fixture
+def stranger(bus: Bus):
+    stranger = Stranger(bus)
+    yield stranger
+    stranger.close()
 
 
-messages = st.lists(
-    st.tuples(st.integers(0, 2**31), st.integers(-(2**62), 2**62), st.integers(0, 3000) | st.integers(60_000, 400_000)),
-    max_size=6,
-)
-
-
-@settings(max_examples=60, deadline=None)
-@given(messages=messages, cuts=st.lists(st.integers(1, 300_000), min_size=1, max_size=30))
-def test_frames_cut_anywhere_come_whole_and_in_order(folder: Path, messages, cuts) -> None:
-    wanted = [(i, skipped, stamp, bytes([i]) * size) for i, (skipped, stamp, size) in enumerate(messages, start=1)]
-    data = HELLO_FRAME + b"".join(HEADER.pack(DATA, k, len(body), i, t) + body for i, k, t, body in wanted)
-    listener = Listener(folder)
-    try:
-        at = turn = 0
-        while at < len(data):
-            end = min(len(data), at + cuts[turn % len(cuts)])
-            turn += 1
-            at += listener.socket.send(data[at:end])
-            assert listener.inlet.read()
-        assert listener.taken == wanted
-        assert listener.hello == Hello("sender", "/x", BYTES, type_digest(BYTES), "00" * 8)
-        listener.socket.close()
-        assert not listener.inlet.read()
-    finally:
-        listener.close()
-
-
-kinds = st.sampled_from([HELLO, DATA, HELLO + (1 << 40), DATA + (2 << 40), DATA - 1]) | st.integers(0, 2**64 - 1)
-frames = st.builds(
-    lambda kind, size, body: HEADER.pack(kind, 0, size, 1, 0) + body, kinds, st.integers(0, 60), st.binary(max_size=60)
-)
+def good(stranger: Stranger) -> bytes:
+    """A header as the good publisher would send it."""
+    return HEADER.pack(INLINE, 1, 5, stranger.out._id, type_digest(BYTES), 3)
 
 
 @settings(max_examples=200, deadline=None)
-@given(data=st.lists(frames | st.binary(max_size=200), max_size=5).map(b"".join))
-def test_foreign_bytes_are_refused_in_words_or_wait_for_more(folder: Path, data: bytes) -> None:
-    listener = Listener(folder)
+@given(st.binary(max_size=60) | st.builds(lambda rest: MAGIC + bytes([VERSION]) + rest, st.binary(max_size=60)))
+def test_foreign_bytes_are_a_header_or_an_error(data: bytes) -> None:
     try:
-        listener.socket.sendall(data)
-        try:
-            while listener.inlet.read() and len(data) > RECEIVE_BYTES:
-                pass
-        except FrameError as error:
-            assert str(error)
-        listener.socket.close()
-        try:
-            assert listener.inlet.read() in (True, False)
-        except FrameError as error:
-            assert str(error)
-    finally:
-        listener.close()
+        assert len(unpack_header(data)) == 6
+    except FrameError as error:
+        assert str(error)
 
 
-def test_frame_of_another_version_says_so(folder: Path) -> None:
-    listener = Listener(folder)
-    other = int.from_bytes(MAGIC + bytes([VERSION + 1, 2, 0, 0]), "little")
-    try:
-        listener.socket.sendall(HEADER.pack(other, 0, 0, 1, 0))
-        with pytest.raises(FrameError, match=f"not a frame of version {VERSION} .*version {VERSION + 1}"):
-            listener.inlet.read()
-    finally:
-        listener.close()
+def test_frame_of_another_version_says_so() -> None:
+    with pytest.raises(FrameError, match=f"not a frame of version {VERSION} .version {VERSION + 1}"):
+        unpack_header(MAGIC + bytes([VERSION + 1]) + bytes(43))
 
 
-NO_TEXT = json.dumps({"node": 1, "topic": 2, "type_name": 3, "digest": 4, "publisher": 5}).encode()
+def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Stranger, caplog) -> None:
+    header, reader = good(stranger), stranger.reader
+    bad = [
+        [b"/x"],
+        [b"/x", b"no header"],
+        [b"/x\0", header],
+        [b"/x\0", header, b"four"],
+        [b"/x\0", HEADER.pack(SHARED, 1, 5, stranger.out._id, type_digest(BYTES), 3), b"abc"],
+        [b"/x\0", HEADER.pack(INLINE, 1, 5, b"nobody..", type_digest(BYTES), 3), b"abc"],
+        [b"/xyz", b"", b"", b"", b""],
+    ]
+    for count, parts in enumerate(bad, start=1):
+        stranger.send(*parts)
+        assert reader.stats.rejected >= count, parts
+    assert "not a frame of version 3" in caplog.text
+    assert "message of 4 bytes, 3 announced" in caplog.text
+    assert "not in the registry (identity 6e6f626f64792e2e)" in caplog.text
+    assert reader.poll() == []
+    stranger.out.send(numbered(1))
+    wait_for(lambda: reader.numbers() == [1])
+    assert reader.stats.lost == 0
 
 
-@pytest.mark.parametrize("body", [b"", b"[]", b"{}", b"\xff", NO_TEXT])
-def test_greeting_that_cannot_be_read(body: bytes) -> None:
-    with pytest.raises(FrameError, match="greeting"):
-        Hello.unpack(body)
+def test_reference_to_something_else_is_not_opened(stranger: Stranger, caplog) -> None:
+    """A descriptor that is no memory of the bus, here a pipe nobody writes to: opening it would block."""
+    pipe = os.pipe()
+    header = HEADER.pack(SHARED, 1, 5, stranger.out._id, type_digest(BYTES), 3)
+    stranger.send(b"/x\1", header, REFERENCE.pack(os.getpid(), pipe[0], 1, 1))
+    assert "shared memory of sender cannot be used (no shared memory of the bus)" in caplog.text
+    assert stranger.reader.poll() == []
+    for end in pipe:
+        os.close(end)
 
 
-def test_stranger_at_a_publishers_socket_is_refused_and_others_are_served(bus: Bus, caplog) -> None:
+def test_stranger_at_a_publishers_socket_disturbs_nobody(bus: Bus) -> None:
     out, reader = bus.publisher(), bus.reader()
     wait_for(lambda: out.subscriber_count == 1)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as stranger:
-        stranger.settimeout(30)
-        stranger.connect(str(out._path))
-        stranger.send(b"GET / HTTP/1.1\r\n\r\n")
-        assert stranger.recv(100) == b""  # hung up
-    assert "refused a reader of another bus version (expected 2, it sent b'GET '" in caplog.text
-    out.send(numbered(1))
-    wait_for(lambda: reader.numbers() == [1])
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
+        other.connect(str(out._path))
+        other.send(b"GET / HTTP/1.1\r\n\r\n" * 10)
+        out.send(numbered(1))
+        wait_for(lambda: reader.numbers() == [1])
+    wait_for(lambda: out.subscriber_count == 1)
 
 
 def test_payload_in_parts_and_of_any_buffer_is_one_message(bus: Bus) -> None:
@@ -156,49 +133,89 @@ def test_payload_in_parts_and_of_any_buffer_is_one_message(bus: Bus) -> None:
             assert wait_for(reader.poll).pop().payload == want
 
 
-def test_buffer_is_refilled_only_when_nobody_holds_it() -> None:
-    pool = BufferPool()
-    first, _ = pool.acquire(LARGE, most=2)
-    first.holders.add("a")
-    second, _ = pool.acquire(LARGE, most=2)
-    second.holders.add("b")
-    assert first is not second
-    assert pool.acquire(LARGE, most=2) == (None, [])
-    first.holders.clear()
-    assert pool.acquire(LARGE, most=2) == (first, [])
+def written(pool: SlotPool, sequence: int, size: int = LARGE, must: int = 99, should: int = 99) -> Slot | None:
+    slot = pool.acquire(size, 6, must, should)
+    if slot is not None:
+        slot.begin(size).release()
+        slot.finish(sequence)
+        slot.unlock()
+    return slot
+
+
+def test_slot_is_refilled_only_when_nobody_uses_or_still_wants_it() -> None:
+    pool = SlotPool(ID)
+    first = written(pool, 1)
+    reader = SlotMapping(os.getpid(), first.fd, ID)
+    assert reader.lease(1, LARGE)
+    second = written(pool, 2)
+    assert second is not first  # in use
+    third = written(pool, 3, must=1)
+    assert third not in (first, second)  # a reliable reader has not looked at it
+    reader.release()
+    assert written(pool, 4) is first  # the oldest
+    assert written(pool, 5, should=0) not in (first, second, third)  # newest-only readers: not before there are four
+    assert written(pool, 6, should=0) is second
+    assert not reader.lease(1, LARGE)  # another message by now
     pool.close()
 
 
-def test_larger_message_takes_a_new_buffer_and_tells_of_the_old() -> None:
-    pool = BufferPool(most_bytes=10_000_000)
-    small, _ = pool.acquire(LARGE, most=3)
-    large, retired = pool.acquire(5_000_000, most=3)
-    assert retired == [small] and pool.buffers == [large]
-    large.holders.add("a")
-    assert pool.acquire(5_000_000, most=3) == (None, [])  # over the limit of all together
+def test_larger_message_takes_a_new_slot_and_drops_the_small() -> None:
+    pool = SlotPool(ID, most_bytes=10_000_000)
+    small = written(pool, 1)
+    large = written(pool, 2, 5_000_000)
+    assert small not in pool.slots and pool.oldest == large.number
+    assert written(pool, 3, 5_000_000, must=1) is None  # over the limit of all together
     pool.close()
 
 
-def test_mapping_is_read_only_and_checks_the_size() -> None:
-    buffer = SharedBuffer(1, LARGE)
-    with buffer.begin(LARGE) as target:
+def test_mapping_is_read_only_sealed_and_checks_the_size() -> None:
+    slot = Slot(1, LARGE, ID)
+    with slot.begin(LARGE) as target:
         target[:] = numbered(5, LARGE)
-    buffer.finish(5)
-    mapping = SharedMapping(os.dup(buffer.fd))
-    assert mapping.sequence == 5
+    slot.finish(5)
+    mapping = SlotMapping(os.getpid(), slot.fd, ID)
+    assert mapping.lease(5, slot.capacity)
+    mapping.release()
+    assert not mapping.lease(5, slot.capacity + 1) and not mapping.lease(4, LARGE)
     assert mapping.view(LARGE) == numbered(5, LARGE)
     assert mapping.view(LARGE).readonly
-    assert mapping.fits(buffer.capacity) and not mapping.fits(buffer.capacity + 1)
     body = np.frombuffer(mapping.view(LARGE), np.uint8, offset=4)
     assert body.ctypes.data % 64 == 0  # arrays of a CDR message start aligned
-    with pytest.raises(OSError):  # sealed: a reader cannot take the memory away under the publisher
-        os.truncate(buffer.fd, 10)
+    with pytest.raises(OSError):  # sealed: nobody can take the memory away under the others
+        os.truncate(slot.fd, 10)
     with pytest.raises(OSError):
-        import mmap
-
-        mmap.mmap(buffer.fd, 4096, mmap.MAP_SHARED, mmap.PROT_WRITE)
-    buffer.close()
+        mmap.mmap(slot.fd, 4096, mmap.MAP_SHARED, mmap.PROT_WRITE)
+    with pytest.raises(FileNotFoundError):
+        SlotMapping(os.getpid(), slot.fd, b"somebody")
+    assert mapping.lease(5, LARGE)
+    slot.close()
     assert mapping.view(LARGE) == numbered(5, LARGE)  # the reader's share stays
+
+
+def test_writer_killed_in_a_slot_leaves_no_message_in_it() -> None:
+    slot = Slot(1, LARGE, ID)
+    slot.finish(5)
+    mapping = SlotMapping(os.getpid(), slot.fd, ID)
+    assert slot.lock()
+    slot.begin(LARGE).release()
+    assert not mapping.lease(5, LARGE)  # being written
+    slot.close()  # as at a kill: the kernel releases the lock
+    assert not mapping.lease(5, LARGE) and mapping.sequence == 0
+
+
+def test_progress_is_seen_by_the_publisher() -> None:
+    page = ProgressPage(newest_only=False)
+    peer = PeerProgress(page.announcement, ID, joined=3)
+    assert peer.sequence() == 3 and not peer.newest_only
+    page.store(b"another!", 9)
+    page.store(ID, 7)
+    assert peer.sequence() == 7
+    page.forget(ID)
+    assert peer.sequence() == 3
+    for wrong in (b"!1/2/3/0", b"!x", b"!99999999999/1/0", b"!%d/0/0" % os.getpid()):
+        with pytest.raises((OSError, ValueError)):
+            PeerProgress(wrong, ID, 0)
+    page.close()
 
 
 def test_larger_and_larger_messages_reach_the_reader(bus: Bus) -> None:
@@ -208,29 +225,18 @@ def test_larger_and_larger_messages_reach_the_reader(bus: Bus) -> None:
         out.send(numbered(i, size))
         message = wait_for(reader.poll).pop()
         assert struct.unpack_from("<q", message.payload)[0] == i and whole(message) and len(message.payload) == size
-        del message  # gives the buffer back
-    assert len(out._pool.buffers) == 1
-    assert len(next(iter(reader.raw._inlets.values()))[1]._mappings) == 1  # it let go of what was retired
+        del message  # unlocks the slot
+    assert len(out._pool.slots) == 1
+    (source,) = reader.raw._sources.values()
+    assert list(source.slots) == [out._pool.slots[0].number]  # it let go of what was retired
 
 
-def test_descriptor_waits_with_its_frame_until_the_socket_has_room(bus: Bus) -> None:
-    """The socket is full just when a buffer goes out for the first time."""
+def test_stopped_reader_costs_bounded_memory_and_loses_nothing_up_to_there(bus: Bus) -> None:
     out, reader = bus.publisher(), bus.reader()
     wait_for(lambda: out.subscriber_count == 1)
-    (peer,) = out._readers.values()
-    sent = 0
     with reader.transport._read_lock:
-        while peer.prompt:  # until a small message no longer goes out whole
-            sent += 1
-            out.send(numbered(sent, 5000))
-        with out._lock:
-            peer.flush()
-            assert peer._part is not None
-            peer._part = None  # as if the last byte that fits had been this one
-            sent -= 1
-            out._sequence -= 1
-            peer._queue.clear()
-        out.send(numbered(sent + 1, LARGE))
-        assert peer._part_fd is not None
-    wait_for(lambda: reader.poll() and number(reader.received[-1]) == sent + 1)
-    assert whole(reader.received[-1])
+        for i in range(1, 41):
+            out.send(numbered(i, LARGE))
+        assert len(out._pool.slots) <= 9 and out.stats.not_shared >= 30
+    wait_for(lambda: reader.poll() and number(reader.received[-1]) == 40)
+    assert reader.numbers() == list(range(1, 41)) and all(whole(message) for message in reader.received)

@@ -433,67 +433,64 @@ def _parse_http_headers() -> Callable[[bytes], object]:
 # -- bus and bridge ----------------------------------------------------------------------------------------------------
 
 
-def _bus_frames() -> list[bytes]:
-    from instant_ic.bus import frame
+_BUS_PUBLISHER = b"publishr"
 
-    hello = frame.Hello("node", "/topic", "std_msgs/msg/String", "0" * 16, "11" * 8).pack()
-    body = b"\0\1\0\0\6\0\0\0hello\0"
-    data = frame.HEADER.pack(frame.DATA, 0, len(body), 1, 5) + body
-    shared = frame.SHARED_BODY.pack(1, 1, 100)
-    retired = frame.BUFFER_ID.pack(1)
-    return [
-        hello + data + frame.HEADER.pack(frame.DATA, 3, len(body), 5, 6) + body,
-        hello + frame.HEADER.pack(frame.SHARED, 0, len(shared), 1, 5) + shared,
-        hello + frame.HEADER.pack(frame.RETIRED, 0, len(retired), 1, 5) + retired + data,
-        hello + frame.HEADER.pack(frame.DATA, 0, 120_000, 1, 5) + bytes(60_000),
+
+def _bus_frames() -> list[bytes]:
+    """The parts of one message, each behind its length in four bytes."""
+    from instant_ic.bus.frame import HEADER, INLINE, REFERENCE, SHARED, type_digest
+
+    digest, body = type_digest("std_msgs/msg/String"), b"\0\1\0\0\6\0\0\0hello\0"
+    inline = HEADER.pack(INLINE, 1, 5, _BUS_PUBLISHER, digest, len(body))
+    shared = HEADER.pack(SHARED, 2, 6, _BUS_PUBLISHER, digest, 200_000)
+    messages = [
+        (b"/topic\0", inline, body),
+        (b"/topic\1", shared, REFERENCE.pack(1, 0, 1, 1)),
+        (b"/topic\0", inline),
+        (b"/topic\0", inline, body, body),
     ]
+    return [b"".join(len(part).to_bytes(4, "little") + part for part in parts) for parts in messages]
 
 
 def _parse_bus() -> Callable[[bytes], object]:
-    from instant_ic.bus.local_subscription import Inlet
+    """Give parts to a subscription; it counts what is wrong and stays usable."""
+    import zmq
+
+    from instant_ic.bus import registry
+    from instant_ic.bus.host import Host
+    from instant_ic.bus.local_subscription import LocalSubscription
     from instant_ic.bus.qos import RELIABLE
 
-    path = _folder() / "socket"
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    listener.bind(str(path))
-    listener.listen(4)
-    taken: list[object] = []
-
-    def met(inlet: Any) -> None:
-        assert all(isinstance(value, str) for value in vars(inlet.hello).values())
-
-    subscription: Any = SimpleNamespace(
-        shared=True,
-        qos=RELIABLE,
-        deliver=lambda inlet, sequence, skipped, stamp, payload: taken.append(payload),
-        met=met,
-        tell_torn=lambda inlet: None,
-    )
+    host = Host(_folder() / "run", "fuzz", lambda: 0, lambda: 0)
+    subscription = LocalSubscription(host, "/topic", "std_msgs/msg/String", RELIABLE, lambda: None, lambda _: None)
+    stem = host.run_dir / "topics" / "topic" / "stranger"
+    claim = registry.Claim(stem, "fuzz")
+    claim.write(
+        {
+            "topic": "/topic", "type": "std_msgs/msg/String", "qos": "reliable", "node": "stranger", "pid": 1,
+            "socket": f"{stem}.sock", "id": _BUS_PUBLISHER.hex(), "started_ns": 1,
+        }
+    )  # fmt: skip
+    logging.getLogger("instant_ic.bus").setLevel(logging.CRITICAL)
+    out = host.context.socket(zmq.PUB)
+    out.bind("inproc://fuzz")
+    subscription._socket.connect("inproc://fuzz")
+    subscription.read()
 
     def parse(data: bytes) -> None:
-        inlet = Inlet(subscription, str(path))
-        there, _ = listener.accept()
-        with there:
-            there.setblocking(False)
-            there.send(data)
-            there.shutdown(socket.SHUT_WR)
-            try:
-                while inlet.read():
-                    pass
-            finally:
-                taken.clear()
-                inlet.close()
+        parts, at = [], 0
+        while at + 4 <= len(data) and len(parts) < 8:
+            size = int.from_bytes(data[at : at + 4], "little")
+            parts.append(data[at + 4 : at + 4 + size])
+            at += 4 + size
+        out.send_multipart(parts or [data])
+        subscription.read()
+        subscription.take()
+        assert claim.json_path.exists()  # the registry's entry stays alive
+        for source in subscription._sources.values():
+            source.expected = 0
 
     return parse
-
-
-def _fix_hello(data: bytes, rng: random.Random) -> bytes:
-    """The greeting's length: whatever stands before the next frame."""
-    from instant_ic.bus.frame import HEADER, HELLO
-
-    end = data.find(b"IIC\0", HEADER.size)
-    end = len(data) if end < 0 else end
-    return HEADER.pack(HELLO, 0, max(0, end - HEADER.size), 0, 0) + data[HEADER.size :]
 
 
 def _fix_prefix(data: bytes, rng: random.Random) -> bytes:
@@ -501,12 +498,6 @@ def _fix_prefix(data: bytes, rng: random.Random) -> bytes:
     from instant_ic.console.protocol import PREFIX, VERSION
 
     return PREFIX.pack(VERSION, rng.randrange(6), 0, 5, max(0, len(data) - PREFIX.size)) + data[PREFIX.size :]
-
-
-def _frame_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.bus.frame import FrameError
-
-    return (FrameError,)
 
 
 _CDR_TYPES = ("Twist", "TwistStamped", "Bool", "String", "LaserScan", "PointCloud2", "OccupancyGrid", "TFMessage")
@@ -1049,9 +1040,7 @@ TARGETS = {
             "bus-frames",
             _bus_frames,
             _parse_bus,
-            _frame_errors(),
-            (b"IIC\0\2\1", b"IIC\0\2\2", b"IIC\0\2\3"),
-               fix=_fix_hello,
+            dictionary=(b"IIC\0\3\0", b"IIC\0\3\1", b"/topic", _BUS_PUBLISHER),
             share=1000,
         ),
         Target("cdr", _cdr, _parse_cdr, _message_errors(), share=2000),

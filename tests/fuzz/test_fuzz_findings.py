@@ -14,7 +14,6 @@ from instant_ic.bag import BagError, BagReader, BagWriter
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import preset_of_text, schema_or_unknown, with_hash
 from instant_ic.bag.recover import recover, reindex
-from instant_ic.bus.frame import FrameError, Hello
 from instant_ic.bus.qos import RELIABLE, SENSOR
 from instant_ic.camera.http import Session
 from instant_ic.config.params import ParameterError, load_file
@@ -137,11 +136,6 @@ def test_redirect_of_the_camera_is_not_even_read() -> None:
     response = requests.Response()
     response.status_code, response.headers["Location"] = 302, "http://\xbe/"
     assert Session("", "").get_redirect_target(response) is None
-
-
-def test_nested_greeting_of_a_publisher_is_a_frame_error() -> None:
-    with pytest.raises(FrameError, match="greeting"):
-        Hello.unpack(NESTED)
 
 
 def test_nested_header_of_a_console_frame_is_a_protocol_error() -> None:
