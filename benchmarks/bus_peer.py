@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """One side of one transport, for benchmarks/bus.py; controlled by JSON lines on standard input.
 
-Runs under any Python 3.9, because rospy needs Debian's own interpreter. A frame carries the send time (CLOCK_MONOTONIC,
+A frame carries the send time (CLOCK_MONOTONIC,
 one clock for all processes of a machine) at byte 8. A receiver reads one byte of every 4096 before it takes the time,
 so that a transport gains nothing by delivering data that is not yet in memory.
 
@@ -10,6 +10,7 @@ so that a transport gains nothing by delivering data that is not yet in memory.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import struct
@@ -171,45 +172,7 @@ def zmq_pub(topics, address):
     return send
 
 
-def zmq_curve_sub(topics, address, receiver):
-    return _zmq_curve("SUB", topics, address, receiver)
-
-
-def zmq_curve_pub(topics, address):
-    return _zmq_curve("PUB", topics, address, None)
-
-
-def _zmq_curve(kind, topics, address, receiver):
-    import zmq
-
-    # Keys for this measurement only; they are public.
-    public, secret = b"Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID", b"D:)Q[IlAW!ahhC2ac:9*A}h:p?([4%wOTJ%JR%cs"
-    socket = zmq.Context().socket(getattr(zmq, kind))
-    socket.curve_publickey, socket.curve_secretkey = public, secret
-    if kind == "PUB":
-        socket.curve_server = True
-        socket.bind(address)
-
-        def send(topic, frame):
-            socket.send_multipart([topic.encode() + b"\0", frame], copy=len(frame) < 65536)
-
-        return send
-    socket.curve_serverkey = public
-    for topic in topics:
-        socket.setsockopt(zmq.SUBSCRIBE, topic.encode() + b"\0")
-    socket.connect(address)
-
-    def run():
-        while True:
-            receiver.got(socket.recv_multipart(copy=False)[1].buffer)
-
-    return run
-
-
-zmq_tcp_sub, zmq_tcp_pub = zmq_sub, zmq_pub
-
-
-def zenoh_session(role, address, shared):
+def zenoh_session(role, address):
     import zenoh
 
     config = zenoh.Config()
@@ -218,21 +181,13 @@ def zenoh_session(role, address, shared):
     config.insert_json5("listen/endpoints" if role == "pub" else "connect/endpoints", json.dumps([address]))
     if role == "sub":
         config.insert_json5("listen/endpoints", "[]")
-    config.insert_json5("transport/shared_memory/enabled", json.dumps(shared))
+    config.insert_json5("transport/shared_memory/enabled", "true")
     KEEP.append(zenoh.open(config))
     return KEEP[-1]
 
 
-def zenoh_tcp_sub(topics, address, receiver):
-    return _zenoh_sub(topics, address, receiver, False)
-
-
 def zenoh_shm_sub(topics, address, receiver):
-    return _zenoh_sub(topics, address, receiver, True)
-
-
-def _zenoh_sub(topics, address, receiver, shared):
-    session = zenoh_session("sub", address, shared)
+    session = zenoh_session("sub", address)
 
     def on_sample(sample):
         receiver.got(sample.payload.to_bytes())  # its Python binding offers no view of the payload
@@ -241,16 +196,10 @@ def _zenoh_sub(topics, address, receiver, shared):
     return threading.Event().wait
 
 
-def zenoh_tcp_pub(topics, address):
-    session = zenoh_session("pub", address, False)
-    publishers = {topic: session.declare_publisher(topic) for topic in topics}
-    return lambda topic, frame: publishers[topic].put(bytes(frame))
-
-
 def zenoh_shm_pub(topics, address):
     import zenoh
 
-    session = zenoh_session("pub", address, True)
+    session = zenoh_session("pub", address)
     provider = zenoh.shm.ShmProvider.default_backend(256 << 20)
     policy = zenoh.shm.GarbageCollect()
     publishers = {topic: session.declare_publisher(topic) for topic in topics}
@@ -261,6 +210,80 @@ def zenoh_shm_pub(topics, address):
         publishers[topic].put(buffer)
 
     return send
+
+
+def iceoryx2_node(address):
+    import iceoryx2
+
+    iceoryx2.set_log_level(iceoryx2.LogLevel.Fatal)
+    node = iceoryx2.NodeBuilder.new().create(iceoryx2.ServiceType.Ipc)
+
+    def service(topic):
+        name = iceoryx2.ServiceName.new(f"{address}/{topic}")
+        data = node.service_builder(name).publish_subscribe(iceoryx2.Slice[ctypes.c_uint8])
+        data = data.subscriber_max_buffer_size(100).open_or_create()
+        # It has no blocking receive: one event for all topics wakes the reader.
+        return data, node.service_builder(iceoryx2.ServiceName.new(address)).event().open_or_create()
+
+    KEEP.append(node)
+    return service
+
+
+def iceoryx2_sub(topics, address, receiver):
+    import iceoryx2
+    import numpy
+
+    service = iceoryx2_node(address)
+    services = [service(topic) for topic in topics]
+    subscribers = [data.subscriber_builder().buffer_size(100).create() for data, _ in services]
+    listener = services[0][1].listener_builder().create()
+
+    def run():
+        while True:
+            listener.timed_wait(iceoryx2.Duration.from_secs(1))
+            for subscriber in subscribers:
+                while (sample := subscriber.receive()) is not None:
+                    receiver.got(numpy.frombuffer(sample.payload().as_memory_view(), numpy.uint8).data)
+                    sample.delete()
+
+    return run
+
+
+def iceoryx2_pub(topics, address):
+    service = iceoryx2_node(address)
+    publishers = {}
+    for topic, size in topics.items():
+        data, event = service(topic)
+        publisher = data.publisher_builder().initial_max_slice_len(size).create()
+        publishers[topic] = publisher, event.notifier_builder().create()
+
+    def send(topic, frame):
+        publisher, notifier = publishers[topic]
+        sample = publisher.loan_slice_uninit(len(frame))
+        ctypes.memmove(sample.payload_ptr, (ctypes.c_char * len(frame)).from_buffer(frame), len(frame))
+        sample.assume_init().send()
+        notifier.notify()
+
+    return send
+
+
+def ecal_sub(topics, address, receiver):
+    import ecal.nanobind_core as ecal
+
+    ecal.initialize("sub")
+    for topic in topics:
+        subscriber = ecal.Subscriber(address.replace("/", "_") + topic)
+        subscriber.set_receive_callback(lambda _publisher, _type, data: receiver.got(data.buffer))
+        KEEP.append(subscriber)
+    return threading.Event().wait
+
+
+def ecal_pub(topics, address):
+    import ecal.nanobind_core as ecal
+
+    ecal.initialize("pub")
+    publishers = {topic: ecal.Publisher(address.replace("/", "_") + topic) for topic in topics}
+    return lambda topic, frame: publishers[topic].send(bytes(frame))
 
 
 def lcm_sub(topics, address, receiver):
@@ -282,29 +305,6 @@ def lcm_pub(topics, address):
 
     link = lcm.LCM(address)
     return lambda topic, frame: link.publish(topic, bytes(frame))
-
-
-def rospy_sub(topics, address, receiver):
-    import rospy
-    from std_msgs.msg import UInt8MultiArray
-
-    os.environ["ROS_MASTER_URI"] = address
-    rospy.init_node("sub", anonymous=True, disable_signals=True)
-    for topic in topics:
-        rospy.Subscriber(
-            topic, UInt8MultiArray, lambda m: receiver.got(m.data), queue_size=1, buff_size=1 << 24, tcp_nodelay=True
-        )
-    return rospy.spin
-
-
-def rospy_pub(topics, address):
-    import rospy
-    from std_msgs.msg import UInt8MultiArray
-
-    os.environ["ROS_MASTER_URI"] = address
-    rospy.init_node("pub", anonymous=True, disable_signals=True)
-    publishers = {topic: rospy.Publisher(topic, UInt8MultiArray, queue_size=10, tcp_nodelay=True) for topic in topics}
-    return lambda topic, frame: publishers[topic].publish(UInt8MultiArray(data=bytes(frame)))
 
 
 def main():
