@@ -48,7 +48,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.thread: ControllerThread | None = None
         self.refuse_pace()
         self.controller = BaseController(config, self.clock.now_ns, self.clock.steady_ns, type(self).open_port)
-        self.gate = CommandGate(config)
+        also = "/cmd_vel is also published by %s; it must be the arbiter alone"
+        self.gate = CommandGate(config, lambda publisher: self.log.warning(also, publisher))
         self.report = BaseReport(config, self.controller, self.clock.steady_ns())
         self.latch = EstopLatch()
         self.button: bool | None = None  # state of the controller's emergency stop input

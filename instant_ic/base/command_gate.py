@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from instant_ic.base.config import CrawlerBaseConfig
 from instant_ic.base.recent import RecentCount
@@ -12,6 +13,10 @@ from instant_ic.diagnosis import Diagnosis, Level
 class CommandGate:
     """Checks commands, and counts those that are dropped and the nodes that may not drive.
 
+    Args:
+        config: parameters.
+        on_stranger: called once with the name of each second publisher.
+
     Attributes:
         driver: the obeyed node; with any source allowed, the last publisher.
         dropped: number of refused commands.
@@ -19,14 +24,15 @@ class CommandGate:
         command: what became of the newest command; None before the first.
     """
 
-    def __init__(self, config: CrawlerBaseConfig) -> None:
+    def __init__(self, config: CrawlerBaseConfig, on_stranger: Callable[[str], None]) -> None:
         self.config = config
         self.driver = config.command_source
         self.dropped = 0
         self.publishers = Diagnosis("publishers", Level.OK, "no second publisher of /cmd_vel")
         self.command: Diagnosis | None = None
         self._drops = RecentCount(config.recent_s)
-        self._strangers_ns: int | None = None
+        self._on_stranger = on_stranger
+        self._strangers: dict[str, int] = {}  # second publishers, with the time of their last message
 
     def admit_publisher(self, publisher: str, steady_ns: int) -> bool:
         """Whether a node's commands are obeyed; every publisher besides the driving node is a warning."""
@@ -71,12 +77,14 @@ class CommandGate:
         recent = f"in the last {self.config.recent_s:g} s"
         if self.dropped and not self._drops.count(steady_ns):
             self._set(Level.OK, f"none dropped {recent}")
-        if self._strangers_ns is not None and steady_ns - self._strangers_ns > self.config.recent_s * 1e9:
-            self._strangers_ns = None
+        if self._strangers and steady_ns - max(self._strangers.values()) > self.config.recent_s * 1e9:
+            self._strangers.clear()
             self.publishers = Diagnosis("publishers", Level.OK, f"no second publisher of /cmd_vel {recent}")
 
     def _warn_of(self, publisher: str, steady_ns: int) -> None:
-        self._strangers_ns = steady_ns
+        if publisher not in self._strangers:
+            self._on_stranger(publisher)
+        self._strangers[publisher] = steady_ns
         text = f"/cmd_vel is also published by {publisher}: stop that node"
         self.publishers = Diagnosis("publishers", Level.WARN, text)
 
