@@ -8,7 +8,7 @@ import numpy as np
 
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix, transform_points
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.msg import Path, path_array, matrix_from_pose
+from instant_ic.msg import Path, matrix_from_pose, path_array
 
 
 class Newest(Protocol):

@@ -82,7 +82,7 @@ class ArbiterConfig:
 
     Attributes:
         collision_monitor: last step before /cmd_vel; the most restrictive polygon wins.
-        planner: tells whether there is a way round the obstacle; the navigator has its own.
+        planner: finds out whether there is a way round the obstacle; the navigator has its own.
         timeouts: s; with an older message the command is zero. Images (camera, view): late_s after their usual arrival,
             if longer.
     """

@@ -11,8 +11,6 @@ from instant_ic.config.robot import MotionLimits
 from instant_ic.geometry.poses import wrap_angle
 
 
-
-
 def _towards(value: float, target: float, step: float) -> float:
     return value + min(max(target - value, -step), step)
 

@@ -30,7 +30,7 @@ class KeyframeSelectionConfig:
 
 
 class KeyframeSelector:
-    """Decides for each scaled depth picture in turn whether it becomes a keyframe."""
+    """Decide for each scaled depth image in turn whether it becomes a keyframe."""
 
     def __init__(self, config: KeyframeSelectionConfig | None = None) -> None:
         self.config = config or KeyframeSelectionConfig()
@@ -40,10 +40,10 @@ class KeyframeSelector:
         self._due_since_ns: int | None = None
 
     def take(self, map_from_camera: NDArray[np.float64], fit: bool, stamp_ns: int) -> bool:
-        """Whether the picture at this pose becomes a keyframe; if so it is the last one from now on.
+        """Whether the image at this pose becomes a keyframe; if so it is the last one from now on.
 
         Args:
-            map_from_camera: (4, 4) pose of the picture.
+            map_from_camera: (4, 4) pose of the image.
             fit: whether its depth could be scaled.
             stamp_ns: its time; waiting is measured by it.
         """
@@ -60,7 +60,7 @@ class KeyframeSelector:
         return True
 
     def restart(self) -> None:
-        """Forgets the last keyframe: the next fit picture becomes one. The count goes on."""
+        """Forget the last keyframe: the next fit image becomes one. The count goes on."""
         self._pose, self._fit, self._due_since_ns = None, False, None
 
     def _due(self, map_from_camera: NDArray[np.float64], fit: bool) -> bool:

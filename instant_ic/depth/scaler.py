@@ -89,7 +89,7 @@ class ScaleFit:
 
     Attributes:
         ok: false: do not trust ``depth_m``; ``message`` says why.
-        scale: metres per unit of depth; for ``disparity``, inverse metres per unit. Of the whole picture.
+        scale: metres per unit of depth; for ``disparity``, inverse metres per unit. Of the whole image.
         shift: metres (``relative``) or inverse metres (``disparity``) added after scaling; else 0.
         depth_m: (H, W) float32 scaled radial depth, 0 = unknown.
         quality: share of points whose range agrees with the scaled depth, 0..1.
@@ -117,11 +117,11 @@ class DepthScaler:
         self.config = config or ScalerConfig()
 
     def fit(self, depth: Floats, points: Floats) -> ScaleFit:
-        """Scales one depth picture.
+        """Scale one depth image.
 
         Args:
             depth: (H, W) estimated radial depth (or disparity), 0 = unknown.
-            points: (N, 3) LiDAR points in the camera's frame at the picture's time, metres.
+            points: (N, 3) LiDAR points in the camera's frame at the image's time, metres.
 
         Returns:
             The fit; where no scale can be found ``ok`` is false, ``scale`` 1 and ``depth_m`` the depth as given

@@ -56,12 +56,12 @@ class TrainConfig:
         table_lr: learning rate of the hash table at the start.
         network_lr: learning rate of the network at the start.
         final_lr_share: both have fallen to this share at the end.
-        fine_lr_share: rate of the table's finest level against the coarsest's: less is less grain, slower detail.
+        fine_lr_share: learning rate of the finest level relative to the coarsest; less reduces grain and slows detail.
         refresh_lr_share: share of both when a keyframe refreshes a trained field.
         distance_weight: of the geometry's error against the colour's.
         band_colour_weight: of the colour error beside the surface against that on it.
         depth_weight: with density: of the error of a ray's depth, by its uncertainty.
-        opacity_weight: with density: of what of the light passes through a surface.
+        opacity_weight: with density: weight of the opacity regulariser.
         distortion_weight: with density: of how far the density is spread along a ray.
         seed: of the first weights and of the rays.
     """
@@ -95,7 +95,7 @@ class GeometryConfig:
         band_min: share of the depth: narrowest half width in which geometry is learnt.
         band_max: widest.
         band_sigmas: half width in standard deviations of the keyframe's depth, between the two.
-        torn_ratio: depth jump between neighbouring pixels that is an edge.
+        torn_ratio: neighbouring depths that differ by more than this share are an edge, unless they lie on one plane.
         min_depth_m: m; nearer depths are set to it.
         max_depth_m: m; farther depths are set to it.
         min_known_share: keyframes with a smaller share of known depth are refused.
@@ -129,8 +129,8 @@ class ReadinessConfig:
 
     Attributes:
         psnr_db: PSNR of the training rays from which the space is fit to show, or takes over from the one before.
-        plateau_iterations: also ready when this many iterations.
-        plateau_db: have gained less than this.
+        plateau_iterations: iterations over which that gain is taken.
+        plateau_db: dB; less gain than this over plateau_iterations also counts as ready.
         max_radius_m: m from the keyframe, at most, that a view is fit to show.
         parallax_rad: rad: displacement of surfaces by the depth's error that is still fit to show.
     """
@@ -147,7 +147,7 @@ class ReadinessConfig:
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """What a picture shows: the keyframe's panorama, warped by its depth, then the field as it becomes better.
+    """Content of a view: the keyframe's panorama, warped by its depth, then the field as it becomes better.
 
     The share of the panorama falls linearly in the PSNR of the training rays.
 

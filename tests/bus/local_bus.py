@@ -20,7 +20,7 @@ LARGE = 200_000
 """Goes through shared memory; what comes of this size over a socket is `bytes`, not a view."""
 
 
-def wait_for(condition: Callable[[], Any], timeout_s: float = 15.0) -> Any:
+def wait_for(condition: Callable[[], Any], timeout_s: float = 60.0) -> Any:
     deadline = time.monotonic() + timeout_s
     while not (value := condition()):
         assert time.monotonic() < deadline, "waited too long"

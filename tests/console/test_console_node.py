@@ -31,7 +31,6 @@ from instant_ic.msg import (
     twist_message,
     twist_values,
 )
-
 from nodes.console import ConsoleNode
 
 START = 1_000_000_000

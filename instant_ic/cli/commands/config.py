@@ -111,7 +111,7 @@ def show_node(args: argparse.Namespace) -> int:
     """Print value and origin of each parameter."""
     from instant_ic.cli.commands.param import show_value
     from instant_ic.config.parameter_info import parameter_infos
-    from instant_ic.config.params import ParameterError, ProcessParameters, configure
+    from instant_ic.config.params import ParameterError, configure
     from instant_ic.launch.parameters import given_values
 
     spec = _node(args.node, args.launch[:1], launch_values(args.launch[1:]))
@@ -122,8 +122,8 @@ def show_node(args: argparse.Namespace) -> int:
         raise UserError(str(error)) from error
     infos = [
         info
-        for kind, config in zip((config_class, ProcessParameters), configurations, strict=True)
-        for info in parameter_infos(kind, config)
+        for config in configurations
+        for info in parameter_infos(type(config), config)
         if not args.changed or info.value != info.default
     ]
     rows = [(i.name, show_value(i.value), values[i.name].where if i.name in values else "default") for i in infos]
