@@ -57,8 +57,12 @@ class Waker:
         self._set = False
         if self._written:
             self._written = False
-            with contextlib.suppress(BlockingIOError):  # not written yet: one later wait ends early
-                os.eventfd_read(self.fd)
+            self.drain()
+
+    def drain(self) -> None:
+        """Take the event from the descriptor, which would end every later wait at once."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.fd)
 
     def close(self) -> None:
         """Close the event; later calls of ``set`` do nothing."""
@@ -232,7 +236,10 @@ class LocalTransport:
         with self._read_lock:
             for fd, _ in events:
                 subscription = self._readers.get(fd)
-                if subscription is not None:
+                if subscription is None:
+                    if reader is not None:  # `clear` came between a `set` and its write
+                        reader.drain()
+                else:
                     subscription.read(one=reader is not None)  # looking for more would delay this one
                     if reader is not None:
                         self._unread.append(subscription)

@@ -16,7 +16,7 @@ NODES = node_names()
 @pytest.mark.parametrize("name", NODES)
 def test_live_parameters_exist(name):
     cls = node_class(name)
-    keys = [info.name for info in parameter_infos(cls.config_class(), node=cls.name)]
+    keys = [info.name for info in parameter_infos(cls.config_class())]
     for entry in cls.live_parameters:
         assert any(is_live(key, [entry]) for key in keys), f"{entry} is no parameter of {name}"
 

@@ -223,3 +223,17 @@ def test_signal_while_the_loop_holds_its_lock_does_not_hang(run_dir):
     assert done.returncode == 0, done.stderr
     assert "left in order" in done.stderr
     assert list(run_dir.glob("topics/*/*.sock")) == []
+
+
+def test_an_event_that_is_written_late_ends_one_wait_not_all(bus):
+    """`clear` may come between a `set` and its write in another thread; the node would then spin until the next one."""
+    transport = bus.node("reader")
+    waker = transport.waker()
+    ends: list[None] = []
+    os.eventfd_write(waker.fd, 1)
+    deadline = time.monotonic() + 0.3
+    while time.monotonic() < deadline:
+        waker.wait(0.1)
+        waker.clear()
+        ends.append(None)
+    assert len(ends) <= 6
