@@ -41,7 +41,7 @@ def topics(source: str) -> dict[str, dict[str, str]]:
                 kind = arguments[1]
                 if name in ("subscribe_raw", "subscribe_received"):  # raw bytes, passed on or decoded by the callback
                     kind = next((k.value for k in call.keywords if k.arg == "message_class"), ast.Name("bytes"))
-                found[CALLS[name]][topic] = ast.unparse(kind).removeprefix("msg.")
+                found[CALLS[name]][topic] = re.sub(r"^msg\.|^message_type\('(\w+)'\)$", r"\1", ast.unparse(kind))
         elif name == "tf_broadcast":
             found["gives"]["/tf"] = "TFMessage"
         elif name == "tf_broadcast_static":
@@ -50,6 +50,22 @@ def topics(source: str) -> dict[str, dict[str, str]]:
         found["takes"].setdefault("/tf", "TFMessage")
         found["takes"].setdefault("/tf_static", "TFMessage")
     return found
+
+
+def topic_table() -> list[str]:
+    """Lines of a table of all topics with a literal name: type, publishers, subscribers."""
+    kinds: dict[str, str] = {}
+    ends: dict[str, dict[str, list[str]]] = {}
+    for path in sorted((ROOT / "nodes").glob("[a-z]*.py")):
+        for direction, listed in topics(path.read_text()).items():
+            for topic, kind in listed.items():
+                kinds[topic] = kind if kind != "bytes" else kinds.get(topic, kind)
+                ends.setdefault(topic, {"gives": [], "takes": []})[direction].append(path.stem)
+    rows = [
+        f"| `{topic}` | {kinds[topic]} | {', '.join(nodes['gives'])} | {', '.join(nodes['takes'])} |"
+        for topic, nodes in sorted(ends.items())
+    ]
+    return ["## Topics", "", "| Topic | Type | Published by | Subscribed by |", "|---|---|---|---|", *rows]
 
 
 def cell(text: str) -> str:
@@ -71,6 +87,7 @@ def render() -> str:
         "the node runs (`ic param set`). [Messages](#messages) has the fields of every message type.",
         "",
     ]
+    lines += [*topic_table(), ""]
     missing: list[str] = []
     unbounded: list[str] = []
     for path in sorted((ROOT / "nodes").glob("[a-z]*.py")):
