@@ -6,6 +6,7 @@ import logging
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 
 import zmq
@@ -36,8 +37,8 @@ bookkeeping (``benchmarks/bus.py --only inline shared``)."""
 SLOTS_A_READER = 5
 """How many slots each reader adds to a publisher's limit; see also :data:`~.local_subscription.VIEWS_HELD`."""
 
-_QUEUE = 4000
 _QUEUE_BYTES = 128 << 20
+"""What may wait for a blocked reader: of messages through the socket, and of large ones that no slot had room for."""
 LINGER_S = 0.2  # lets a last zero command leave when a node shuts down
 _MEMORY_RETRY_S = 5.0
 _MORE = int(zmq.SNDMORE)
@@ -80,7 +81,8 @@ class LocalPublisher:
         self._progress: dict[bytes, PeerProgress] = {}
         self._pool = SlotPool(self._id)
         self._memory_retry_s = 0.0
-        self._largest = 0
+        self._inlined: deque[tuple[int, int]] = deque()  # sequence and size of large messages through the socket
+        self._inlined_bytes = 0
         self._last: tuple[bytes, Buffer, Slot | None] | None = None  # header, third part, slot of the latched value
         self._closed = False
         self._claim, self._path = registry.claim_socket(host.run_dir, topic, host.node)
@@ -88,7 +90,8 @@ class LocalPublisher:
         try:
             self._socket.setsockopt(zmq.LINGER, int(LINGER_S * 1000))
             self._socket.setsockopt(zmq.XPUB_MANUAL, 1)
-            self._limit_queue(SHARED_FROM_BYTES)
+            # For good: libzmq can stall a connection for ever when the limit is lowered on a socket in use.
+            self._socket.setsockopt(zmq.SNDHWM, _QUEUE_BYTES // SHARED_FROM_BYTES)
             self._socket.bind(f"ipc://{self._path}")
             self._path.chmod(0o600)
             self._claim.write(
@@ -163,6 +166,8 @@ class LocalPublisher:
                 self._sequence += 1
             elif (slot := self._slot(size)) is not None:
                 self._send_shared(slot, size, fill, publish_ns)
+            elif not self.qos.latched and not self._has_room(size):
+                self._sequence += 1  # readers count the gap
             else:
                 body = bytearray(size)
                 fill(memoryview(body))
@@ -223,17 +228,21 @@ class LocalPublisher:
         return HEADER.pack(kind, self._sequence, stamp, self._id, self._type_hash, size)
 
     def _emit(self, key: bytes, header: bytes, body: Buffer) -> None:
-        if len(body) > self._largest:
-            self._limit_queue(len(body))
         send = self._socket.send
         send(self._name + key, _MORE)
         send(header, _MORE)
         send(body)
 
-    def _limit_queue(self, size: int) -> None:
-        """Limit what ZeroMQ keeps for a blocked reader, which is counted in messages, to a number of bytes."""
-        self._largest = size
-        self._socket.setsockopt(zmq.SNDHWM, max(4, min(_QUEUE, _QUEUE_BYTES // size)))
+    def _has_room(self, size: int) -> bool:
+        """Whether a large message may go through the socket: its own limit counts messages, not bytes."""
+        seen = min((progress.sequence() for progress in self._progress.values()), default=self._sequence)
+        while self._inlined and self._inlined[0][0] <= seen:
+            self._inlined_bytes -= self._inlined.popleft()[1]
+        if self._inlined and self._inlined_bytes + size > _QUEUE_BYTES:
+            return False
+        self._inlined.append((self._sequence + 1, size))
+        self._inlined_bytes += size
+        return True
 
     def _send_shared(self, slot: Slot, size: int, fill: Callable[[memoryview], None], publish_ns: int | None) -> None:
         try:

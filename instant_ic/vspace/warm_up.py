@@ -23,7 +23,7 @@ def warm_up(config: VirtualSpaceConfig) -> None:
         field=dataclasses.replace(config.field, log2_table=10),
         train=dataclasses.replace(config.train, ray_columns=16, ray_rows=16),
         # Images of both the warp and the field.
-        picture=dataclasses.replace(config.picture, panorama_until_db=-1e3, field_from_db=1e3),
+        picture=dataclasses.replace(config.picture, panorama_until_db=-100.0, field_from_db=200.0),
     )
     space = VirtualSpace(small)
     rgb = np.zeros((32, 64, 3), np.uint8)

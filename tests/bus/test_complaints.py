@@ -12,6 +12,7 @@ import threading
 import time
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -561,3 +562,30 @@ def test_message_that_does_not_fit_its_type_leaves_the_topic_usable(bus: Bus) ->
     out.publish(message)
     wait_for(reader.poll)
     assert reader.stats.lost == 0 and len(out.raw._pool.slots) == 1
+
+
+def test_large_messages_through_the_socket_after_many_small_ones(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """libzmq stalls a connection for ever when its limit is lowered after more messages than the new limit."""
+    out = bus.publisher()
+    reader = bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    for i in range(1, 801):
+        out.send(numbered(i, 100))
+        if i % 100 == 0:
+            wait_for(lambda i=i: reader.poll() is not None and len(reader.received) >= i)
+    monkeypatch.setattr(out._pool, "acquire", lambda *_: None)  # readers hold all slots
+    for i in range(801, 821):
+        out.send(numbered(i, LARGE))
+    wait_for(lambda: reader.poll() is not None and len(reader.received) == 820)
+    assert reader.numbers() == list(range(1, 821))
+
+
+def test_large_messages_through_the_socket_are_bounded_in_bytes(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = bus.publisher()
+    bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    monkeypatch.setattr(out._pool, "acquire", lambda *_: None)
+    monkeypatch.setattr(out, "_progress", {b"": SimpleNamespace(sequence=lambda: 0, newest_only=False)})  # stopped
+    for i in range(1, 200):
+        out.send(numbered(i, 1 << 20))
+    assert out._inlined_bytes <= 128 << 20

@@ -138,7 +138,7 @@ def test_set_is_taken_on_the_nodes_thread_and_told(tuned):
     ("values", "words"),
     [
         ({"inner.gain": 1.5}, r"tuned: inner.gain must lie in 0..1 \(got 1.5\)"),
-        ({"inner.gain": float("nan")}, r"inner.gain must lie in 0..1 \(got nan\)"),
+        ({"inner.gain": float("nan")}, r"inner.gain must be a finite number \(got nan\)"),
         ({"rate_hz": 0}, r"rate_hz must be > 0 \(got 0\)"),
         ({"rate_hz": "fast"}, r"rate_hz must be float \(got 'fast'\)"),
         ({"inner.gian": 0.1}, "unknown parameter 'inner.gian'; did you mean 'inner.gain'"),
