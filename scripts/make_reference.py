@@ -52,8 +52,19 @@ def topics(source: str) -> dict[str, dict[str, str]]:
     return found
 
 
+EVERY_NODE = {
+    "/heartbeat": "NodeStatus",
+    "/diagnostics": "DiagnosticArray",
+    "/rosout": "Log",
+    "/parameter_events": "ParameterEvent",
+}
+"""Topics that the base class of all nodes publishes."""
+
+
 def topic_table() -> list[str]:
     """Lines of a table of all topics with a literal name: type, publishers, subscribers."""
+    from instant_ic.msg import message_type
+
     kinds: dict[str, str] = {}
     ends: dict[str, dict[str, list[str]]] = {}
     for path in sorted((ROOT / "nodes").glob("[a-z]*.py")):
@@ -61,8 +72,12 @@ def topic_table() -> list[str]:
             for topic, kind in listed.items():
                 kinds[topic] = kind if kind != "bytes" else kinds.get(topic, kind)
                 ends.setdefault(topic, {"gives": [], "takes": []})[direction].append(path.stem)
+    for topic, kind in EVERY_NODE.items():
+        kinds[topic] = kind
+        ends.setdefault(topic, {"gives": [], "takes": []})["gives"] = ["every node"]
+    full = {topic: message_type(kind).__msgtype__.replace("/msg/", "/") for topic, kind in kinds.items()}
     rows = [
-        f"| `{topic}` | {kinds[topic]} | {', '.join(nodes['gives'])} | {', '.join(nodes['takes'])} |"
+        f"| `{topic}` | {full[topic]} | {', '.join(nodes['gives'])} | {', '.join(nodes['takes'])} |"
         for topic, nodes in sorted(ends.items())
     ]
     return ["## Topics", "", "| Topic | Type | Published by | Subscribed by |", "|---|---|---|---|", *rows]

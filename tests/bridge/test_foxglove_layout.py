@@ -23,13 +23,9 @@ def layout():
 
 @pytest.fixture(scope="module")
 def types():
-    """Topic → type of docs/architecture.md, which the system test holds to what runs."""
-    found = {}
-    for names, kinds in re.findall(
-        r"^\| ((?:`/[\w/]+`(?:, )?)+) \| ([^|]+) \|", (ROOT / "docs/architecture.md").read_text(), re.M
-    ):
-        topics, words = re.findall(r"`(/[\w/]+)`", names), re.findall(r"\w+/\w+", kinds)
-        found.update(zip(topics, words if len(words) == len(topics) else words * len(topics), strict=True))
+    """Topic → type of docs/reference.md, which the system test holds to what runs."""
+    rows = re.findall(r"^\| `(/[\w/]+)` \| (\w+/\w+) \|", (ROOT / "docs/reference.md").read_text(), re.M)
+    found = dict(rows)
     return found
 
 
