@@ -207,9 +207,9 @@ def measure(transports: list[str], rounds: int, count: int, flood_s: float, note
             for turn in range(rounds):
                 for topic in topics:
                     for transport, pair in pairs.items():
-                        told, got = pair.send(topic, count, PERIOD_S[topic])
+                        written, got = pair.send(topic, count, PERIOD_S[topic])
                         latency[transport][topic] += got[0]["latencies_us"]
-                        sent[transport][topic] += told["sent"]
+                        sent[transport][topic] += written["sent"]
                 note(f"latency, round {turn + 1} of {rounds}")
         finally:
             for pair in pairs.values():
@@ -233,11 +233,11 @@ def measure(transports: list[str], rounds: int, count: int, flood_s: float, note
                     note(f"{transport}: fan-out not measured: {error}")
                     continue
                 try:
-                    told, got = pair.send("m5", count, PERIOD_S["m5"])
+                    written, got = pair.send("m5", count, PERIOD_S["m5"])
                 finally:
                     pair.close()
                 gathered[transport] += [value for g in got for value in g["latencies_us"]]
-                fan_sent[transport] += told["sent"] * FANOUT
+                fan_sent[transport] += written["sent"] * FANOUT
             note("fan-out")
         result["fanout"] = {t: summary(gathered[t], fan_sent[t]) for t in fan if t in gathered}
     return result
@@ -250,12 +250,12 @@ def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
     try:
         cells = {}
         for topic in topics:
-            told, got = pair.send(topic, 10**9, 0.0, seconds)
-            took = max(told["seconds"], got[0]["seconds"])
+            written, got = pair.send(topic, 10**9, 0.0, seconds)
+            took = max(written["seconds"], got[0]["seconds"])
             cells[topic.removeprefix("flood_")] = {
                 "mb_per_s": round(got[0]["bytes"] / took / 1e6, 1),
                 "messages_per_s": round(got[0]["count"] / took),
-                "delivered": round(got[0]["count"] / max(1, told["sent"]), 4),
+                "delivered": round(got[0]["count"] / max(1, written["sent"]), 4),
             }
         return cells
     finally:
@@ -269,11 +269,11 @@ def verdicts(result: dict[str, Any]) -> dict[str, Any]:
     def p50(transport: str, topic: str) -> float | None:
         return latency.get(transport, {}).get(topic, {}).get("p50_us")
 
-    told: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for rival, topic, most in (("zmq", "k20", 1.15), ("zmq", "m5", 0.8), ("zenoh_shm", "m5", 0.5)):
         if (value := p50(rival, topic)) and (own := p50("ours", topic)):
-            told[f"p50 at {LABELS[topic]} over {NAMES[rival]}"] = {"ratio": round(own / value, 2), "at most": most}
-    return told
+            found[f"p50 at {LABELS[topic]} over {NAMES[rival]}"] = {"ratio": round(own / value, 2), "at most": most}
+    return found
 
 
 def table(result: dict[str, Any]) -> str:

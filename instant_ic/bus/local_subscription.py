@@ -270,7 +270,7 @@ class LocalSubscription:
     def _done(self, source: _Source, slot: SlotMapping, sequence: int) -> None:
         """Unlock a slot when its last view is gone; may run in any thread."""
         if slot.sequence != sequence:
-            self.stats.torn += 1
+            self.stats.overwritten += 1
             log.error("%s: %s overwrote a message that was still in use", self.topic, source.node)
         source.views -= 1
         slot.release()

@@ -742,19 +742,19 @@ class Node(Generic[ConfigT]):
         now = self.clock.steady_ns()
         for subscription in self.subscriptions:
             stats = subscription.raw.stats
-            if not (stats.lost or stats.rejected or stats.torn):
+            if not (stats.lost or stats.rejected or stats.overwritten):
                 continue
             values = {
                 "lost": stats.lost,
                 **{f"lost from {node}": n for node, n in sorted(stats.lost_by.items())},
                 "refused": stats.rejected,
-                "torn": stats.torn,
+                "overwritten": stats.overwritten,
                 "rate_hz": round(stats.rate_hz(now), 2),
                 "age_s": round(stats.age_s(now), 3),
             }
             entries.append(
                 status(
-                    level=ERROR if stats.rejected or stats.torn else WARN,
+                    level=ERROR if stats.rejected or stats.overwritten else WARN,
                     name=f"{self.node_name}: input {subscription.raw.topic}",
                     message=f"{stats.lost} messages lost, {stats.rejected} refused",
                     hardware_id="",

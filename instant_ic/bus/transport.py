@@ -62,7 +62,7 @@ class Stats:
         self.skipped = 0
         """Messages that a newest-only reader did not need to look at."""
         self.rejected = 0
-        self.torn = 0
+        self.overwritten = 0
         self.bytes = 0
         self.newest_ns = 0
         self._arrivals: deque[int] = deque(maxlen=50)

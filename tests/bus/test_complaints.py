@@ -462,7 +462,7 @@ def test_torn_frames_fast_writer_slow_readers(bus: Bus) -> None:
         stop.set()
         writer.join()
     assert all(whole(message) for message in held)
-    assert all(reader.stats.torn == 0 and reader.raw.stats.rejected == 0 for reader in readers)
+    assert all(reader.stats.overwritten == 0 and reader.raw.stats.rejected == 0 for reader in readers)
     held.clear()
 
 
@@ -475,12 +475,12 @@ def test_writing_over_a_lent_buffer_is_seen_and_told(bus: Bus, caplog: pytest.Lo
     out._pool.slots[0].finish(99)
     reader.received.clear()
     gc.collect()
-    wait_for(lambda: reader.stats.torn == 1)
+    wait_for(lambda: reader.stats.overwritten == 1)
     with reader.transport._read_lock:
         out.send(numbered(2, LARGE))
         out._pool.slots[-1].finish(98)
     wait_for(lambda: reader.stats.lost_by == {"sender": 1})
-    assert reader.poll() == [] and reader.stats.torn == 1
+    assert reader.poll() == [] and reader.stats.overwritten == 1
     assert "sender overwrote a message that was still in use" in caplog.text
 
 

@@ -99,23 +99,23 @@ def test_a_full_disk_is_told(desk):
 def test_bookmarks_are_listed_with_their_place_in_the_recording(desk):
     made, recorder, wait_for = desk
     made.bookmark("before")
-    told = wait_for(lambda m: m["bookmarks"])
-    assert told["bookmarks"][0]["seconds"] is None and "not recording" in told["notice"]["text"]
+    statuses = wait_for(lambda m: m["bookmarks"])
+    assert statuses["bookmarks"][0]["seconds"] is None and "not recording" in statuses["notice"]["text"]
     recorder.state = "recording"
     wait_for(lambda m: m["state"] == "recording")
     for n in range(MAX_BOOKMARKS):
         made.bookmark(f"door {n}")
-    told = wait_for(lambda m: m["bookmarks"][-1]["name"] == f"door {MAX_BOOKMARKS - 1}")
-    assert len(told["bookmarks"]) == MAX_BOOKMARKS and told["bookmarks"][0]["name"] == "door 0"
-    assert told["bookmarks"][-1]["recording"] == "rec_1"
-    assert 12.5 <= told["bookmarks"][-1]["seconds"] < 12.5 + WAIT_S  # and what has passed since it was asked
+    statuses = wait_for(lambda m: m["bookmarks"][-1]["name"] == f"door {MAX_BOOKMARKS - 1}")
+    assert len(statuses["bookmarks"]) == MAX_BOOKMARKS and statuses["bookmarks"][0]["name"] == "door 0"
+    assert statuses["bookmarks"][-1]["recording"] == "rec_1"
+    assert 12.5 <= statuses["bookmarks"][-1]["seconds"] < 12.5 + WAIT_S  # and what has passed since it was asked
 
 
 def test_a_recorder_that_records_all_the_time_is_no_recorder_for_the_button():
-    told = []
-    made = RecordingDesk(lambda command, **arguments: {"path": "/d/drive"}, told.append)
-    told.append(made.status())
-    assert told[0]["recorder"] == "missing" and "drive continuously" in told[0]["text"]
+    statuses = []
+    made = RecordingDesk(lambda command, **arguments: {"path": "/d/drive"}, statuses.append)
+    statuses.append(made.status())
+    assert statuses[0]["recorder"] == "missing" and "drive continuously" in statuses[0]["text"]
 
 
 # ---- the node --------------------------------------------------------------------------------------
