@@ -176,7 +176,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         charge = self.report.charge(health)
         self.battery.publish(battery_message(health.battery_v, charge, self.config.base_frame, health.stamp_ns))
         self.show(*self.report.health(health))
-        pressed = "emergency stop" in health.status.faults
+        pressed = health.status.estop
         if pressed != self.button:
             self.button = pressed
             self.button_out.publish(Bool(data=pressed))

@@ -133,6 +133,10 @@ def decode_reply(address: int, command: int, reply: bytes) -> bytes:
     return data
 
 
+ESTOP_BITS = {4: 0x0001, 2: 0x0004}
+"""Bit of the emergency stop input, by the length of the status."""
+
+
 def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str]]:
     """Texts of the faults and warnings in a status.
 

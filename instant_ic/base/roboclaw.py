@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.protocol import (
     ACKNOWLEDGE,
+    ESTOP_BITS,
     INTER_BYTE_GAP_S,
     Command,
     ProtocolError,
@@ -59,6 +60,11 @@ class Status:
 
     value: int
     size: int
+
+    @property
+    def estop(self) -> bool:
+        """Whether the controller's emergency stop input is active."""
+        return bool(self.value & ESTOP_BITS[self.size])
 
     @property
     def faults(self) -> list[str]:
