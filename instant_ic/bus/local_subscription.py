@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import threading
 import time
 import weakref
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
@@ -88,8 +90,8 @@ class LocalSubscription:
         self._queue: deque[Received] = deque()
         self._depth = qos.depth
         self._now_ns, self._steady_ns, self._next_order = host.now_ns, host.steady_ns, host.next_order
-        self._folder = registry.topic_dir(host.run_dir, topic)
-        registry.own_folder(self._folder)
+        self._folder = str(registry.topic_dir(host.run_dir, topic))
+        registry.own_folder(Path(self._folder))
         self._seen_mtime = -1
         self._next_full_look = 0.0
         self._sources: dict[bytes, _Source] = {}
@@ -113,7 +115,7 @@ class LocalSubscription:
         Raises:
             OSError: the run directory is gone.
         """
-        mtime = self._folder.stat().st_mtime_ns
+        mtime = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - five times a second for each topic
         now = time.monotonic()
         if mtime == self._seen_mtime and now < self._next_full_look:
             return

@@ -4,6 +4,9 @@ Which thread reads: while the node's thread waits in :meth:`Waker.wait`, it read
 only that thread. During a long callback the bus thread reads instead, so that the newest message does not grow old in
 a queue. The bus thread also serves new subscriptions and looks for publishers.
 
+A thread that wakes runs with cold caches: a message then costs ten times what it costs in a row of messages. So no
+thread wakes to look whether there is something to do, except for publishers.
+
 Both wait on the sockets' file descriptors and touch a socket only under a lock, since ZeroMQ's are not thread-safe.
 A thread that touches one must read all it has: its descriptor does not report an event twice.
 """
@@ -25,10 +28,10 @@ from instant_ic.bus.local_publisher import LINGER_S, LocalPublisher
 from instant_ic.bus.local_subscription import LocalSubscription
 from instant_ic.bus.qos import QoS
 
-_DISCOVERY_S = 0.1
+_DISCOVERY_S = 0.2
 _IDLE_S = 1.0
-_BUSY_S = 0.015  # during a longer callback the bus thread reads instead
-_SLOW_FOR_S = 10.0  # how long after a slow callback the bus thread keeps checking at that interval
+_BUSY_S = 0.015  # a longer callback is slow
+_SLOW_FOR_S = 10.0  # how long after a slow callback the bus thread reads during every callback
 _CLOSE_S = 5.0
 
 log = logging.getLogger(__name__)
@@ -42,6 +45,8 @@ class Waker:
         self._set = False
         self._written = False
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._poll = select.poll()
+        self._poll.register(self.fd, select.POLLIN)
 
     def set(self) -> None:
         """End the present or the next wait; may be called from any thread."""
@@ -58,6 +63,14 @@ class Waker:
         if self._written:
             self._written = False
             self.drain()
+
+    def is_set(self) -> bool:
+        """Whether the event is set."""
+        return self._set
+
+    def rest(self, timeout: float) -> None:
+        """Wait for the event only."""
+        self._poll.poll(1000.0 * timeout)
 
     def drain(self) -> None:
         """Take the event from the descriptor, which would end every later wait at once."""
@@ -84,6 +97,9 @@ class LocalTransport:
         now_ns: the node's clock, for stamps.
         steady_ns: the node's steady clock, for rates and ages.
 
+    Attributes:
+        patient: messages do not end a wait; they are read when it ends.
+
     Raises:
         RegistryError: the run directory cannot be used.
     """
@@ -95,6 +111,7 @@ class LocalTransport:
         now_ns: Callable[[], int],
         steady_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
+        self.patient = False
         self._host = Host(run_dir, node, now_ns, steady_ns)
         self.run_dir = self._host.run_dir
         self.node = node
@@ -201,19 +218,32 @@ class LocalTransport:
     def wait(self, timeout: float) -> None:
         """Read the node's sockets until a message arrives or the time is over; on the node's thread."""
         self._waiting = True
-        if self._bus_reads:
-            self._bus_reads = False
-            self._events.modify(self._inputs.fileno(), 0)
         self.driver = threading.get_ident()
+        waker = self._waker
+        if self._bus_reads:
+            with self._read_lock:  # the bus thread may just be taking the event from the waker's descriptor
+                self._hand_reading(False)
+            timeout = 0.0 if waker is not None and waker.is_set() else timeout
         now = time.monotonic()
         if now - self._left_s > _BUSY_S:
-            if now > self._slow_until_s:
-                os.eventfd_write(self._poke, 1)
             self._slow_until_s = now + _SLOW_FOR_S
         if not (self._unread and self._read_rest()):
-            self._drain(self._inputs.poll(timeout, 16), self._waker)
+            if self.patient and waker is not None:
+                waker.rest(timeout)
+                timeout = 0.0
+            self._drain(self._inputs.poll(timeout, 64), waker)
         self._left_s = time.monotonic()
+        if self.patient:
+            self._read_rest()
+        elif self._left_s < self._slow_until_s:
+            self._read_rest()
+            self._hand_reading(True)
         self._waiting = False
+
+    def _hand_reading(self, to_bus: bool) -> None:
+        """Let the bus thread read, or no longer."""
+        self._bus_reads = to_bus
+        self._events.modify(self._inputs.fileno(), select.EPOLLIN if to_bus else 0)
 
     def _read_rest(self) -> bool:
         """Read what was left of sockets of which one message was read; True if there was any."""
@@ -236,9 +266,9 @@ class LocalTransport:
         with self._read_lock:
             for fd, _ in events:
                 subscription = self._readers.get(fd)
-                if subscription is None:
-                    if reader is not None:  # `clear` came between a `set` and its write
-                        reader.drain()
+                if subscription is None:  # the waker: left as it is, it would end every poll of the bus thread at once
+                    if self._waker is not None and (reader is not None or not self._waiting):
+                        self._waker.drain()
                 else:
                     subscription.read(one=reader is not None)  # looking for more would delay this one
                     if reader is not None:
@@ -258,13 +288,10 @@ class LocalTransport:
             if self._look_now or now >= next_look:
                 self._look_now = False
                 next_look = now + (_DISCOVERY_S if self._look() else 1.0)
-            if not self._waiting and not self._bus_reads and now - self._left_s > _BUSY_S:
-                self._bus_reads = True
-                self._events.modify(inputs, select.EPOLLIN)
+            if not (self._waiting or self._bus_reads or self.patient) and now - self._left_s > _BUSY_S:
+                self._hand_reading(True)
                 self._read_rest()
             timeout = min(_IDLE_S, next_look - now) if self._subscriptions else _IDLE_S
-            if now < self._slow_until_s:
-                timeout = min(timeout, _BUSY_S)
             try:
                 for fd, _ in self._events.poll(max(0.0, timeout), 64):
                     if fd == inputs:
@@ -292,6 +319,6 @@ class LocalTransport:
                     log.error("%s: %s", subscription.topic, error)
                     fine = False
                 fresh, subscription.fresh = subscription.fresh, False
-            if fresh:
+            if fresh and not self.patient:
                 subscription.on_ready()
         return fine

@@ -85,6 +85,7 @@ class _Subscription:
 
 class _Transport:
     run_dir: Path | None = None
+    patient = False
 
     def waker(self) -> threading.Event:
         return threading.Event()

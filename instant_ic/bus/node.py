@@ -6,6 +6,7 @@ import dataclasses
 import heapq
 import itertools
 import logging
+import mmap
 import os
 import threading
 import time
@@ -42,12 +43,10 @@ OK, WARN, ERROR, STALE = 0, 1, 2, 3
 
 ConfigT = TypeVar("ConfigT")
 
-_HEARTBEAT_S = 0.5
-_DIAGNOSTICS_S = 1.0
+_REPORT_S = 1.0  # period of heartbeat and diagnostics, which also sees a stop flag set by a signal
 _WENT_BACK_NS = 100_000_000  # a simulated clock that goes back farther resets timers and transforms; less is jitter
 _START_GRACE_S = 15.0  # how long after its start a node may wait for others without a warning in the log
 _NO_CLOCK_S = 5.0
-_IDLE_S = 0.5  # longest sleep of the loop, so that it sees a stop flag set by a signal
 
 
 class NodeError(RuntimeError):
@@ -269,6 +268,7 @@ class Node(Generic[ConfigT]):
         self._well: set[str] = set()  # diagnoses that have been OK before
         self._waiting: set[str] = set()  # diagnoses never OK so far, logged as information only
         self._running: tuple[str, float] | None = None
+        self._load = time.process_time(), self._began_s  # CPU seconds of the process, and when
         self._parameter_events: Publisher | None = None
         self.on_registry_change: Callable[[], None] | None = None
 
@@ -432,6 +432,14 @@ class Node(Generic[ConfigT]):
         """Whether the loop has been asked to end."""
         return self._stop.is_set()
 
+    def be_patient(self, patient: bool) -> None:
+        """Let messages wait until a timer or :meth:`call_soon` wakes the node, at least once a second, or no longer.
+
+        For a node that nobody waits for: a wake-up costs several times what a further message costs in the same
+        wake-up. Messages get the time of the wake-up as their time of arrival.
+        """
+        self._transport.patient = patient
+
     # -- parameters and log level while it runs ---------------------------------------------------
 
     def parameters(self) -> list[ParameterInfo]:
@@ -570,24 +578,22 @@ class Node(Generic[ConfigT]):
 
     def spin(self) -> None:
         """Run callbacks until :meth:`stop`."""
-        next_beat = next_diagnostics = 0.0
+        next_report = 0.0
         system_clock = JumpDetector()
         while not self._stop.is_set():
             self._wake.clear()
             self.spin_once()
             now = time.monotonic()
-            if now >= next_beat:
-                next_beat = now + _HEARTBEAT_S
+            if now >= next_report:
+                next_report = now + _REPORT_S
                 self._beat()
+                self._publish_diagnostics()
+                self._end_start_grace()
                 if (jump_s := system_clock.jump_s()) and not self.use_sim_time:
                     self.log.warning(
                         "the machine's clock was set by %+.1f s: stamps jump, timers are not affected", jump_s
                     )
-            if now >= next_diagnostics:
-                next_diagnostics = now + _DIAGNOSTICS_S
-                self._publish_diagnostics()
-                self._end_start_grace()
-            wait = min(_IDLE_S, next_beat - now, next_diagnostics - now)
+            wait = next_report - now
             if self._timers:
                 due = (self._timers[0][0] - self.clock.steady_ns()) / 1e9
                 # Simulated time may run slower or faster than the machine's, so its timers are checked often.
@@ -704,7 +710,9 @@ class Node(Generic[ConfigT]):
         inputs = [s.raw for s in self.subscriptions]
         outputs = [p.raw for p in self.publishers]
         losses = [(s.topic, node, count) for s in inputs for node, count in sorted(s.stats.lost_by.items())]
-        process = _process()
+        cpu_s, at_s = time.process_time(), time.monotonic()
+        before_cpu_s, before_s = self._load
+        self._load = cpu_s, at_s
         self._heartbeat.publish(
             status(
                 header=header("", time.time_ns()),
@@ -712,8 +720,8 @@ class Node(Generic[ConfigT]):
                 pid=os.getpid(),
                 state=getattr(status, state),
                 message=worst[1] if worst[0] >= WARN else "",
-                cpu_percent=float(process.cpu_percent()),
-                rss_mb=float(process.memory_info().rss / 1e6),
+                cpu_percent=100.0 * (cpu_s - before_cpu_s) / max(at_s - before_s, 1e-3),
+                rss_mb=int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 1e6,
                 inputs=[s.topic for s in inputs],
                 input_rates_hz=_f32(s.stats.rate_hz(now) for s in inputs),
                 input_ages_s=_f32(s.stats.age_s(now) for s in inputs),
@@ -829,18 +837,6 @@ class _RosoutHandler(logging.Handler):
             )
         except Exception:  # noqa: BLE001 - a bad log line must not end the callback that wrote it
             self.handleError(record)
-
-
-def _process() -> Any:
-    global _PROCESS
-    if _PROCESS is None:
-        import psutil
-
-        _PROCESS = psutil.Process()
-    return _PROCESS
-
-
-_PROCESS: Any = None
 
 
 def _f32(values: Any) -> Any:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import functools
 import json
 import os
 import re
@@ -141,7 +142,7 @@ def own_folder(folder: Path) -> None:
         folder.chmod(0o700)
 
 
-def open_lock(path: Path, create: bool = False) -> int:
+def open_lock(path: Path | str, create: bool = False) -> int:
     """Open a lock file and return its descriptor.
 
     Raises:
@@ -249,9 +250,8 @@ def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
     return claim, socket
 
 
-def _alive(json_path: Path) -> bool:
-    """Whether the owner of a JSON file holds its lock."""
-    lock_path = json_path.with_suffix(".lock")
+def _alive(lock_path: Path | str) -> bool:
+    """Whether the owner of an entry holds its lock."""
     try:
         fd = open_lock(lock_path)
     except (FileNotFoundError, RegistryError):  # another user's file is not an entry
@@ -265,12 +265,25 @@ def _alive(json_path: Path) -> bool:
     return False
 
 
+@functools.lru_cache(1024)
+def _content(path: str, written: tuple[int, int]) -> dict[str, Any]:
+    """Content of a JSON file, which is never changed after it was written."""
+    entry: dict[str, Any] = json.loads(Path(path).read_text())
+    return entry
+
+
 def _entries(folder: Path) -> Iterator[dict[str, Any]]:
-    for path in sorted(folder.glob("*.json")):
-        if not _alive(path):
+    try:
+        names = sorted(name for name in os.listdir(folder) if name.endswith(".json"))  # noqa: PTH208 - as below
+    except FileNotFoundError:
+        return
+    for name in names:
+        path = f"{folder}/{name}"
+        if not _alive(f"{path.removesuffix('.json')}.lock"):
             continue
         try:
-            content = json.loads(path.read_text())
+            status = os.stat(path)  # noqa: PTH116 - for some hundred files a second
+            content = _content(path, (status.st_ino, status.st_mtime_ns))
         except (OSError, ValueError):  # just removed, or the disk is full: try again at the next look
             continue
         yield content

@@ -160,7 +160,13 @@ class Waker(Protocol):
 
 
 class Transport(Protocol):
-    """Topics of one node."""
+    """Topics of one node.
+
+    Attributes:
+        patient: messages do not end a wait of the node's thread; they are read when it ends.
+    """
+
+    patient: bool
 
     @property
     def run_dir(self) -> Path | None:

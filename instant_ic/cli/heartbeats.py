@@ -117,7 +117,7 @@ class Heartbeats:
         return self.newest
 
 
-def hear(run_dir: Path, nodes: Collection[str], seconds: float = 1.5) -> dict[str, Heartbeat]:
+def hear(run_dir: Path, nodes: Collection[str], seconds: float = 2.5) -> dict[str, Heartbeat]:
     """Heartbeats of the given nodes, without those that send none within ``seconds``."""
     if not nodes:
         return {}

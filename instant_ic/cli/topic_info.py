@@ -82,4 +82,4 @@ def _rate(rate_hz: float, age_s: float) -> str:
 
 
 def _silence(is_node: bool) -> str:
-    return "unknown: no heartbeat within 1.5 s" if is_node else "unknown: not a node; measure it with ic topic hz"
+    return "unknown: no heartbeat within 2.5 s" if is_node else "unknown: not a node; measure it with ic topic hz"

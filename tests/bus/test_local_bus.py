@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from local_bus import BYTES
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, RegistryError, registry
 from instant_ic.bus.local_transport import LocalTransport
@@ -237,3 +238,43 @@ def test_an_event_that_is_written_late_ends_one_wait_not_all(bus):
         waker.clear()
         ends.append(None)
     assert len(ends) <= 6
+
+
+def test_an_event_during_a_long_callback_does_not_keep_the_bus_thread_busy(bus, monkeypatch):
+    transport = bus.node("reader")
+    waker = transport.waker()
+    subscription = transport.subscribe("/x", BYTES, RELIABLE, waker.set)
+    publisher = bus.publisher("/x")
+    wait_for(lambda: publisher.subscriber_count)
+    waker.wait(0.01)
+    wait_for(lambda: transport._bus_reads)  # the callback has become long
+    rounds: list[None] = []
+    drain = transport._drain
+    monkeypatch.setattr(transport, "_drain", lambda *args: (rounds.append(None), drain(*args)))
+    publisher.send(b"first")  # the bus thread reads it and sets the event
+    wait_for(lambda: waker.is_set())
+    time.sleep(0.2)
+    assert len(rounds) <= 6
+    waker.wait(3600.0)  # ended by the event
+    waker.clear()
+    assert [bytes(received.payload) for received in subscription.take()] == [b"first"]
+
+
+def test_messages_do_not_wake_a_patient_node_and_are_all_read_when_it_wakes(bus):
+    transport = bus.node("reader")
+    waker = transport.waker()
+    transport.patient = True
+    waker.wait(0.0)  # until the first wait the bus thread reads
+    subscription = transport.subscribe("/x", BYTES, RELIABLE, waker.set)
+    publisher = bus.publisher("/x")
+    wait_for(lambda: publisher.subscriber_count)
+    sent = [b"%d" % number for number in range(20)]
+    for payload in sent:
+        publisher.send(payload)
+    began = time.monotonic()
+    waker.wait(0.3)
+    assert time.monotonic() - began > 0.29
+    assert [bytes(received.payload) for received in subscription.take()] == sent
+    waker.clear()
+    threading.Timer(0.05, waker.set).start()
+    waker.wait(3600.0)  # ended by the event

@@ -75,7 +75,7 @@ def show(args: argparse.Namespace) -> int:
     print(f"{node.name}: {node.executable}, pid {node.pid}")
     beat = hear(paths.run_dir(), [node.name]).get(node.name)
     if beat is None:
-        print("state: silent, no heartbeat within 1.5 s")
+        print("state: silent, no heartbeat within 2.5 s")
     else:
         print(f"state: {beat.state}{f', {beat.message}' if beat.message else ''}")
         print(f"process: {beat.cpu_percent:.0f} % of a core, {beat.rss_mb:.0f} MB")
