@@ -84,6 +84,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             self.subscribe("/operator/estop", Bool, lambda m: self._on_stop("operator", bool(m.data)))
             self.subscribe("/ic/state", ControlState, lambda m: self._on_stop("arbiter", bool(m.estop)))
             self.on_demand = OnDemand(self.recorder.path, self._begin)
+            self.be_patient(True)  # the discovery wakes it
         self.commands = {
             "pause": self.recorder.pause,
             "resume": self.recorder.resume,
@@ -206,7 +207,8 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         except BagError as error:
             self.log.error("%s", error)
             raise SystemExit(1) from None
-        self.log.info("%s: %d messages", self.recorder.path, self.recorder.count)
+        if not self.config.snapshot:
+            self.log.info("%s: %d messages", self.recorder.path, self.recorder.count)
         if self.recorder.failed:
             self.log.error("the bag is incomplete: %s", self.recorder.error or "see the errors above")
             raise SystemExit(1)

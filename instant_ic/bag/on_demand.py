@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.recorder import Recorder, dated
+from instant_ic.bag.recorder import Recorder, dated, on_disk
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 
 IDLE, ENDING = "idle", "ending"
@@ -98,7 +98,7 @@ class OnDemand:
         """
         status = {"state": IDLE, **self._last} if self._recorder is None else self._state(self._recorder)
         try:
-            status["free_bytes"] = shutil.disk_usage(self.folder).free
+            status["free_bytes"] = shutil.disk_usage(on_disk(self.folder)).free
         except OSError:
             status["free_bytes"] = None
         return status

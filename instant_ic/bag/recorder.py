@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import shutil
 import threading
 import time
@@ -26,7 +27,6 @@ from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, check_ranges
-from instant_ic.private import make_folder
 
 FOREIGN_CLOCK_NS = 10_000_000_000
 """A stamp farther than this from the simulated clock comes from another clock."""
@@ -206,10 +206,8 @@ class Recorder:
         self._writer: BagWriter | None = None
         self._cache: SnapshotCache | None = None
         if self.options.snapshot:
-            try:
-                make_folder(path, exist_ok=True)
-            except OSError as error:
-                raise BagError(f"folder {path} for snapshots cannot be created: {error.strerror}") from None
+            if not (above := on_disk(path)).is_dir() or not os.access(above, os.W_OK):
+                raise BagError(f"folder {path} for snapshots cannot be created: {above} is not a writable folder")
             self._cache = SnapshotCache(self.options.snapshot_seconds, self.options.max_cache_mb * _MB)
         else:
             self._writer = BagWriter(
@@ -387,6 +385,7 @@ class Recorder:
             if waiting.state == "waiting":
                 self._write_snapshot(waiting)
         self._ending.set()
+        self._queue.put(lambda: None)  # wakes the thread
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             raise BagError(
@@ -446,7 +445,7 @@ class Recorder:
         next_flush = next_space = 0.0
         next_custom = time.monotonic() + _KEEP_CUSTOM_S
         while True:
-            item = self._queue.take(0.0 if self._ending.is_set() else 0.2)
+            item = self._queue.take(0.0 if self._ending.is_set() else _SPACE_S)
             if item is None and self._ending.is_set():
                 break
             try:
@@ -498,7 +497,8 @@ class Recorder:
         if self._state == FAILED:
             return
         try:
-            free = self._free_bytes(self.path)
+            # Without a snapshot so far, the folder for snapshots need not exist.
+            free = self._free_bytes(self.path if self._cache is None else on_disk(self.path))
         except OSError as error:
             self._stop(FAILED, f"bag {self.path}: {error.strerror}: its folder was removed")
             return
@@ -561,6 +561,11 @@ class Recorder:
         except BagError as error:
             if self._state != FAILED:  # otherwise keep the first reason
                 self._stop(FAILED, str(error))
+
+
+def on_disk(path: Path) -> Path:
+    """Return the path, or the nearest one above it that exists."""
+    return next(above for above in (path, *path.absolute().parents) if above.exists())
 
 
 def dated(folder: Path, words: str, prefix: str = "") -> Path:

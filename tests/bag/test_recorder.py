@@ -280,7 +280,6 @@ def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
     recorder = make(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
     recorder.take("/estop", BOOL, NO, 1 * S)
     recorder.take("/scan", BOOL, b"1", 2 * S)
-    assert list((tmp_path / "snaps").iterdir()) == []  # nothing is written until asked
     first = recorder.snapshot("door / stuck!")
     wait_for(lambda: first.state == "done", "the snapshot")
     recorder.take("/scan", BOOL, b"2", 3 * S)
@@ -293,6 +292,20 @@ def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
     assert [(m[0], m[2]) for m in read(second.path)][-1] == ("/estop", YES)
     assert [m[2] for m in read(second.path) if m[0] == "/scan"] == [b"1", b"2"]
     assert second.state == "done" and second.words == "4 messages, 2.0 s"
+
+
+def test_folder_for_snapshots_is_created_with_the_first_one(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "runs" / "snaps", snapshot=True, free=lambda path: shutil.disk_usage(path).free)
+    recorder.take("/scan", BOOL, b"1", 1 * S)
+    time.sleep(0.05)  # the disk's space has been looked at
+    assert list(tmp_path.iterdir()) == [] and recorder.state == RECORDING
+    saved = recorder.snapshot()
+    wait_for(lambda: saved.state == "done", "the snapshot")
+    recorder.close()
+    assert saved.path.parent == tmp_path / "runs" / "snaps"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BagError, match="file is not a writable folder"):
+        make(tmp_path / "file" / "snaps", snapshot=True)
 
 
 def test_snapshot_that_cannot_be_written_is_told_and_the_next_succeeds(tmp_path: Path) -> None:
