@@ -98,6 +98,8 @@ class HealthMonitor:
         groups = {spec.group: spec.run_dir or run_dir for spec in nodes} | {"": run_dir}
         name = f"launch_{os.getpid()}"
         self._transports = {group: LocalTransport(folder, name, time.time_ns) for group, folder in groups.items()}
+        for transport in self._transports.values():
+            transport.patient = True
         self._folders = groups
         self._beats = [(spec_group, beat) for spec_group, beat in self._subscribe_beats()]
         self._vspace = [
@@ -127,6 +129,8 @@ class HealthMonitor:
 
     def poll(self) -> None:
         """Process the messages that have arrived; never waits."""
+        for transport in self._transports.values():
+            transport.wait(0.0)
         for group, subscription in self._beats:
             for received in subscription.take():
                 self._take(deserialize(received.payload, received.type_name), group)

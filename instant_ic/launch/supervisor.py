@@ -35,6 +35,7 @@ BUSY_FACTOR = 6.0
 """Factor on the hang time-out for a node that computes (a compiler at its first image)."""
 
 _BUSY_SHARE = 0.5
+_ROUND_S = 0.25  # also the time to react to Ctrl-C; output of a node, and its end, come at once
 _LOG_BYTES = 32 << 20  # how much may wait for the disk
 _REAPER = Path(__file__).with_name("reaper.py")
 
@@ -165,7 +166,7 @@ class Supervisor:
                     process.start_s = self._start_s + process.spec.start_delay_s
                 try:
                     while not self._stop:
-                        self._step(0.1)
+                        self._step(_ROUND_S)
                         if all(process.state in (State.ENDED, State.FAILED) for process in self.processes):
                             failed = [p for p in self.processes if p.state is State.FAILED]
                             self._status = 1 if failed else self._status
