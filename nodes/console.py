@@ -8,6 +8,7 @@ from typing import Any
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node, NodeError, main
 from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
+from instant_ic.bus.node import Timer
 from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.access import AccessError, offer_sign_in
 from instant_ic.console.config import ConsoleConfig
@@ -51,8 +52,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.request_view = self.publisher("/view/request", ViewRequest, qos=SENSOR).publish
         self.report_shown = self.publisher("/view/shown", ShownPictures, qos=SENSOR).publish
         inputs = Inputs(
-            control=self.latest("/ic/state", ControlState, max_age_s=1.0, qos=LATCHED),
-            vbot=self.latest("/vbot/odom", Odometry, max_age_s=0.5),
+            control=self.latest("/ic/state", ControlState, 1.0, LATCHED, lambda m: self.feed.take_control(m)),
+            vbot=self.latest("/vbot/odom", Odometry, 0.5, SENSOR, lambda m: self.feed.take_vbot(m)),
             trajectory=self.latest("/ic/trajectory", Path, max_age_s=0.5),
             path=self.latest("/nav/path", Path, max_age_s=5.0),
             subgoal=self.latest("/ic/subgoal", PoseStamped, max_age_s=1.0),
@@ -65,18 +66,16 @@ class ConsoleNode(Node[ConsoleConfig]):
             raise NodeError(str(error)) from error
         self.recording = RecordingDesk(self.ask_recorder, lambda status: self.server.publish("recording", status))
         self.feed = feed = PageFeed(config, self.server, self.tf, inputs, self, self.clock, self.diagnose)
-        self.subscribe("/ic/state", ControlState, feed.take_control, qos=LATCHED)
-        self.subscribe("/vbot/odom", Odometry, feed.take_vbot, qos=SENSOR)
         self.subscribe("/camera/image/compressed", CompressedImage, feed.take_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", RenderedView, feed.take_view, qos=SENSOR)
         self.subscribe("/map", OccupancyGrid, partial(feed.grids.take, FrameKind.MAP), qos=LATCHED)
         self.subscribe("/costmap", OccupancyGrid, partial(feed.grids.take, FrameKind.COSTMAP), qos=SENSOR)
         self.subscribe("/diagnostics", DiagnosticArray, feed.take_diagnostics, qos=RELIABLE)
         self.subscribe("/heartbeat", NodeStatus, feed.take_heartbeat, qos=RELIABLE)
-        self.timer(1.0 / config.state_rate_hz, feed.send_state_if_due)
-        self.timer(0.2, feed.send_plan)
         self.timer(1.0, feed.send_health)
-        self.timer(1.0 / config.map_rate_hz, feed.send_grids)
+        self.page_timers: list[Timer] = []
+        self.server.on_watched = lambda watched: self.call_soon(self.feed_page, watched)
+        self.feed_page(self.run_dir is None)  # in lockstep there are no pages that could come
         for warning in self.server.warnings:
             self.log.warning(warning)
         if self.run_dir is not None:
@@ -90,6 +89,19 @@ class ConsoleNode(Node[ConsoleConfig]):
         except (ConsoleError, AccessError) as error:
             raise NodeError(str(error)) from error
         self.recording.start()
+
+    def feed_page(self, watched: bool) -> None:
+        """Send everything as long as there is a page; without one, only keep what a new page gets at once."""
+        self.feed.watched = watched
+        self.be_patient(not watched)
+        for timer in self.page_timers:
+            timer.cancel()
+        rates = (
+            (1.0 / self.config.state_rate_hz, self.feed.send_state_if_due),
+            (0.2, self.feed.send_plan),
+            (1.0 / self.config.map_rate_hz, self.feed.send_grids),
+        )
+        self.page_timers = [self.timer(*rate) for rate in rates] if watched else []
 
     def reconfigure(self, config: ConsoleConfig) -> None:
         super().reconfigure(config)

@@ -193,7 +193,9 @@ class Worker:
             self._node.call_soon(self._on_result, result)
 
 
-class _Timer:
+class Timer:
+    """A callback once per period."""
+
     def __init__(self, period_ns: int, due_ns: int, callback: Callable[[], None]) -> None:
         self.period_ns = period_ns
         self.due_ns = due_ns
@@ -247,7 +249,7 @@ class Node(Generic[ConfigT]):
         self.subscriptions: list[Subscription] = []
         self._transport = transport
         self._remaps = dict(remaps or {})
-        self._timers: list[tuple[int, int, _Timer]] = []
+        self._timers: list[tuple[int, int, Timer]] = []
         self._timer_orders = itertools.count()
         self._soon: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
         self._wake = transport.waker()
@@ -357,23 +359,32 @@ class Node(Generic[ConfigT]):
             self.subscriptions.remove(item)
         self._registry_changed()
 
-    def latest(self, topic: str, message_class: Any, max_age_s: float, qos: QoS = SENSOR) -> Latest:
-        """Subscribe and keep the newest message of a topic."""
+    def latest(
+        self,
+        topic: str,
+        message_class: Any,
+        max_age_s: float,
+        qos: QoS = SENSOR,
+        callback: Callable[[Any], None] = lambda message: None,
+    ) -> Latest:
+        """Subscribe and keep the newest message of a topic; ``callback(message)`` runs once it is stored."""
         latest = Latest(self.clock, max_age_s)
         name = type_name(message_class)
 
         def keep(received: Received) -> None:
-            latest.put(deserialize(received.payload, name), received)
+            message = deserialize(received.payload, name)
+            latest.put(message, received)
+            callback(message)
 
         self._subscribe(topic, name, keep, qos)
         return latest
 
-    def timer(self, period_s: float, callback: Callable[[], None]) -> _Timer:
+    def timer(self, period_s: float, callback: Callable[[], None]) -> Timer:
         """Call back once per period of the node's clock; missed periods are not caught up."""
         if period_s <= 0:
             raise ValueError(f"timer period must be > 0 (got {period_s})")
         period = int(period_s * 1e9)
-        timer = _Timer(period, self.clock.steady_ns() + period, callback)
+        timer = Timer(period, self.clock.steady_ns() + period, callback)
         heapq.heappush(self._timers, (timer.due_ns, next(self._timer_orders), timer))
         self._wake.set()
         return timer

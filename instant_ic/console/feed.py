@@ -78,6 +78,10 @@ class PageFeed:
         outputs: receiver of requests and reports.
         clock: see :class:`Clock`.
         diagnose: sets a diagnosis: name, level, text, values.
+
+    Attributes:
+        watched: whether there is a page. Without one, no state is sent, no view is requested and no report goes to the
+            arbiter.
     """
 
     def __init__(
@@ -90,6 +94,7 @@ class PageFeed:
         clock: Clock,
         diagnose: Callable[..., None],
     ) -> None:
+        self.watched = True
         self.server = server
         self.scene = Scene(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
         self.display = Display(config.lead, self.scene)
@@ -147,7 +152,7 @@ class PageFeed:
     def lose_driver(self) -> None:
         """Report a lost driver to the arbiter at once. Called on the server's thread."""
         self.display.lose_driver(self._clock.steady_ns())
-        self.report_shown()
+        self.report_shown(always=True)
 
     # ---- timers --------------------------------------------------------------------------------------
 
@@ -158,6 +163,8 @@ class PageFeed:
 
     def send_state(self) -> None:
         """Send mode, poses and commands; request a view if one is due."""
+        if not self.watched:
+            return
         self._state_sent_ns = self._clock.steady_ns()
         control, vbot = self._inputs.control.message, self._inputs.vbot.message
         self.display.step(control, self._state_sent_ns)
@@ -188,11 +195,14 @@ class PageFeed:
         for kind, image in self.grids.changed():
             self.server.send_frame(kind, image.header, image.png)
 
-    def report_shown(self) -> None:
+    def report_shown(self, always: bool = False) -> None:
         """Report the available images and the loss of the driver. Any thread may call it."""
-        self._outputs.report_shown(self.display.report(self._clock.now_ns(), self._clock.steady_ns()))
+        if self.watched or always:
+            self._outputs.report_shown(self.display.report(self._clock.now_ns(), self._clock.steady_ns()))
 
     def _request_view(self) -> None:
+        if not self.watched:
+            return
         status = self._inputs.vspace.message
         renders = status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
         request = self.requests.next(renders, self.server.watching, self._clock.now_ns(), self._clock.steady_ns())

@@ -150,6 +150,8 @@ class ConsoleServer:
         self.backend = backend
         self.config = config or ServerConfig()
         self.page = page or {}
+        self.on_watched: Callable[[bool], None] = lambda watched: None
+        """Called on the server's thread when the first page comes (True) and when the last one has gone (False)."""
         self.gate = DriveGate(self.config.drive)
         try:
             self.access = Access(self.config.access, self.config.host)
@@ -256,7 +258,8 @@ class ConsoleServer:
 
     def show(self, *kinds: FrameKind) -> None:
         """Set which of PANORAMA and VIEW the page shows or soon will; the other is sent at a low rate."""
-        self._call(self._show, frozenset(kinds))
+        if (shown := frozenset(kinds)) != self._foreground:
+            self._call(self._show, shown)
 
     def _call(self, function: Callable[..., None], *args: Any) -> None:
         if self._loop is None:
@@ -463,6 +466,8 @@ class ConsoleServer:
         session = Session(self._next_number, socket, connection, bucket, may_drive, request[_COOKIE])
         self._next_number += 1
         self._sessions[session.number] = session  # before the first await, so that the place is taken
+        if len(self._sessions) == 1:
+            self.on_watched(True)
         loop = asyncio.get_running_loop()
         sender: asyncio.Task[None] | None = None
         expiry: asyncio.TimerHandle | None = None
@@ -496,6 +501,8 @@ class ConsoleServer:
         self._own = {key: at for key, at in self._own.items() if key[0] != session.number}
         self._emit_due()
         self._send_session()
+        if not self._sessions:
+            self.on_watched(False)
 
     def _end(self, session: Session, code: WSCloseCode, reason: str) -> None:
         """Drop a session at once, then close its socket whatever the client does."""
@@ -774,8 +781,6 @@ class ConsoleServer:
                 session.put_frame(kind, frame)
 
     def _show(self, kinds: frozenset[FrameKind]) -> None:
-        if kinds == self._foreground:
-            return
         self._foreground = kinds
         for session in self._sessions.values():
             session.set_foreground(kinds, 1.0 / self.config.background_picture_hz)

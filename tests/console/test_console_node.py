@@ -492,3 +492,23 @@ def test_configuration_file_holds_the_defaults():
 def test_bad_parameters_are_refused_by_name(key, value):
     with pytest.raises(ValueError, match=key):
         ConsoleConfig(**{key: value})
+
+
+def test_without_a_page_nothing_is_sent_or_requested(setup):
+    bus, node, server = setup
+    publish_tree(bus)
+    bus.publish("/vspace/status", vspace_status(VspaceStatus.READY), latched=True)
+    node.feed_page(False)
+    for _ in range(20):
+        bus.publish("/ic/state", control(bus, ControlState.REAL), latched=True)
+        bus.publish("/camera/image/compressed", compressed_image_message(b"JPEG", "camera", bus.clock.now_ns()))
+        bus.advance(0.1)
+    assert not bus.messages("/view/shown") and not bus.messages("/view/request")
+    assert "state" not in server.texts and "health" in server.texts
+    assert server.frames[-1][0] is FrameKind.PANORAMA  # a new page, and the export, get the newest image
+    node.on_operator(False)
+    assert len(bus.messages("/view/shown")) == 1  # the loss of the driver is always reported
+    node.feed_page(True)
+    bus.advance(1.0)
+    assert "state" in server.texts and len(bus.messages("/view/request")) == 1
+    assert 20 <= len(bus.messages("/view/shown")) <= 22

@@ -101,6 +101,22 @@ def test_page_and_modules_are_served_with_a_content_policy(serve):
     asyncio.run(scenario())
 
 
+def test_the_first_page_and_the_end_of_the_last_are_reported(serve):
+    server, _ = serve()
+    watched = []
+    server.on_watched = watched.append
+
+    async def scenario():
+        async with ConsoleClient(server.url):
+            async with ConsoleClient(server.url):
+                assert watched == [True]
+            await until(lambda: len(server._sessions) == 1)
+            assert watched == [True]
+        await until(lambda: watched == [True, False])
+
+    asyncio.run(scenario())
+
+
 def test_fault_any_client_drives(serve):
     server, backend = serve()
 
