@@ -1,81 +1,248 @@
-"""Pace of a simulated stack's time relative to the machine's: slow motion for a machine that is too slow.
+"""Pace of a simulated stack's time relative to the machine's: slow motion for a machine that is too slow or busy.
 
-All processes of a stack share one pace. The launcher writes it into the run directory (``ic launch sim --pace 0.5``),
-and each process reads it at start-up. Stamps, timers and time-outs of the nodes follow it, and so do the simulated
-devices. Functions that concern only the machine (heartbeats, shutdown of processes) do not.
+All processes of a stack share one pace. The launcher writes it into a file of the run directory, and each process maps
+that file. Stamps, timers and time-outs of the nodes follow the pace, and so do the simulated devices. Functions that
+concern only the machine (heartbeats, shutdown of processes) do not.
+
+The launcher may change the pace while the stack runs. It writes each change ``LEAD_S`` ahead, so that all processes
+change at the same instant: the stack's time has no jump, and is the same in all of them.
 """
 
 from __future__ import annotations
 
-import json
 import math
+import mmap
+import os
+import struct
 import time
-from dataclasses import asdict, dataclass
+import zlib
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
-FILE = "pace.json"
+from instant_ic.private import open_file
+
+FILE = "pace"
 SLOWEST, FASTEST = 0.02, 10.0
+LEAD_S = 0.2
+"""Machine seconds from the writing of a change until it takes effect. Waits shorter than this are exact."""
+
+# Words of eight bytes: number of the record, whether the pace adapts, two stretches, and a CRC of all before it. The
+# CRC makes a record that is being written recognisable, whatever the order in which its words arrive.
+_RECORD = struct.Struct("=QQdqqqdqqqQ")
 
 
 class PaceError(ValueError):
     """The pace is out of range, or the run directory's pace file cannot be read."""
 
 
-@dataclass(frozen=True)
-class Pace:
-    """A pace, with the moment at which its time equalled the machine's.
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A stretch of the stack's time with one factor.
 
     Attributes:
         factor: seconds of the stack per second of the machine.
-        epoch_ns: nanoseconds since the epoch at that moment.
-        monotonic_ns: the machine's steady clock at that moment; all processes of a machine share it.
+        monotonic_ns: the machine's steady clock at its begin; all processes of a machine share it.
+        epoch_ns: the stack's nanoseconds since the epoch at its begin.
+        steady_ns: the stack's steady clock at its begin.
     """
 
-    factor: float = 1.0
-    epoch_ns: int = 0
-    monotonic_ns: int = 0
+    factor: float
+    monotonic_ns: int
+    epoch_ns: int
+    steady_ns: int
+
+    def since_begin_ns(self, monotonic_ns: int) -> int:
+        """Nanoseconds of the stack from the begin until an instant of the machine's steady clock."""
+        return round(self.factor * (monotonic_ns - self.monotonic_ns))
+
+    def followed_by(self, factor: float, monotonic_ns: int) -> Stretch:
+        """The stretch with another factor that begins where this one is at an instant."""
+        ns = self.since_begin_ns(monotonic_ns)
+        return Stretch(factor, monotonic_ns, self.epoch_ns + ns, self.steady_ns + ns)
+
+
+class Pace:
+    """The stack's time: the machine's own, or that of the newest two stretches.
+
+    Args:
+        stretch: a pace that does not change; None: the machine's own time.
+
+    Attributes:
+        adapts: whether the launcher chooses the pace by what the machine can do.
+    """
+
+    def __init__(self, stretch: Stretch | None = None) -> None:
+        self.adapts = False
+        self._stretches = None if stretch is None else (stretch, stretch)  # before and after the newest change
+        self._record: mmap.mmap | None = None
+        self._words = memoryview(bytes(8)).cast("Q")
+        self._number = 0  # of the record in _stretches
 
     @classmethod
     def from_now(cls, factor: float) -> Pace:
-        """A pace that starts now.
+        """A pace that starts now and does not change.
 
         Raises:
             PaceError: the factor is out of range.
         """
-        if not (math.isfinite(factor) and SLOWEST <= factor <= FASTEST):
-            raise PaceError(f"pace must lie in {SLOWEST}..{FASTEST:g} (got {factor:g})")
-        return cls(float(factor), time.time_ns(), time.monotonic_ns())
+        return cls(Stretch(check_factor(factor), time.monotonic_ns(), time.time_ns(), 0))
 
     @property
     def real(self) -> bool:
-        """Whether this is the machine's own time."""
-        return self.factor == 1.0
+        """Whether this is the machine's own time, now and later."""
+        return self._stretches is None
+
+    @property
+    def factor(self) -> float:
+        """Seconds of the stack per second of the machine, at present."""
+        return 1.0 if self._stretches is None else self._at(time.monotonic_ns()).factor
+
+    @property
+    def text(self) -> str:
+        """The pace for the operator; empty in real time."""
+        return describe(self.factor, self.adapts)
 
     def now_ns(self) -> int:
         """Nanoseconds since the epoch."""
-        if self.real:
+        if self._stretches is None:
             return time.time_ns()
-        return self.epoch_ns + round(self.factor * (time.monotonic_ns() - self.monotonic_ns))
+        now_ns = time.monotonic_ns()
+        stretch = self._at(now_ns)
+        return stretch.epoch_ns + stretch.since_begin_ns(now_ns)
 
     def steady_ns(self) -> int:
         """Nanoseconds since an arbitrary origin; only differences are meaningful."""
-        return time.monotonic_ns() if self.real else round(self.factor * (time.monotonic_ns() - self.monotonic_ns))
+        now_ns = time.monotonic_ns()
+        if self._stretches is None:
+            return now_ns
+        stretch = self._at(now_ns)
+        return stretch.steady_ns + stretch.since_begin_ns(now_ns)
 
     def steady_s(self) -> float:
         """Seconds since an arbitrary origin; only differences are meaningful."""
         return self.steady_ns() * 1e-9
 
     def wait_s(self, seconds: float) -> float:
-        """Convert seconds of the stack to seconds of the machine."""
-        return seconds / self.factor
+        """Convert seconds of the stack, from now on, to seconds of the machine.
+
+        A result above ``LEAD_S`` does not include changes that are not written yet: wait again for what is left.
+        """
+        if self._stretches is None:
+            return seconds
+        now_ns = time.monotonic_ns()
+        stretch, newest = self._at(now_ns), self._stretches[1]
+        until_change_s = (newest.monotonic_ns - now_ns) * 1e-9
+        if 0.0 < until_change_s < seconds / stretch.factor:
+            return until_change_s + (seconds - until_change_s * stretch.factor) / newest.factor
+        return seconds / stretch.factor
 
     def sleep(self, seconds: float) -> None:
         """Sleep for a number of the stack's seconds."""
-        time.sleep(self.wait_s(seconds))
+        if self._stretches is None:
+            time.sleep(seconds)
+            return
+        until_ns = self.steady_ns() + round(seconds * 1e9)
+        while (left_ns := until_ns - self.steady_ns()) > 0:
+            time.sleep(min(self.wait_s(left_ns * 1e-9), LEAD_S))
 
     def stamp_ns(self, machine_ns: int) -> int:
         """Convert a recent stamp of the machine's clock to the stack's time."""
-        return machine_ns if self.real else self.now_ns() - round(self.factor * (time.time_ns() - machine_ns))
+        if self._stretches is None:
+            return machine_ns
+        then_ns = time.monotonic_ns() - (time.time_ns() - machine_ns)
+        stretch = self._at(then_ns)
+        return stretch.epoch_ns + stretch.since_begin_ns(then_ns)
+
+    def _at(self, monotonic_ns: int) -> Stretch:
+        """The stretch of an instant; read the clock before the call, so that no change can come in between."""
+        if self._words[0] != self._number and self._record is not None:
+            self._take(self._record[:])
+        assert self._stretches is not None
+        before, newest = self._stretches
+        return newest if monotonic_ns >= newest.monotonic_ns else before
+
+    def _take(self, record: bytes) -> bool:
+        """Take over a record; False while it is being written."""
+        number, adapts, *fields, crc = _RECORD.unpack(record)
+        if crc != zlib.crc32(record[:-8]):
+            return False
+        self._stretches = (Stretch(*fields[:4]), Stretch(*fields[4:]))
+        self.adapts, self._number = bool(adapts), number
+        return True
+
+    @classmethod
+    def _of_record(cls, record: mmap.mmap) -> Pace:
+        pace = cls()
+        if not pace._take(record[:]):
+            raise ValueError("its check sum is wrong")
+        assert pace._stretches is not None
+        for stretch in pace._stretches:
+            check_factor(stretch.factor)
+        pace._record, pace._words = record, memoryview(record).cast("Q")
+        return pace
+
+
+class PaceFiles:
+    """The pace in the run directories of a stack, one for each of its groups; only the launcher writes it.
+
+    Args:
+        folders: run directories.
+        factor: pace at the start.
+        adapts: whether :meth:`change` will be called.
+
+    Raises:
+        PaceError: the factor is out of range.
+    """
+
+    def __init__(self, folders: Iterable[Path], factor: float, adapts: bool = False) -> None:
+        self._newest = Stretch(check_factor(factor), time.monotonic_ns(), time.time_ns(), 0)
+        self._adapts = adapts
+        self._number = 1
+        self._records = [_create(folder / FILE, self._packed(self._newest)) for folder in folders]
+
+    @property
+    def factor(self) -> float:
+        """The factor written last."""
+        return self._newest.factor
+
+    def change(self, factor: float) -> None:
+        """Change the pace in ``LEAD_S`` machine seconds; nothing happens while an earlier change is still ahead.
+
+        Raises:
+            PaceError: the factor is out of range.
+        """
+        before, now_ns = self._newest, time.monotonic_ns()
+        if now_ns < before.monotonic_ns:
+            return
+        self._newest = before.followed_by(check_factor(factor), now_ns + round(LEAD_S * 1e9))
+        self._number += 1
+        packed = self._packed(before)
+        for record in self._records:
+            record[:] = packed
+
+    def _packed(self, before: Stretch) -> bytes:
+        body = _RECORD.pack(self._number, self._adapts, *astuple(before), *astuple(self._newest), 0)[:-8]
+        return body + struct.pack("=Q", zlib.crc32(body))
+
+
+def check_factor(factor: float) -> float:
+    """Return the factor.
+
+    Raises:
+        PaceError: it is out of range.
+    """
+    if not (math.isfinite(factor) and SLOWEST <= factor <= FASTEST):
+        raise PaceError(f"pace must lie in {SLOWEST}..{FASTEST:g} (got {factor:g})")
+    return float(factor)
+
+
+def describe(factor: float, adapts: bool) -> str:
+    """The pace for the operator; empty in real time. A pace that adapts is rounded, so that the text changes rarely."""
+    factor = round(factor, 1) if adapts else factor
+    if factor == 1.0:
+        return ""
+    return f"simulation at {factor:g} of real time{': this machine is busy' if adapts else ''}"
 
 
 _current = Pace()
@@ -92,35 +259,42 @@ def use(pace: Pace) -> None:
     _current = pace
 
 
-def write(run_dir: Path, pace: Pace) -> None:
-    """Write the pace into a run directory; the machine's own pace leaves no file."""
-    file = run_dir / FILE
-    if pace.real:
-        file.unlink(missing_ok=True)
-        return
+def remove_files(folders: Iterable[Path]) -> None:
+    """Return run directories to the machine's own time, for processes that start from now on."""
+    for folder in folders:
+        (folder / FILE).unlink(missing_ok=True)
+
+
+def _create(file: Path, content: bytes) -> mmap.mmap:
+    """Replace a file and map the new one; processes that mapped the old one keep it."""
     part = file.with_suffix(".part")
-    part.write_text(json.dumps(asdict(pace)), encoding="utf-8")
-    part.replace(file)
+    descriptor = open_file(part, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+    try:
+        os.write(descriptor, content)
+        part.replace(file)
+        return mmap.mmap(descriptor, len(content))
+    finally:
+        os.close(descriptor)
 
 
 def read(run_dir: Path) -> Pace:
-    """Read the pace of a run directory.
+    """The pace of a run directory; it follows the launcher's changes. Without a file it is the machine's own.
 
     Raises:
         PaceError: its file is damaged.
     """
     file = run_dir / FILE
     try:
-        text = file.read_text(encoding="utf-8")
+        descriptor = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     except FileNotFoundError:
         return Pace()
     except OSError as error:
         raise PaceError(f"{file}: cannot be read: {error.strerror}") from error
     try:
-        fields = json.loads(text)
-        pace = Pace(float(fields["factor"]), int(fields["epoch_ns"]), int(fields["monotonic_ns"]))
-    except (ValueError, KeyError, TypeError) as error:
+        if (size := os.fstat(descriptor).st_size) != _RECORD.size:
+            raise ValueError(f"{size} bytes instead of {_RECORD.size}")
+        return Pace._of_record(mmap.mmap(descriptor, _RECORD.size, prot=mmap.PROT_READ))
+    except (ValueError, OSError) as error:
         raise PaceError(f"{file}: not a valid pace ({error}); delete the file, or restart the stack") from error
-    if not (math.isfinite(pace.factor) and SLOWEST <= pace.factor <= FASTEST):
-        raise PaceError(f"{file}: pace must lie in {SLOWEST}..{FASTEST:g} (got {pace.factor:g})")
-    return pace
+    finally:
+        os.close(descriptor)

@@ -98,7 +98,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             return
         raise NodeError(
             f"the stack runs at pace {pace.factor:g}, for simulated devices only, and {self.config.roboclaw.port} is "
-            f"not the simulator's (in {folder}): start without --pace"
+            f"not the simulator's (in {folder}): start with --pace 1"
         )
 
     def on_command(self, received: Received) -> None:

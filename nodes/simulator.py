@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.lidar.capture import CaptureError
-from instant_ic.msg import Bool, Odometry, odometry_message
+from instant_ic.msg import Bool, Float32, Odometry, odometry_message
 from instant_ic.pace import current
 from instant_ic.paths import run_dir
 from instant_ic.sim.capture_replay import CaptureReplay
-from instant_ic.sim.real_time import DevicesConfig, RealTimeLoop, SimulatedDevices
+from instant_ic.sim.real_time import ACCEPTABLE_LAG_S, DevicesConfig, RealTimeLoop, SimulatedDevices
 from instant_ic.sim.simulation import Simulation
+from instant_ic.sim.theta import ACCEPTABLE_DELAY_S
 from instant_ic.sim.vlp16 import Vlp16Server
 
 _TRUTH_S = 1.0 / 30.0
+_LATE_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,9 @@ class SimulatorNode(Node[SimulatorConfig]):
             self.call_soon(self.fault, "simulation", error)
 
         self._loop = RealTimeLoop(self.simulation, self._devices.scanner, report)
+        self.late = self.publisher("/simulation/late", Float32, qos=SENSOR)
         self.timer(_TRUTH_S, self._publish_truth)
+        self.timer(_LATE_S, self._publish_late)
         self.timer(1.0, self._check)
 
     def teardown(self) -> None:
@@ -72,6 +76,13 @@ class SimulatorNode(Node[SimulatorConfig]):
             self._published = contact
             self.contact.publish(Bool(data=robot.contact))
 
+    def _publish_late(self) -> None:
+        """Publish the devices' delay as a share of the acceptable one; above 1 the launcher slows the stack."""
+        loop, devices = self._loop, self._devices
+        if loop is not None and devices is not None:
+            camera_s = devices.camera.late_s if devices.camera is not None else 0.0
+            self.late.publish(Float32(max(loop.take_lag_s() / ACCEPTABLE_LAG_S, camera_s / ACCEPTABLE_DELAY_S)))
+
     def _check(self) -> None:
         loop, robot = self._loop, self.simulation.robot
         if loop is None:
@@ -86,7 +97,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         if paused_s > 0:
             self.diagnose("pace", WARN, f"the machine is too slow: the simulation paused for {paused_s:.2f} s")
         else:
-            self.diagnose("pace", OK, "real time" if current().real else f"{current().factor:g} of real time")
+            self.diagnose("pace", OK, current().text or "real time")
         self._check_devices()
 
     def _check_devices(self) -> None:

@@ -30,6 +30,7 @@ from instant_ic.msg import (
     matrix_from_pose,
     stamp_ns,
 )
+from instant_ic.pace import current
 
 IMAGE_TIMEOUT_S = 2.0
 
@@ -188,7 +189,7 @@ class PageFeed:
         if self.server.plain_http:  # on the page only, not as a diagnosis: the node itself works
             faults.append({"level": "warn", "name": "network", "text": PLAIN_HTTP})
         newest = self._inputs.vspace.message, self._inputs.battery.message
-        self.server.publish("health", page.health_message(*newest, faults, self.faults.nodes))
+        self.server.publish("health", page.health_message(*newest, faults, self.faults.nodes, current().text))
 
     def send_grids(self) -> None:
         """Send map and costmap if they have changed."""

@@ -19,6 +19,7 @@ from instant_ic.bus import SENSOR, Node, QoS
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.launch.process import dies_with_us
+from instant_ic.pace import read as read_pace
 
 T = TypeVar("T")
 _ENOUGH_PER_S = 33e6
@@ -105,7 +106,7 @@ class Stack:
         arguments: launch arguments.
         log_path: file for the launcher's output (default: ``RUN_DIR/launch.log``).
         prefix: command that starts the launcher, such as ``ip netns exec NAME``.
-        pace: of the stack's time, see :mod:`instant_ic.pace`.
+        pace: of the stack's time, see :mod:`instant_ic.pace`; None: what the machine can do.
 
     Example::
 
@@ -121,22 +122,27 @@ class Stack:
         arguments: dict[str, Any],
         log_path: Path | None = None,
         prefix: Sequence[str] = (),
-        pace: float = 1.0,
+        pace: float | None = 1.0,
     ) -> None:
         self.launch_file = launch_file
         self.run_dir = run_dir
         self.arguments = dict(arguments)
         self.log_path = log_path or run_dir / "launch.log"
         self.prefix = list(prefix)
-        self.pace = pace
+        self._pace = pace
         self.process: subprocess.Popen[bytes] | None = None
         self.observer: Observer
+
+    @property
+    def pace(self) -> float:
+        """Seconds of the stack per second of the machine, at present."""
+        return read_pace(self.run_dir).factor if self._pace is None else self._pace
 
     def __enter__(self) -> Self:
         """Start the launcher and the observer."""
         self.run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         words = [f"{key}:={_word(value)}" for key, value in self.arguments.items()]
-        launch = [self.launch_file, *words, f"--pace={self.pace:g}"]
+        launch = [self.launch_file, *words, f"--pace={self._pace or 'auto'}"]
         environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(self.run_dir)}
         with self.log_path.open("wb") as log:
             self.process = subprocess.Popen(
@@ -176,13 +182,14 @@ class Stack:
         Raises:
             StackError: timeout, or the launcher exited.
         """
-        deadline = time.monotonic() + timeout_s / self.pace
+        left_s, looked_s = timeout_s, time.monotonic()
         while True:
             self.observer.spin_once()
             if value := condition():
                 return value
             self.check_alive(what)
-            if time.monotonic() > deadline:
+            left_s, looked_s = left_s - (time.monotonic() - looked_s) * self.pace, time.monotonic()
+            if left_s < 0:
                 raise StackError(f"no {what} within {timeout_s:g} s; the stack's output ends with:\n{self.log_tail()}")
             time.sleep(0.005)
 

@@ -14,26 +14,28 @@ from instant_ic.estop_state import RunMark
 from instant_ic.launch.description import LaunchDescription
 from instant_ic.launch.health import EVERY_NODES, HealthMonitor, TopicFault
 from instant_ic.launch.outlet import Outlet
+from instant_ic.launch.pacing import Pacing
 from instant_ic.launch.process import ManagedProcess, State
 from instant_ic.launch.rundir import StackLock
 from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.launch.supervisor import Supervisor
 from instant_ic.launch.topics import nominal_rate
-from instant_ic.pace import Pace
-from instant_ic.pace import write as write_pace
+from instant_ic.pace import PaceFiles, describe, remove_files
 
 _VIEW_PERIOD_S = 0.5
 _WAITING_LINES = 2000  # how many lines a terminal may lag behind
 
 
-def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None = None, pace: Pace | None = None) -> int:
+def run_stack(
+    description: LaunchDescription, run_dir: Path, live: bool | None = None, pace: float | None = None
+) -> int:
     """Start everything, show its state, and stop it at the end.
 
     Args:
         description: what to start.
         run_dir: run directory; created if missing, with those of the groups inside.
         live: show a table of the nodes below the lines; default: only if standard output is a terminal.
-        pace: of the stack's time; default: the machine's.
+        pace: of the stack's time. Default: what the machine can do, if the devices are simulated; else the machine's.
 
     Returns:
         Exit status, see :meth:`Supervisor.run`.
@@ -42,21 +44,26 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
         RegistryError: a run directory cannot be used.
         StackRunningError: another stack uses one of them.
         EstopStateError: the mark of a running stack cannot be written.
+        PaceError: the pace is out of range.
     """
+    folders = description.run_dirs(run_dir)
     with ExitStack() as locks:
-        for folder in description.run_dirs(run_dir):
+        for folder in folders:
             registry.prepare(folder)
             locks.enter_context(StackLock(folder, description.file.name))
             registry.sweep(folder)
-            write_pace(folder, pace or Pace())
             locks.enter_context(RunMark(folder))
         output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live)
         status = 1
         try:
             count = f"{len(description.nodes)} node{'' if len(description.nodes) == 1 else 's'}"
             output.event(f"{count} of {description.file}, run directory {run_dir}")
-            if pace is not None and not pace.real:
-                output.event(f"time runs at {pace.factor:g} of real time: for simulated devices only")
+            remove_files(folders)
+            if pace is None and description.simulated:
+                output.pacing = Pacing(folders, output.event)
+            elif pace is not None and pace != 1.0:
+                PaceFiles(folders, pace)
+                output.event(f"{describe(pace, adapts=False)}, for simulated devices only")
             status = Supervisor(
                 description.nodes,
                 run_dir,
@@ -79,6 +86,7 @@ class _Output:
         self._outlet = Outlet("screen", _WAITING_LINES)
         self._outlet.put(self._screen.start, always=True)
         self._health: HealthMonitor | None = None
+        self.pacing: Pacing | None = None
         self._ending = False
         self._left_out = 0  # lines not shown on the terminal
         self._next_view_s = 0.0
@@ -101,7 +109,9 @@ class _Output:
         self._outlet.put(self._screen.event, text, bad, always=True)
 
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
-        """Update the view, at most twice a second."""
+        """Adapt the pace, and update the view at most twice a second."""
+        if self.pacing is not None and self._health is not None and not self._ending:
+            self.pacing.step(self._health)
         if time.monotonic() >= self._next_view_s:
             self._next_view_s = time.monotonic() + _VIEW_PERIOD_S
             self._outlet.put(self._screen.refresh, self._view(processes))

@@ -127,6 +127,11 @@ class LaunchDescription:
     announcements: tuple[Announcement, ...] = ()
     shutdown: Shutdown | None = None
 
+    @property
+    def simulated(self) -> bool:
+        """Whether the devices are simulated, so that the stack's time need not be the machine's."""
+        return any(node.exec == "simulator" for node in self.nodes)
+
     def run_dirs(self, run_dir: Path) -> list[Path]:
         """All run directories of the stack, its own first."""
         others = {node.run_dir for node in self.nodes if node.run_dir is not None}

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from instant_ic.bus import RELIABLE, registry
+from instant_ic.bus import RELIABLE, SENSOR, registry
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import ERROR, OK, WARN
 from instant_ic.launch.description import NodeSpec
@@ -30,6 +30,9 @@ _STATES = ("starting", "running", "degraded", "failed", "stopping")
 _UP = ("running", "degraded")
 _VSPACE_READY = 2
 _DIAGNOSTICS_S = 1.0
+
+LATE = "/simulation/late"
+"""Topic of the node ``simulator``."""
 
 MILESTONES: tuple[tuple[str, str, str], ...] = (
     ("camera", "theta_camera", "/camera/image/compressed"),
@@ -116,10 +119,21 @@ class HealthMonitor:
         self._diagnostics = {
             group: transport.advertise("/diagnostics", array, RELIABLE) for group, transport in self._transports.items()
         }
+        self._late = [self._subscribe(spec, LATE, "std_msgs/msg/Float32") for spec in self._of("simulator")]
+        control = "instant_ic_msgs/msg/ControlState"
+        self._control = [self._subscribe(spec, "/ic/state", control) for spec in self._of("arbiter") if self._late]
         self._next_diagnostics_s = 0.0
         self._reached: set[str] = set()
         self._flowed: set[tuple[str, str]] = set()
         self._wrong_since: dict[tuple[str, str], float] = {}
+
+    def _of(self, program: str) -> list[NodeSpec]:
+        return [spec for spec in self._specs if spec.exec == program]
+
+    def _subscribe(self, spec: NodeSpec, topic: str, type_name: str) -> Any:
+        namespace = spec.namespace.strip("/")
+        name = f"/{namespace}{topic}" if namespace else topic
+        return self._transports[spec.group].subscribe(name, type_name, SENSOR, lambda: None)
 
     def _subscribe_beats(self) -> Iterable[tuple[str, Any]]:
         status = "instant_ic_msgs/msg/NodeStatus"
@@ -158,6 +172,20 @@ class HealthMonitor:
             int(message.pid),
             dict(zip(outputs, map(float, message.output_ages_s), strict=False)),
         )
+
+    @property
+    def cpu_cores(self) -> float:
+        """Cores that the nodes use, by their newest heartbeats."""
+        return sum(health.cpu_percent for health in self.nodes.values()) / 100.0
+
+    def take_late(self) -> tuple[float | None, bool]:
+        """Largest delay of the simulated devices since the last call, and whether the arbiter reported a stale source.
+
+        The delay is a share of the acceptable one; None without a report. Both only with a simulator in the stack.
+        """
+        late = max((float(message.data) for message in _taken(self._late)), default=None)
+        reasons = [message.reason_code for message in _taken(self._control)]
+        return late, any(reason >= message_type("ControlState").REASON_SCAN_STALE for reason in reasons)
 
     def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
         """Monotonic time of the newest heartbeat in which this process reported that it runs; None before the first."""
@@ -243,6 +271,12 @@ class HealthMonitor:
         """Disconnect from the bus."""
         for transport in self._transports.values():
             transport.close()
+
+
+def _taken(subscriptions: Iterable[Any]) -> Iterable[Any]:
+    for subscription in subscriptions:
+        for received in subscription.take():
+            yield deserialize(received.payload, received.type_name)
 
 
 def _labelled(spec: NodeSpec, word: str) -> str:

@@ -23,6 +23,8 @@ _MAX_WAIT_S = 0.3
 """Longest wait for a running step at shutdown."""
 _MAX_LAG_S = 0.25
 """Most simulated time to catch up on at once after a stall."""
+ACCEPTABLE_LAG_S = 0.15
+"""Lag of the simulation with which the stack still works as on a fast machine."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ class RealTimeLoop:
     ) -> None:
         self.fault: Exception | None = None
         self._simulation, self._scanner, self._on_fault = simulation, scanner, on_fault
-        self._paused_s = 0.0
+        self._paused_s = self._lag_s = 0.0
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="simulation", daemon=True)
         self._thread.start()
@@ -127,6 +129,11 @@ class RealTimeLoop:
         paused, self._paused_s = self._paused_s, 0.0
         return paused
 
+    def take_lag_s(self) -> float:
+        """Largest lag behind the stack's time since the last call."""
+        lag, self._lag_s = self._lag_s, 0.0
+        return lag
+
     def _run(self) -> None:
         simulation, pace = self._simulation, current()
         offset = pace.steady_s() - simulation.time_s
@@ -137,6 +144,7 @@ class RealTimeLoop:
                 if lag < _STEP_S:
                     pace.sleep(_STEP_S - lag)
                     continue
+                self._lag_s = max(self._lag_s, lag)
                 if lag > _MAX_LAG_S:
                     # The machine stalled: the robot stands too, and the devices pause instead of catching up.
                     self._paused_s += lag - _MAX_LAG_S

@@ -24,6 +24,8 @@ log = logging.getLogger(__name__)
 #: Formats of the live preview (Z1, firmware 2.21.1): width, height, frames per second.
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
 BOUNDARY = "---osclivepreview---"
+#: Delay of an image with which the stack still works as with a punctual camera, seconds.
+ACCEPTABLE_DELAY_S = 0.06
 #: Time after setting options during which the preview is not ready, seconds.
 SETTLE_S = 0.8
 
@@ -109,6 +111,7 @@ class ThetaServer:
         port: listening port.
         rate_hz: recent frame rate; 0 without a viewer and for the first four frames.
         frames: number of rendered images.
+        late_s: recent delay of the images behind their plan, in the stack's seconds; 0 without a viewer.
     """
 
     def __init__(self, config: ThetaConfig, source: PictureSource, seed: int = 0) -> None:
@@ -116,6 +119,7 @@ class ThetaServer:
         self.source = source
         self.rate_hz = 0.0
         self.frames = 0
+        self.late_s = 0.0
         self._format = next(f for f in PREVIEW_FORMATS if f[:2] == (config.width, config.height))
         self._options: dict[str, Any] = {"captureMode": "image", "sleepDelay": 180, "offDelay": 600}
         self._options_set_s = -1e9
@@ -175,7 +179,7 @@ class ThetaServer:
         while True:
             with self._changed:
                 while self._viewers == 0 and not self._stopping:
-                    self.rate_hz, made = 0.0, 0
+                    self.rate_hz, self.late_s, made = 0.0, 0.0, 0
                     self._changed.wait(1.0)
                     due = current().steady_s()
                 if self._stopping:
@@ -192,6 +196,7 @@ class ThetaServer:
             if not ok:
                 raise RuntimeError(f"OpenCV could not encode an image of {width}x{height}")
             self._sleep(began + self.config.latency_s)
+            late_s = current().steady_s() - began - self.config.latency_s
             with self._changed:
                 self._frame = encoded.tobytes()
                 self._number += 1
@@ -199,7 +204,10 @@ class ThetaServer:
                 self._changed.notify_all()
             period = 1.0 / min(self.config.rate, promised)
             # If rendering takes too long, the camera delivers fewer images, never old ones.
-            due = max(due + period, current().steady_s())
+            due += period
+            late_s = min(max(late_s, current().steady_s() - due, 0.0), period)  # one late image is no slow machine
+            self.late_s = 0.5 * self.late_s + 0.5 * late_s
+            due = max(due, current().steady_s())
             self._sleep(due)
             took = current().steady_s() - began
             made += 1

@@ -1,8 +1,8 @@
 """The pace of a simulated stack: its time, its file in the run directory, and a real base that refuses it."""
 
-import json
 import subprocess
 import sys
+import time
 
 import pytest
 from hypothesis import given
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from instant_ic import pace
 from instant_ic.bus import NodeError
 from instant_ic.bus.clock import SystemClock
-from instant_ic.pace import Pace, PaceError
+from instant_ic.pace import Pace, PaceError, PaceFiles
 from nodes.crawler_base import CrawlerBaseNode
 
 
@@ -59,21 +59,142 @@ def test_real_time_is_the_machines(machine):
     assert (clock.now_ns(), clock.steady_ns()) == (10_000_001_000, 5_000_001_000)
 
 
-@given(st.floats(pace.SLOWEST, pace.FASTEST), st.integers(0, 2**62), st.integers(0, 2**62))
-def test_pace_comes_back_from_its_file(tmp_path_factory, factor, epoch_ns, monotonic_ns):
-    folder = tmp_path_factory.mktemp("r")
-    written = Pace(factor, epoch_ns, monotonic_ns)
-    pace.write(folder, written)
-    read = pace.read(folder)
-    assert read == (written if factor != 1.0 else Pace())
-    pace.write(folder, Pace())
-    assert pace.read(folder).real and not list(folder.iterdir())
+@given(st.lists(st.tuples(st.integers(0, 10**9), st.floats(pace.SLOWEST, pace.FASTEST)), min_size=1, max_size=20))
+def test_time_is_continuous_monotonic_and_the_same_in_all_processes(tmp_path_factory, changes):
+    """Processes that look often, seldom, and for the first time."""
+    folder, now = tmp_path_factory.mktemp("r"), [7_000_000_000]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("time.monotonic_ns", lambda: now[0])
+        patch.setattr("time.time_ns", lambda: 10**18)
+        files = PaceFiles([folder], 0.5, adapts=True)
+        often, seldom = pace.read(folder), pace.read(folder)
+        last = often.now_ns(), often.steady_ns()
+        for wait_ns, factor in changes:
+            files.change(factor)
+            for ns in (wait_ns // 2, wait_ns - wait_ns // 2, 1):
+                before = often.factor
+                now[0] += ns
+                time_ns = often.now_ns(), often.steady_ns()
+                most = max(before, often.factor, pace.read(folder).factor) * ns + 2
+                assert all(0 <= after - earlier <= most for earlier, after in zip(last, time_ns, strict=True))
+                assert time_ns[0] - time_ns[1] == 10**18  # stamps and timers do not drift apart
+                last = time_ns
+            fresh = pace.read(folder)  # of a process that has just been restarted
+            assert (fresh.now_ns(), fresh.steady_ns()) == last
+            if wait_ns % 2:  # a process that slept through some changes
+                assert (seldom.now_ns(), seldom.steady_ns()) == last
 
 
-@pytest.mark.parametrize("text", ["", "[1]", '{"factor": 0.5}', '{"factor": "x", "epoch_ns": 1, "monotonic_ns": 1}'])
-def test_damaged_file_is_named(tmp_path, text):
-    (tmp_path / pace.FILE).write_text(text)
-    with pytest.raises(PaceError, match=r"pace\.json.*restart the stack"):
+def test_a_change_takes_effect_at_its_time_and_waits_reach_across_it(machine, tmp_path):
+    files = PaceFiles([tmp_path], 0.5, adapts=True)
+    made = pace.read(tmp_path)
+    assert (made.factor, made.real, made.adapts) == (0.5, False, True)
+    machine(1_000_000_000)
+    files.change(1.0)
+    files.change(0.1)  # too soon after the change before, which has not happened yet
+    assert (made.factor, files.factor) == (0.5, 1.0)
+    # 0.2 s at half the machine's speed, then 0.4 s at the machine's.
+    assert made.wait_s(0.5) == pytest.approx(0.6)
+    assert made.wait_s(0.1) == pytest.approx(0.2)
+    machine(200_000_000)
+    assert (made.factor, made.steady_ns()) == (1.0, 600_000_000)
+    # A packet of 0.3 s ago: 0.2 s of them passed before the change, at half speed.
+    machine(100_000_000)
+    assert made.now_ns() - made.stamp_ns(11_300_000_000 - 300_000_000) == 200_000_000
+
+
+def test_sleep_follows_changes(machine, tmp_path, monkeypatch):
+    files = PaceFiles([tmp_path], 0.1, adapts=True)
+    made, slept = pace.read(tmp_path), []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        machine(round(seconds * 1e9))
+        files.change(1.0)
+
+    monkeypatch.setattr("time.sleep", sleep)
+    made.sleep(1.0)
+    assert made.steady_s() == pytest.approx(1.0, abs=1e-6)
+    assert sum(slept) == pytest.approx(1.36, abs=0.01)  # 0.4 s until the change, then 0.96 s in real time
+
+
+def test_all_folders_of_a_stack_have_one_time(machine, tmp_path):
+    folders = [tmp_path / name for name in "ab"]
+    for folder in folders:
+        folder.mkdir()
+    files = PaceFiles(folders, 0.5, adapts=True)
+    machine(300_000_000)
+    files.change(0.25)
+    machine(900_000_000)
+    first, second = map(pace.read, folders)
+    assert first.now_ns() == second.now_ns() and first.factor == second.factor == 0.25
+    pace.remove_files(folders)
+    assert pace.read(folders[0]).real and not list(folders[0].iterdir())
+
+
+_READER = """
+import sys, time
+from pathlib import Path
+from instant_ic import pace
+made = pace.read(Path(sys.argv[1]))
+last, end = 0, time.monotonic() + 1.5
+while time.monotonic() < end:
+    machine = time.monotonic_ns()
+    steady, again = made.steady_ns(), time.monotonic_ns()
+    assert steady >= last, (steady, last)
+    print(machine, steady, again)
+    last = steady
+    time.sleep(0.003)
+"""
+
+
+def test_real_processes_change_at_the_same_instant(tmp_path):
+    files = PaceFiles([tmp_path], 0.3, adapts=True)
+    readers = [
+        subprocess.Popen([sys.executable, "-c", _READER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+        for _ in range(3)
+    ]
+    stretches = [files._newest]
+    while any(reader.poll() is None for reader in readers):
+        files.change(1.0 if files.factor < 1.0 else 0.3)
+        if files._newest is not stretches[-1]:
+            stretches.append(files._newest)
+        time.sleep(0.05)
+    assert len(stretches) > 4
+    for reader in readers:
+        output, _ = reader.communicate()
+        assert reader.returncode == 0 and output
+        for line in output.splitlines():
+            machine_ns, steady_ns, again_ns = map(int, line.split())
+            low, high = (_steady_ns(stretches, ns) for ns in (machine_ns, again_ns))
+            assert low <= steady_ns <= high
+
+
+def _steady_ns(stretches, monotonic_ns):
+    now = [stretch for stretch in stretches if stretch.monotonic_ns <= monotonic_ns][-1]
+    return now.steady_ns + now.since_begin_ns(monotonic_ns)
+
+
+def test_a_record_that_is_being_written_is_left_for_the_next_look(tmp_path):
+    files = PaceFiles([tmp_path], 0.5, adapts=True)
+    made = pace.read(tmp_path)
+    (record,) = files._records
+    before = record[:]
+    files.change(2.0)
+    whole = record[:]
+    record[:40] = whole[:40]
+    record[40:] = before[40:]
+    assert made._stretches == (made._stretches[0],) * 2 and made.steady_ns() >= 0
+    assert made._number == 1
+    record[:] = whole
+    made.steady_ns()
+    assert made._number == 2 and made._stretches[1].factor == 2.0
+
+
+@pytest.mark.parametrize("content", [b"", b"[1]", b"x" * 88, b"\0" * 88])
+def test_damaged_file_is_named(tmp_path, content):
+    (tmp_path / pace.FILE).write_bytes(content)
+    with pytest.raises(PaceError, match=r"pace: not a valid pace.*restart the stack"):
         pace.read(tmp_path)
 
 
@@ -81,9 +202,17 @@ def test_damaged_file_is_named(tmp_path, text):
 def test_pace_out_of_range_is_refused(tmp_path, factor):
     with pytest.raises(PaceError, match="must lie in"):
         Pace.from_now(factor)
-    (tmp_path / pace.FILE).write_text(json.dumps({"factor": factor, "epoch_ns": 1, "monotonic_ns": 1}))
     with pytest.raises(PaceError, match="must lie in"):
-        pace.read(tmp_path)
+        PaceFiles([tmp_path], factor)
+
+
+def test_text_for_the_operator(tmp_path):
+    assert Pace().text == ""
+    assert Pace.from_now(0.45).text == "simulation at 0.45 of real time"
+    PaceFiles([tmp_path], 0.62, adapts=True)
+    assert pace.read(tmp_path).text == "simulation at 0.6 of real time: this machine is busy"
+    PaceFiles([tmp_path], 0.97, adapts=True)
+    assert pace.read(tmp_path).text == ""
 
 
 def test_launcher_refuses_a_pace_out_of_range():

@@ -46,10 +46,11 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--plain", action="store_true", help="plain log lines even in a terminal")
     parser.add_argument(
         "--pace",
-        type=float,
-        default=1.0,
+        type=_pace,
+        default=None,
         metavar="X",
-        help="speed of simulated time relative to real time: 0.5 is half as fast, for a slow machine",
+        help="speed of simulated time relative to real time, such as 0.5; default: auto, as fast as the machine can "
+        "run simulated devices (with real devices: 1)",
     )
     parser.add_argument("--run-dir", type=Path, default=None, metavar="DIR", help="default: $INSTANT_IC_RUN_DIR")
     parser.set_defaults(func=run)
@@ -70,7 +71,6 @@ def run(args: argparse.Namespace) -> int:
     """Read, check and run the launch file."""
     from instant_ic import paths
     from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
-    from instant_ic.pace import Pace, PaceError
 
     try:
         file = find_launch_file(args.file)
@@ -79,10 +79,6 @@ def run(args: argparse.Namespace) -> int:
     if args.show_args:
         _show(file.name, read_arguments(file), read_arguments(file, included=True))
         return 0
-    try:
-        pace = Pace.from_now(args.pace)
-    except PaceError as error:
-        raise UserError(f"--{error}", 2) from None
     values = launch_values(args.arguments)
     run_dir = (args.run_dir or paths.run_dir()).absolute()
     description = read_launch_file(file, values, run_dir)
@@ -99,7 +95,21 @@ def run(args: argparse.Namespace) -> int:
         return 0
     from instant_ic.launch.app import run_stack
 
-    return run_stack(description, run_dir, False if args.plain else None, pace)
+    return run_stack(description, run_dir, False if args.plain else None, args.pace)
+
+
+def _pace(word: str) -> float | None:
+    """Read the value of ``--pace``; None is auto."""
+    from instant_ic.pace import PaceError, check_factor
+
+    if word == "auto":
+        return None
+    try:
+        return check_factor(float(word))
+    except PaceError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number or auto (got {word!r})") from None
 
 
 def _show(name: str, arguments: Sequence[Any], included: Sequence[Any]) -> None:

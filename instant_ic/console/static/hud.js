@@ -43,10 +43,12 @@ export function showLatency(link, images) {
 }
 
 /** @param {Health} health */
-export function showHealth({ vspace, battery, faults }) {
+export function showHealth({ vspace, battery, faults, pace }) {
   byId("vspace-dot").dataset.state = vspace?.state ?? "empty";
   write(byId("vspace-text"), texts.vspaceText(vspace));
   write(byId("vspace-more"), texts.vspaceQuality(vspace));
+  byId("pace").hidden = !pace;
+  write(byId("pace"), pace ?? "");
   byId("battery-row").hidden = !battery;
   if (battery) {
     const share = battery.percent === null ? "" : ` · ${Math.round(battery.percent)} %`;

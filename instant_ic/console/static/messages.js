@@ -105,6 +105,7 @@ const health = object({
   vspace: optional(vspace),
   battery: optional(object({ voltage: number, percent: optional(number) })),
   faults: list(object({ level: oneOf("warn", "error"), name: text, text })),
+  pace: optional(text),
 });
 const recording = object({
   type: oneOf("recording"),

@@ -1,0 +1,223 @@
+"""Chooses the pace of a simulated stack (:mod:`instant_ic.pace`) by what the machine can do."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from instant_ic.pace import PaceFiles, describe
+
+SLOWEST = 0.1
+"""Slowest pace that is chosen."""
+
+_ENOUGH_PER_S = 50e6
+"""Iterations of an empty loop per second on the kind of core that ``_NEEDED_CORES`` counts."""
+_NEEDED_CORES = 1.2
+"""Cores that a whole stack needs in real time while it drives, with some margin."""
+_MEASURE_S = 0.03
+_PERIOD_S = 0.25
+
+
+@dataclass(frozen=True)
+class Sample:
+    """State of a stack and its machine at one time.
+
+    Attributes:
+        now_s: the machine's steady clock.
+        late: largest delay of the simulated devices since the last sample, as a share of the acceptable delay; None: no
+            report has arrived since then.
+        stale: whether the arbiter waits for a source that had been fresh.
+        idle_cores: cores that nothing used since the last sample.
+        stack_cores: cores that the stack used.
+    """
+
+    now_s: float
+    late: float | None = None
+    stale: bool = False
+    idle_cores: float = 0.0
+    stack_cores: float = 1.0
+
+
+class PaceChooser:
+    """Samples in, pace out: falls at once when the stack is late, rises in small steps while it is punctual.
+
+    After a fall the pace is held. Each fall that follows soon after a rise doubles the next hold, so that a constant
+    load leads to a constant pace.
+
+    Args:
+        pace: pace at the start.
+    """
+
+    STEP = 0.05
+    """Largest rise."""
+    RISE_S = 1.0
+    """Time between two rises while cores are idle."""
+    PROBE_S = 4.0
+    """Time between two rises while no core is idle: only a try shows whether the stack would stay punctual."""
+    PUNCTUAL = 0.5
+    """Largest share of the acceptable delay at which the pace may rise."""
+    SILENCE_S = 1.0
+    """Longest time without a report while the stack counts as punctual, in the stack's seconds."""
+    HOLD_S, LONGEST_HOLD_S = 3.0, 120.0
+    AGAIN_S = 30.0
+    """A fall within this time after a hold, doubled, means that the last rise was too much."""
+    OTHERS_CORES = 0.5
+    """When other processes use so much less than at the fall, the cause of the fall is gone."""
+    FAULT_S = 3.0
+    """A source that is stale for longer has a fault that no pace cures."""
+    BUSY_CORES = 0.3
+    """With more idle cores than this a stale source is not the machine's fault."""
+
+    def __init__(self, pace: float) -> None:
+        self.pace = min(1.0, max(SLOWEST, pace))
+        self._hold_s = 0.0
+        self._fell_s = self._changed_s = -math.inf
+        self._punctual_s: float | None = None  # since when
+        self._heard_s = -math.inf
+        self._available_cores = math.inf  # at the last fall
+        self._fresh_s = -math.inf  # when no source was stale last
+
+    def step(self, sample: Sample) -> float:
+        """Take a sample and return the pace."""
+        now_s = sample.now_s
+        if not sample.stale:
+            self._fresh_s = now_s
+        machine = sample.stale and sample.idle_cores < self.BUSY_CORES and now_s - self._fresh_s < self.FAULT_S
+        late = max(sample.late or 0.0, 1.4 if machine else 0.0)
+        if sample.late is not None:
+            self._heard_s = now_s
+        if late > self.PUNCTUAL or now_s - self._heard_s > self.SILENCE_S / self.pace:
+            self._punctual_s = None
+        elif self._punctual_s is None:
+            self._punctual_s = now_s
+        if late > 1.0:
+            self._fall(sample, late)
+        elif self._punctual_s is not None:
+            self._rise(sample, self._punctual_s)
+        return self.pace
+
+    def _fall(self, sample: Sample, late: float) -> None:
+        now_s = sample.now_s
+        # The effect of a fall shows in the next images, which come later the slower the pace is.
+        if self.pace <= SLOWEST or now_s - self._fell_s < 0.25 + 0.4 / self.pace:
+            return
+        if self._changed_s > self._fell_s or not self._hold_s:  # it has risen; else this is one fall in several steps
+            again = now_s - self._fell_s < 2.0 * self._hold_s + self.AGAIN_S
+            self._hold_s = min(2.0 * self._hold_s, self.LONGEST_HOLD_S) if again else self.HOLD_S
+        self._fell_s = self._changed_s = now_s
+        self._available_cores = sample.idle_cores + sample.stack_cores
+        self.pace = max(SLOWEST, self.pace * min(0.9, max(0.6, 1.0 / late)))
+
+    def _rise(self, sample: Sample, punctual_s: float) -> None:
+        now_s = sample.now_s
+        if sample.idle_cores + sample.stack_cores > self._available_cores + self.OTHERS_CORES:
+            self._hold_s = min(self._hold_s, self.HOLD_S)
+        free = self.pace * 0.7 * sample.idle_cores / max(sample.stack_cores, 0.1)  # rise that the idle cores allow
+        wait_s = self.RISE_S if free >= self.STEP else self.PROBE_S
+        since_s = max(self._changed_s, punctual_s, self._fell_s + self._hold_s - wait_s)
+        if self.pace < 1.0 and now_s - since_s >= wait_s:
+            self._changed_s = now_s
+            self.pace = min(1.0, self.pace + self.STEP)
+
+
+def machine_pace() -> float:
+    """Pace that this machine could hold at this moment, from its cores, their speed and their load; takes 30 ms."""
+    began_s, count = time.thread_time(), 0
+    while (cpu_s := time.thread_time() - began_s) < _MEASURE_S:
+        for _ in range(10_000):
+            pass
+        count += 10_000
+    return pace_of(len(os.sched_getaffinity(0)), count / cpu_s, os.getloadavg()[0])
+
+
+def pace_of(cores: int, loops_per_s: float, load: float) -> float:
+    """Pace that a stack could hold beside other processes.
+
+    Args:
+        cores: their number.
+        loops_per_s: iterations of an empty loop on one of them.
+        load: mean number of processes that already run.
+    """
+    share = cores / (1.0 + load / cores)
+    return min(1.0, max(SLOWEST, share / _NEEDED_CORES * loops_per_s / _ENOUGH_PER_S))
+
+
+class CoreLoad:
+    """How many cores of the machine are idle.
+
+    Args:
+        file: the kernel's counters.
+    """
+
+    def __init__(self, file: Path = Path("/proc/stat")) -> None:
+        self._file = file
+        self._ticks_per_s = os.sysconf("SC_CLK_TCK")
+        self._before = self._look()
+
+    def idle_cores(self) -> float:
+        """Mean number of idle cores since the last call."""
+        before, self._before = self._before, self._look()
+        seconds = self._before[0] - before[0]
+        return max(0.0, self._before[1] - before[1]) / self._ticks_per_s / seconds if seconds > 0 else 0.0
+
+    def _look(self) -> tuple[float, int]:
+        with self._file.open(encoding="ascii") as stat:
+            fields = stat.readline().split()
+        return time.monotonic(), int(fields[4]) + int(fields[5])  # idle, and waiting for a disk
+
+
+class Lateness(Protocol):
+    """The stack as :class:`Pacing` sees it."""
+
+    @property
+    def cpu_cores(self) -> float:
+        """Cores that the stack uses."""
+        ...
+
+    def take_late(self) -> tuple[float | None, bool]:
+        """``late`` and ``stale`` of :class:`Sample`, since the last call."""
+        ...
+
+
+class Pacing:
+    """Adapts the pace of a running stack, and reports changes that an operator notices.
+
+    Args:
+        folders: run directories of the stack.
+        report: receives the texts.
+    """
+
+    REPORT_STEP = 0.1
+    REPORT_S = 10.0
+
+    def __init__(self, folders: Iterable[Path], report: Callable[[str], None]) -> None:
+        self._chooser = PaceChooser(machine_pace())
+        self._files = PaceFiles(folders, self._chooser.pace, adapts=True)
+        self._load = CoreLoad()
+        self._report = report
+        self._reported = 1.0
+        self._sample_s = self._report_s = -math.inf
+        self._tell(time.monotonic())
+
+    def step(self, stack: Lateness) -> None:
+        """Adapt the pace, at most four times a second."""
+        now_s = time.monotonic()
+        if now_s - self._sample_s < _PERIOD_S:
+            return
+        self._sample_s = now_s
+        pace = self._chooser.step(Sample(now_s, *stack.take_late(), self._load.idle_cores(), stack.cpu_cores))
+        if pace != self._files.factor:
+            self._files.change(pace)
+        self._tell(now_s)
+
+    def _tell(self, now_s: float) -> None:
+        pace = self._files.factor
+        noticed = abs(pace - self._reported) >= self.REPORT_STEP or (pace == 1.0) != (self._reported == 1.0)
+        if noticed and now_s - self._report_s >= self.REPORT_S:
+            self._reported, self._report_s = pace, now_s
+            self._report(describe(pace, adapts=True) or "simulation in real time")

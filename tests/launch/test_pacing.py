@@ -1,0 +1,158 @@
+"""The pace that the launcher chooses: on traces of a machine, and from the machine's own counters."""
+
+import itertools
+
+import pytest
+
+from instant_ic import pace
+from instant_ic.launch import pacing
+from instant_ic.launch.pacing import SLOWEST, CoreLoad, PaceChooser, Pacing, Sample, pace_of
+
+
+class Machine:
+    """A stack on a machine: late above the pace at which its cores are used up, which the trace gives by time.
+
+    Args:
+        feasible: machine time → largest pace at which the stack is punctual.
+        alone: feasible pace without other processes; default: there are none.
+        idle: whether what the stack leaves is idle; else other processes use it.
+    """
+
+    cores = 2
+
+    def __init__(self, feasible, alone=None, idle=True):
+        self.feasible, self.alone, self.idle = feasible, alone, idle
+        self.chooser = PaceChooser(1.0)
+        self.now_s, self.paces = 100.0, []
+
+    def run(self, seconds):
+        for _ in range(round(seconds / 0.25)):
+            self.now_s += 0.25
+            feasible, factor = self.feasible(self.now_s - 100.0), self.chooser.pace
+            available = 2.0 * feasible / (self.alone or feasible)
+            used = available * min(1.0, factor / feasible)
+            idle = available - used + self.cores - 2 if self.idle else 0.0
+            late = 0.2 if factor <= feasible else 1.0 + 5.0 * (factor / feasible - 1.0)
+            self.paces.append(self.chooser.step(Sample(self.now_s, late, False, idle, used)))
+        return self.paces[-1]
+
+
+def test_a_machine_that_is_fast_enough_stays_at_real_time():
+    assert set(Machine(lambda t: 1.3).paces + [Machine(lambda t: 1.3).run(60)]) == {1.0}
+
+
+@pytest.mark.parametrize("feasible", [0.75, 0.45, 0.2])
+@pytest.mark.parametrize("idle", [True, False])
+def test_a_slow_machine_finds_its_pace_and_keeps_it(feasible, idle):
+    machine = Machine(lambda t: feasible, idle=idle)
+    machine.run(300)
+    assert machine.paces[round(6.0 / 0.25)] <= feasible  # reached within seconds
+    late = machine.paces[round(200 / 0.25) :]
+    assert sum(late) / len(late) > 0.7 * feasible
+    falls = sum(after < before for before, after in itertools.pairwise(late))
+    assert falls <= 4  # no oscillation: the holds grow
+
+
+def test_a_slow_thread_on_many_cores_slows_the_stack_too():
+    machine = Machine(lambda t: 0.6)
+    machine.cores = 16
+    machine.run(200)
+    assert all(0.3 < factor <= 0.65 for factor in machine.paces[round(60 / 0.25) :])
+
+
+def test_a_fall_takes_at_most_a_second_and_a_rise_some():
+    machine = Machine(lambda t: 0.4 if 10 <= t < 40 else 1.2, alone=1.2)
+    assert machine.run(9.75) == 1.0
+    assert machine.run(1.25) < 0.9
+    assert machine.run(4.0) <= 0.4
+    machine.run(25)
+    assert machine.run(2.0) < 0.6  # the load is gone
+    assert machine.run(60) == 1.0
+
+
+def test_after_one_spike_the_pace_is_soon_real_time_again():
+    machine = Machine(lambda t: 0.5 if 10 <= t < 10.5 else 1.2, alone=1.2)
+    machine.run(12.0)
+    assert 0.3 < min(machine.paces) < 1.0
+    assert machine.run(25) == 1.0
+
+
+def test_steps_are_small_and_within_bounds():
+    machine = Machine(lambda t: 0.02 if t < 30 else 5.0)
+    machine.run(200)
+    assert min(machine.paces) == SLOWEST and max(machine.paces) == 1.0
+    for before, after in itertools.pairwise(machine.paces):
+        assert 0.6 * before - 1e-9 <= after <= before + PaceChooser.STEP + 1e-9
+
+
+def test_no_rise_without_a_report():
+    chooser = PaceChooser(0.5)
+    assert {chooser.step(Sample(t / 4, None, False, 2.0)) for t in range(400)} == {0.5}
+
+
+@pytest.mark.parametrize(("idle", "falls"), [(0.0, True), (1.0, False)])
+def test_a_stale_source_is_the_machines_fault_only_while_the_machine_is_busy(idle, falls):
+    chooser = PaceChooser(1.0)
+    chooser.step(Sample(0.0, 0.1))
+    assert (chooser.step(Sample(0.25, 0.1, True, idle)) < 1.0) == falls
+
+
+def test_a_source_that_stays_stale_has_a_fault_of_its_own():
+    chooser = PaceChooser(1.0)
+    paces = [chooser.step(Sample(t / 4, 0.1, t > 4)) for t in range(800)]
+    assert min(paces) > SLOWEST and paces[-1] > min(paces)
+
+
+def test_first_pace_from_cores_speed_and_load():
+    fast = 60e6
+    assert pace_of(2, fast, 0.0) == 1.0
+    assert pace_of(16, fast, 8.0) == 1.0
+    assert pace_of(2, fast, 4.0) == pytest.approx(0.667, abs=0.01)  # a third of two cores, of 1.2 at 50e6
+    assert pace_of(1, fast / 4, 0.0) == pytest.approx(0.25)
+    assert pace_of(1, 1e6, 20.0) == SLOWEST
+
+
+def test_idle_cores_from_the_kernels_counters(tmp_path, monkeypatch):
+    stat, now = tmp_path / "stat", [5.0]
+    monkeypatch.setattr(pacing.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(pacing.os, "sysconf", lambda name: 100)
+    stat.write_text("cpu  10 0 10 1000 50 0 0 0 0 0\ncpu0 1 2 3\n")
+    load = CoreLoad(stat)
+    assert load.idle_cores() == 0.0  # no time has passed
+    now[0] += 2.0
+    stat.write_text("cpu  99 9 99 1240 70 0 0 0 0 0\n")
+    assert load.idle_cores() == pytest.approx(1.3)  # 260 ticks of 10 ms in 2 s
+
+
+class Stack:
+    """A stack that is as late as the test says."""
+
+    cpu_cores, late = 1.0, 0.1
+
+    def take_late(self):
+        return self.late, False
+
+
+def test_the_operator_learns_what_matters(tmp_path, monkeypatch):
+    now = [5.0]
+    monkeypatch.setattr(pacing.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(pacing.time, "monotonic_ns", lambda: round(now[0] * 1e9))
+    monkeypatch.setattr(pacing, "machine_pace", lambda: 1.0)
+    monkeypatch.setattr(CoreLoad, "idle_cores", lambda self: 1.0)
+    lines, stack = [], Stack()
+    made = Pacing([tmp_path], lines.append)
+    assert not pace.read(tmp_path).real and pace.read(tmp_path).factor == 1.0
+
+    def go_on(seconds):
+        for _ in range(round(seconds / 0.25)):
+            now[0] += 0.25
+            made.step(stack)
+
+    go_on(20)
+    assert lines == []
+    stack.late = 1.7
+    go_on(0.25)
+    assert lines == ["simulation at 0.6 of real time: this machine is busy"]
+    stack.late = 0.1
+    go_on(120)
+    assert lines[-1] == "simulation in real time" and len(lines) <= 4
