@@ -16,7 +16,6 @@ motion:
     after_m     motion in the second after it has stopped: must be zero
 
 All times are seconds of the stack, which runs at the pace of the machine (``--pace``, 1.0 on one that is fast enough).
-The timeouts of the console's server and of serial replies use the machine's clock and are stretched by the pace.
 """
 
 from __future__ import annotations
@@ -45,13 +44,10 @@ from typing import Any, NamedTuple
 
 import aiohttp
 import numpy as np
-import yaml
 
 from instant_ic import pace
-from instant_ic.base.config import RoboclawConfig
 from instant_ic.bus import LATCHED, registry
 from instant_ic.console.client import ConsoleClient
-from instant_ic.console.drive import DriveConfig
 from instant_ic.control.states import Reason
 from instant_ic.experiments.drive import pump
 from instant_ic.experiments.impaired_link import ImpairedLink
@@ -87,7 +83,6 @@ LAUNCH = """launch:
     - {{name: lidar_port, value: {lidar_link}}}
     - {{name: lidar_position_port, value: {position}}}
     - {{name: serial_port, value: $(run-dir)/dev/relay}}
-    - {{name: params, value: {params}}}
 - include:
     file: {folder}/station.yaml
     arg:
@@ -95,7 +90,6 @@ LAUNCH = """launch:
     - {{name: vspace, value: false}}
     - {{name: recorder, value: false}}
     - {{name: console_port, value: {console}}}
-    - {{name: params, value: {params}}}
 """
 
 
@@ -351,13 +345,6 @@ def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     ports = {name: free_port() for name in ("camera", "console")}
     ports |= {name: free_port(socket.SOCK_DGRAM) for name in ("lidar", "lidar_link", "position")}
-    drive = DriveConfig()
-    # The page's server and the serial port use machine time.
-    stretched = {key: getattr(drive, key) / factor for key in ("watchdog_s", "beat_timeout_s", "max_command_age_s")}
-    params = run_dir / "stretched.yaml"
-    serial_s = {"reply_timeout_s": RoboclawConfig().reply_timeout_s / factor}
-    values = {"console": {"server": {"drive": stretched}}, "crawler_base": {"roboclaw": serial_s}}
-    params.write_text(yaml.safe_dump({node: {"ros__parameters": each} for node, each in values.items()}))
     (run_dir / "dev").mkdir(mode=0o700)
     launch = run_dir / "stopping.yaml"
     with contextlib.ExitStack() as ends:
@@ -368,7 +355,7 @@ def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
         ends.callback(packets.close)
         serial = SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw")
         ends.callback(serial.close)
-        launch.write_text(text.format(**ports, camera_link=camera_link.port, folder=share_dir("launch"), params=params))
+        launch.write_text(text.format(**ports, camera_link=camera_link.port, folder=share_dir("launch")))
         stack = ends.enter_context(Stack(str(launch), run_dir, {}, log, pace=factor))
         made = Rig(stack, run_dir, ports["console"], page_link, camera_link, packets, serial)
         stack.wait_for(lambda: registry.list_nodes(run_dir), 60, "first node")

@@ -24,6 +24,8 @@ from instant_ic.private import open_file
 
 FILE = "pace"
 SLOWEST, FASTEST = 0.02, 10.0
+SLOWEST_CHOSEN = 0.1
+"""Slowest pace to which the launcher adapts."""
 LEAD_S = 0.2
 """Machine seconds from the writing of a change until it takes effect. Waits shorter than this are exact."""
 
@@ -136,6 +138,10 @@ class Pace:
         if 0.0 < until_change_s < seconds / stretch.factor:
             return until_change_s + (seconds - until_change_s * stretch.factor) / newest.factor
         return seconds / stretch.factor
+
+    def timeout_s(self, seconds: float) -> float:
+        """Convert a time-out in seconds of the stack to one on the machine's clock that holds at any later pace."""
+        return seconds / (SLOWEST_CHOSEN if self.adapts else self.factor)
 
     def sleep(self, seconds: float) -> None:
         """Sleep for a number of the stack's seconds."""

@@ -23,6 +23,7 @@ from instant_ic.base.protocol import (
     read_request,
     write_frame,
 )
+from instant_ic.pace import current
 
 
 class LinkError(ConnectionError):
@@ -104,12 +105,13 @@ def open_serial(config: RoboclawConfig) -> SerialPort:
     """
     import serial
 
+    timeout_s = current().timeout_s(config.reply_timeout_s)
     try:
         return serial.Serial(
             config.port,
             config.baud,
-            timeout=config.reply_timeout_s,
-            write_timeout=max(0.2, config.reply_timeout_s),
+            timeout=timeout_s,
+            write_timeout=max(0.2, timeout_s),
             exclusive=True,
         )
     except (serial.SerialException, OSError) as error:

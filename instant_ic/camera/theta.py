@@ -161,7 +161,7 @@ class ThetaClient:
                 "POST",
                 "/osc/commands/execute",
                 {"name": "camera.getLivePreview"},
-                current().wait_s(self.config.read_timeout_s),
+                current().timeout_s(self.config.read_timeout_s),
             )
             if not is_multipart(response):
                 kind = response.headers.get("Content-Type", "")[:_MOST_TEXT]
@@ -279,7 +279,7 @@ class ThetaCamera(Camera):
         response, session = self._response, self._session
         if response is None or session is None:
             raise CameraError(f"{self.client.url}: not connected; call connect() first")
-        timeout_s = current().wait_s(self.config.read_timeout_s)
+        timeout_s = current().timeout_s(self.config.read_timeout_s)
         deadline = time.monotonic() + timeout_s
         # One read may need several receives: the head of a chunk can arrive byte by byte.
         session.deadline.start(2.0 * timeout_s)

@@ -90,6 +90,7 @@ class Demo:
         self.button = False  # e-stop button on the robot
         self.forced_mode: str | None = None
         self.faults: list[dict[str, str]] = []
+        self.pace = ""
         self.images = True
         self.depth: bytes | None = None  # sent instead of the views' own depth
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
@@ -195,7 +196,7 @@ class Demo:
 
     def reset(self) -> None:
         """Restore the initial state, with the mode forced to REAL; for tests that share a demo."""
-        self.forced_mode, self.faults, self.images = "real", [], True
+        self.forced_mode, self.faults, self.images, self.pace = "real", [], True, ""
         self.recorder.missing, self.recorder.error, self.recorder.state = False, "", "idle"
         self.place(0.0, 0.0, 0.0)
         self.commands.clear()
@@ -287,7 +288,8 @@ class Demo:
         vspace = {"state": "ready", "psnr_db": 27.4, "train_seconds": 9.0, "message": ""}
         vspace |= {"expected_psnr_db": 25.6, "unseen_share": 0.03, "radius_m": 2.0}
         battery = {"voltage": 24.6, "percent": 81.0}
-        self.server.publish("health", {"vspace": vspace, "battery": battery, "faults": self.faults})
+        health = {"vspace": vspace, "battery": battery, "faults": self.faults, "pace": self.pace}
+        self.server.publish("health", health)
 
     def _send_panorama(self) -> None:
         captured_ms = self.server.now_ms()

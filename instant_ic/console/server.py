@@ -40,6 +40,7 @@ from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, short_text, whole
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
+from instant_ic.pace import current
 from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
 
 STATIC = Path(__file__).parent / "static"
@@ -303,7 +304,7 @@ class ConsoleServer:
             self._started.set()
             await self._finish.wait()
             drive_task.cancel()
-            self.gate.stop(time.monotonic())
+            self.gate.stop(current().steady_s())
             self._emit_due()
             await listener.close()
             sessions = list(self._sessions.values())
@@ -496,7 +497,7 @@ class ConsoleServer:
         """Remove a session: it loses the lease and receives nothing more."""
         if self._sessions.pop(session.number, None) is None:
             return
-        self.gate.forget(session.number, time.monotonic())
+        self.gate.forget(session.number, current().steady_s())
         self._looks.pop(session.number, None)
         self._own = {key: at for key, at in self._own.items() if key[0] != session.number}
         self._emit_due()
@@ -565,12 +566,11 @@ class ConsoleServer:
                 return
             if session.number not in self._sessions:  # ended meanwhile
                 return
-            now = time.monotonic()
             # A watcher sends no commands, only pings and looks.
             session.bucket.rate = limit if session.number == self.gate.driver else limit * WATCHER_SHARE
-            within = session.bucket.take(now)
+            within = session.bucket.take(time.monotonic())
             if message.type is WSMsgType.TEXT:
-                self._take(session, message.data, now, only_a_stop=not within)
+                self._take(session, message.data, current().steady_s(), only_a_stop=not within)
             elif message.type is WSMsgType.PING:
                 if within:
                     await session.socket.pong(message.data)
@@ -624,21 +624,21 @@ class ConsoleServer:
         handler(session, message, now)
 
     def _on_ping(self, session: Session, message: dict[str, Any], now: float) -> None:
-        age_s = self.gate.last_age_s
+        age_s, factor = self.gate.last_age_s, current().factor
         session.reply(
             {
                 "type": "pong",
                 "client_ms": number(message, "client_ms"),
                 "server_ms": self.now_ms(),
-                "command_age_ms": None if age_s is None else max(age_s, 0.0) * 1000.0,
-                "command_hz": self.gate.rate_hz(now),
+                "command_age_ms": None if age_s is None else max(age_s, 0.0) * 1000.0 / factor,
+                "command_hz": round(self.gate.rate_hz(now) * factor),
             }
         )
 
     def _on_drive(self, session: Session, message: dict[str, Any], now: float) -> None:
-        age_s = (self.now_ms() - number(message, "time_ms")) / 1000.0
+        age_s = (self.now_ms() - number(message, "time_ms")) / 1000.0 * current().factor
         linear, angular = number(message, "linear"), number(message, "angular")
-        verdict = self.gate.receive(session.number, whole(message, "seq"), age_s, linear, angular, time.monotonic())
+        verdict = self.gate.receive(session.number, whole(message, "seq"), age_s, linear, angular, now)
         # A zero needs no permission and is harmless out of order, so only refused motion is reported.
         if verdict is not Verdict.ACCEPTED and (linear, angular) != (0.0, 0.0):
             session.reply({"type": "refused", "reason": verdict.name.lower(), "text": verdict.value})
@@ -665,7 +665,7 @@ class ConsoleServer:
     def _stop_robot(self, who: str) -> None:
         """Set the emergency stop; it is published before this returns."""
         news = not self.gate.estop
-        self.gate.set_estop(time.monotonic())
+        self.gate.set_estop(current().steady_s())
         self.backend.on_estop(True)
         self._emit_due()
         if news:
@@ -724,12 +724,13 @@ class ConsoleServer:
             session.bucket.give_back()  # acknowledgements are limited by the server's own frames
 
     async def _drive_forever(self) -> None:
+        pace = current()
         while True:
             driver, trips = self.gate.driver, self.gate.watchdog_trips
-            deadline = self.gate.next_deadline(time.monotonic())
+            deadline = self.gate.next_deadline(current().steady_s())
             self._gate_wake.clear()
             with contextlib.suppress(TimeoutError):
-                delay = None if deadline is None else max(deadline - time.monotonic(), 0.001)
+                delay = None if deadline is None else max(pace.wait_s(deadline - pace.steady_s()), 0.001)
                 await asyncio.wait_for(self._gate_wake.wait(), delay)
                 continue  # woken: the deadline may have changed
             self._emit_due(wake=False)
@@ -739,7 +740,7 @@ class ConsoleServer:
                 self._send_session()
 
     def _emit_due(self, *, wake: bool = True) -> None:
-        now = time.monotonic()
+        now = current().steady_s()
         command = self.gate.take_due(now)
         if command is not None:
             self.backend.on_drive(*command)

@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from instant_ic.pace import SLOWEST_CHOSEN as SLOWEST
 from instant_ic.pace import PaceFiles, describe
-
-SLOWEST = 0.1
-"""Slowest pace that is chosen."""
 
 _ENOUGH_PER_S = 50e6
 """Iterations of an empty loop per second on the kind of core that ``_NEEDED_CORES`` counts."""

@@ -1,5 +1,6 @@
 """The pace of a simulated stack: its time, its file in the run directory, and a real base that refuses it."""
 
+import os
 import subprocess
 import sys
 import time
@@ -9,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from instant_ic import pace
+from instant_ic.base.config import RoboclawConfig
+from instant_ic.base.roboclaw import open_serial
 from instant_ic.bus import NodeError
 from instant_ic.bus.clock import SystemClock
 from instant_ic.pace import Pace, PaceError, PaceFiles
@@ -220,6 +223,20 @@ def test_launcher_refuses_a_pace_out_of_range():
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert "pace must lie in 0.02..10 (got 50)" in done.stderr
+
+
+def test_time_outs_on_the_machines_clock_hold_at_every_pace_that_may_come(tmp_path):
+    assert Pace().timeout_s(0.1) == 0.1
+    assert Pace.from_now(0.5).timeout_s(0.1) == 0.2
+    PaceFiles([tmp_path], 1.0, adapts=True)
+    assert pace.read(tmp_path).timeout_s(0.1) == pytest.approx(1.0)  # the pace may fall to 0.1
+    other_end, end = os.openpty()
+    pace.use(Pace.from_now(0.5))
+    port = open_serial(RoboclawConfig(port=os.ttyname(end), reply_timeout_s=0.1))
+    assert port.timeout == 0.2
+    port.close()
+    os.close(other_end)
+    os.close(end)
 
 
 class _Base:

@@ -256,6 +256,16 @@ def test_controls_held_through_a_stop_are_told_to_be_let_go(driver, shared_demo)
     expect_body(driver, "mode", "real")
 
 
+def test_the_pace_of_a_simulation_is_shown_beside_the_mode(driver, shared_demo):
+    pace = driver.locator("#mode #pace")
+    pace.wait_for(state="hidden")
+    shared_demo.pace = "simulation at 0.6 of real time: this machine is busy"
+    pace.wait_for()
+    assert pace.inner_text() == shared_demo.pace
+    shared_demo.reset()
+    pace.wait_for(state="hidden")
+
+
 def test_faults_and_a_silent_camera_are_told(driver, shared_demo):
     expect_body(driver, "image", "live")
     text = "<img src=x onerror=alert(1)> no packets"

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from instant_ic import pace
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.console import FrameKind, Look, ViewConfig
 from instant_ic.console.config import ConsoleConfig
@@ -512,3 +513,15 @@ def test_without_a_page_nothing_is_sent_or_requested(setup):
     bus.advance(1.0)
     assert "state" in server.texts and len(bus.messages("/view/request")) == 1
     assert 20 <= len(bus.messages("/view/shown")) <= 22
+
+
+def test_the_page_shows_the_pace_of_a_simulation(setup):
+    bus, _, server = setup
+    bus.advance(1.1)
+    assert server.texts["health"]["pace"] == ""
+    pace.use(pace.Pace.from_now(0.4))
+    try:
+        bus.advance(1.1)
+    finally:
+        pace.use(pace.Pace())
+    assert server.texts["health"]["pace"] == "simulation at 0.4 of real time"

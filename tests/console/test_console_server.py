@@ -7,6 +7,7 @@ import time
 import aiohttp
 import pytest
 
+from instant_ic import pace
 from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, FrameKind, ServerConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import OWN_S, origin_allowed
@@ -152,6 +153,25 @@ def test_fault_robot_runs_its_last_command_when_its_page_falls_silent(serve):
 
     asyncio.run(scenario())
     assert (0.3, 0.0) in backend.commands
+
+
+def test_the_watchdog_follows_the_pace_of_a_simulation(serve):
+    """A busy machine slows the simulation; it must not take the operator's command for lost."""
+    pace.use(pace.Pace.from_now(0.02))
+    try:
+        server, backend = serve(DriveConfig(watchdog_s=0.25, lease_timeout_s=60.0, max_command_age_s=10.0))
+
+        async def scenario():
+            async with ConsoleClient(server.url) as client:
+                await client.acquire()
+                await client.send_drive(0.3, 0.0)
+                await in_thread(backend.wait, lambda b: (0.3, 0.0) in b.commands)
+                await asyncio.sleep(0.6)
+                assert client.session["watchdog_trips"] == 0 and backend.commands[-1] == (0.3, 0.0)
+
+        asyncio.run(scenario())
+    finally:
+        pace.use(pace.Pace())
 
 
 def test_fault_socket_cut_leaves_the_throttle(serve):
