@@ -41,13 +41,14 @@ install: $(STAMP)
 PIP := $(BIN)/python -m pip install -q --disable-pip-version-check --progress-bar off
 $(STAMP): pyproject.toml constraints.txt requirements.lock scripts/install_torch.sh
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 run")'
-	@echo "Setting up $(VENV)/ (about three minutes, once)"
+	@echo "Setting up $(VENV)/ (about four minutes, once)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "  the packages of requirements.lock ..."
 	@$(PIP) --require-hashes --only-binary :all: -r requirements.lock
 	@echo "  torch (CPU build) ..."
 	@scripts/install_torch.sh $(BIN)/python
 	@$(PIP) --no-deps --no-build-isolation -e .
+	@$(BIN)/ic compile
 	@touch $@
 
 lock:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.capture import CaptureError
 from instant_ic.msg import Bool, Float32, Odometry, odometry_message
 from instant_ic.pace import current
@@ -37,6 +38,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         self._loop: RealTimeLoop | None = None
         self._published: tuple[bool | None, int] = (None, 0)
         self._skipped = 0
+        leave_out_blas()
         try:
             self.simulation = Simulation(self.config, start_ns=self.clock.now_ns())
             self._devices = SimulatedDevices(self.config, self.simulation, run_dir() / "dev", self.log)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import NotNegative, Percent, Positive, Range, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import HeightConfig, HeightLayer, SortedPoints, shifted
+from instant_ic.control.static_map import StaticMap
 
 FREE = 0
 INSCRIBED = 253
@@ -162,21 +163,6 @@ def _occupancy_tables() -> tuple[NDArray[np.int8], NDArray[np.uint8]]:
 
 
 _TO_OCCUPANCY, _FROM_OCCUPANCY = _occupancy_tables()
-
-
-@dataclass(frozen=True)
-class StaticMap:
-    """An occupancy grid: -1 unknown, 0..100 probability of being occupied."""
-
-    occupancy: NDArray[np.int8]
-    resolution: float
-    origin: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        if self.occupancy.ndim != 2 or self.occupancy.size == 0:
-            raise ValueError(f"map must be a grid with cells (got shape {self.occupancy.shape})")
-        if not self.resolution > 0:
-            raise ValueError(f"map resolution must be > 0 (got {self.resolution})")
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, scan_points, scan_rays
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import SortedPoints, sort_points
+from instant_ic.control.static_map import StaticMap
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 

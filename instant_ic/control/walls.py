@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.costmap import StaticMap
+from instant_ic.control.static_map import StaticMap
 
 
 def occupied_cells(static: StaticMap, occupied_threshold: int) -> NDArray[np.bool_]:

@@ -13,10 +13,12 @@ from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
+from instant_ic.jit import leave_out_blas
 
 
 def warm_up() -> None:
     """Run each numba kernel of this folder once on a small room."""
+    leave_out_blas()
     config, footprint = CostmapConfig(width=4.0), Footprint()
     ranges = np.full(90, 1.5, dtype=np.float64)
     rays = scan_rays(ranges, -math.pi, 2 * math.pi / 90, 0.1, 10.0, np.eye(4), config)

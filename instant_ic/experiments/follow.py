@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, scan_points, scan_rays
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import sort_points
@@ -29,6 +29,7 @@ from instant_ic.control.navigator import Navigator
 from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
+from instant_ic.control.static_map import StaticMap
 from instant_ic.control.subgoal import SubgoalConfig, choose_subgoal
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.motion import PlanarMotion
 from instant_ic.lidar.packets import BLOCKS, FIRINGS, LASERS, encode_data_packet
@@ -131,6 +132,7 @@ def deskew(revolution: Revolution, base_from_lidar: NDArray[np.float64], motion:
 
 def warm_up() -> None:
     """Compile decoder and projection now (takes seconds the first time on a machine), before packets arrive."""
+    leave_out_blas()
     stream = PacketStream()
     nothing = np.zeros((BLOCKS, FIRINGS, LASERS), np.int64)
     stream.feed(encode_data_packet(np.zeros(BLOCKS, np.int64), nothing + 1000, nothing, 0), 0)

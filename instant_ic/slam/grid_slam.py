@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2
+from instant_ic.jit import leave_out_blas
 from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.front_end import FrontEnd, Guess, SlamStatus, Track, constant_velocity
 from instant_ic.slam.localization import Place, SavedMap
@@ -343,6 +344,7 @@ def make_slam(config: SlamConfig | None = None, map_file: Path | None = None, lo
 
 def warm_up(config: SlamConfig | None = None) -> None:
     """Compile the kernels, or load them from their cache, so that they do not delay the first scan."""
+    leave_out_blas()
     slam = GridSlam(config)
     angles = np.linspace(-math.pi, math.pi, 181)[:-1]
     ranges = np.minimum(2.0 / np.maximum(np.abs(np.cos(angles)), 1e-6), 3.0 / np.maximum(np.abs(np.sin(angles)), 1e-6))

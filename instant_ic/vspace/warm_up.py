@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from instant_ic.jit import leave_out_blas
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.space import VirtualSpace
 
@@ -18,6 +19,7 @@ def warm_up(config: VirtualSpaceConfig) -> None:
     """
     if config.source == "mesh":  # renders its first image as it is made
         return
+    leave_out_blas()
     small = dataclasses.replace(
         config,
         field=dataclasses.replace(config.field, log2_table=10),

@@ -13,7 +13,7 @@ import numpy as np
 
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
-from instant_ic.control.costmap import CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.costmap import CostmapConfig, RollingCostmap, scan_points, scan_rays
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
@@ -21,6 +21,7 @@ from instant_ic.control.navigator import Navigator, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.snapshot import ArbiterInputs, Vspace
 from instant_ic.control.states import Mode, VbotAction
+from instant_ic.control.static_map import StaticMap
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from control_world import corridor, draw_map, rectangle
 
-from instant_ic.control.costmap import LETHAL, Costmap, StaticMap
+from instant_ic.control.costmap import LETHAL, Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, accelerate, move
 from instant_ic.control.navigator import meeting_pose
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig
+from instant_ic.control.static_map import StaticMap
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 

@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.control.costmap import LETHAL, UNKNOWN, Costmap, CostmapConfig, RollingCostmap, StaticMap
+from instant_ic.control.costmap import LETHAL, UNKNOWN, Costmap, CostmapConfig, RollingCostmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
+from instant_ic.control.static_map import StaticMap
 
 CELL = 0.05
 PLANNER = HybridPlanner(PlannerConfig())

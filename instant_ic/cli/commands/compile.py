@@ -1,0 +1,38 @@
+"""``ic compile``: compile the kernels ahead of the first start."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+NODES = ("simulator", "vlp16_driver", "grid_slam", "arbiter", "navigator", "nerf")
+"""The nodes that run kernels."""
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the verb."""
+    parser = subparsers.add_parser(
+        "compile",
+        help="compile the kernels ahead of the first start",
+        description="Compile the numba kernels of all nodes, which takes a minute on two cores after an installation "
+        "or a change of their sources. `make install` runs it, and `ic launch` where it is needed.",
+        epilog="example: ic compile",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(func=run)
+
+
+def run(args: argparse.Namespace | None = None) -> int:
+    """Compile with progress; 1 if a part cannot be compiled."""
+    from instant_ic.cli.kernels import are_compiled, compile_all
+    from instant_ic.cli.progress import progress
+
+    if are_compiled():
+        return 0
+    print("compiling kernels (about a minute, once)", file=sys.stderr, flush=True)
+    with progress("compiling kernels") as report:
+        problems = compile_all(report)
+    for problem in problems:
+        print(f"ic: {problem}", file=sys.stderr)
+    return 1 if problems else 0

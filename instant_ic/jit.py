@@ -1,0 +1,17 @@
+"""Faster start of numba's kernels."""
+
+from __future__ import annotations
+
+
+def leave_out_blas() -> None:
+    """Keep numba from loading scipy's linear algebra, a third of the CPU of a process's first kernel call.
+
+    numba loads it with its array functions, whether or not a kernel multiplies matrices. None of ours does; one that
+    did would fail to compile with numba's text. Call it before the first kernel runs.
+    """
+    from numba.np import linalg
+
+    def refuse() -> None:
+        raise ImportError("instant_ic.jit leaves out scipy's linear algebra: write the sums out")
+
+    linalg.ensure_blas = refuse

@@ -1,0 +1,115 @@
+"""Kernels are compiled ahead: once, for one caller at a time, and noted beside numba's cache."""
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from instant_ic.cli import kernels
+from instant_ic.cli.main import main
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def test_a_part_is_compiled_into_the_cache_and_noted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "PARTS", ("lidar",))
+    shares: list[float] = []
+    assert not kernels.are_compiled()
+    assert kernels.compile_all(shares.append) == []
+    assert kernels.are_compiled() and shares[-1] == 1.0
+    assert list(folder.rglob("*.nbi"))
+    monkeypatch.setattr(kernels, "PARTS", ("no such part would be compiled again",))
+    assert kernels.compile_all(shares.append) == []
+
+
+def test_a_part_that_fails_is_reported_and_nothing_noted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "PARTS", ("slam",))
+    monkeypatch.setenv("NUMBA_DISABLE_JIT", "no number")
+    monkeypatch.setenv("PYTHONPATH", f"{folder / 'empty'}")
+    (folder / "empty" / "numba").mkdir(parents=True)
+    (folder / "empty" / "numba" / "__init__.py").write_text("raise ImportError('numba is broken')")
+    monkeypatch.chdir(Path(kernels.__file__).parents[2])
+    (problem,) = kernels.compile_all(lambda share: None)
+    assert problem == "the kernels of slam cannot be compiled: ImportError: numba is broken"
+    assert not kernels.are_compiled()
+
+
+def test_a_second_caller_waits_and_then_has_nothing_to_do(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "PARTS", ("no such part",))
+    folder.mkdir()
+    second = threading.Thread(target=kernels.compile_all, args=(lambda share: None,))
+    with (folder / "kernels.lock").open("w") as first:
+        fcntl.flock(first, fcntl.LOCK_EX)
+        second.start()
+        second.join(0.3)
+        assert second.is_alive()
+        (folder / "kernels.txt").write_text(kernels._key())
+    second.join(60)
+    assert not second.is_alive() and kernels.are_compiled()
+
+
+def test_a_changed_source_and_a_read_only_installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "kernel.py").write_text("import numba\n")
+    monkeypatch.setattr(kernels, "_PACKAGE", package)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    assert kernels._folder() == package / "__pycache__"
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert kernels._folder() == tmp_path / "home" / "instant_ic"
+    before = kernels._key()
+    (package / "other.py").write_text("no kernel\n")
+    assert kernels._key() == before
+    (package / "kernel.py").write_text("import numba  # changed\n")
+    assert kernels._key() != before
+
+
+def test_ctrl_c_ends_the_compilers(folder: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "instant_ic.cli.main", "compile"],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stderr is not None and process.stderr.readline().startswith("compiling kernels")
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(30) == 130
+    with pytest.raises(ProcessLookupError):
+        for _ in range(600):
+            os.killpg(process.pid, 0)
+            threading.Event().wait(0.05)
+
+
+def test_the_command_has_nothing_to_do_once_all_is_compiled(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder.mkdir()
+    (folder / "kernels.txt").write_text(kernels._key())
+    monkeypatch.setattr(kernels, "_compile_parts", None)
+    assert main(["compile"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("node", ["virtual_robot", "crawler_base", "theta_camera", "depth_scaler", "console"])
+def test_nodes_without_kernels_do_not_load_numba(node: str) -> None:
+    code = f"import sys\nfrom instant_ic.bus.node_files import node_class\nnode_class({node!r})"
+    code += "\nprint('numba' in sys.modules)"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True, timeout=120) == "False\n"
+
+
+def test_the_first_kernel_loads_no_linear_algebra() -> None:
+    code = (
+        "from instant_ic.lidar.flatscan import warm_up\nwarm_up()\n"
+        "import sys; print('scipy.linalg' in sys.modules, 'numba' in sys.modules)"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True, timeout=300) == "False True\n"
