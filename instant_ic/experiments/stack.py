@@ -142,7 +142,7 @@ class Stack:
         """Start the launcher and the observer."""
         self.run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         words = [f"{key}:={_word(value)}" for key, value in self.arguments.items()]
-        launch = [self.launch_file, *words, f"--pace={self._pace or 'auto'}"]
+        launch = [self.launch_file, *words, "--verbose", f"--pace={self._pace or 'auto'}"]
         environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(self.run_dir)}
         with self.log_path.open("wb") as log:
             self.process = subprocess.Popen(

@@ -27,7 +27,11 @@ _WAITING_LINES = 2000  # how many lines a terminal may lag behind
 
 
 def run_stack(
-    description: LaunchDescription, run_dir: Path, live: bool | None = None, pace: float | None = None
+    description: LaunchDescription,
+    run_dir: Path,
+    live: bool | None = None,
+    pace: float | None = None,
+    verbose: bool = False,
 ) -> int:
     """Start everything, show its state, and stop it at the end.
 
@@ -36,6 +40,7 @@ def run_stack(
         run_dir: run directory; created if missing, with those of the groups inside.
         live: show a table of the nodes below the lines; default: only if standard output is a terminal.
         pace: of the stack's time. Default: what the machine can do, if the devices are simulated; else the machine's.
+        verbose: show every line of the nodes' output; default: warnings and errors after the start, each once.
 
     Returns:
         Exit status, see :meth:`Supervisor.run`.
@@ -53,7 +58,7 @@ def run_stack(
             locks.enter_context(StackLock(folder, description.file.name))
             registry.sweep(folder)
             locks.enter_context(RunMark(folder))
-        output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live)
+        output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live, verbose)
         status = 1
         try:
             count = f"{len(description.nodes)} node{'' if len(description.nodes) == 1 else 's'}"
@@ -80,9 +85,9 @@ def run_stack(
 class _Output:
     """The screen, on a thread of its own so that a blocked terminal does not hold up the stack."""
 
-    def __init__(self, description: LaunchDescription, run_dir: Path, live: bool) -> None:
+    def __init__(self, description: LaunchDescription, run_dir: Path, live: bool, verbose: bool) -> None:
         self._description, self._run_dir = description, run_dir
-        self._screen = Screen([node.label for node in description.nodes], live)
+        self._screen = Screen([node.label for node in description.nodes], live, verbose=verbose)
         self._outlet = Outlet("screen", _WAITING_LINES)
         self._outlet.put(self._screen.start, always=True)
         self._health: HealthMonitor | None = None
@@ -131,9 +136,11 @@ class _Output:
         if not self._ending:
             down = {p.spec.label: p.state.value for p in processes if p.state in (State.FAILED, State.WAITING)}
             health.publish(down, faults)
+        # Nothing waits for an optional node that has ended: a recorder whose disk is full.
+        gone = {p.spec.label for p in processes if p.state in (State.FAILED, State.ENDED) and not p.spec.respawn}
         return View(
             rows=tuple(_row(process, health, faults) for process in processes),
-            missing=tuple(health.nodes_missing()),
+            missing=tuple(label for label in health.nodes_missing() if label not in gone),
             waiting=tuple(health.waiting_for()),
             address=self._address,
             faults=tuple(f"{fault.topic} of {fault.label}: {fault.words}" for fault in faults),

@@ -35,11 +35,11 @@ LATE = "/simulation/late"
 """Topic of the node ``simulator``."""
 
 MILESTONES: tuple[tuple[str, str, str], ...] = (
-    ("camera", "theta_camera", "/camera/image/compressed"),
-    ("lidar", "vlp16_driver", "/scan"),
-    ("base", "crawler_base", "/wheel/odom"),
+    ("camera's first image", "theta_camera", "/camera/image/compressed"),
+    ("LiDAR's first scan", "vlp16_driver", "/scan"),
+    ("base's odometry", "crawler_base", "/wheel/odom"),
     ("map", "grid_slam", "/pose"),  # the map itself is published only when it changes
-    ("depth", "depth_scaler", "/depth/scaled"),
+    ("first depth image", "depth_scaler", "/depth/scaled"),
 )
 """What an operator waits for at start-up: label, node, and the topic whose messages show that it works."""
 
@@ -107,7 +107,7 @@ class HealthMonitor:
         self._beats = [(spec_group, beat) for spec_group, beat in self._subscribe_beats()]
         self._vspace = [
             (
-                _labelled(spec, "v-space"),
+                _labelled(spec, "virtual space"),
                 self._transports[spec.group].subscribe(
                     "/vspace/status", "instant_ic_msgs/msg/VspaceStatus", RELIABLE, lambda: None
                 ),
@@ -122,6 +122,7 @@ class HealthMonitor:
         self._late = [self._subscribe(spec, LATE, "std_msgs/msg/Float32") for spec in self._of("simulator")]
         control = "instant_ic_msgs/msg/ControlState"
         self._control = [self._subscribe(spec, "/ic/state", control) for spec in self._of("arbiter") if self._late]
+        self._vspace_text: dict[str, str] = {}
         self._next_diagnostics_s = 0.0
         self._reached: set[str] = set()
         self._flowed: set[tuple[str, str]] = set()
@@ -150,7 +151,9 @@ class HealthMonitor:
                 self._take(deserialize(received.payload, received.type_name), group)
         for label, subscription in self._vspace:
             for received in subscription.take():
-                if deserialize(received.payload, received.type_name).state == _VSPACE_READY:
+                status = deserialize(received.payload, received.type_name)
+                self._vspace_text[label] = status.message
+                if status.state == _VSPACE_READY:
                     self._reached.add(label)
         for word, program, topic in MILESTONES:
             for spec in self._specs:
@@ -201,7 +204,12 @@ class HealthMonitor:
         wanted = [
             _labelled(spec, word) for word, program, _ in MILESTONES for spec in self._specs if spec.exec == program
         ]
-        return [label for label in [*wanted, *(label for label, _ in self._vspace)] if label not in self._reached]
+        left = [label for label in wanted if label not in self._reached]
+        for label, _ in self._vspace:
+            if label not in self._reached:
+                text = self._vspace_text.get(label)
+                left.append(f"{label} ({text})" if text else label)
+        return left
 
     def topic_faults(self) -> list[TopicFault]:
         """Topics that have stopped or become too slow (config/topics.yaml), once the fault has lasted a while.

@@ -166,6 +166,18 @@ def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = Non
     return list(dict.fromkeys(text for _, text in problems))
 
 
+def existing_bags(nodes: Sequence[NodeSpec]) -> list[str]:
+    """A text for each recorder whose bag's folder exists already: it would refuse, and the stack run unrecorded."""
+    problems = []
+    for spec in nodes:
+        given = dict(word.split(":=", 1) for word in spec.command if ":=" in word)
+        if spec.exec == "bag_recorder" and given.get("path") and given.get("snapshot") != "true":
+            path = Path(spec.cwd or ".") / Path(given["path"]).expanduser()
+            if path.exists():
+                problems.append(f"{path} exists: record into a new folder (node {spec.label})")
+    return problems
+
+
 def _frozen(node: _Node) -> str:
     return json.dumps(vars(node), sort_keys=True, default=str)
 

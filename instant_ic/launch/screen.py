@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,6 +25,10 @@ _STATE_STYLES = {
 }
 _LINE_STYLES = {" WARNING ": "yellow", " ERROR ": "red", " CRITICAL ": "bold red"}
 _BAD_STYLE = ("●", "bold red")
+_LOGGED = re.compile(r"(?:\x1b\[[\d;]*m)*\d\d:\d\d:\d\d\.\d{3} ([A-Z]+) +(.*)")
+"""A line that a node logs: time, level, text."""
+_HOLDS_BACK_S = 30.0
+"""Warnings wait for "ready" for this long, since most of a start's end with it."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,8 @@ class Screen:
         live: keep a table of the nodes below the lines.
         progress_period_s: without the table, how often to print what the stack still waits for.
         console: destination; for tests.
+        verbose: print every line of the nodes. Otherwise warnings and errors, each once, and what is not a log line;
+            those of the start only if it is not over within ``_HOLDS_BACK_S``.
     """
 
     def __init__(
@@ -88,6 +95,7 @@ class Screen:
         live: bool,
         progress_period_s: float = 5.0,
         console: Console | None = None,
+        verbose: bool = False,
     ) -> None:
         self._console = console or Console(highlight=False, soft_wrap=True)
         self._colours = {node: _COLOURS[index % len(_COLOURS)] for index, node in enumerate(nodes)}
@@ -99,6 +107,11 @@ class Screen:
         self._told_nodes = self._told_ready = False
         self._address: str | None = None
         self._told_faults: tuple[str, ...] = ()
+        self._verbose = verbose
+        self._shows = dict.fromkeys(nodes, True)
+        """Whether a node's last log line was shown; the lines of a traceback follow it."""
+        self._shown: set[tuple[str, str]] = set()
+        self._held_back: list[tuple[str, str]] = []
 
     def __enter__(self) -> Screen:
         """Show the table."""
@@ -120,7 +133,28 @@ class Screen:
             self._live.stop()
 
     def node_line(self, node: str, text: str) -> None:
-        """Print a line of a node's output."""
+        """Print a line of a node's output, if it is worth it."""
+        if self._verbose or self._is_worth_showing(node, text):
+            self._print_line(node, text)
+
+    def _is_worth_showing(self, node: str, text: str) -> bool:
+        logged = _LOGGED.match(text)
+        if logged is None:
+            return self._shows.get(node, True)
+        key = node, re.sub(r"\d+", "0", logged[2])
+        new = logged[1] in ("WARNING", "ERROR", "CRITICAL") and key not in self._shown
+        if new:
+            self._shown.add(key)
+            if self._starting:
+                self._held_back.append((node, text))
+        self._shows[node] = new and not self._starting
+        return self._shows[node]
+
+    @property
+    def _starting(self) -> bool:
+        return not self._told_ready and time.monotonic() - self._started_s < _HOLDS_BACK_S
+
+    def _print_line(self, node: str, text: str) -> None:
         prefix = (f"{node:>{self._width}} │ ", self._colours.get(node, "white"))
         style = next((style for word, style in _LINE_STYLES.items() if word in text), "")
         self._console.print(Text.assemble(prefix, Text.from_ansi(text, style=style)))
@@ -140,7 +174,7 @@ class Screen:
     def _tell_progress(self, view: View, now: float) -> None:
         if not view.missing and not self._told_nodes:
             self._told_nodes = True
-            count = len(self._colours)
+            count = sum(row.state not in ("failed", "ended") for row in view.rows) or len(self._colours)
             up = "the node is up" if count == 1 else f"all {count} nodes are up"
             self.event(f"{up} after {now - self._started_s:.1f} s")
         if self._address is None and view.address:
@@ -150,6 +184,14 @@ class Screen:
             self._told_ready = True
             at = f": {self._address}" if self._address else ""
             self.event(f"ready after {now - self._started_s:.1f} s{at}")
+            self._held_back.clear()  # the start's; what is still wrong is in the nodes' own reports
+            for row in view.rows:
+                if row.text and not self._verbose:
+                    self.event(f"{row.label}: {row.text}", bad=row.state not in _STATE_STYLES)
+        if not self._starting:
+            for node, text in self._held_back:
+                self._print_line(node, text)
+            self._held_back.clear()
         if self._live is not None:
             return  # the table shows the rest
         if now >= self._next_progress_s:

@@ -77,3 +77,39 @@ def test_a_signal_before_the_stack_is_up_ends_the_launcher_with_0(
         main(["launch", "sim"])
     assert end.value.code == 0
     assert signal.getsignal(signum) is before
+
+
+SLOW = """
+import time
+from dataclasses import dataclass
+from instant_ic.bus import Node, main
+
+@dataclass(frozen=True)
+class Config:
+    pass
+
+class Slow(Node[Config]):
+    name = "slow"
+    def setup(self):
+        print("setup", flush=True)
+        for _ in range(600):
+            time.sleep(0.1)
+
+main(Slow)
+"""
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_node_that_is_still_compiling_in_its_setup(tmp_path: Path, signum: int) -> None:
+    (tmp_path / "slow.py").write_text(SLOW)
+    process = subprocess.Popen(
+        [sys.executable, str(NODE_MAIN), str(tmp_path / "slow.py"), "--run-dir", str(tmp_path / "r")],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "setup\n"
+        process.send_signal(signum)
+        assert process.wait(30) == 0
+    finally:
+        process.kill()

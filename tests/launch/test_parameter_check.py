@@ -109,3 +109,16 @@ def test_options_and_arguments_stand_in_any_order(
     )
     assert main(["launch", *(str(file) if word == "F" else word for word in words)]) == 0
     assert f"{0 if 'n:=one' in words else 1} nodes, no errors" in capsys.readouterr().out
+
+
+def test_a_recording_into_an_existing_folder_is_refused_before_the_start(
+    stack: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["launch", "sim", "--run-dir", str(stack.parent / "r"), "recorder:=false"]
+    (stack.parent / "drive").mkdir()
+    assert main([*words, "record:=drive"]) == 2
+    assert capsys.readouterr().err == (
+        f"ic: {stack.parent / 'drive'} exists: record into a new folder (node bag_recorder)\n"
+    )
+    assert not (stack.parent / "r").exists()
+    assert main([*words, "--check", "record:=new", "snapshots:=drive"]) == 0  # snapshots may share a folder

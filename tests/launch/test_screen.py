@@ -24,9 +24,9 @@ def out() -> io.StringIO:
     return io.StringIO()
 
 
-def screen_on(out: io.StringIO, live: bool, period_s: float = 0.0) -> Screen:
+def screen_on(out: io.StringIO, live: bool, period_s: float = 0.0, verbose: bool = False) -> Screen:
     console = Console(file=out, width=120, force_terminal=live, color_system=None)
-    return Screen(["slam", "page"], live, period_s, console)
+    return Screen(["slam", "page"], live, period_s, console, verbose)
 
 
 def test_plain_lines_tell_what_is_waited_for(out: io.StringIO) -> None:
@@ -60,6 +60,46 @@ def test_plain_lines_tell_a_degraded_topic_once_and_its_recovery(out: io.StringI
         "launch │ back to the right rate: /scan of lidar",
         "launch │ back to the right rate: /pose of slam",
     ]
+
+
+WARNED = "12:00:00.000 WARNING slam: scan: 3 of 10 beams"
+
+
+def test_a_nodes_warnings_are_shown_once_and_after_the_start_only(out: io.StringIO) -> None:
+    with screen_on(out, live=False, period_s=60.0) as screen:
+        screen.node_line("slam", "12:00:00.000 INFO    slam: running")
+        screen.node_line("slam", "12:00:00.000 ERROR   slam: scan: none yet")
+        screen.refresh(View((Row("page", "degraded", text="no camera"), Row("slam", "running"))))
+        screen.node_line("slam", WARNED)
+        screen.node_line("slam", "  a line that belongs to it")
+        screen.node_line("slam", WARNED.replace("3", "4").replace("12:", "13:"))
+        screen.node_line("slam", "  a line that belongs to a line not shown")
+        screen.node_line("slam", "12:00:00.000 INFO    slam: running")
+        screen.node_line("page", "Traceback (most recent call last):")
+    lines = out.getvalue().splitlines()
+    assert lines[1].startswith("launch │ ready after ")
+    assert lines[2:] == [
+        "launch │ page: no camera",
+        f"  slam │ {WARNED}",
+        "  slam │   a line that belongs to it",
+        "  page │ Traceback (most recent call last):",
+    ]
+
+
+def test_warnings_of_a_start_that_does_not_end_are_shown(out: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    with screen_on(out, live=False, period_s=60.0) as screen:
+        screen.node_line("slam", WARNED)
+        screen.refresh(View(missing=("page",)))
+        assert out.getvalue() == ""
+        monkeypatch.setattr(time, "monotonic", lambda: screen._started_s + 31.0)
+        screen.refresh(View(missing=("page",)))
+    assert out.getvalue().splitlines()[0] == f"  slam │ {WARNED}"
+
+
+def test_verbose_shows_every_line(out: io.StringIO) -> None:
+    with screen_on(out, live=False, verbose=True) as screen:
+        screen.node_line("slam", "12:00:00.000 INFO    slam: running")
+    assert out.getvalue() == "  slam │ 12:00:00.000 INFO    slam: running\n"
 
 
 def test_table_of_nodes(out: io.StringIO) -> None:

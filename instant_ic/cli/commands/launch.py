@@ -43,6 +43,7 @@ def add_parser(subparsers: Any) -> None:
         action="store_true",
         help="skip the check of node parameters before the start (each node checks its own)",
     )
+    parser.add_argument("-v", "--verbose", action="store_true", help="show every line that the nodes log")
     parser.add_argument("--plain", action="store_true", help="plain log lines even in a terminal")
     parser.add_argument(
         "--pace",
@@ -83,9 +84,9 @@ def run(args: argparse.Namespace) -> int:
     run_dir = (args.run_dir or paths.run_dir()).absolute()
     description = read_launch_file(file, values, run_dir)
     if args.check or not args.no_check:
-        from instant_ic.launch.parameters import check_parameters_quickly
+        from instant_ic.launch.parameters import check_parameters_quickly, existing_bags
 
-        problems = check_parameters_quickly(description.nodes)
+        problems = check_parameters_quickly(description.nodes) + existing_bags(description.nodes)
         for problem in problems:
             print(f"ic: {problem}", file=sys.stderr)
         if problems:
@@ -93,9 +94,12 @@ def run(args: argparse.Namespace) -> int:
     if args.check:
         print(f"{description.file.name}: {len(description.nodes)} nodes, no errors")
         return 0
+    from instant_ic.cli.commands import compile as kernels
     from instant_ic.launch.app import run_stack
 
-    return run_stack(description, run_dir, False if args.plain else None, args.pace)
+    if any(node.exec in kernels.NODES for node in description.nodes):
+        kernels.run()  # what fails here is reported by the node that needs it
+    return run_stack(description, run_dir, False if args.plain else None, args.pace, verbose=args.verbose)
 
 
 def _pace(word: str) -> float | None:
