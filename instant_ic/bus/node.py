@@ -410,7 +410,7 @@ class Node(Generic[ConfigT]):
             self._well.add(name)
             self._waiting.discard(name)
             if before is not None and before[0] >= WARN:
-                self.log.info("%s: %s", name, message)
+                self.log.info("%s: %s", name, message or "fine again")
 
     def _log_diagnosis(self, name: str, level: int, message: str) -> None:
         """Log a diagnosis; one that was never OK is logged once, as information, while other nodes still start."""

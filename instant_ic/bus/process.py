@@ -23,6 +23,9 @@ from instant_ic.bus.node import Node, NodeError
 from instant_ic.config import params
 from instant_ic.msg import MessageError
 
+_SETUP_ENDS_S = 1.0
+"""How long a signal waits for a node's ``setup``; the launcher sends the next one after 2.5 s."""
+
 
 def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
     """Command line parser of a node."""
@@ -92,6 +95,9 @@ def _stop_on_signals(node: Node[Any]) -> None:
     def wait_for_signal() -> None:
         os.read(heard, 1)
         node.stop()
+        time.sleep(_SETUP_ENDS_S)
+        if node.starting:  # in a compiler, or waiting for a device: no motor, bag or robot is in use yet
+            leave(0)
 
     threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
 

@@ -18,7 +18,7 @@ class ReconnectConfig:
     """
 
     min_s: Positive = 0.5
-    max_s: Positive = 5.0
+    max_s: Positive = 2.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
