@@ -168,7 +168,7 @@ class NerfNode(Node[NerfConfig]):
                 header=header("map", now),
                 request_id=order.id,
                 keyframe_id=0 if keyframe is None else keyframe.id,
-                pose=order.message.pose,
+                pose=encoded.order.message.pose,
                 fov_rad=order.fov_rad,
                 width=order.width,
                 height=order.height,

@@ -184,7 +184,8 @@ class VirtualSpaceConfig:
     """Everything about the virtual space but the bus.
 
     Attributes:
-        source: field: the panorama warped by its depth until the field is better; warp: that alone, no training; mesh.
+        source: field: the panorama warped by its depth until the field is better; warp: that alone, no training; auto:
+            field on a GPU, else warp, because no field trained on a CPU becomes better in time; mesh.
         mesh: file of a place scanned beforehand (GLB, glTF, PLY, OBJ), with source: mesh.
         mesh_pose: where the mesh lies in the map: x, y, z (m), yaw (degrees, counter-clockwise).
         mesh_max_triangles: larger meshes are refused.
@@ -214,7 +215,7 @@ class VirtualSpaceConfig:
         check_ranges(self)
         devices = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
         require(self, "device", self.device in devices, "one of " + ", ".join(devices))
-        require(self, "source", self.source in ("field", "warp", "mesh"), "field, warp or mesh")
+        require(self, "source", self.source in ("auto", "field", "warp", "mesh"), "auto, field, warp or mesh")
         require(self, "mesh", self.source != "mesh" or bool(self.mesh), "a file with source: mesh")
         require(self, "mesh_pose", len(self.mesh_pose) == 4, "x, y, z in metres and yaw in degrees")
         for key in ("ray_columns", "ray_rows") if self.field.geometry == "density" else ():

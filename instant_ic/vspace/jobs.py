@@ -43,6 +43,10 @@ class JobKind(enum.Enum):
     TRAIN = "train"
 
 
+_SAME_POSE = 5e-4
+"""Metres and radians within which poses are the same: a tenth of a view's pixel. A standing robot's pose jitters."""
+_CHANGES = (JobKind.SHOW, JobKind.LEARN, JobKind.TRAIN)
+"""Jobs after which the same request gives another view."""
 _INPUT_JOBS = (JobKind.PREPARE, JobKind.SHOW, JobKind.RENDER)
 """A ValueError in one of these is the sender's fault: the keyframe or the request is refused."""
 
@@ -69,6 +73,12 @@ class ViewOrder:
     fov_rad: float
     jpeg_quality: int
 
+    def same_view(self, other: ViewOrder) -> bool:
+        """Whether both ask for the same view."""
+        keys = ("width", "height", "fov_rad", "jpeg_quality")
+        alike = all(getattr(self, key) == getattr(other, key) for key in keys)
+        return alike and np.allclose(self.pose(), other.pose(), rtol=0, atol=_SAME_POSE)
+
 
 @dataclass(frozen=True)
 class Job:
@@ -91,8 +101,10 @@ class Job:
 
 @dataclass(frozen=True)
 class EncodedView:
-    """A rendered view as it is sent."""
+    """A rendered view as it is sent, the order that it was rendered for, and the time that this took."""
 
+    order: ViewOrder
+    render_ms: float
     view: View
     jpeg: bytes
     mask_png: bytes
@@ -115,7 +127,6 @@ class Outcome:
     made: Any = None
     encoded: EncodedView | None = None
     status: Status | None = None
-    elapsed_ms: float = 0.0
     refused: str = ""
     error: Exception | None = None
     is_bug: bool = False
@@ -135,10 +146,10 @@ class SpaceWorker:
         self.config = config
         self.space: Space | None = None
         self._robot, self._nice, self._warm = robot, nice, warm
+        self._newest: EncodedView | None = None  # view of the space as it is
 
     def run(self, job: Job) -> Outcome:
         """Do a job; errors are part of the outcome."""
-        start = time.perf_counter()
         try:
             outcome = self.do(job)
         except Exception as error:  # noqa: BLE001 - reported on the node's thread, which must know that this one is free
@@ -148,7 +159,7 @@ class SpaceWorker:
                 expected = is_device_fault(error) or isinstance(error, MeshError)
                 outcome = Outcome(job, error=error, is_bug=not expected)
         status = None if self.space is None else self.space.status
-        return replace(outcome, status=status, elapsed_ms=(time.perf_counter() - start) * 1e3)
+        return replace(outcome, status=status)
 
     def do(self, job: Job) -> Outcome:
         """Do a job; errors are raised."""
@@ -160,6 +171,8 @@ class SpaceWorker:
             return Outcome(job)
         space = self.space
         assert space is not None
+        if job.kind in _CHANGES:
+            self._newest = None
         if job.kind is JobKind.PREPARE:
             assert job.keyframe is not None
             if self._warm:
@@ -178,8 +191,16 @@ class SpaceWorker:
             space.train(job.budget_ms, job.iterations)
         elif job.kind is JobKind.RENDER:
             assert job.view is not None
-            return Outcome(job, encoded=_render(space, job.view))
+            return Outcome(job, encoded=self._rendered(space, job.view))
         return Outcome(job)
+
+    def _rendered(self, space: Space, order: ViewOrder) -> EncodedView:
+        """The view of an order; the newest one again where it would be the same: a standing robot costs nothing."""
+        if self._newest is None or not self._newest.order.same_view(order):
+            encoded = _render(space, order)
+            self._newest = None if space.dissolving else encoded
+            return encoded
+        return self._newest
 
     def _yield_to_others(self) -> None:
         """Lower this thread's priority (Linux has one per thread)."""
@@ -188,9 +209,11 @@ class SpaceWorker:
 
 
 def _render(space: Space, order: ViewOrder) -> EncodedView:
+    start = time.perf_counter()
     view = space.render(order.pose(), order.width, order.height, order.fov_rad)
     _, jpeg = cv2.imencode(".jpg", view.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, order.jpeg_quality])
-    return EncodedView(view, jpeg.tobytes(), view.mask_png(), *encode_depth(view.depth_m, order.fov_rad))
+    encoded = jpeg.tobytes(), view.mask_png(), *encode_depth(view.depth_m, order.fov_rad)
+    return EncodedView(order, (time.perf_counter() - start) * 1e3, view, *encoded)
 
 
 def decode_panorama(data: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -46,6 +46,8 @@ class Space(Protocol):
     config: VirtualSpaceConfig
 
     @property
+    def dissolving(self) -> bool: ...
+    @property
     def keyframe(self) -> PanoramaPrior | None: ...
     @property
     def status(self) -> Status: ...
@@ -87,6 +89,7 @@ class MeshSpace(Drawn):
 
     keyframe = None
     """Views do not come from keyframes."""
+    dissolving = False
 
     def __init__(self, config: VirtualSpaceConfig) -> None:
         self.config = config
@@ -193,6 +196,7 @@ class MeshSpace(Drawn):
             ms_per_iteration=0.0,
             ready_radius_m=float(np.linalg.norm(high - low)),  # from any place in it to any other
             converged=True,
+            source="mesh",
             device="cpu (embree)",
             warning=self._warning,
         )

@@ -203,13 +203,13 @@ class JobSchedule:
         elif job.kind is JobKind.SHOW:
             self.keyframe, self.failure, self._is_ready = job.keyframe, "", False
             changed = True
-            if self.config.source == "field":
+            if self.status is not None and self.status.source == "field":
                 self._prepare(Job(JobKind.SCENE, job.keyframe, made=job.made))
             else:
                 self.preparing = False
         elif outcome.encoded is not None:
             view = outcome.encoded.view
-            self._render_ms = 0.0 if self._lockstep else outcome.elapsed_ms
+            self._render_ms = 0.0 if self._lockstep else outcome.encoded.render_ms
             self._expected_psnr_db = 0.0 if math.isnan(view.expected_psnr_db) else view.expected_psnr_db
             self._unseen_share = view.unseen_share
             self.turns.rendered(self._render_ms)
@@ -233,16 +233,16 @@ class JobSchedule:
 
     def text(self) -> str:
         """The state in a sentence for people."""
-        space, status = self.config, self.status
+        status = self.status
         if self.failure:
             return self.failure
         if status is None:
             return "warming up: kernels are being compiled"
-        if space.source == "mesh":
-            return f"the scanned place {Path(space.mesh).name}; nothing is trained (source: mesh)"
+        if status.source == "mesh":
+            return f"the scanned place {Path(self.config.mesh).name}; nothing is trained (source: mesh)"
         if self.keyframe is None:
             return "waiting for the first keyframe"
-        if space.source == "warp":
+        if status.source == "warp":
             return "the panorama warped by its depth; nothing is trained (source: warp)"
         if status.converged:
             text = f"trained, {status.psnr_db:.1f} dB; idle"
@@ -250,7 +250,7 @@ class JobSchedule:
             text = f"training, {status.psnr_db:.1f} dB" if status.iterations else "training"
         if status.refreshing:
             text += f"; learning keyframe {self.keyframe.id}"
-        share = space.picture.panorama_share(status.psnr_db)
+        share = self.config.picture.panorama_share(status.psnr_db)
         return f"{text}; shown: {share:.0%} warped panorama" if share > 0 else text
 
     def findings(self, outcome: Outcome) -> list[Finding]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
-from instant_ic.vspace.canvas import Drawing, Painted, Picture
+from instant_ic.vspace.canvas import CpuCanvas, Drawing, Painted, Picture
 from instant_ic.vspace.compose import exposure_gains, moved
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_out_of_memory, make_device
@@ -77,6 +77,8 @@ class Status:
     ready_radius_m: float
     """Distance from the keyframe up to which views may be shown."""
     converged: bool
+    source: str
+    """What is shown: ``field``, ``warp`` or ``mesh``."""
     device: str
     warning: str = ""
     """Problem of the device; empty when there is none."""
@@ -125,6 +127,9 @@ class VirtualSpace(Drawn):
         self._robot = robot
         self._device, self._warning = make_device(self.config)
         self._can_warp = importlib.util.find_spec("numba") is not None
+        if self.config.source == "auto":
+            source = "warp" if self._can_warp and isinstance(self._device.canvas, CpuCanvas) else "field"
+            self.config = dataclasses.replace(self.config, source=source)
         # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
         self._store = KeyframeStore(self.config.keyframes + 2)
         self._shown: KeyframeSet | None = None
@@ -157,6 +162,11 @@ class VirtualSpace(Drawn):
         return () if self._shown is None else self._shown.priors
 
     @property
+    def dissolving(self) -> bool:
+        """Whether the next views still change, from the keyframe before into the newest."""
+        return self._before is not None
+
+    @property
     def _psnr_db(self) -> float:
         return psnr_of_mse(self._colour_error)
 
@@ -172,7 +182,7 @@ class VirtualSpace(Drawn):
         map_from_camera: NDArray[np.floating],
         relative_sigma: float | NDArray[np.floating],
     ) -> None:
-        """Use a new keyframe: ``prepare``, ``scene_of``, ``learn`` and ``show`` in sequence.
+        """Use a new keyframe: ``prepare``, ``scene_of`` and ``learn`` where a field is trained, and ``show``.
 
         Args: as ``prior.prepare``.
 
@@ -180,7 +190,8 @@ class VirtualSpace(Drawn):
             KeyframeError: the keyframe is no good; the old space stays as it was.
         """
         prepared = self.prepare(rgb, depth_m, map_from_camera, relative_sigma)
-        self.learn(self.scene_of(prepared))
+        if self.config.source == "field":
+            self.learn(self.scene_of(prepared))
         self.show(prepared)
 
     def prepare(
@@ -332,6 +343,7 @@ class VirtualSpace(Drawn):
             ms_per_iteration=self._train_seconds * 1e3 / iterations if iterations else 0.0,
             ready_radius_m=self._ready_radius_m() if state == State.READY else 0.0,
             converged=self._shown is not None and self._done,
+            source=self.config.source,
             device=self._device.name,
             warning=self._warning,
         )

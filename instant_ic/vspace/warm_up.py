@@ -13,7 +13,7 @@ from instant_ic.vspace.space import VirtualSpace
 
 
 def warm_up(config: VirtualSpaceConfig) -> None:
-    """Train and render a scratch space of the same kind once, so that numba's kernels are compiled and cached on disk.
+    """Render a scratch space of the same kind once, trained where the kind is: numba's kernels are compiled and cached.
 
     About 8 s of CPU on the first run of an installation, below 1 s after it.
     """
@@ -36,6 +36,7 @@ def warm_up(config: VirtualSpaceConfig) -> None:
     aside[1, 3] = 1.0
     for pose in (np.eye(4), aside)[: config.keyframes]:
         space.set_keyframe(rgb, depth, pose, 0.05)
-    space.train(iterations=1)
+    if space.config.source == "field":
+        space.train(iterations=1)
+        space.render_equirect(np.eye(4), 64)
     space.render(aside if config.keyframes == 1 else np.eye(4), 32, 16, math.pi / 2)
-    space.render_equirect(np.eye(4), 64)
