@@ -43,8 +43,8 @@ class JobKind(enum.Enum):
     TRAIN = "train"
 
 
-_SAME_POSE = 5e-4
-"""Metres and radians within which poses are the same: a tenth of a view's pixel. A standing robot's pose jitters."""
+_SAME_POSE = 2e-3
+"""Metres and radians within which poses are the same: a third of a view's pixel. A standing robot's pose jitters."""
 _CHANGES = (JobKind.SHOW, JobKind.LEARN, JobKind.TRAIN)
 """Jobs after which the same request gives another view."""
 _INPUT_JOBS = (JobKind.PREPARE, JobKind.SHOW, JobKind.RENDER)
@@ -196,11 +196,12 @@ class SpaceWorker:
 
     def _rendered(self, space: Space, order: ViewOrder) -> EncodedView:
         """The view of an order; the newest one again where it would be the same: a standing robot costs nothing."""
-        if self._newest is None or not self._newest.order.same_view(order):
-            encoded = _render(space, order)
-            self._newest = None if space.dissolving else encoded
-            return encoded
-        return self._newest
+        if self._newest is not None and self._newest.order.same_view(order):
+            return self._newest
+        changes = space.dissolving
+        encoded = _render(space, order)
+        self._newest = None if changes else encoded
+        return encoded
 
     def _yield_to_others(self) -> None:
         """Lower this thread's priority (Linux has one per thread)."""

@@ -139,6 +139,44 @@ def test_the_warp_as_the_source_is_ready_with_the_keyframe():
         assert bus.last("/vspace/view").confidence > 0.9
 
 
+def test_auto_trains_nothing_on_a_cpu():
+    with LockstepBus(start_ns=10 * S) as bus:
+        node = bus.add(NerfNode, NerfConfig(space=dataclasses.replace(SPACE, source="auto")))
+        bus.publish("/keyframe", keyframe_message(number=4), latched=True)
+        bus.advance(1.0)
+        status = bus.last("/vspace/status")
+        assert (status.state, status.keyframe_id, status.iterations) == (READY, 4, 0)
+        assert "source: warp" in status.message
+        assert node.work.space._scene is None  # not even an occupancy grid
+
+
+def test_a_view_is_rendered_again_only_when_it_would_differ():
+    with LockstepBus(start_ns=10 * S) as bus:
+        node = bus.add(NerfNode, NerfConfig(space=dataclasses.replace(SPACE, source="warp")))
+        bus.publish("/keyframe", keyframe_message(number=4), latched=True)
+        space, rendered = node.work.space, []
+        whole = space.render
+        space.render = lambda *args: rendered.append(args) or whole(*args)
+
+        def renders(request):
+            rendered.clear()
+            bus.publish("/view/request", request)
+            assert bus.last("/vspace/view").request_id == request.id  # the page waits for an answer to each
+            return len(rendered)
+
+        beside = CAMERA @ pose_matrix(y=0.001)
+        assert [renders(request_message(number)) for number in (1, 2)] == [1, 0]
+        assert renders(request_message(3, pose=beside)) == 0
+        assert bus.last("/vspace/view").pose == pose_message(CAMERA)  # where it was rendered
+        assert renders(request_message(4, pose=CAMERA @ pose_matrix(y=0.004))) == 1
+        assert renders(request_message(5, pose=CAMERA @ pose_matrix(y=0.004), fov=1.4)) == 1
+        bus.publish("/keyframe", keyframe_message(number=5), latched=True)
+        numbers = range(6, 6 + SPACE.picture.refresh_pictures + 2)
+        # Rendered until the keyframe before has dissolved into the new one, once more, and then no more.
+        counts = [renders(request_message(number, pose=beside)) for number in numbers]
+        assert counts == [1] * SPACE.picture.refresh_pictures + [0, 0], counts
+
+
 def test_the_same_input_gives_the_same_bytes():
     def run():
         with LockstepBus(start_ns=10 * S) as bus:
