@@ -1,7 +1,8 @@
-"""Estimates the depth of the camera's panoramas (paper, section IV.B): newest image only, at a limited rate."""
+"""Estimates the depth of the camera's panoramas (paper, section IV.B) that are requested, at a limited rate."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from instant_ic.depth.model import DEFAULT_MODEL, DepthModel, InferenceError
 from instant_ic.depth.providers import CHOICES
 from instant_ic.jpeg import JpegError
 from instant_ic.limits import decode_rgb
-from instant_ic.msg import CompressedImage, DepthModelInfo, Image, header, image_message, stamp_ns
+from instant_ic.msg import CompressedImage, DepthModelInfo, Header, Image, header, image_message, stamp_ns
 from instant_ic.paths import shipped_file
 
 _WATCH_S = 0.5
@@ -31,7 +32,8 @@ class DepthEstimatorConfig:
         model: ONNX file or its manifest; a bare name is searched for in ``models/``.
         provider: execution provider; ``auto`` takes the first of TensorRT, CUDA and CPU that works.
         threads: CPU threads per inference.
-        max_rate_hz: highest rate of estimates, per second; leaves CPU time to other nodes.
+        max_rate_hz: highest rate of estimates, per second; leaves CPU time to other nodes. Without any request, as in
+            the replay of an older bag, this is the rate.
         max_age_s: age of an image at the end of its estimation, in seconds, above which the node warns.
         timeout_s: seconds after which an inference is cancelled and reported.
     """
@@ -52,14 +54,16 @@ class DepthEstimatorConfig:
 
 
 class DepthEstimatorNode(Node[DepthEstimatorConfig]):
-    """``/camera/image/compressed`` → ``/depth/raw``, ``/depth/model``."""
+    """``/camera/image/compressed``, ``/depth/request`` → ``/depth/raw``, ``/depth/model``."""
 
     name = "depth_estimator"
     live_parameters = ("max_rate_hz", "max_age_s", "timeout_s")
 
     def setup(self) -> None:
         self.load(self.config.provider)
+        self.newest: Any = None  # image
         self.last_ns: int | None = None
+        self.wanted_ns = -math.inf  # images from this stamp on: all before the first request, then none without one
         self.began_ns = 0  # start of the running inference on the steady clock; 0 while none runs
         self.failures = 0
         self.depth = self.publisher("/depth/raw", Image, qos=SENSOR)
@@ -67,6 +71,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.publish_model()
         self.worker = self.background(self.estimate, self.on_result)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_image, qos=SENSOR)
+        self.subscribe("/depth/request", Header, self.on_request, qos=LATCHED)
         self.timer(_WATCH_S, self.watch)
 
     def load(self, provider: str) -> None:
@@ -97,12 +102,27 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.info.publish(info)
 
     def on_image(self, message: Any) -> None:
+        self.newest = message
+        self.serve()
+
+    def on_request(self, request: Any) -> None:
+        stamp = stamp_ns(request)
+        begun = self.last_ns is not None and 0 <= self.last_ns - stamp < 1e9 / self.config.max_rate_hz
+        self.wanted_ns = math.inf if begun else stamp
+        if self.newest is not None:
+            self.serve()
+
+    def serve(self) -> None:
+        """Estimate the newest image if it is wanted, or wait for the next one."""
         # By the images' stamps, so that a replay picks the same ones; 5 % tolerance for the camera's jitter.
-        stamp = stamp_ns(message)
-        if self.last_ns is not None and 0 <= stamp - self.last_ns < 0.95e9 / self.config.max_rate_hz:
+        stamp = stamp_ns(self.newest)
+        early = self.last_ns is not None and 0 <= stamp - self.last_ns < 0.95e9 / self.config.max_rate_hz
+        if early or stamp < self.wanted_ns:
             return
         self.last_ns = stamp
-        self.worker.submit(message)
+        if self.wanted_ns > -math.inf:
+            self.wanted_ns = math.inf
+        self.worker.submit(self.newest)
 
     def estimate(self, message: Any) -> tuple[Any, NDArray[np.float32] | None, str]:
         """Run on the worker's thread; return header, depth, and an error text if there is no depth."""

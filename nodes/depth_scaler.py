@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.depth.fusion import FusionConfig
-from instant_ic.depth.inputs import KEEP_NS, HeldImage, RecentInputs, Revolution, RevolutionTrigger, SilenceWatch
+from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, Revolution, RevolutionTrigger
 from instant_ic.depth.keyframes import KeyframeSelectionConfig, KeyframeSelector, encode_sigma
 from instant_ic.depth.lidar_depth import LidarDepthConfig
 from instant_ic.depth.metric_depth import Frames, MetricDepth, MetricDepthConfig
@@ -22,6 +22,7 @@ from instant_ic.geometry.transforms import TransformError
 from instant_ic.msg import (
     CompressedImage,
     DepthModelInfo,
+    Header,
     Image,
     Keyframe,
     PointCloud2,
@@ -34,6 +35,8 @@ from instant_ic.msg import (
     stamp_ns,
 )
 
+_SILENT_S = 10.0  # without an answer to any request
+
 
 @dataclass(frozen=True)
 class DepthScalerConfig:
@@ -45,7 +48,7 @@ class DepthScalerConfig:
         lidar: depth from points alone.
         fusion: combination of both.
         keyframes: selection of keyframes.
-        max_rate_hz: rate of source ``lidar``, by the images' stamps; the others follow ``/depth/raw``.
+        max_rate_hz: highest rate of source ``lidar``, by the images' stamps; that of the others is depth_estimator's.
         rows: height of the depth image of source ``lidar``; the others have the network's.
         body_elevation_deg: below this elevation the image shows the robot itself, not the room; -90: nowhere.
         max_cloud_age_s: largest difference in seconds between the middle of a revolution and the image.
@@ -83,7 +86,9 @@ class DepthScalerConfig:
 
 
 class DepthScalerNode(Node[DepthScalerConfig]):
-    """``/depth/raw``, ``/lidar/points``, ``/tf``, ``/camera/image/compressed`` → ``/depth/scaled``, ``/keyframe``."""
+    """``/camera/image/compressed``, ``/tf`` → ``/depth/request``; with ``/depth/raw`` and ``/lidar/points`` →
+    ``/depth/scaled``, ``/keyframe``.
+    """
 
     name = "depth_scaler"
     live_parameters = tuple(one.name for one in fields(DepthScalerConfig))
@@ -91,9 +96,11 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     def setup(self) -> None:
         self.source = DepthSource(self.config.depth_source)
         self.selector = KeyframeSelector(self.config.keyframes)
-        self.inputs, self.trigger, self.silence = RecentInputs(), RevolutionTrigger(), SilenceWatch()
+        self.inputs, self.trigger, self.requests = RecentInputs(), RevolutionTrigger(), DepthRequests()
         self.model: Any = None
         self.last_ns: int | None = None  # stamp of the newest depth
+        self.image_ns = 0
+        self.request = self.publisher("/depth/request", Header, qos=LATCHED)
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
         self.warn_of_method()
@@ -127,16 +134,32 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.diagnose("model", OK, f"{message.name}: {message.output_kind} depth")
 
     def on_image(self, message: Any) -> None:
-        stamp = stamp_ns(message)
+        """Have the depth of an image computed if a keyframe could be taken of it."""
+        stamp, camera = stamp_ns(message), message.header.frame_id
+        if stamp < self.image_ns - KEEP_NS:
+            self.log.warning("time went back by %.1f s: restarting", (self.image_ns - stamp) / 1e9)
+            self.selector.restart()
+        self.image_ns = stamp
         self.inputs.add_image(stamp, message)
+        self.inputs.discard(self.requests.since_ns or stamp)
+        try:
+            due = self.selector.due(self.metric.map_from_camera(camera, stamp), stamp)
+        except TransformError as error:
+            return self.diagnose("pose", WARN, f"no keyframe without a pose: {error}")
+        self.diagnose("pose", OK, "the camera's pose is known")
+        if not due:
+            return
         if self.config.source == "lidar":
-            image = HeldImage(message.header.frame_id, stamp)
+            image = HeldImage(camera, stamp)
             late = self.trigger.image(image, self.last_ns, self.config.max_rate_hz, self.config.max_cloud_age_s)
             if late is not None:
                 self.handle(None, late.frame, late.stamp_ns)
-        elif silent_s := self.silence.silent_s(stamp, self.last_ns):
-            text = "does depth_estimator run? source lidar needs none"
-            self.diagnose("scale", WARN, f"no /depth/raw for {silent_s:.0f} s: {text}")
+        elif self.requests.due(stamp):
+            self.request.publish(header(camera, stamp))
+            silent_s = (stamp - self.requests.since_ns) / 1e9
+            if silent_s > _SILENT_S:
+                text = "does depth_estimator run? source lidar needs none"
+                self.diagnose("scale", WARN, f"no /depth/raw for {silent_s:.0f} s: {text}")
 
     def on_cloud(self, message: Any) -> None:
         time_s, xyz = cloud_array(message)["time"], functools.partial(cloud_xyz, message)
@@ -148,20 +171,17 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def on_depth(self, message: Any) -> None:
         if self.config.source != "lidar":
+            self.requests.answered()
             self.handle(image_array(message), message.header.frame_id, stamp_ns(message))
 
     def handle(self, raw: NDArray[np.float32] | None, camera: str, stamp: int) -> None:
         """Compute, report and publish the depth of the image taken at ``stamp``."""
-        if self.last_ns is not None and stamp < self.last_ns - KEEP_NS:
-            self.log.warning("time went back by %.1f s: restarting", (self.last_ns - stamp) / 1e9)
-            self.selector.restart()
         self.last_ns = stamp
         result = self.metric.estimate(raw, camera, stamp)
         self.diagnose("scale", OK if result.ok else WARN, result.message, **result.figures())
         if result.ok:
             self.scaled.publish(image_message(result.depth_m, "32FC1", camera, stamp))
         self.offer_keyframe(result, camera, stamp)
-        self.inputs.discard(stamp)
 
     def offer_keyframe(self, result: DepthResult, camera: str, stamp: int) -> None:
         image = self.inputs.images.get(stamp)

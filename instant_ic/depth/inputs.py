@@ -14,7 +14,7 @@ KEEP_NS = 4_000_000_000
 """Images and revolutions that differ more from the newest depth are discarded."""
 _MAX_IMAGES = 150
 _MAX_REVOLUTIONS = 40
-_SILENT_NS = 10_000_000_000
+_REPEAT_NS = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -115,21 +115,26 @@ class RevolutionTrigger:
         self._held = None
 
 
-class SilenceWatch:
-    """Notices that images arrive but no depth of the network."""
+class DepthRequests:
+    """Requests for the network's depth of an image: one at a time, repeated until there is an answer.
+
+    Attributes:
+        since_ns: stamp of the first image that was requested without an answer; None when there is none.
+    """
 
     def __init__(self) -> None:
-        self._since_ns: int | None = None
+        self.since_ns: int | None = None
+        self._newest_ns = 0
 
-    def silent_s(self, image_ns: int, depth_ns: int | None) -> float:
-        """Seconds without depth, by the images' stamps; 0 up to a limit of 10 s.
+    def due(self, stamp_ns: int) -> bool:
+        """Whether to request the depth of this image, of which a keyframe could be taken, or to wait for the answer."""
+        if self.since_ns is not None and 0 <= stamp_ns - self._newest_ns < _REPEAT_NS:
+            return False
+        if self.since_ns is None or stamp_ns < self.since_ns:
+            self.since_ns = stamp_ns
+        self._newest_ns = stamp_ns
+        return True
 
-        Args:
-            image_ns: stamp of the newest image.
-            depth_ns: stamp of the newest depth; None before the first.
-        """
-        if self._since_ns is None or image_ns < self._since_ns:
-            self._since_ns = image_ns
-            return 0.0
-        silence = image_ns - max(depth_ns or 0, self._since_ns)
-        return silence / 1e9 if silence > _SILENT_NS else 0.0
+    def answered(self) -> None:
+        """Depth has arrived. A slow network answers after the repetition, so any depth is the answer."""
+        self.since_ns = None

@@ -18,11 +18,13 @@ class KeyframeSelectionConfig:
     Attributes:
         distance_m: metres of motion to a new keyframe; smaller renews the virtual space more often.
         angle_deg: degrees of rotation to a new keyframe.
+        refresh_s: seconds after which the keyframe of a standing robot is taken again, for what has moved around it.
         unfit_after_s: seconds that a due keyframe waits for depth that can be scaled.
     """
 
     distance_m: Positive = 0.6
     angle_deg: Positive = 45.0
+    refresh_s: Positive = 30.0
     unfit_after_s: NotNegative = 5.0
 
     def __post_init__(self) -> None:
@@ -30,13 +32,14 @@ class KeyframeSelectionConfig:
 
 
 class KeyframeSelector:
-    """Decide for each scaled depth image in turn whether it becomes a keyframe."""
+    """Decide of which images a keyframe could be taken, and for each scaled depth image whether it becomes one."""
 
     def __init__(self, config: KeyframeSelectionConfig | None = None) -> None:
         self.config = config or KeyframeSelectionConfig()
         self.count = 0
         self._pose: NDArray[np.float64] | None = None
         self._fit = False
+        self._taken_ns = 0
         self._due_since_ns: int | None = None
 
     def take(self, map_from_camera: NDArray[np.float64], fit: bool, stamp_ns: int) -> bool:
@@ -47,7 +50,7 @@ class KeyframeSelector:
             fit: whether its depth could be scaled.
             stamp_ns: its time; waiting is measured by it.
         """
-        if not self._due(map_from_camera, fit):
+        if not self.due(map_from_camera, stamp_ns, fit):
             self._due_since_ns = None
             return False
         if not fit:
@@ -55,7 +58,8 @@ class KeyframeSelector:
                 self._due_since_ns = stamp_ns
             if stamp_ns - self._due_since_ns < self.config.unfit_after_s * 1e9:
                 return False
-        self._pose, self._fit, self._due_since_ns = np.array(map_from_camera), fit, None
+        self._pose, self._fit, self._taken_ns = np.array(map_from_camera), fit, stamp_ns
+        self._due_since_ns = None
         self.count += 1
         return True
 
@@ -63,8 +67,11 @@ class KeyframeSelector:
         """Forget the last keyframe: the next fit image becomes one. The count goes on."""
         self._pose, self._fit, self._due_since_ns = None, False, None
 
-    def _due(self, map_from_camera: NDArray[np.float64], fit: bool) -> bool:
+    def due(self, map_from_camera: NDArray[np.float64], stamp_ns: int, fit: bool = True) -> bool:
+        """Whether an image at this pose and time would become a keyframe, with depth that could be scaled (``fit``)."""
         if self._pose is None or (fit and not self._fit):
+            return True
+        if fit and stamp_ns - self._taken_ns >= self.config.refresh_s * 1e9:
             return True
         moved = float(np.linalg.norm(map_from_camera[:3, 3] - self._pose[:3, 3]))
         if moved >= self.config.distance_m:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Iterable, Sequence
@@ -158,7 +159,7 @@ class HealthMonitor:
         for word, program, topic in MILESTONES:
             for spec in self._specs:
                 health = self.nodes.get(spec.label)
-                if spec.exec == program and health is not None and health.rates_hz.get(topic, 0.0) > 0:
+                if spec.exec == program and health is not None and health.ages_s.get(topic, math.inf) < math.inf:
                     self._reached.add(_labelled(spec, word))
 
     def _take(self, message: Any, group: str) -> None:

@@ -93,8 +93,8 @@ def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def publish_tf(bus: LockstepBus, stamp: int) -> None:
-    odom_from_base = inverse(MAP_FROM_ODOM) @ base_at(stamp)
+def publish_tf(bus: LockstepBus, stamp: int, map_from_base: np.ndarray | None = None) -> None:
+    odom_from_base = inverse(MAP_FROM_ODOM) @ (base_at(stamp) if map_from_base is None else map_from_base)
     bus.publish(
         "/tf",
         TFMessage(
@@ -205,12 +205,82 @@ def test_lidar_alone_needs_no_network() -> None:
         drive(bus, 2.5, network=False)
         scaled, keyframes = bus.messages("/depth/scaled"), bus.messages("/keyframe")
         assert level(node, "scale")[0] == 0
-    # Pictures at 0.2, 0.7, 1.2... s, one a second; the ceiling's height is the configuration's word.
-    assert [(stamp_ns(m) - START) / S for m in scaled] == [0.2, 1.2, 2.2]
+    # Images at 0.2, 0.7, 1.2... s, depth where a keyframe is due; the ceiling's height is from the configuration.
+    assert [(stamp_ns(m) - START) / S for m in scaled] == [0.2, 1.7]
     assert image_array(scaled[0]).shape == (128, 256)
     for message in scaled:
         assert np.quantile(far_off(image_array(message), stamp_ns(message)), 0.99) < 0.04
     assert keyframes[0].fit and keyframes[0].source == "lidar" and keyframes[0].scale == 1.0
+
+
+def images(bus: LockstepBus, x_m: list[float], begin: int, cloud: np.ndarray | None = None) -> list[int]:
+    """Images at 5 Hz, each from its place on the x axis, after a revolution of the LiDAR; returns their stamps."""
+    stamps = [begin + number * S // 5 for number in range(len(x_m))]
+    for stamp, x in zip(stamps, x_m, strict=True):
+        publish_tf(bus, stamp - S // 10, pose_matrix(x))
+        publish_tf(bus, stamp, pose_matrix(x))
+        if cloud is not None:
+            bus.publish("/lidar/points", cloud_message(cloud, "velodyne", stamp - S // 10), stamp_ns=stamp)
+        bus.publish("/camera/image/compressed", compressed_image_message(jpeg(1), "camera", stamp), stamp_ns=stamp)
+    return stamps
+
+
+def publish_mounts(bus: LockstepBus) -> None:
+    mounts = [("camera", BASE_FROM_CAMERA), ("velodyne", BASE_FROM_LIDAR)]
+    static = [transform_message(pose, "base_link", child, START) for child, pose in mounts]
+    bus.publish("/tf_static", TFMessage(static), stamp_ns=START, latched=True)
+
+
+def test_a_standing_robot_needs_one_depth_and_a_moving_one_at_once(model_file: Path) -> None:
+    anything = ScalerConfig(min_quality=0.0, max_scale=1e6, max_rival=1.0)
+    with LockstepBus(START) as bus:
+        estimator = bus.add(DepthEstimatorNode, DepthEstimatorConfig(model=str(model_file), max_rate_hz=0.5))
+        bus.add(DepthScalerNode, DepthScalerConfig(source="network", scaler=anything))
+        publish_mounts(bus)
+        cloud = revolution(START)
+        images(bus, [0.0] * 20, START + S, cloud)
+        assert [stamp_ns(m) - START for m in bus.messages("/depth/raw")] == [S]
+        assert [k.id for k in bus.messages("/keyframe")] == [1]
+        # 0.12 m an image: the fifth is the first at 0.6 m from the keyframe, and its own depth makes the next one.
+        stamps = images(bus, [0.12 * n + 1e-6 for n in range(1, 8)], START + 6 * S, cloud)
+        for topic in ("/depth/request", "/depth/raw", "/depth/scaled", "/keyframe"):
+            assert stamp_ns(bus.last(topic)) == stamps[4] and len(bus.messages(topic)) == 2, topic
+        assert estimator.diagnoses()["depth"][0] == 0
+
+
+def test_what_moves_around_a_standing_robot_is_seen_after_a_while(model_file: Path) -> None:
+    config = DepthScalerConfig(keyframes=KeyframeSelectionConfig(refresh_s=2.0), scaler=ScalerConfig("as_estimated"))
+    with LockstepBus(START) as bus:
+        bus.add(DepthEstimatorNode, DepthEstimatorConfig(model=str(model_file)))
+        bus.add(DepthScalerNode, config)
+        publish_mounts(bus)
+        images(bus, [0.0] * 25, START)
+        assert [(stamp_ns(k) - START) / S for k in bus.messages("/keyframe")] == [0.0, 2.0, 4.0]
+        assert len(bus.messages("/depth/raw")) == 3
+
+
+def test_a_request_is_repeated_until_depth_arrives() -> None:
+    with LockstepBus(START) as bus:
+        bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated")))
+        publish_mounts(bus)
+        stamps = images(bus, [0.0] * 16, START)
+        assert [stamp_ns(m) for m in bus.messages("/depth/request")] == [stamps[0], stamps[10]]
+        depth = room_depth(BASE_FROM_CAMERA)
+        bus.publish("/depth/raw", image_message(depth, "32FC1", "camera", stamps[10]), stamp_ns=stamps[15] + 1)
+        assert [stamp_ns(k) for k in bus.messages("/keyframe")] == [stamps[10]]
+        images(bus, [0.0] * 16, START + 4 * S)
+        assert len(bus.messages("/depth/request")) == 2
+
+
+def test_time_that_goes_back_makes_a_new_keyframe() -> None:
+    with LockstepBus(START) as bus:
+        bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated")))
+        publish_mounts(bus)
+        depth = room_depth(BASE_FROM_CAMERA)
+        for begin in (START + 20 * S, START + 10 * S):
+            (stamp,) = images(bus, [0.0], begin)
+            bus.publish("/depth/raw", image_message(depth, "32FC1", "camera", stamp), stamp_ns=stamp)
+        assert [stamp_ns(k) - START for k in bus.messages("/keyframe")] == [20 * S, 10 * S]
 
 
 def test_lidar_alone_tells_a_silent_lidar() -> None:
@@ -224,9 +294,7 @@ def test_lidar_alone_tells_a_silent_lidar() -> None:
 def test_a_silent_network_is_told() -> None:
     with LockstepBus(START) as bus:
         node = bus.add(DepthScalerNode)
-        for second in range(13):
-            stamp = START + second * S
-            bus.publish("/camera/image/compressed", compressed_image_message(b"x", "camera", stamp), stamp_ns=stamp)
+        drive(bus, 12.7, network=False, lidar=False)
         severity, words = level(node, "scale")
     assert severity == 1 and "no /depth/raw for 12 s" in words and "source lidar" in words
 
@@ -359,6 +427,34 @@ def test_estimator_keeps_stamp_frame_and_rate(model_file: Path) -> None:
     np.testing.assert_array_equal(image_array(depths[1]), node.model.estimate(np.ascontiguousarray(picture)))
 
 
+def test_estimator_takes_what_is_requested(model_file: Path) -> None:
+    def image(tick: int) -> None:
+        stamp = START + tick * S // 5
+        bus.publish("/camera/image/compressed", compressed_image_message(jpeg(1), "camera", stamp), stamp_ns=stamp)
+
+    def request(tick: int) -> None:
+        bus.publish("/depth/request", header("camera", START + tick * S // 5), latched=True)
+
+    def estimated() -> list[int]:
+        return [(stamp_ns(m) - START) * 5 // S for m in bus.messages("/depth/raw")]
+
+    with LockstepBus(START) as bus:
+        bus.add(DepthEstimatorNode, DepthEstimatorConfig(model=str(model_file), max_rate_hz=2.0))
+        for tick in range(4):
+            image(tick)
+        assert estimated() == [0, 3]  # nobody has requested anything yet: as in the replay of an older bag
+        request(2)  # a newer one has been estimated since
+        for tick in range(4, 12):
+            image(tick)
+        assert estimated() == [0, 3]
+        request(11)  # the newest image
+        assert estimated() == [0, 3, 11]
+        request(12)  # still to come, and earlier than the rate allows: a later one
+        for tick in range(12, 20):
+            image(tick)
+        assert estimated() == [0, 3, 11, 14]
+
+
 def test_estimator_tells_broken_pictures_and_old_depth(model_file: Path) -> None:
     with LockstepBus(START) as bus:
         node = bus.add(DepthEstimatorNode, DepthEstimatorConfig(model=str(model_file)))
@@ -392,6 +488,9 @@ def test_selector_by_hand() -> None:
     assert not selector.take(away, False, 13 * S)
     assert selector.take(away, True, 14 * S)
     assert selector.count == 5
+    assert not selector.due(away, 43 * S)
+    assert selector.due(away, 44 * S)  # 30 s: what stands around may have moved
+    assert not selector.due(away, 44 * S, fit=False)
     selector.restart()
     assert selector.take(away, True, 15 * S)
     assert selector.count == 6

@@ -168,6 +168,19 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
         transport.close()
 
 
+def test_one_message_reaches_a_milestone(tmp_path: Path) -> None:
+    monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
+    try:
+        monitor._take(beat("my_slam", rate_hz=0.0, age_s=float("inf")), "")
+        monitor.poll()
+        assert monitor.waiting_for() == ["map"]
+        monitor._take(beat("my_slam", rate_hz=0.0, age_s=40.0), "")  # a single message has no rate
+        monitor.poll()
+        assert monitor.waiting_for() == []
+    finally:
+        monitor.close()
+
+
 def test_a_topic_that_flowed_and_slows_down_or_stops_is_a_fault_after_a_while(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
