@@ -156,7 +156,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
                 self.handle(None, late.frame, late.stamp_ns)
         elif self.requests.due(stamp):
             self.request.publish(header(camera, stamp))
-            silent_s = (stamp - self.requests.since_ns) / 1e9
+            silent_s = (stamp - (self.requests.since_ns or stamp)) / 1e9
             if silent_s > _SILENT_S:
                 text = "does depth_estimator run? source lidar needs none"
                 self.diagnose("scale", WARN, f"no /depth/raw for {silent_s:.0f} s: {text}")
