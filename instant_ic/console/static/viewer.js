@@ -2,53 +2,23 @@
 // The view in WebGL 2: panorama and rendered view in one projection and one pass.
 
 /** @import { Scene } from "./images.js" */
+import { plain } from "./colour.js";
+import { rotate } from "./math.js";
+import { Program } from "./program.js";
 
-const VERTEX = `#version 300 es
-out vec2 screen;
-void main() {
-  vec2 corner = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2);
-  screen = corner * 2.0 - 1.0;
-  gl_Position = vec4(screen, 0.0, 1.0);
-}`;
+const EDGE = 0.94; // the rendered view fades out from here to 1, its edge
+const SOFT_LEVEL = 4; // mipmap level of the view for unseen places
 
-const FRAGMENT = `#version 300 es
+const COMMON = `
 precision highp float;
 in vec2 screen;
 out vec4 colour;
-uniform sampler2D panorama, view, mask, depth;
-uniform bool hasPanorama;
-uniform mat3 panoramaFromLook, viewFromLook;
-uniform vec2 tanHalf;      // of the shown field of view
-uniform vec2 viewTanHalf;  // of the rendered view
-uniform vec2 viewSize;     // pixels
-uniform float blend;       // 0 camera, 1 virtual space
-uniform bool hasMask;
-uniform bool slow;         // the CPU renders
-uniform bool moved;        // the camera has moved since the view was rendered
-uniform vec2 aside;        // motion to the right and up, divided by viewTanHalf, m
-uniform float along;       // motion forward, m
-uniform float perInverse;  // inverse depth along the axis of value 1 in the depth image, 1/m
-uniform float mostInverse; // upper limit: nearer surfaces would tear
-uniform int only;          // 0 the result; for samples: 1 the panorama, 2 the view with its confidence as alpha
-uniform vec3 panoramaGain, panoramaOffset, viewGain, viewOffset;
-const float PI = 3.14159265358979;
-const vec3 NIGHT = vec3(0.035, 0.043, 0.055);
+uniform sampler2D view;
 const vec3 GREY = vec3(0.30, 0.59, 0.11);
-const float SOFT_LEVEL = 4.0; // mipmap level of the view for unseen places
 
-vec3 fromPanorama(vec3 direction) {
-  if (!hasPanorama) return NIGHT;
-  vec3 d = panoramaFromLook * direction;
-  float u = 0.5 - atan(d.y, d.x) / (2.0 * PI);
-  float v = 0.5 - asin(clamp(d.z, -1.0, 1.0)) / PI;
-  return textureLod(panorama, vec2(u, v), 0.0).rgb;
-}
-
-// Cubic B-spline by four bilinear look-ups: an enlarged small view stays smooth, without visible pixels.
-vec3 smoothView(vec2 uv, float level) {
-  if (slow && level == 0.0) return textureLod(view, uv, 0.0).rgb; // four look-ups would be a third of the CPU's work
-  vec2 viewSize = max(floor(viewSize / exp2(level)), 1.0);
-  vec2 p = uv * viewSize - 0.5;
+// Cubic B-spline by four bilinear look-ups: an enlarged small image stays smooth, without visible pixels.
+vec4 smoothView(vec2 uv, vec2 size, float level) {
+  vec2 p = uv * size - 0.5;
   vec2 i = floor(p), f = p - i;
   vec2 f2 = f * f, f3 = f2 * f;
   vec2 w0 = (1.0 - 3.0 * f + 3.0 * f2 - f3) / 6.0;
@@ -56,10 +26,47 @@ vec3 smoothView(vec2 uv, float level) {
   vec2 w3 = f3 / 6.0;
   vec2 w2 = 1.0 - w0 - w1 - w3;
   vec2 low = w0 + w1, high = w2 + w3;
-  vec2 a = (i - 0.5 + w1 / low) / viewSize, b = (i + 1.5 + w3 / high) / viewSize;
+  vec2 a = (i - 0.5 + w1 / low) / size, b = (i + 1.5 + w3 / high) / size;
   return mix(
     mix(textureLod(view, vec2(a.x, a.y), level), textureLod(view, vec2(b.x, a.y), level), high.x),
-    mix(textureLod(view, vec2(a.x, b.y), level), textureLod(view, vec2(b.x, b.y), level), high.x), high.y).rgb;
+    mix(textureLod(view, vec2(a.x, b.y), level), textureLod(view, vec2(b.x, b.y), level), high.x), high.y);
+}`;
+
+// Once per view: seen places are sharp; the rest is a guess from its surroundings, so it is blurred and paler.
+const SOFTEN = `${COMMON}
+uniform sampler2D mask;
+uniform vec2 softSize; // pixels of that mipmap level
+void main() {
+  vec2 uv = 0.5 + 0.5 * screen;
+  float level = textureLod(mask, uv, 0.0).r, seen = smoothstep(0.0, 1.0, level);
+  vec3 soft = smoothView(uv, softSize, ${SOFT_LEVEL}.0).rgb;
+  colour = vec4(mix(mix(soft, vec3(dot(soft, GREY)), 0.5), textureLod(view, uv, 0.0).rgb, seen), level);
+}`;
+
+// A CPU executes all branches of a shader. Each combination of the constants has a program without the unused ones:
+// REAL: the camera's image is visible; VIEW: the rendered view is; MOVED: the camera has moved since that was rendered;
+// PLAIN: the CPU renders; SAMPLE: the result is the view with its confidence as alpha.
+const FRAGMENT = `${COMMON}
+uniform sampler2D panorama, depth;
+uniform mat3 panoramaFromLook, viewFromLook;
+uniform vec2 tanHalf;      // of the shown field of view
+uniform vec2 viewTanHalf;  // of the rendered view
+uniform vec2 viewSize;     // pixels
+uniform float blend;       // 0 camera, 1 virtual space
+uniform vec2 aside;        // motion to the right and up, divided by viewTanHalf, m
+uniform float along;       // motion forward, m
+uniform float perInverse;  // inverse depth along the axis of value 1 in the depth image, 1/m
+uniform float mostInverse; // upper limit: nearer surfaces would tear
+uniform vec3 panoramaGain, panoramaOffset, viewGain, viewOffset;
+const float PI = 3.14159265358979;
+const float EDGE = ${EDGE};
+const vec3 NIGHT = vec3(0.035, 0.043, 0.055);
+
+vec3 fromPanorama(vec3 direction) {
+  vec3 d = panoramaFromLook * direction;
+  float u = 0.5 - atan(d.y, d.x) / (2.0 * PI);
+  float v = 0.5 - asin(clamp(d.z, -1.0, 1.0)) / PI;
+  return textureLod(panorama, vec2(u, v), 0.0).rgb;
 }
 
 // Position in the rendered view of what the moved camera sees. Fixed-point iteration on the depth, from the
@@ -75,43 +82,29 @@ vec2 before(vec2 at) {
   return at + inverse * perInverseDepth;
 }
 
-// Seen places are sharp; the rest is a guess from its surroundings, so it is shown blurred and paler.
-vec3 fromView(vec2 uv) {
-  float seen = hasMask ? smoothstep(0.0, 1.0, textureLod(mask, uv, 0.0).r) : 1.0;
-  vec3 result = seen > 0.004 ? smoothView(uv, 0.0) : vec3(0.0);
-  if (seen < 0.996) {
-    vec3 soft = smoothView(uv, SOFT_LEVEL);
-    result = mix(mix(soft, vec3(dot(soft, GREY)), 0.5), result, seen);
-  }
-  return result;
-}
-
 void main() {
   vec3 direction = normalize(vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y));
-  if (only == 1) {
-    colour = vec4(fromPanorama(direction), 1.0);
-    return;
-  }
-  vec3 d = viewFromLook * direction;
-  vec2 uv = vec2(0.0);
+  vec3 real = vec3(0.0);
+  vec4 rendered = vec4(0.0);
   float inside = 0.0; // inside the rendered view, with a soft edge
-  if (blend > 0.0 && d.x > 0.0) {
+  if (REAL) real = fromPanorama(direction) * panoramaGain + panoramaOffset;
+  if (VIEW) {
+    vec3 d = viewFromLook * direction;
     vec2 at = vec2(-d.y, d.z) / (d.x * viewTanHalf);
-    if (moved) at = before(at);
-    vec2 edge = smoothstep(1.0, 0.94, abs(at));
-    uv = vec2(0.5 + 0.5 * at.x, 0.5 - 0.5 * at.y);
-    inside = edge.x * edge.y;
+    if (MOVED) at = before(at);
+    vec2 edge = smoothstep(1.0, EDGE, abs(at)), uv = vec2(0.5 + 0.5 * at.x, 0.5 - 0.5 * at.y);
+    if (REAL || SAMPLE) inside = d.x > 0.0 ? edge.x * edge.y : 0.0;
+    else inside = 1.0;
+    // Four look-ups would be a third of the CPU's work.
+    rendered = PLAIN ? textureLod(view, uv, 0.0) : smoothView(uv, viewSize, 0.0);
   }
-  if (only == 2) {
-    colour = vec4(smoothView(uv, 0.0), inside * (hasMask ? textureLod(mask, uv, 0.0).r : 1.0));
-    return;
+  if (SAMPLE) colour = vec4(rendered.rgb, inside * rendered.a);
+  else if (!VIEW) colour = vec4(real, 1.0);
+  else {
+    // Beyond the rendered view's edge the camera's image continues, dim and grey.
+    vec3 around = mix(NIGHT, vec3(dot(real, GREY)), 0.35);
+    colour = vec4(mix(real, mix(around, rendered.rgb * viewGain + viewOffset, inside), blend), 1.0);
   }
-  vec3 real = vec3(0.0), rendered = vec3(0.0);
-  if (blend < 1.0 || inside < 1.0) real = fromPanorama(direction) * panoramaGain + panoramaOffset;
-  if (inside > 0.0) rendered = fromView(uv) * viewGain + viewOffset;
-  // Beyond the rendered view's edge the camera's image continues, dim and grey.
-  vec3 around = mix(NIGHT, vec3(dot(real, GREY)), 0.35);
-  colour = vec4(mix(real, mix(around, rendered, inside), blend), 1.0);
 }`;
 
 /** Size of the samples, cells; each is the mean of SAMPLE_FINE × SAMPLE_FINE pixels. */
@@ -137,23 +130,22 @@ export class GlViewer {
     this.slow = /swiftshader|llvmpipe|software|basic render/i.test(renderer);
     this.lost = false;
     canvas.addEventListener("webglcontextlost", () => { this.lost = true; });
-    this._program = link(gl, VERTEX, FRAGMENT);
-    /** @type {Map<string, WebGLUniformLocation | null>} */
-    const places = new Map();
-    /** @param {string} name @returns {WebGLUniformLocation | null} */
-    this._at = (name) => {
-      if (!places.has(name)) places.set(name, gl.getUniformLocation(this._program, name));
-      return places.get(name) ?? null;
-    };
+    /** @type {Map<string, Program>} By the constants of FRAGMENT. */
+    this._programs = new Map();
+    this._softener = new Program(gl, SOFTEN);
     this._panorama = this._texture(0, gl.REPEAT);
     this._view = this._texture(1, gl.CLAMP_TO_EDGE);
     this._mask = this._texture(2, gl.CLAMP_TO_EDGE);
     this._depth = this._texture(3, gl.CLAMP_TO_EDGE);
+    this._softened = this._texture(4, gl.CLAMP_TO_EDGE);
+    this._softTarget = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this._softTarget);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this._softened, 0);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.activeTexture(gl.TEXTURE1);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_NEAREST);
-    gl.generateMipmap(gl.TEXTURE_2D);
-    this._hasPanorama = false;
-    this._hasMask = false;
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, 0);
+    this._viewUnit = 1; // 4: softened where the view was not seen
     this._perInverse = 0; // 1/m; 0: depth unknown
     this._viewSize = [1, 1];
     /** @type {WebGLSync | null} Signalled when the CPU has rendered the last frame. */
@@ -162,17 +154,18 @@ export class GlViewer {
     this._samples = null;
     this._renderedAt = 0;
     this._restUntil = 0;
-    gl.useProgram(this._program);
-    gl.uniform1i(this._at("panorama"), 0);
-    gl.uniform1i(this._at("view"), 1);
-    gl.uniform1i(this._at("mask"), 2);
-    gl.uniform1i(this._at("depth"), 3);
+    // A program is translated at its first use; that must not delay the first frame after a switch.
+    gl.viewport(0, 0, 1, 1);
+    for (const [real, view, sample] of [[true, false, false], [false, true, false], [true, true, false], [false, true, true]])
+      for (const moved of view ? [false, true] : [false]) {
+        this._use({ REAL: real, VIEW: view, MOVED: moved, PLAIN: this.slow, SAMPLE: sample });
+        gl.drawArrays(gl.TRIANGLES, 0, 3);
+      }
   }
 
   /** @param {ImageBitmap} bitmap */
   setPanorama(bitmap) {
     this._upload(0, this._panorama, bitmap);
-    this._hasPanorama = true;
   }
 
   /**
@@ -183,9 +176,8 @@ export class GlViewer {
   setView(bitmap, mask, depth) {
     this._upload(1, this._view, bitmap);
     this._viewSize = [bitmap.width, bitmap.height];
-    this.gl.generateMipmap(this.gl.TEXTURE_2D); // to blur unseen places
-    this._hasMask = mask !== null;
-    if (mask) this._upload(2, this._mask, mask);
+    this._viewUnit = mask ? 4 : 1;
+    if (mask) this._soften(mask);
     this._perInverse = depth ? 1 / depth.near_m : 0;
     if (depth) this._upload(3, this._depth, depth.image);
   }
@@ -193,7 +185,7 @@ export class GlViewer {
   /** @param {Scene} scene */
   render(scene) {
     const gl = this.gl;
-    this._render(scene, this.canvas.width, this.canvas.height, 0);
+    this._render(scene, this.canvas.width, this.canvas.height, false);
     if (!this.slow) return;
     if (this._fence) gl.deleteSync(this._fence);
     this._fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -227,46 +219,73 @@ export class GlViewer {
     this._samples ??= this._target(width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this._samples);
     const pixels = new Uint8Array(4 * width * height);
-    /** @param {number} only */
-    const read = (only) => {
-      this._render({ ...scene, blend: 1 }, width, height, only);
+    const raw = { ...scene, panoramaColour: plain, viewColour: plain };
+    /** @param {number} blend */
+    const read = (blend) => {
+      this._render({ ...raw, blend }, width, height, blend === 1);
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
       return cells(pixels);
     };
-    const panorama = read(1), view = read(2);
+    const panorama = read(0), view = read(1);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     return { 1: panorama.colours, 2: view.colours, weights: view.alpha };
   }
 
-  /** @param {Scene} scene @param {number} width @param {number} height @param {number} only see the shader */
-  _render(scene, width, height, only) {
-    const gl = this.gl;
+  /** @param {Scene} scene @param {number} width @param {number} height @param {boolean} sample see the shader */
+  _render(scene, width, height, sample) {
+    const gl = this.gl, shown = scene.blend > 0;
+    const moved = shown && this._perInverse > 0 ? scene.moved : null;
+    const mostInverse = moved ? Math.min(this._perInverse, MOST_PARALLAX / Math.hypot(...moved)) : 0;
+    const real = !sample && (scene.blend < 1 || !covers(scene, mostInverse));
+    const at = this._use({ REAL: real, VIEW: shown, MOVED: moved !== null, PLAIN: this.slow, SAMPLE: sample });
     gl.viewport(0, 0, width, height);
-    gl.uniform1i(this._at("only"), only);
-    gl.uniform1i(this._at("hasMask"), this._hasMask ? 1 : 0);
-    gl.uniform1i(this._at("slow"), this.slow ? 1 : 0);
-    gl.uniform3fv(this._at("panoramaGain"), scene.panoramaColour.gain);
-    gl.uniform3fv(this._at("panoramaOffset"), scene.panoramaColour.offset);
-    gl.uniform3fv(this._at("viewGain"), scene.viewColour.gain);
-    gl.uniform3fv(this._at("viewOffset"), scene.viewColour.offset);
-    gl.uniform1i(this._at("hasPanorama"), this._hasPanorama ? 1 : 0);
+    gl.uniform1i(at("view"), this._viewUnit);
+    gl.uniform3fv(at("panoramaGain"), scene.panoramaColour.gain);
+    gl.uniform3fv(at("panoramaOffset"), scene.panoramaColour.offset);
+    gl.uniform3fv(at("viewGain"), scene.viewColour.gain);
+    gl.uniform3fv(at("viewOffset"), scene.viewColour.offset);
     // transpose = true: our matrices are row-major.
-    gl.uniformMatrix3fv(this._at("panoramaFromLook"), true, scene.panoramaFromLook);
-    gl.uniformMatrix3fv(this._at("viewFromLook"), true, scene.viewFromLook);
-    gl.uniform2fv(this._at("tanHalf"), scene.tanHalf);
-    gl.uniform2fv(this._at("viewTanHalf"), scene.viewTanHalf);
-    gl.uniform2fv(this._at("viewSize"), this._viewSize);
-    const moved = this._perInverse > 0 ? scene.moved : null;
-    gl.uniform1i(this._at("moved"), moved ? 1 : 0);
+    gl.uniformMatrix3fv(at("panoramaFromLook"), true, scene.panoramaFromLook);
+    gl.uniformMatrix3fv(at("viewFromLook"), true, scene.viewFromLook);
+    gl.uniform2fv(at("tanHalf"), scene.tanHalf);
+    gl.uniform2fv(at("viewTanHalf"), scene.viewTanHalf);
+    gl.uniform2fv(at("viewSize"), this._viewSize);
     if (moved) {
       const [forward, left, up] = moved;
-      gl.uniform2f(this._at("aside"), -left / scene.viewTanHalf[0], up / scene.viewTanHalf[1]);
-      gl.uniform1f(this._at("along"), forward);
-      gl.uniform1f(this._at("perInverse"), this._perInverse);
-      gl.uniform1f(this._at("mostInverse"), Math.min(this._perInverse, MOST_PARALLAX / Math.hypot(...moved)));
+      gl.uniform2f(at("aside"), -left / scene.viewTanHalf[0], up / scene.viewTanHalf[1]);
+      gl.uniform1f(at("along"), forward);
+      gl.uniform1f(at("perInverse"), this._perInverse);
+      gl.uniform1f(at("mostInverse"), mostInverse);
     }
-    gl.uniform1f(this._at("blend"), scene.blend);
+    gl.uniform1f(at("blend"), scene.blend);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** Blurs the view where the mask is dark. @param {OffscreenCanvas} mask */
+  _soften(mask) {
+    const gl = this.gl, [width, height] = this._viewSize, at = this._softener.use();
+    this._upload(2, this._mask, mask);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, SOFT_LEVEL);
+    gl.generateMipmap(gl.TEXTURE_2D);
+    gl.activeTexture(gl.TEXTURE4);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this._softTarget);
+    gl.viewport(0, 0, width, height);
+    gl.uniform1i(at("view"), 1);
+    gl.uniform2fv(at("softSize"), [width, height].map((size) => Math.max(size >> SOFT_LEVEL, 1)));
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAX_LEVEL, 0); // the next view may come without a mask
+  }
+
+  /** Uses the program with these constants; returns its uniforms by name. @param {Record<string, boolean>} constants */
+  _use(constants) {
+    const header = Object.entries(constants).map(([name, value]) => `const bool ${name} = ${value};\n`).join("");
+    let program = this._programs.get(header);
+    if (!program) this._programs.set(header, program = new Program(this.gl, header + FRAGMENT));
+    return program.use();
   }
 
   /** @param {number} width @param {number} height */
@@ -302,6 +321,22 @@ export class GlViewer {
 }
 
 /**
+ * Whether the rendered view fills the window at any depth.
+ * @param {Pick<Scene, "viewFromLook" | "tanHalf" | "viewTanHalf" | "moved">} scene
+ * @param {number} mostInverse largest inverse depth by which the view is moved, 1/m
+ */
+export function covers({ viewFromLook, tanHalf, viewTanHalf, moved }, mostInverse) {
+  const [forward, left, up] = moved ?? [0, 0, 0], aside = [-left / viewTanHalf[0], up / viewTanHalf[1]];
+  return [[-1, -1], [-1, 1], [1, -1], [1, 1]].every(([x, y]) => {
+    const d = rotate(viewFromLook, [1, -x * tanHalf[0], y * tanHalf[1]]);
+    const at = [-d[1] / (d[0] * viewTanHalf[0]), d[2] / (d[0] * viewTanHalf[1])];
+    // Linear in the inverse depth, so both ends decide.
+    return d[0] > 0 && [0, mostInverse].every((inverse) =>
+      at.every((value, i) => Math.abs(value + inverse * (aside[i] - forward * value)) <= EDGE));
+  });
+}
+
+/**
  * Averages RGBA pixels over the cells: 3 colours and 1 alpha per cell, 0..1.
  * @param {Uint8Array | Uint8ClampedArray} pixels
  * @returns {{colours: number[], alpha: number[]}}
@@ -315,21 +350,4 @@ export function cells(pixels) {
     alpha[cell] += pixels[4 * i + 3] * share;
   }
   return { colours, alpha };
-}
-
-/** @param {WebGL2RenderingContext} gl @param {string} vertexSource @param {string} fragmentSource */
-function link(gl, vertexSource, fragmentSource) {
-  const program = gl.createProgram();
-  for (const { type, source } of [
-    { type: gl.VERTEX_SHADER, source: vertexSource }, { type: gl.FRAGMENT_SHADER, source: fragmentSource }]) {
-    const shader = gl.createShader(type);
-    if (!shader) throw new Error("the WebGL context is lost");
-    gl.shaderSource(shader, source);
-    gl.compileShader(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`shader: ${gl.getShaderInfoLog(shader)}`);
-    gl.attachShader(program, shader);
-  }
-  gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(`program: ${gl.getProgramInfoLog(program)}`);
-  return program;
 }

@@ -1,0 +1,53 @@
+// @ts-check
+// WebGL 2 programs that fill the target: a fragment shader and its uniforms.
+
+const VERTEX = `#version 300 es
+out vec2 screen;
+void main() {
+  vec2 corner = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2);
+  screen = corner * 2.0 - 1.0;
+  gl_Position = vec4(screen, 0.0, 1.0);
+}`;
+
+/** A program that fills the target. */
+export class Program {
+  /** @param {WebGL2RenderingContext} gl @param {string} fragment */
+  constructor(gl, fragment) {
+    this._gl = gl;
+    this._program = link(gl, VERTEX, `#version 300 es\n${fragment}`);
+    /** @type {Map<string, WebGLUniformLocation | null>} */
+    this._places = new Map();
+    gl.useProgram(this._program);
+    ["panorama", "view", "mask", "depth"].forEach((name, unit) => gl.uniform1i(this._at(name), unit));
+  }
+
+  /** Uses it; returns its uniforms by name. */
+  use() {
+    this._gl.useProgram(this._program);
+    return this._at;
+  }
+
+  /** @param {string} name @returns {WebGLUniformLocation | null} */
+  _at = (name) => {
+    let place = this._places.get(name);
+    if (place === undefined) this._places.set(name, place = this._gl.getUniformLocation(this._program, name));
+    return place;
+  };
+}
+
+/** @param {WebGL2RenderingContext} gl @param {string} vertexSource @param {string} fragmentSource */
+function link(gl, vertexSource, fragmentSource) {
+  const program = gl.createProgram();
+  for (const { type, source } of [
+    { type: gl.VERTEX_SHADER, source: vertexSource }, { type: gl.FRAGMENT_SHADER, source: fragmentSource }]) {
+    const shader = gl.createShader(type);
+    if (!shader) throw new Error("the WebGL context is lost");
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`shader: ${gl.getShaderInfoLog(shader)}`);
+    gl.attachShader(program, shader);
+  }
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(`program: ${gl.getProgramInfoLog(program)}`);
+  return program;
+}
