@@ -30,6 +30,7 @@ const images = new Images(viewer, link);
 const screen = new Screen(viewer, images, look, link, lease);
 const recording = new Recording(link, drive);
 const pads = new Gamepads(drive, look);
+const wake = () => screen.wake();
 
 function makeViewer() {
   if (options.get("viewer") !== "canvas") {
@@ -66,7 +67,7 @@ onDetail(link, "message", (/** @type {Message} */ message) => {
       break;
     }
     case "state":
-      screen.state = message;
+      screen.take(message);
       hud.showMode(message, lease.driver);
       showBanner();
       break;
@@ -90,7 +91,7 @@ onDetail(link, "message", (/** @type {Message} */ message) => {
   }
 });
 onDetail(link, "frame", (/** @type {Frame} */ received) => {
-  if (received.kind === PANORAMA || received.kind === VIEW) images.take(received);
+  if (received.kind === PANORAMA || received.kind === VIEW) images.take(received).then(wake);
   else takeGrid(received);
 });
 
@@ -103,6 +104,7 @@ async function takeGrid(grid) {
   } catch (error) {
     console.warn(`map ${grid.sequence}: ${error}`);
   } finally {
+    wake();
     link.acknowledge(grid);
   }
 }
@@ -205,16 +207,21 @@ pads.addEventListener("stop", stopNow);
 pads.addEventListener("centre", () => look.centre());
 onDetail(pads, "scale", (/** @type {number} */ change) => setScale(+scale.value + change));
 onDetail(pads, "notice", hud.toast);
+drive.addEventListener("change", showCommand);
 onDetail(drive, "stop", (/** @type {string} */ why) => hud.toast(`Stopped: ${why}`));
 
 const keyCaps = [...document.querySelectorAll("#keys kbd")].filter((cap) => cap instanceof HTMLElement);
 
-/** @param {number} now */
-function frame(now) {
-  requestAnimationFrame(frame);
-  screen.frame(now);
+function showCommand() {
   hud.showCommand(drive);
   for (const cap of keyCaps) cap.classList.toggle("held", drive.holds(cap.dataset.code ?? ""));
+}
+
+for (const name of ["pointerdown", "pointermove", "wheel", "dblclick", "click", "keydown", "keyup", "resize"]) {
+  window.addEventListener(name, wake, { passive: true });
+}
+for (const [target, name] of /** @type {const} */ ([[link, "open"], [link, "lost"], [pads, "look"], [pads, "centre"]])) {
+  target.addEventListener(name, wake);
 }
 
 if (options.get("quality") === "full") viewer.slow = false;
@@ -222,4 +229,5 @@ mark("viewer", viewer.name);
 mark("quality", viewer.slow ? "plain" : "full");
 setScale(70);
 hud.showMode(null, lease.driver);
-requestAnimationFrame(frame);
+showCommand();
+wake();

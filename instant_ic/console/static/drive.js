@@ -25,7 +25,7 @@ export function isDriveKey(event) {
   return event.code in KEYS && !slider;
 }
 
-/** Event "stop" (detail: reason) when anything but a released key or stick ends a drive. */
+/** Events: "change" when keys, stick or command may have changed; "stop" (detail: reason) when anything but a released key or stick ends a drive. */
 export class Drive extends EventTarget {
   /** @param {Link} link */
   constructor(link) {
@@ -115,6 +115,7 @@ export class Drive extends EventTarget {
     const angular = clamp(left, -1, 1) * this.scale * this.limits.angular;
     const changed = linear !== this.command[0] || angular !== this.command[1];
     this.command = [linear, angular];
+    this.dispatchEvent(new Event("change"));
     if (!changed) return;
     this._send();
     const active = linear !== 0 || angular !== 0;

@@ -13,7 +13,7 @@ const LOOK_RATE = radians(110); // per second, at full deflection
 const STEP = 10; // percent of the speed limit
 
 /**
- * Events: "drive" (the shoulder button was pressed), "stop", "centre", "scale" (detail: percent to add),
+ * Events: "drive" (the shoulder button was pressed), "look" (the direction changed), "stop", "centre", "scale" (detail: percent to add),
  * "notice" (detail: text). It drives only if the window has focus and the button was pressed after it gained focus.
  */
 export class Gamepads extends EventTarget {
@@ -73,7 +73,10 @@ export class Gamepads extends EventTarget {
     if (fresh.includes(FASTER)) this._emit("scale", STEP);
     if (fresh.includes(SLOWER)) this._emit("scale", -STEP);
     const [yaw, pitch] = [deadZone(-pad.axes[2]), deadZone(-pad.axes[3])];
-    if (yaw || pitch) this.look.turn(yaw * LOOK_RATE * seconds, pitch * LOOK_RATE * seconds);
+    if (yaw || pitch) {
+      this.look.turn(yaw * LOOK_RATE * seconds, pitch * LOOK_RATE * seconds);
+      this._emit("look");
+    }
     if (fresh.some((button) => SHOULDERS.includes(button))) {
       this._driving = true;
       this._emit("drive");

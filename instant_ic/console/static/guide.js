@@ -10,6 +10,8 @@ const NAMES = { 0: "AHEAD", 90: "RIGHT", "-90": "LEFT", "-180": "BEHIND" };
 const NEAREST_M = 0.25;
 const REACH_M = 4; // the nearby floor is out of view, so the arc is extended to here
 const STEP_M = 0.1;
+const TILE = 64; // pixels of the window; the canvas covers whole tiles, so that its size seldom changes
+const RAIL = 2.5; // width, pixels of the window
 
 /**
  * Returns `points`, extended along the arc of their last bend to REACH_M from the start.
@@ -37,22 +39,68 @@ export function extended(points) {
 }
 
 /**
- * Draws `trajectory` (map frame, [[x, y], ...]) on the floor as seen by the shown camera.
+ * Draws `trajectory` (map frame, [[x, y], ...]) on the floor as seen by the shown camera, and fits the canvas around it:
+ * on a CPU, a layer over the whole window would cost as much as the view.
  * @param {HTMLCanvasElement} canvas @param {[number, number][]} trajectory
  * @param {{lookFromMap: Mat3, position: Vec3}} camera @param {[number, number]} tanHalf of the shown field of view
  * @param {number} halfWidth m @param {string} colour
  */
 export function drawGuide(canvas, trajectory, camera, tanHalf, halfWidth, colour) {
+  const ribbon = trajectory.length < 2 ? null : projected(trajectory, camera, tanHalf, halfWidth);
+  canvas.hidden = ribbon === null;
+  if (!ribbon) return;
+  const { left, right } = ribbon, ratio = Math.min(devicePixelRatio, 2), box = tiles([...left, ...right], innerWidth, innerHeight);
   const context = context2d(canvas);
-  context.clearRect(0, 0, canvas.width, canvas.height);
-  if (trajectory.length < 2) return;
+  Object.assign(canvas.style, { left: `${box.x}px`, top: `${box.y}px`, width: `${box.width}px`, height: `${box.height}px` });
+  canvas.width = box.width * ratio; // also clears it
+  canvas.height = box.height * ratio;
+  context.setTransform(ratio, 0, 0, ratio, -box.x * ratio, -box.y * ratio);
+  const near = Math.max(left[0][1], right[0][1]), far = Math.min(left[left.length - 1][1], right[right.length - 1][1]);
+  const fade = context.createLinearGradient(0, Math.min(near, innerHeight), 0, far);
+  fade.addColorStop(0, `${colour}66`);
+  fade.addColorStop(1, `${colour}08`);
+  context.fillStyle = fade;
+  context.beginPath();
+  left.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+  right.toReversed().forEach(([x, y]) => context.lineTo(x, y));
+  context.fill();
+  context.lineWidth = RAIL;
+  context.strokeStyle = `${colour}cc`;
+  for (const rail of [left, right]) {
+    context.beginPath();
+    rail.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+    context.stroke();
+  }
+}
+
+/**
+ * Smallest box of whole tiles around the points within the window, pixels.
+ * @param {[number, number][]} points @param {number} width of the window @param {number} height
+ */
+export function tiles(points, width, height) {
+  /** @param {0 | 1} axis @param {number} size */
+  const span = (axis, size) => {
+    const values = points.map((point) => point[axis]);
+    const from = TILE * Math.floor(Math.min(Math.max(Math.min(...values) - RAIL, 0), size) / TILE);
+    return [from, Math.min(TILE * Math.ceil(Math.max(...values) / TILE + RAIL / TILE), size)];
+  };
+  const [x, right] = span(0, width), [y, bottom] = span(1, height);
+  return { x, y, width: Math.max(right - x, 0), height: Math.max(bottom - y, 0) };
+}
+
+/**
+ * Both rails of the ribbon in the window, pixels; null if it is out of view.
+ * @param {[number, number][]} trajectory @param {{lookFromMap: Mat3, position: Vec3}} camera
+ * @param {[number, number]} tanHalf @param {number} halfWidth
+ */
+function projected(trajectory, camera, tanHalf, halfWidth) {
   /** @param {number} x @param {number} y @returns {[number, number] | null} */
   const project = (x, y) => {
     const p = rotate(camera.lookFromMap, [x - camera.position[0], y - camera.position[1], -camera.position[2]]);
     if (p[0] < NEAREST_M) return null;
     return [
-      canvas.width * (0.5 - p[1] / p[0] / tanHalf[0] / 2),
-      canvas.height * (0.5 - p[2] / p[0] / tanHalf[1] / 2),
+      innerWidth * (0.5 - p[1] / p[0] / tanHalf[0] / 2),
+      innerHeight * (0.5 - p[2] / p[0] / tanHalf[1] / 2),
     ];
   };
   trajectory = extended(trajectory);
@@ -70,23 +118,7 @@ export function drawGuide(canvas, trajectory, camera, tanHalf, halfWidth, colour
       right.push(r);
     }
   }
-  if (left.length < 2) return;
-  const near = Math.max(left[0][1], right[0][1]), far = Math.min(left[left.length - 1][1], right[right.length - 1][1]);
-  const fade = context.createLinearGradient(0, Math.min(near, canvas.height), 0, far);
-  fade.addColorStop(0, `${colour}66`);
-  fade.addColorStop(1, `${colour}08`);
-  context.fillStyle = fade;
-  context.beginPath();
-  left.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
-  right.toReversed().forEach(([x, y]) => context.lineTo(x, y));
-  context.fill();
-  context.lineWidth = 2.5 * devicePixelRatio;
-  context.strokeStyle = `${colour}cc`;
-  for (const rail of [left, right]) {
-    context.beginPath();
-    rail.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
-    context.stroke();
-  }
+  return left.length < 2 ? null : { left, right };
 }
 
 /**

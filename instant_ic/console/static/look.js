@@ -50,6 +50,11 @@ export class Look {
     window.addEventListener("blur", () => this._held.clear());
   }
 
+  /** Whether keys or centring turn it. */
+  get moves() {
+    return this._held.size > 0 || this._centring !== null;
+  }
+
   /** Turns to straight ahead. */
   centre() {
     this._centring = { yaw: this.yaw, pitch: this.pitch, start: performance.now() };

@@ -1,5 +1,6 @@
 // @ts-check
-// Renders the page once per frame of the display: main image, trajectory, compass and map; each only if it has changed.
+// Renders main image, trajectory, compass and map, each only if it has changed. Frames follow each other while something
+// moves; otherwise a message, an image or an input calls for the next one.
 
 /** @import { Settings } from "./settings.js" */
 /** @import { Plan, State } from "./messages.js" */
@@ -9,6 +10,7 @@
 /** @import { Look } from "./look.js" */
 /** @import { Vec3 } from "./math.js" */
 import { byId, elementOf, mark } from "./dom.js";
+import { FrameRate } from "./framerate.js";
 import { drawCompass, drawGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
@@ -21,8 +23,9 @@ const LOOK_MS = 100; // shortest interval between two look messages
 const MAX_FOV = radians(149);
 const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
-const SLOW_PIXELS = 0.5;
+const SLOW_PIXELS = 0.5, SLOW_VIEW_PIXELS = 0.36; // share of the window's pixels per axis; a rendered view has fewer
 const SLOW_MAP_MS = 200;
+const IDLE_MS = 200; // longest interval between two frames while messages arrive
 const COLOURS = { real: "#45c4b0", entering: "#45c4b0", virtual: "#f0ac45", returning: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
 
 export class Screen {
@@ -42,40 +45,71 @@ export class Screen {
     this.settings = DEFAULTS;
     this._guide = elementOf("guide", HTMLCanvasElement);
     this._compass = elementOf("compass-tape", HTMLCanvasElement);
-    this._frameAt = performance.now();
+    this._rate = new FrameRate();
+    this._frameAt = this._steppedAt = performance.now();
+    this._requested = this._runs = false;
     this._latencyAt = this._mapAt = this._lookAt = 0;
     this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
     link.addEventListener("open", () => { this._sentLook = ""; });
-    document.addEventListener("visibilitychange", () => { this._frameAt = performance.now(); });
+    document.addEventListener("visibilitychange", () => { this._steppedAt = performance.now(); });
   }
 
-  /** Sends the look direction, and renders what has changed. @param {number} now ms of this page's clock */
-  frame(now) {
-    const sinceFrame = now - this._frameAt;
-    if (this.viewer.slow && (this.viewer.busy || sinceFrame < (this.images.changed ? SLOW_FRAME_MS / 2 : SLOW_FRAME_MS))) return;
-    const elapsed = Math.min(sinceFrame, 200);
+  /** Takes a state message. @param {State} state */
+  take(state) {
+    const same = this.state && JSON.stringify({ ...this.state, at_ms: state.at_ms }) === JSON.stringify(state);
+    this.state = state;
+    if (!same || performance.now() - this._frameAt > IDLE_MS) this.wake();
+  }
+
+  /** Requests a frame. */
+  wake() {
+    if (this._requested) return;
+    if (!this._runs) this._steppedAt = performance.now(); // nothing moved until now
+    this._requested = this._runs = true;
+    requestAnimationFrame((now) => this._frame(now));
+  }
+
+  /** @param {number} now ms of this page's clock */
+  _frame(now) {
+    this._requested = false;
+    const pause = this.images.changed ? SLOW_FRAME_MS / 2 : SLOW_FRAME_MS, left = this._frameAt + pause - now;
+    if (this.viewer.slow && this.viewer.busy) this.wake();
+    else if (this.viewer.slow && left > 0) setTimeout(() => this.wake(), left);
+    else {
+      this._runs = this._renderFrame(now);
+      if (this._runs) this.wake();
+    }
+  }
+
+  /** Sends the look direction, and renders what has changed; returns whether something moves. @param {number} now */
+  _renderFrame(now) {
+    const elapsed = Math.min(Math.max(now - this._steppedAt, 0), 200);
     this._frameAt = now;
+    this._steppedAt = Math.max(now, this._steppedAt);
     this.look.step(elapsed / 1000);
-    const tanHalf = this._tanHalf();
-    this._sendLook(tanHalf, now);
+    const tanHalf = this._tanHalf(), waits = this._sendLook(tanHalf, now);
     const scene = this.images.scene(this.state, this.look, tanHalf, elapsed);
-    this._renderView(scene);
+    const moved = this._renderView(scene);
+    this._rate.frame(now, moved);
     this._drawOverlay(scene, tanHalf);
     this._drawMap(tanHalf, now);
     if (now - this._latencyAt > LATENCY_MS) {
       this._latencyAt = now;
       showLatency(this.link, this.images);
+      mark("fps", this._rate.perSecond.toFixed(1));
       mark("image", this.images.shown ? (this.images.stale ? "stale" : "live") : "none");
     }
     // For tests and debugging.
     mark("blend", scene.blend.toFixed(2));
     mark("map", this.minimap.hasMap ? "drawn" : "none");
+    return moved || waits || this.look.moves;
   }
 
   enlargeMap() {
     const large = this.minimap.large = byId("map").classList.toggle("large");
     byId("map-size").setAttribute("aria-label", large ? "Shrink the map" : "Enlarge the map");
     this.minimap.changed = true;
+    this.wake();
   }
 
   /** Saves the shown view as a file. */
@@ -83,6 +117,7 @@ export class Screen {
     const render = () => this.viewer.render(this.images.scene(this.state, this.look, this._tanHalf(), 0));
     saveView(this.viewer.canvas, render);
     this._viewKey = "";
+    this.wake();
   }
 
   /** Tangents of half the shown field of view: horizontal, vertical. @returns {[number, number]} */
@@ -91,28 +126,31 @@ export class Screen {
     return [(tanV * clientWidth) / Math.max(clientHeight, 1), tanV];
   }
 
-  /** @param {[number, number]} tanHalf @param {number} now */
+  /** Returns whether a direction waits to be sent. @param {[number, number]} tanHalf @param {number} now */
   _sendLook(tanHalf, now) {
-    if (!this.link.connected || now - this._lookAt < LOOK_MS) return;
     const { yaw, pitch } = this.look;
     const [hfov, vfov] = tanHalf.map((tan) => Math.min(2 * Math.atan(tan), MAX_FOV));
     const key = rounded([yaw, pitch, hfov, vfov], 3) + this.lease.driver;
-    if (key === this._sentLook) return;
+    if (!this.link.connected || key === this._sentLook) return false;
+    if (now - this._lookAt < LOOK_MS) return true;
     this._sentLook = key;
     this._lookAt = now;
     this.link.send({ type: "look", yaw, pitch, hfov, vfov });
+    return false;
   }
 
   /**
-   * Renders if a new image arrived, the direction changed by half a pixel, or the window size changed.
+   * Renders if a new image arrived, the direction changed by half a pixel, or the window size changed. Returns whether
+   * the shown place or the blend has changed, so that the next frame is likely to differ too.
    * @param {Scene} scene
    */
   _renderView(scene) {
     const { viewer, images, look } = this;
     const moved = scene.blend > 0 ? rounded(scene.moved, 3) : "";
-    const key = rounded([...scene.mapFromLook, look.yaw, look.vfov], 4) + moved;
-    const resized = fit(viewer.canvas, viewer.slow ? SLOW_PIXELS : 1);
-    if (viewer.lost || !(resized || images.changed || key !== this._viewKey)) return;
+    const key = rounded([...scene.mapFromLook, look.yaw, look.vfov, scene.blend], 4) + moved;
+    const resized = fit(viewer.canvas, viewer.slow ? (scene.blend === 1 ? SLOW_VIEW_PIXELS : SLOW_PIXELS) : 1);
+    const moves = key !== this._viewKey;
+    if (viewer.lost || !(resized || images.changed || moves)) return false;
     this._viewKey = key;
     images.changed = false;
     viewer.render(scene);
@@ -120,6 +158,7 @@ export class Screen {
     const { motion, view, panorama, place } = images;
     const detail = { shown: shows(this.state), pose: motion.pose, blend: scene.blend, view, panorama, place };
     dispatchEvent(new CustomEvent("rendered", { detail }));
+    return moves;
   }
 
   /** @param {Scene} scene @param {[number, number]} tanHalf */
@@ -128,9 +167,8 @@ export class Screen {
     const trajectory = position && this.link.connected ? this.plan.trajectory : [];
     // Without a trajectory nothing in the overlay can move.
     const place = trajectory.length && position ? rounded([...scene.mapFromLook, ...position], 3) + trajectory.join() : "";
-    const key = [place, colour, rounded([look.yaw, look.vfov], 3)].join();
-    const guideResized = fit(this._guide, this.viewer.slow ? SLOW_PIXELS : 1), compassResized = fit(this._compass);
-    if (!guideResized && !compassResized && key === this._guideKey) return;
+    const key = [place, colour, rounded([look.yaw, look.vfov, ...tanHalf], 3)].join();
+    if (!fit(this._compass) && key === this._guideKey) return;
     this._guideKey = key;
     const camera = { lookFromMap: transpose(scene.mapFromLook), position: position ?? [0, 0, 0] };
     drawGuide(this._guide, trajectory, camera, tanHalf, this.settings.footprint[1] / 2, colour);
