@@ -44,54 +44,54 @@ def matrix_from_quaternion(xyzw: ArrayLike, translation: ArrayLike = (0.0, 0.0, 
     Raises:
         ValueError: the quaternion is zero or not finite.
     """
-    x, y, z, w = (float(value) for value in np.asarray(xyzw, dtype=np.float64))
+    # Plain floats: numpy's overhead on arrays of three or four numbers is ten times the arithmetic.
+    x, y, z, w = np.asarray(xyzw, dtype=np.float64).tolist()
+    tx, ty, tz = np.asarray(translation, dtype=np.float64).tolist()
     norm2 = x * x + y * y + z * z + w * w
     if not math.isfinite(norm2) or norm2 < 1e-12:
         raise ValueError(f"quaternion ({x}, {y}, {z}, {w}) has no direction")
     s = 2.0 / norm2
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
-        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
-        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
-    ]
-    matrix[:3, 3] = translation
-    return matrix
+    return np.array(
+        [
+            [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w), tx],
+            [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w), ty],
+            [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y), tz],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def quaternion_from_matrix(matrix: ArrayLike) -> NDArray[np.float64]:
     """Unit quaternion (x, y, z, w), w ≥ 0, of a pose or a rotation matrix."""
-    r = np.asarray(matrix, dtype=np.float64)[:3, :3]
+    return np.array(_quaternion(np.asarray(matrix, dtype=np.float64)))
+
+
+def _quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    (a, b, c), (d, e, f), (g, h, i) = matrix[:3, :3].tolist()
     # Divide by the largest of the four squared components: no loss of precision near 180°.
-    squares = np.array(
-        [
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-        ]
-    )
-    largest = int(np.argmax(squares))
-    d = squares[largest]
-    if largest == 0:
-        q = np.array([d, r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]])
-    elif largest == 1:
-        q = np.array([r[0, 1] + r[1, 0], d, r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]])
-    elif largest == 2:
-        q = np.array([r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], d, r[1, 0] - r[0, 1]])
-    else:
-        q = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], d])
-    q /= np.linalg.norm(q)
-    return -q if q[3] < 0 else q
+    squares = (1 + a - e - i, 1 - a + e - i, 1 - a - e + i, 1 + a + e + i)
+    largest = squares.index(max(squares))
+    x, y, z, w = (
+        (squares[0], b + d, c + g, h - f),
+        (b + d, squares[1], f + h, c - g),
+        (c + g, f + h, squares[2], d - b),
+        (h - f, c - g, d - b, squares[3]),
+    )[largest]
+    norm = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), w)
+    return x / norm, y / norm, z / norm, w / norm
 
 
 def inverse(matrix: Matrix) -> Matrix:
     """Inverse of a rigid transform."""
-    rotation = matrix[:3, :3].T
-    result = np.eye(4)
-    result[:3, :3] = rotation
-    result[:3, 3] = -rotation @ matrix[:3, 3]
-    return result
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), _ = matrix.tolist()
+    return np.array(
+        [
+            [a, d, g, -(a * x + d * y + g * z)],
+            [b, e, h, -(b * x + e * y + h * z)],
+            [c, f, i, -(c * x + f * y + i * z)],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def transform_points(target_from_source: Matrix, points: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -112,17 +112,17 @@ def interpolate(matrix0: Matrix, matrix1: Matrix, alpha: float) -> Matrix:
 
     ``alpha`` outside 0..1 extrapolates.
     """
-    q0, q1 = quaternion_from_matrix(matrix0), quaternion_from_matrix(matrix1)
-    dot = float(q0 @ q1)
-    if dot < 0:
-        q1, dot = -q1, -dot
+    q0, q1 = _quaternion(matrix0), _quaternion(matrix1)
+    dot = sum(a * b for a, b in zip(q0, q1, strict=True))
+    sign, dot = (-1.0, -dot) if dot < 0 else (1.0, dot)
     if dot > 0.9995:
-        q = q0 + alpha * (q1 - q0)
+        share0, share1 = 1.0 - alpha, sign * alpha
     else:
         angle = math.acos(min(dot, 1.0))
-        q = (math.sin((1 - alpha) * angle) * q0 + math.sin(alpha * angle) * q1) / math.sin(angle)
+        share0 = math.sin((1 - alpha) * angle) / math.sin(angle)
+        share1 = sign * math.sin(alpha * angle) / math.sin(angle)
     translation = (1 - alpha) * matrix0[:3, 3] + alpha * matrix1[:3, 3]
-    return matrix_from_quaternion(q, translation)
+    return matrix_from_quaternion([share0 * a + share1 * b for a, b in zip(q0, q1, strict=True)], translation)
 
 
 def wrap_angle(angle_rad: float) -> float:
@@ -138,21 +138,22 @@ def pose2_from_matrix(matrix: Matrix) -> Pose2:
 
 def matrix_from_pose2(pose: ArrayLike) -> Matrix:
     """Pose on the plane z = 0 from ``(x, y, yaw)``."""
-    x, y, yaw = (float(value) for value in np.asarray(pose))
-    return pose_matrix(x=x, y=y, yaw=yaw)
+    x, y, yaw = np.asarray(pose, dtype=np.float64).tolist()
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def compose2(a: ArrayLike, b: ArrayLike) -> Pose2:
     """Planar composition ``a ∘ b``: ``b`` is given in ``a``'s frame, the result in the parent frame of ``a``."""
-    ax, ay, ayaw = (float(value) for value in np.asarray(a))
-    bx, by, byaw = (float(value) for value in np.asarray(b))
+    ax, ay, ayaw = np.asarray(a, dtype=np.float64).tolist()
+    bx, by, byaw = np.asarray(b, dtype=np.float64).tolist()
     c, s = math.cos(ayaw), math.sin(ayaw)
     return np.array([ax + c * bx - s * by, ay + s * bx + c * by, wrap_angle(ayaw + byaw)])
 
 
 def inverse2(a: ArrayLike) -> Pose2:
     """Inverse of a planar pose."""
-    x, y, yaw = (float(value) for value in np.asarray(a))
+    x, y, yaw = np.asarray(a, dtype=np.float64).tolist()
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([-c * x - s * y, s * x - c * y, wrap_angle(-yaw)])
 
