@@ -67,7 +67,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.thread = ControllerThread(
                 self.controller,
                 config.rate_hz,
-                on_state=lambda state: self.call_soon(self.on_state, state),
+                on_state=self.on_step,
                 on_end=lambda fault, unstopped: self.call_soon(self.on_end, fault, unstopped),
             )
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
@@ -85,7 +85,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         if self.thread is not None:
             self.thread.hurry()
         else:
-            self.on_state(self.controller.step())
+            self.on_step(self.controller.step())
 
     def refuse_pace(self) -> None:
         """Refuse to run a real base on scaled time: it would stop late. Only the simulator's base may.
@@ -152,12 +152,17 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         by = "a button on the robot" if self.latch.button else self.latch.publisher
         self.diagnose("emergency stop", WARN, f"latched by {by}: release it on the operator's page")
 
-    def on_state(self, state: BaseState) -> None:
-        """Publish the result of a controller step."""
-        if state.link:
-            self.show(self.report.link(state.connected, state.link, self.clock.steady_ns()))
+    def on_step(self, state: BaseState) -> None:
+        """Publish the result of a controller step, the odometry at once; called on the serial thread."""
         if state.odometry is not None:
             self.publish_odometry(state.odometry)
+        if state.link or state.health is not None:
+            self.call_soon(self.on_state, state)
+
+    def on_state(self, state: BaseState) -> None:
+        """Publish the state of link and controller."""
+        if state.link:
+            self.show(self.report.link(state.connected, state.link, self.clock.steady_ns()))
         if state.health is not None:
             self.publish_health(state.health)
 
