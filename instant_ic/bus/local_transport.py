@@ -31,7 +31,7 @@ from instant_ic.bus.qos import QoS
 _DISCOVERY_S = 0.2
 _IDLE_S = 1.0
 _BUSY_S = 0.015  # a longer callback is slow
-_SLOW_FOR_S = 10.0  # how long after a slow callback the bus thread reads during every callback
+_SLOW_FOR_S = 10.0  # how long after a slow callback a message wakes the bus thread during each callback
 _CLOSE_S = 5.0
 
 log = logging.getLogger(__name__)
@@ -236,7 +236,6 @@ class LocalTransport:
         if self.patient:
             self._read_rest()
         elif self._left_s < self._slow_until_s:
-            self._read_rest()
             self._hand_reading(True)
         self._waiting = False
 
@@ -283,6 +282,7 @@ class LocalTransport:
     def _run(self) -> None:
         inputs = self._inputs.fileno()
         next_look = 0.0
+        early = False
         while not self._stop.is_set():
             now = time.monotonic()
             if self._look_now or now >= next_look:
@@ -292,10 +292,18 @@ class LocalTransport:
                 self._hand_reading(True)
                 self._read_rest()
             timeout = min(_IDLE_S, next_look - now) if self._subscriptions else _IDLE_S
+            if early:
+                timeout = min(timeout, _BUSY_S)
+            early = False
             try:
                 for fd, _ in self._events.poll(max(0.0, timeout), 64):
                     if fd == inputs:
-                        self._drain(self._inputs.poll(0, 64), None)
+                        # Most callbacks end soon: two threads that read in turn would wait for each other all the time.
+                        early = not self._waiting and time.monotonic() - self._left_s < _BUSY_S
+                        if early:
+                            self._hand_reading(False)
+                        else:
+                            self._drain(self._inputs.poll(0, 64), None)
                     elif fd == self._poke:
                         os.eventfd_read(fd)
                     elif (publisher := self._writers.get(fd)) is not None:
