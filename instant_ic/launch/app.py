@@ -145,6 +145,7 @@ class _Output:
             address=self._address,
             faults=tuple(f"{fault.topic} of {fault.label}: {fault.words}" for fault in faults),
             ending=self._ending,
+            pace=self.pacing.text if self.pacing is not None else "",
         )
 
     def close(self, status: int) -> None:

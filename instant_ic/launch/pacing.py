@@ -202,6 +202,11 @@ class Pacing:
         self._sample_s = self._report_s = -math.inf
         self._tell(time.monotonic())
 
+    @property
+    def text(self) -> str:
+        """The present pace for the operator; empty in real time."""
+        return describe(self._files.factor, adapts=True)
+
     def step(self, stack: Lateness) -> None:
         """Adapt the pace, at most four times a second."""
         now_s = time.monotonic()
@@ -218,4 +223,4 @@ class Pacing:
         noticed = abs(pace - self._reported) >= self.REPORT_STEP or (pace == 1.0) != (self._reported == 1.0)
         if noticed and now_s - self._report_s >= self.REPORT_S:
             self._reported, self._report_s = pace, now_s
-            self._report(describe(pace, adapts=True) or "simulation in real time")
+            self._report(self.text or "simulation in real time")

@@ -66,6 +66,7 @@ class View:
         faults: topics that have stopped or are too slow, as text.
         looked: whether the launcher receives heartbeats already.
         ending: whether the stack is shutting down, so that nothing is waited for.
+        pace: of the simulation, as text; empty in real time.
     """
 
     rows: tuple[Row, ...] = ()
@@ -75,6 +76,7 @@ class View:
     faults: tuple[str, ...] = field(default=())
     looked: bool = True
     ending: bool = False
+    pace: str = ""
 
 
 class Screen:
@@ -259,6 +261,8 @@ class Screen:
             words.append("ready", style="bold green")
         if self._address:
             words.append(" · ").append(self._address, style="bold underline")
+        if view.pace:
+            words.append(f" · {view.pace}", style="yellow")
         words.append(f" · {_duration(time.monotonic() - self._started_s)} · Ctrl-C stops the stack", style="dim")
         return words
 

@@ -1,12 +1,20 @@
 """The pace that the launcher chooses: on traces of a machine, and from the machine's own counters."""
 
 import itertools
+import time
 
+import numpy as np
 import pytest
 
 from instant_ic import pace
+from instant_ic.bus import LATCHED, SENSOR
+from instant_ic.bus.local_transport import LocalTransport
+from instant_ic.bus.registry import prepare
 from instant_ic.launch import pacing
+from instant_ic.launch.description import NodeSpec
+from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.pacing import SLOWEST, CoreLoad, PaceChooser, Pacing, Sample, pace_of
+from instant_ic.msg import ControlState, Float32, header, pose_message, serialize, twist_message
 
 
 class Machine:
@@ -156,3 +164,40 @@ def test_the_operator_learns_what_matters(tmp_path, monkeypatch):
     stack.late = 0.1
     go_on(120)
     assert lines[-1] == "simulation in real time" and len(lines) <= 4
+
+
+def control(reason_code):
+    """A ControlState with this reason."""
+    pose, still = pose_message(np.eye(4)), twist_message()
+    poses = dict.fromkeys(("robot_pose", "vbot_start", "vbot_pose", "vbot_target"), pose)
+    twists = dict.fromkeys(("operator_command", "applied_command", "robot_twist"), still)
+    zeros = dict.fromkeys(("mode", "transitions", "shown", "vbot_action"), 0)
+    gaps = dict.fromkeys(("pose_gap_m", "yaw_gap_rad", "time_to_obstacle_s", "vbot_limit_m_s"), 0.0)
+    flags = {"estop": False, "blocked": False, "reason": "", "header": header("map", 0), "reason_code": reason_code}
+    return ControlState(**poses, **twists, **zeros, **gaps, **flags)
+
+
+def test_delays_and_stale_sources_come_from_the_simulated_stack(tmp_path):
+    group = tmp_path / "left"
+    for folder in (tmp_path, group):
+        prepare(folder)
+    nodes = [NodeSpec("s", "simulator", (), "ns", run_dir=group, group="left"), NodeSpec("a", "arbiter", ())]
+    devices, arbiter = LocalTransport(group, "s", lambda: 1), LocalTransport(tmp_path, "a", lambda: 1)
+    monitor = HealthMonitor(nodes, tmp_path)
+    try:
+        assert monitor.take_late() == (None, False)
+        late = devices.advertise("/ns/simulation/late", "std_msgs/msg/Float32", SENSOR)
+        state = arbiter.advertise("/ic/state", "instant_ic_msgs/msg/ControlState", LATCHED)
+        found = set()
+        for count in range(3000):  # until the subscriptions are connected
+            late.send(serialize(Float32(1.5)))
+            stale = ControlState.REASON_SCAN_STALE if count % 2 else ControlState.REASON_STARTING
+            state.send(serialize(control(stale)))
+            found.add(monitor.take_late())
+            if {(1.5, True), (1.5, False)} <= found:
+                break
+            time.sleep(0.01)
+        assert {(1.5, True), (1.5, False)} <= found
+    finally:
+        for transport in (monitor, devices, arbiter):
+            transport.close()

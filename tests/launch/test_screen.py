@@ -110,8 +110,9 @@ def test_table_of_nodes(out: io.StringIO) -> None:
         Row("new", "starting"),
     )
     with screen_on(out, live=True) as screen:
-        screen.refresh(View(rows, missing=("new",)))
+        screen.refresh(View(rows, missing=("new",), pace="simulation at 0.6 of real time"))
     text = out.getvalue()
+    assert " · simulation at 0.6 of real time · " in text
     found = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line and line[0].isalpha()}
     assert found["slam"] == ["●", "running", "12", "100", "pose", "10.0"]
     assert found["page"] == ["●", "silent", "↻2", "1", "10"]
