@@ -1,12 +1,16 @@
 """The examples in the docs run as they are printed."""
 
+import itertools
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from instant_ic.cli.main import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -24,3 +28,45 @@ def test_the_node_of_the_page_passes_the_test_of_the_page(page, name, tmp_path):
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path)]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=250)
     assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr
+
+
+PAGES = ["README.md", *(f"docs/{file.name}" for file in sorted((ROOT / "docs").glob("*.md")))]
+
+
+def commands(page: str) -> list[str]:
+    """Every ``ic`` command of a page, in the order given, without its explanation."""
+    text = re.sub(r"\\\n *", "", (ROOT / page).read_text(encoding="utf-8"))
+    blocks = "".join(re.findall(r"^```(?:sh)?\n(.*?)^```", text, re.S | re.M))
+    found = re.findall(r"^(?:\$ )?(ic [^#\n]+)", blocks, re.M)
+    if page == "README.md":
+        found += re.findall(r"^\|[^|]+\| `(ic [^`]+)` \|", text, re.M)
+    return [re.split(r" {3,}|;| & | > |  (?=\S)", command.strip())[0] for command in found]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_of_a_page_is_understood(page, capsys):
+    for command in commands(page):
+        try:
+            build_parser().parse_args(shlex.split(command)[1:])
+        except SystemExit as end:
+            assert end.code == 0, f"{page}: {command}: {capsys.readouterr().err}"
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/bags.md"])
+def test_commands_of_a_page_make_what_the_later_ones_read_and_nothing_twice(page):
+    made = {"runs/recordings"}  # by the page's record button
+    for command in commands(page):
+        words = shlex.split(command)
+        if words[1:3] == ["bag", "diff"]:
+            assert set(words[3:5]) <= made, command
+        read = words[2] if words[1] == "replay" else words[words.index("--compare") + 1] if "--compare" in words else ""
+        assert not read or read in made or (ROOT / read).exists(), command
+        new = [after for option, after in itertools.pairwise(words) if option in ("-o", "--out")]
+        new += [word.partition(":=")[2] for word in words if word.startswith("record:=")]
+        assert not made & set(new), command
+        made |= set(new)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_name_the_command_in_one_way(page):
+    assert ".venv/bin/ic" not in (ROOT / page).read_text(encoding="utf-8")

@@ -299,7 +299,9 @@ def check_camera(expectation: Expectation) -> Iterator[Finding]:
         yield Finding(missing, f"camera {url}", _short(error), advice)
         return
     if reply.status_code != 200:
-        advice = "in client mode the camera needs user and password (docs/devices.md)"
+        advice = "something else answers there: set camera_url:=... to the camera's address"
+        if reply.status_code in (401, 403):
+            advice = "in client mode the camera needs user and password (docs/devices.md)"
         yield Finding(missing, f"camera {url}", f"HTTP status {reply.status_code}", advice)
         return
     model, firmware = info.get("model", "unknown model"), info.get("firmwareVersion", "?")

@@ -20,9 +20,11 @@ from instant_ic.cli.main import main
 
 
 class Theta(http.server.BaseHTTPRequestHandler):
+    status = 200
+
     def do_GET(self) -> None:
         body = json.dumps({"model": "RICOH THETA Z1", "firmwareVersion": "2.21.1"}).encode()
-        self.send_response(200 if self.path == "/osc/info" else 404)
+        self.send_response(self.status if self.path == "/osc/info" else 404)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(body)
@@ -55,6 +57,13 @@ def free_port(kind: socket.SocketKind) -> int:
 def test_camera_that_answers(theta: str) -> None:
     found = one(doctor.check_camera(Expectation(camera_url=theta)))
     assert (found.level, found.words) == (OK, "RICOH THETA Z1, firmware 2.21.1")
+
+
+@pytest.mark.parametrize(("status", "advice"), [(404, "something else answers"), (401, "user and password")])
+def test_camera_that_refuses(status: int, advice: str, theta: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Theta, "status", status)
+    found = one(doctor.check_camera(Expectation(camera_url=theta)))
+    assert found.words == f"HTTP status {status}" and advice in found.advice
 
 
 @pytest.mark.parametrize(("real", "level"), [(False, WARN), (True, FAIL)])
