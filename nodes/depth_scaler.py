@@ -210,8 +210,10 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             )
         )
         text = f"keyframe {self.selector.count}: {result.message}"
-        self.diagnose("keyframe", OK if result.ok else WARN, text, id=self.selector.count)
-        self.log.info(text)
+        before, level = self._diagnoses.get("keyframe", (OK,))[0], OK if result.ok else WARN
+        self.diagnose("keyframe", level, text, id=self.selector.count)
+        if level == before:  # else the diagnosis is in the log already
+            self.log.info(text)
 
 
 if __name__ == "__main__":

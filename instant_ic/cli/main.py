@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from types import FrameType
 
 from instant_ic.cli import commands
@@ -53,21 +53,26 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return the exit status."""
     words = sys.argv[1:] if argv is None else argv
-    with _quiet_end() if words[:1] == ["launch"] else nullcontext():
+    with _clean_end(words[:1] == ["launch"]):
         return _main(argv)
 
 
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP, which end a command as Ctrl-C does: it stops what it started and removes its scratch files."""
+
+
 @contextmanager
-def _quiet_end() -> Iterator[None]:
-    """End ``ic launch`` cleanly, with status 0, on a signal that arrives before the stack is up."""
+def _clean_end(launches: bool) -> Iterator[None]:
+    """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def end(signum: int, frame: FrameType | None) -> None:
-        raise SystemExit(0)
+        raise SystemExit(0) if launches else _Terminated
 
-    before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if launches else (signal.SIGTERM, signal.SIGHUP)
+    before = [(number, signal.signal(number, end)) for number in numbers]
     try:
         yield
     finally:
@@ -98,6 +103,8 @@ def _call(args: argparse.Namespace) -> int:
     except UserError as error:
         print(f"ic: {error}", file=sys.stderr)
         return error.status
+    except _Terminated:
+        return 143
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # ic topic echo ... | head

@@ -12,13 +12,13 @@ import math
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from instant_ic.bus import LATCHED, SENSOR
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.experiments.pictures import (
     correlation,
     perspective_crop,
@@ -102,6 +102,11 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     started = time.monotonic()
     scans = stack.collect("/scan", message_type("LaserScan"))
     poses = stack.collect("/pose", message_type("PoseWithCovarianceStamped"))
+    points: list[None] = []
+    clouds = stack.observer.subscribe(
+        "/lidar/points", message_type("PointCloud2"), lambda cloud: points.append(None), SENSOR
+    )
+    faults = stack.collect("/diagnostics", message_type("DiagnosticArray"), RELIABLE)
     maps = stack.collect("/map", message_type("OccupancyGrid"), LATCHED)
     keyframes = stack.collect("/keyframe", message_type("Keyframe"), LATCHED)
     statuses = stack.collect("/vspace/status", message_type("VspaceStatus"), LATCHED)
@@ -113,7 +118,14 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
         tell(f"waiting for {what}")
         return stack.wait_for(condition, max(1.0, timeout_s - (time.monotonic() - started) * stack.pace), what)
 
-    wait(lambda: len(scans) >= 5, "laser scans of the capture")
+    try:
+        wait(lambda: len(scans) >= 5, "laser scans of the capture")
+    except StackError:
+        stack.check_alive("laser scans of the capture")
+        raise StackError(
+            f"the capture gives {len(points)} point clouds and {len(scans)} scans{_reasons(faults)}"
+        ) from None
+    stack.observer.drop(clouds)
     wait(lambda: maps and poses, "a map")
     keyframe = wait(lambda: keyframes and keyframes[-1], "a keyframe of the photo")
 
@@ -181,6 +193,13 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
         "depth_message": str(keyframe.message),
         "device": str(statuses[-1].device),
     }
+
+
+def _reasons(diagnostics: Sequence[Any]) -> str:
+    """The newest texts of the LiDAR's driver about the packets, to be appended to an error."""
+    newest = {status.name: status.message for array in diagnostics for status in array.status}
+    texts = [newest[name] for name in ("vlp16_driver: packets", "vlp16_driver: source") if newest.get(name)]
+    return f" ({'; '.join(texts)})" if texts else ""
 
 
 def _request(number: int, map_from_view: Any, now_ns: int) -> Any:

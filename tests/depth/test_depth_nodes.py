@@ -377,7 +377,10 @@ def test_depth_as_estimated_makes_keyframes_that_say_so() -> None:
     assert "LiDAR was not asked" in keyframe.message
 
 
-def test_unfit_keyframe_goes_out_marked_after_waiting_and_a_fit_one_replaces_it() -> None:
+def test_unfit_keyframe_goes_out_marked_after_waiting_and_a_fit_one_replaces_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
     config = DepthScalerConfig(keyframes=KeyframeSelectionConfig(unfit_after_s=1.0))
     with LockstepBus(START) as bus:
         bus.add(DepthScalerNode, config)
@@ -388,6 +391,8 @@ def test_unfit_keyframe_goes_out_marked_after_waiting_and_a_fit_one_replaces_it(
         assert stamp_ns(unfit) == START + 12 * S // 10  # due at 0.2 s, waited for 1 s
         drive(bus, 0.5, begin=START + 2 * S)
         assert [k.fit for k in bus.messages("/keyframe")] == [False, True]
+    for number in (1, 2):
+        assert sum(f"keyframe {number}: " in text for text in caplog.messages) == 1  # logged once each
 
 
 def test_without_poses_nothing_is_made_up() -> None:

@@ -60,7 +60,7 @@ def evaluate_recordings(args: argparse.Namespace) -> int:
     from instant_ic.experiments.recordings import evaluate_recordings as run
     from instant_ic.experiments.stack import StackError
 
-    console = Console(stderr=True)
+    console = Console(stderr=True, soft_wrap=True)  # the end of a log is not broken at 80 columns
     try:
         with console.status("starting") as status:
 
