@@ -100,6 +100,15 @@ def test_the_command_has_nothing_to_do_once_all_is_compiled(
     assert capsys.readouterr().err == ""
 
 
+def test_without_a_folder_for_the_cache_the_nodes_compile_for_themselves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    assert main(["compile"]) == 1
+    assert "ic: the kernels cannot be compiled ahead: " in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("node", ["virtual_robot", "crawler_base", "theta_camera", "depth_scaler", "console"])
 def test_nodes_without_kernels_do_not_load_numba(node: str) -> None:
     code = f"import sys\nfrom instant_ic.bus.node_files import node_class\nnode_class({node!r})"

@@ -28,11 +28,14 @@ def run(args: argparse.Namespace | None = None) -> int:
     from instant_ic.cli.kernels import are_compiled, compile_all
     from instant_ic.cli.progress import progress
 
-    if are_compiled():
-        return 0
-    print("compiling kernels (about a minute, once)", file=sys.stderr, flush=True)
-    with progress("compiling kernels") as report:
-        problems = compile_all(report)
+    try:
+        if are_compiled():
+            return 0
+        print("compiling kernels (about a minute, once)", file=sys.stderr, flush=True)
+        with progress("compiling kernels") as report:
+            problems = compile_all(report)
+    except OSError as error:  # no folder for a cache: each node compiles for itself
+        problems = [f"the kernels cannot be compiled ahead: {error}"]
     for problem in problems:
         print(f"ic: {problem}", file=sys.stderr)
     return 1 if problems else 0
