@@ -141,9 +141,18 @@ def _compile(part: str) -> None:
 
         warm_up_space(VirtualSpaceConfig())
     elif part == "slam":
+        import numpy as np
+
+        from instant_ic.slam.config import FieldConfig
         from instant_ic.slam.grid_slam import warm_up as warm_up_slam
+        from instant_ic.slam.likelihood_field import LikelihoodField
+        from instant_ic.slam.loop_search import COARSE_POINTS, find_place
 
         warm_up_slam()
+        field = LikelihoodField(FieldConfig())
+        field.values[:] = 0.5
+        # More points than the coarse search takes: of these it takes every second.
+        find_place(field, np.zeros((2 * COARSE_POINTS, 2)), np.zeros(3), reach_m=0.5, reach_rad=0.1)
     elif part == "sim":
         from instant_ic.sim.simulation import Simulation, SimulationConfig
 

@@ -321,7 +321,8 @@ class RollingCostmap:
         occupancy, shift = np.full((1, 1), -1, dtype=np.int8), np.zeros(2)
         resolution = self.config.resolution
         if static is not None:
-            occupancy, resolution, shift = static.occupancy, static.resolution, origin - static.origin
+            occupancy, resolution, shift = static.occupancy.view(), static.resolution, origin - static.origin
+        occupancy.flags.writeable = False  # numba would compile the kernel once more for a map that may be written
         return _join(
             self._observed,
             self.heights.hits,

@@ -16,6 +16,7 @@ def fill(values: NDArray[np.float32], weight: NDArray[np.float32]) -> NDArray[np
         sizes.append(((sizes[-1][0] + 1) // 2, (sizes[-1][1] + 1) // 2))
     count = sum(height * width for height, width in sizes)
     filled = np.array(values, np.float32, order="C")
+    weight = np.ascontiguousarray(weight)  # numba would compile the kernel once more for another order
     pull_push(filled, weight, np.array(sizes, np.int64), np.zeros((count, filled.shape[2] + 1), np.float32))
     return filled
 

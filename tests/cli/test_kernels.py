@@ -8,10 +8,16 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from instant_ic.cli import kernels
 from instant_ic.cli.main import main
+from instant_ic.control import costmap
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.static_map import StaticMap
+from instant_ic.slam import loop_search
+from instant_ic.vspace import fill_kernels
 
 
 @pytest.fixture
@@ -107,6 +113,23 @@ def test_without_a_folder_for_the_cache_the_nodes_compile_for_themselves(
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
     assert main(["compile"]) == 1
     assert "ic: the kernels cannot be compiled ahead: " in capsys.readouterr().err
+
+
+def test_what_the_first_drive_needs_is_compiled_ahead_in_one_variant() -> None:
+    """A later variant, for a map that may not be written or arrays in another order, would hold up the robot."""
+    kernels._compile("slam")
+    kernels._compile("control")
+    for kernel in (loop_search.pool, loop_search.peaks, loop_search.score_volume):
+        assert kernel.signatures
+    read_only = np.zeros((20, 20), np.int8)
+    read_only.flags.writeable = False
+    for occupancy in (read_only, read_only.copy()):
+        window = costmap.RollingCostmap(costmap.CostmapConfig(width=4.0), Footprint())
+        window.update(np.zeros(3), StaticMap(occupancy, 0.1, np.zeros(2)), None, None)
+    assert len(costmap._join.signatures) == 1
+    for weight in (np.ones((4, 8), np.float32), np.ones((8, 4), np.float32).T):
+        fill_kernels.fill(np.ones((4, 8, 3), np.float32), weight)
+    assert len(fill_kernels.pull_push.signatures) == 1
 
 
 @pytest.mark.parametrize("node", ["virtual_robot", "crawler_base", "theta_camera", "depth_scaler", "console"])

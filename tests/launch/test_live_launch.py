@@ -39,7 +39,15 @@ class Launched:
         self.run_dir, self.log = folder / "r", folder / "out"
         with self.log.open("wb") as out:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "instant_ic.cli.main", "launch", str(folder / "stack.yaml"), "--plain"],
+                [
+                    sys.executable,
+                    "-m",
+                    "instant_ic.cli.main",
+                    "launch",
+                    str(folder / "stack.yaml"),
+                    "--plain",
+                    "--verbose",
+                ],
                 env={**os.environ, "INSTANT_IC_RUN_DIR": str(self.run_dir)},
                 stdout=out,
                 stderr=subprocess.STDOUT,
