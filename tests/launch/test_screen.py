@@ -12,7 +12,7 @@ from instant_ic.bus import RELIABLE
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.launch import NodeSpec
-from instant_ic.launch.app import _row
+from instant_ic.launch.app import _Output, _row
 from instant_ic.launch.health import HealthMonitor, NodeHealth, TopicFault, find_console
 from instant_ic.launch.process import State
 from instant_ic.launch.screen import Row, Screen, View
@@ -270,3 +270,24 @@ def test_row_of_a_node_from_its_process_its_heartbeat_and_its_topics() -> None:
     assert _row(process, monitor, []).state == "starting"
     process.ending, process.reason = True, "hangs: no heartbeat for 10 s"
     assert (_row(process, monitor, []).state, _row(process, monitor, []).text) == ("stopping", process.reason)
+
+
+def test_an_optional_node_that_has_ended_is_not_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recorder, slam = NodeSpec("recorder", "bag_recorder", ()), NodeSpec("slam", "grid_slam", (), respawn=True)
+    description: Any = SimpleNamespace(nodes=[recorder, slam])
+    output = _Output(description, tmp_path, live=False, verbose=False)
+    monitor: Any = SimpleNamespace(
+        nodes={},
+        topic_faults=list,
+        waiting_for=list,
+        nodes_missing=lambda: ["recorder", "slam"],
+        console_address=lambda with_token: None,
+        publish=lambda down, faults: None,
+    )
+    output._health = monitor
+    processes: Any = [
+        SimpleNamespace(spec=spec, state=State.FAILED, limit=SimpleNamespace(retries=0), reason="")
+        for spec in (recorder, slam)
+    ]
+    assert output._view(processes).missing == ("slam",)
+    output.close(0)
