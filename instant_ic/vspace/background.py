@@ -8,6 +8,7 @@ the ground round it. The sky is rendered here too, endlessly far.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -30,6 +31,7 @@ _BEHIND = 1.05  # a guess lies farther than what hides it by this factor
 _STEEP, _ALIKE, _LEVEL_SHARE = 0.6, 0.04, 0.6  # beyond this sine of the elevation so many heights agree so far
 _SKY_M = 1e4
 _ROWS = 256  # of the images that the background is made in: it is smooth
+_directions = functools.lru_cache(maxsize=2)(equirect_directions)  # a keyframe is as large as the one before
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ class Background:
         view_from_camera = (np.linalg.inv(map_from_view) @ self.map_from_camera).astype(np.float32)
         nearness, marks = np.zeros(rays.shape, np.float32), np.zeros(rays.shape, np.uint8)
         height, width = self.inverse.shape
-        directions = equirect_directions(width, height)
+        directions = _directions(width, height)
         for mark, quads in ((1, self.guessed), (2, self.sky)):
             draw_quads(quads, mark, self.inverse, directions, view_from_camera, half, nearness, marks)
         drawn = wanted & (nearness.reshape(-1) > 0)

@@ -92,19 +92,21 @@ def checked_pose(map_from_camera: NDArray[np.floating]) -> NDArray[np.float64]:
 def _perspective(width: int, height: int, fov_rad: float) -> tuple[Floats, Floats]:
     directions = perspective_directions(width, height, fov_rad).reshape(-1, 3)
     axial = 1 / np.linalg.norm(directions, axis=1)
-    return directions * axial[:, None], axial
+    return np.asfortranarray(directions * axial[:, None]), axial
 
 
 @functools.lru_cache(maxsize=1)
 def _equirect(width: int, height: int) -> tuple[Floats, Floats]:
-    return equirect_directions(width, height).reshape(-1, 3), np.ones(width * height, np.float32)
+    directions = equirect_directions(width, height).reshape(-1, 3)
+    return np.asfortranarray(directions), np.ones(width * height, np.float32)
 
 
 class LensRays(Rays):
     """Rays of a lens, turned into the map only where that is asked for: a GPU turns them itself.
 
     Attributes:
-        lens: unit vectors of the camera's frame, (P, 3); the same array for all images of one size and projection.
+        lens: unit vectors of the camera's frame, (P, 3) in Fortran's order; the same array for all images of one size and
+            projection.
         turn: map_from_camera rotation, (3, 3) float32.
     """
 
@@ -126,7 +128,8 @@ class LensRays(Rays):
 
 def _turned(directions: Floats, turn: Floats) -> Floats:
     # Not by matmul: BLAS would start threads for it, which wait for each other ten times as long as they compute.
-    return np.einsum("pj,ij->pi", directions, turn)
+    # Coordinate by coordinate, which einsum does four times as fast.
+    return np.ascontiguousarray(np.einsum("jp,ij->ip", directions.T, turn).T)
 
 
 def perspective_rays(pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:

@@ -8,6 +8,7 @@ import pytest
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.vspace import (
     FieldConfig,
     KeyframeError,
@@ -17,6 +18,7 @@ from instant_ic.vspace import (
     VirtualSpace,
     VirtualSpaceConfig,
     fill_kernels,
+    warp_kernels,
 )
 from instant_ic.vspace.prior import _fill
 from instant_ic.vspace.view import perspective_rays
@@ -228,3 +230,16 @@ def test_holes_are_filled_alike_with_and_without_numba(height, width):
     assert fill_kernels.fill(values, weight) == pytest.approx(_fill(values, weight), abs=1e-6)
     nothing = np.zeros((height, width), np.float32)
     assert np.all(fill_kernels.fill(values, nothing) == 0)
+
+
+def test_angle_is_atan2():
+    places = np.empty((4000, 2), np.float32)
+    around = np.linspace(-np.pi, np.pi, 4000, dtype=np.float32)[:, None]
+    directions = np.concatenate([np.cos(around), np.sin(around), np.sin(7 * around)], axis=1)
+    warp_kernels.panorama_places(
+        np.eye(4, dtype=np.float32), np.zeros(3, np.float32), directions, np.ones(4000, np.float32), 1024, 2048, places
+    )
+    u, v = equirect_pixels(directions, 2048, 1024)
+    # 1e-6 rad are 3e-4 pixels; the seam is the same place on either side.
+    assert np.abs((places[:, 0] - u + 1024) % 2048 - 1024).max() < 2e-3
+    assert np.abs(places[:, 1] - v).max() < 2e-3
