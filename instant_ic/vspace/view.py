@@ -105,8 +105,8 @@ class LensRays(Rays):
     """Rays of a lens, turned into the map only where that is asked for: a GPU turns them itself.
 
     Attributes:
-        lens: unit vectors of the camera's frame, (P, 3) in Fortran's order; the same array for all images of one size and
-            projection.
+        lens: unit vectors of the camera's frame, (P, 3) in Fortran's order; the same array for all images of one size
+            and projection.
         turn: map_from_camera rotation, (3, 3) float32.
     """
 
