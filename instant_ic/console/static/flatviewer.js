@@ -22,6 +22,7 @@ export class FlatViewer {
     this.name = "canvas";
     this.slow = true;
     this.busy = false; // renders synchronously
+    this.restUntil = 0;
     this.lost = false;
     /** @type {Layer | null} */
     this._panorama = null;

@@ -27,14 +27,13 @@ export class Gamepads extends EventTarget {
     /** @type {Set<number>} */
     this._held = new Set();
     this._driving = false;
-    this._last = performance.now();
+    this._last = this._timer = 0;
     window.addEventListener("gamepadconnected", ({ gamepad }) => this._connect(gamepad));
     window.addEventListener("gamepaddisconnected", ({ gamepad }) => {
       if (gamepad.index === this._index) this._lose();
     });
     // Any stop also stops the pad: the button must be released and pressed again.
     drive.addEventListener("stop", () => { this._driving = false; });
-    setInterval(() => this._poll(), POLL_MS);
   }
 
   /** @param {Gamepad} pad */
@@ -45,12 +44,15 @@ export class Gamepads extends EventTarget {
     }
     if (this._index !== null) return;
     this._index = pad.index;
+    this._last = performance.now();
+    this._timer = setInterval(() => this._poll(), POLL_MS);
     this._held = pressed(pad); // a button held already was not pressed for driving
     mark("pad", "ready");
     this._emit("notice", "Gamepad connected: hold a shoulder button and drive with the left stick.");
   }
 
   _lose() {
+    clearInterval(this._timer);
     this._index = null;
     this._driving = false;
     mark("pad", "none");
@@ -60,8 +62,7 @@ export class Gamepads extends EventTarget {
   _poll() {
     const now = performance.now(), seconds = Math.min((now - this._last) / 1000, 0.1);
     this._last = now;
-    if (this._index === null) return;
-    const pad = navigator.getGamepads()[this._index];
+    const pad = this._index === null ? null : navigator.getGamepads()[this._index];
     if (!pad?.connected) return this._lose();
     const held = pressed(pad), fresh = [...held].filter((button) => !this._held.has(button));
     this._held = held;

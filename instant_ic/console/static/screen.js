@@ -47,7 +47,8 @@ export class Screen {
     this._compass = elementOf("compass-tape", HTMLCanvasElement);
     this._rate = new FrameRate();
     this._frameAt = this._steppedAt = performance.now();
-    this._requested = this._runs = false;
+    this._requested = this._wanted = false;
+    this._timer = 0;
     this._latencyAt = this._mapAt = this._lookAt = 0;
     this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
     link.addEventListener("open", () => { this._sentLook = ""; });
@@ -63,22 +64,33 @@ export class Screen {
 
   /** Requests a frame. */
   wake() {
+    if (!this._wanted) this._steppedAt = performance.now(); // nothing moved until now
+    this._wanted = true;
+    this._request();
+  }
+
+  _request() {
     if (this._requested) return;
-    if (!this._runs) this._steppedAt = performance.now(); // nothing moved until now
-    this._requested = this._runs = true;
-    requestAnimationFrame((now) => this._frame(now));
+    this._requested = true;
+    clearTimeout(this._timer);
+    requestAnimationFrame((now) => {
+      this._requested = false;
+      this._frame(now);
+    });
   }
 
   /** @param {number} now ms of this page's clock */
   _frame(now) {
-    this._requested = false;
-    const pause = this.images.changed ? SLOW_FRAME_MS / 2 : SLOW_FRAME_MS, left = this._frameAt + pause - now;
-    if (this.viewer.slow && this.viewer.busy) this.wake();
-    else if (this.viewer.slow && left > 0) setTimeout(() => this.wake(), left);
-    else {
-      this._runs = this._renderFrame(now);
-      if (this._runs) this.wake();
+    if (this.viewer.busy) return this._request();
+    if (!this._wanted) return;
+    const pause = this.viewer.slow ? SLOW_FRAME_MS / (this.images.changed ? 2 : 1) : 0;
+    const left = Math.max(this._frameAt + pause, this.viewer.restUntil) - now;
+    if (left > 0) {
+      this._timer = setTimeout(() => this._request(), left);
+      return;
     }
+    this._wanted = this._renderFrame(now);
+    if (this._wanted || this.viewer.busy) this._request();
   }
 
   /** Sends the look direction, and renders what has changed; returns whether something moves. @param {number} now */

@@ -153,7 +153,8 @@ export class GlViewer {
     /** @type {WebGLFramebuffer | null} */
     this._samples = null;
     this._renderedAt = 0;
-    this._restUntil = 0;
+    /** The next frame pauses for as long as the CPU took for this one, so that messages and new views are not delayed. */
+    this.restUntil = 0;
     // A program is translated at its first use; that must not delay the first frame after a switch.
     gl.viewport(0, 0, 1, 1);
     for (const [real, view, sample] of [[true, false, false], [false, true, false], [true, true, false], [false, true, true]])
@@ -193,20 +194,16 @@ export class GlViewer {
     gl.flush();
   }
 
-  /**
-   * Whether the CPU still renders the last frame, or has not yet paused for as long as that took (at most MOST_REST_MS).
-   * Without the pause, rendering would delay messages and new views.
-   */
+  /** Whether the CPU still renders the last frame; to be asked until it is done. */
   get busy() {
     const gl = this.gl;
-    if (this._fence && !this.lost) {
-      if (gl.getSyncParameter(this._fence, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
-      gl.deleteSync(this._fence);
-      this._fence = null;
-      const now = performance.now();
-      this._restUntil = now + Math.min(now - this._renderedAt, MOST_REST_MS);
-    }
-    return performance.now() < this._restUntil;
+    if (!this._fence || this.lost) return false;
+    if (gl.getSyncParameter(this._fence, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
+    gl.deleteSync(this._fence);
+    this._fence = null;
+    const now = performance.now();
+    this.restUntil = now + Math.min(now - this._renderedAt, MOST_REST_MS);
+    return false;
   }
 
   /**
