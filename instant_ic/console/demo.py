@@ -91,6 +91,7 @@ class Demo:
         self.forced_mode: str | None = None
         self.faults: list[dict[str, str]] = []
         self.pace = ""
+        self.nodes = [{"name": "nerf", "cpu_percent": 12.0, "budget_percent": 17.0}]
         self.images = True
         self.depth: bytes | None = None  # sent instead of the views' own depth
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
@@ -288,7 +289,7 @@ class Demo:
         vspace = {"state": "ready", "psnr_db": 27.4, "train_seconds": 9.0, "message": ""}
         vspace |= {"expected_psnr_db": 25.6, "unseen_share": 0.03, "radius_m": 2.0}
         battery = {"voltage": 24.6, "percent": 81.0}
-        health = {"vspace": vspace, "battery": battery, "faults": self.faults, "pace": self.pace}
+        health = {"vspace": vspace, "battery": battery, "faults": self.faults, "nodes": self.nodes, "pace": self.pace}
         self.server.publish("health", health)
 
     def _send_panorama(self) -> None:

@@ -1,7 +1,10 @@
-"""Faults for the operator: the nodes' diagnoses, and nodes whose heartbeat is missing."""
+"""What the nodes report to the operator: diagnoses, missing heartbeats, and CPU against its budget."""
 
 from __future__ import annotations
 
+from typing import Any
+
+from instant_ic.config.cpu_budget import cpu_budget
 from instant_ic.msg import DiagnosticArray, NodeStatus
 
 TIMEOUT_S = 3.0
@@ -15,11 +18,15 @@ class FaultList:
     def __init__(self) -> None:
         self._diagnoses: dict[str, tuple[int, str, float]] = {}
         self._heartbeats: dict[str, tuple[float, bool]] = {}
+        self._cpu_percent: dict[str, float] = {}
 
-    @property
-    def nodes(self) -> list[str]:
-        """Nodes that have sent a heartbeat."""
-        return sorted(self._heartbeats)
+    def nodes(self, now_s: float) -> list[dict[str, Any]]:
+        """Return the running nodes: ``name``, ``cpu_percent`` and ``budget_percent`` of one core (None: no budget)."""
+        return [
+            {"name": name, "cpu_percent": round(self._cpu_percent[name], 1), "budget_percent": cpu_budget(name)}
+            for name, (seen_s, stopping) in sorted(self._heartbeats.items())
+            if not stopping and now_s - seen_s <= TIMEOUT_S
+        ]
 
     def take_diagnoses(self, message: DiagnosticArray, now_s: float) -> None:
         """Store the newest diagnosis of each name."""
@@ -29,6 +36,7 @@ class FaultList:
     def take_heartbeat(self, message: NodeStatus, now_s: float) -> None:
         """Note a node's heartbeat. A node that announced its shutdown does not count as missing."""
         self._heartbeats[message.node] = (now_s, int(message.state) == NodeStatus.STOPPING)
+        self._cpu_percent[message.node] = float(message.cpu_percent)
 
     def worst(self, now_s: float) -> list[dict[str, str]]:
         """Return the worst present fault of each node, worst first: ``level`` (warn, error), ``name``, ``text``."""

@@ -73,7 +73,11 @@ def plan_message(
 
 
 def health_message(
-    vspace: VspaceStatus | None, battery: BatteryState | None, faults: list[dict[str, str]], nodes: list[str], pace: str
+    vspace: VspaceStatus | None,
+    battery: BatteryState | None,
+    faults: list[dict[str, str]],
+    nodes: list[dict[str, Any]],
+    pace: str,
 ) -> dict[str, Any]:
     """Return the ``health`` message; ``pace`` is empty in real time."""
     return {"vspace": _vspace(vspace), "battery": _battery(battery), "faults": faults, "nodes": nodes, "pace": pace}

@@ -1,6 +1,7 @@
 """The console node in lockstep: what goes to the page, and what comes from it to the bus."""
 
 import base64
+import dataclasses
 import math
 
 import numpy as np
@@ -450,6 +451,17 @@ def heartbeat(node, state):
         input_lost=np.zeros(0, np.uint64), lost_topics=[], lost_publishers=[], lost_counts=np.zeros(0, np.uint64),
         outputs=[], output_rates_hz=np.zeros(0, np.float32), output_ages_s=np.zeros(0, np.float32),
     )  # fmt: skip
+
+
+def test_health_lists_the_cpu_of_the_running_nodes_beside_their_budgets(setup):
+    bus, _, server = setup
+    bus.publish("/heartbeat", dataclasses.replace(heartbeat("nerf", NodeStatus.RUNNING), cpu_percent=21.26))
+    bus.publish("/heartbeat", heartbeat("mine", NodeStatus.RUNNING))
+    bus.publish("/heartbeat", heartbeat("bag_player", NodeStatus.STOPPING))
+    bus.advance(1.1)
+    nodes = {node["name"]: node for node in server.texts["health"]["nodes"]}
+    assert nodes["nerf"] == {"name": "nerf", "cpu_percent": 21.3, "budget_percent": 17.0}
+    assert nodes["mine"]["budget_percent"] is None and "bag_player" not in nodes
 
 
 def test_dead_node_is_a_fault_and_one_that_ended_is_not(setup):

@@ -43,7 +43,7 @@ export function showLatency(link, images) {
 }
 
 /** @param {Health} health */
-export function showHealth({ vspace, battery, faults, pace }) {
+export function showHealth({ vspace, battery, faults, nodes, pace }) {
   byId("vspace-dot").dataset.state = vspace?.state ?? "empty";
   write(byId("vspace-text"), texts.vspaceText(vspace));
   write(byId("vspace-more"), texts.vspaceQuality(vspace));
@@ -54,6 +54,14 @@ export function showHealth({ vspace, battery, faults, pace }) {
     const share = battery.percent === null ? "" : ` · ${Math.round(battery.percent)} %`;
     write(byId("battery"), `${battery.voltage.toFixed(1)} V${share}`);
   }
+  const over = nodes.filter(texts.overBudget), total = nodes.reduce((sum, node) => sum + node.cpu_percent, 0);
+  write(byId("cpu"), nodes.length ? `${Math.round(total)} %` : "–");
+  byId("cpu").className = over.length ? "warn" : "";
+  replaceItems(byId("cpu-list"), nodes.map(texts.cpuText), (line) => {
+    const item = document.createElement("li");
+    item.textContent = line;
+    return item;
+  });
   replaceItems(byId("faults"), faults, ({ level, name, text }) => {
     const item = document.createElement("li"), bold = document.createElement("b");
     item.className = level;
