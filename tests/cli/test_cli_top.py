@@ -104,7 +104,7 @@ def run_dir(tmp_path_factory):
 
 def test_once_and_json(ic, run_dir, monkeypatch):
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
-    row_with_rate = r"talker +\d+ +running +\d+ +\d+ +\d+ +0\n(    → .*\n)*    → /scan [\d.]+/10 Hz"
+    row_with_rate = r"talker +\d+ +running +\d+ +- +\d+ +\d+ +0\n(    → .*\n)*    → /scan [\d.]+/10 Hz"
     wait_until(lambda: re.search(row_with_rate, ic("top", "--once")[1]), "a heartbeat with rates")
     row = json.loads(ic("top", "--json")[1])[0]
     assert row["node"] == "talker" and row["rss_mb"] > 10 and row["threads"] > 2 and row["cpu_percent"] is not None
