@@ -1,4 +1,4 @@
-"""Compiled loops of the renderer: adaptive ray casting, filtered texture lookup, shading. All release the GIL."""
+"""Compiled loops of the renderer: visibility, filtered texture lookup, shading. All release the GIL."""
 
 from typing import Any
 
@@ -8,186 +8,151 @@ import numpy.typing as npt
 
 F32 = npt.NDArray[np.float32]
 I32 = npt.NDArray[np.int32]
+I64 = npt.NDArray[np.int64]
 U8 = npt.NDArray[np.uint8]
+U32 = npt.NDArray[np.uint32]
 #: float32 in compiled code; numpy's stubs have several types for it.
 Scalar = Any
 
-#: Entries of the tone table, which maps radiance 0..TONE_MAX to sRGB.
-TONE_SIZE = 8192
-TONE_MAX = 4.0
+#: Entries of the tone table, which maps the square root of radiance, 0..TONE_ROOT, to sRGB.
+TONE_SIZE = 4096
+TONE_ROOT = 2.0
+_ROOT = np.float32((TONE_SIZE - 1) / TONE_ROOT)
+#: Tone index of radiance 1.5, where samples of edge pixels are clipped like in a sensor: lamps keep smooth borders.
+_WHITE = np.float32(_ROOT * np.sqrt(1.5))
+#: A bilinear lookup gives albedo as a square root in units of 1 / (255 · 256).
+_PER_LOOKUP = np.float32(_ROOT / (255 * 256))
+#: Pixels between two light lookups; light is interpolated in between.
+_LIGHT_STEP = 4
+#: Most surfaces that an edge pixel is sampled from.
+_MOST = 32
+#: A surface's border is widened by this, so that no ray slips through between two surfaces, metres.
+_GAP_M = np.float32(1e-4)
+
+UNKNOWN = -2
+SKY = -1
 
 _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
 
 
 @_jit
-def rotate(directions: F32, rotation: F32, out: F32) -> None:
-    """Rotate directions (N, 3) by ``rotation`` (3, 3) into ``out`` (N, 3)."""
-    for i in range(directions.shape[0]):
-        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
-        for k in range(3):
-            out[i, k] = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z
+def _hit(forms: F32, s: int, dx: Scalar, dy: Scalar, dz: Scalar) -> Scalar:
+    """Distance along a ray to surface ``s``, in units of the direction's length; infinite if the ray misses it."""
+    along = forms[s, 0, 0] * dx + forms[s, 0, 1] * dy + forms[s, 0, 2] * dz
+    t = -forms[s, 0, 3] / along
+    if not t > 0:
+        return np.float32(np.inf)
+    for k in range(5, 9):
+        if forms[s, k, 3] + t * (forms[s, k, 0] * dx + forms[s, k, 1] * dy + forms[s, k, 2] * dz) < -_GAP_M:
+            return np.float32(np.inf)
+    return t
 
 
 @_jit
-def surfaces_of(face: I32, face_surface: I32) -> None:
-    """Replace face numbers by surface numbers in place; -1 stays."""
-    for i in range(face.shape[0]):
-        if face[i] >= 0:
-            face[i] = face_surface[face[i]]
+def fill_cells(surface: I32, step: int, wraps: bool) -> None:
+    """Fill in the UNKNOWN pixels of the cells between every ``step``-th row and column that one surface covers.
 
-
-@_jit
-def refine(
-    surface: I32,
-    range_m: F32,
-    directions: F32,
-    origin: F32,
-    normal: F32,
-    offset: F32,
-    step: int,
-    wraps: bool,
-    todo: I32,
-) -> int:
-    """Fill in the pixels between those of a coarse grid.
-
-    ``surface`` and ``range_m`` (H, W) are known where both row and column are multiples of ``2 * step``. If all known
-    neighbours of a pixel at multiples of ``step`` lie on one surface, the pixel lies on it too, because surfaces are
-    planar and convex; its range is computed. Other pixels are listed in ``todo`` (flat indices).
-
-    Returns:
-        Number of listed pixels.
+    It does if it covers the four corners, because surfaces are planar and convex. The last row, and without ``wraps``
+    the last column, also end cells.
     """
     height, width = surface.shape
-    coarse = 2 * step
+    for top in range(0, height - 1, step):
+        bottom = min(top + step, height - 1)
+        for left in range(0, width if wraps else width - 1, step):
+            end = min(left + step, width if wraps else width - 1)
+            right = end if end < width else 0
+            s = surface[top, left]
+            if s >= 0 and surface[top, right] == s and surface[bottom, left] == s and surface[bottom, right] == s:
+                for row in range(top, bottom + 1):
+                    for column in range(left, min(end + 1, width)):
+                        surface[row, column] = s
+
+
+@_jit
+def fill_guessed(surface: I32, across: F32, down: F32, scale: F32, forms: F32) -> None:
+    """Fill in the UNKNOWN pixels with the nearest of the surfaces at their four neighbours that their ray hits."""
+    height, width = surface.shape
+    for row in range(1, height - 1, 2):
+        for column in range(1, width - 1, 2):
+            if surface[row, column] != UNKNOWN:
+                continue
+            dx = scale[row + 1] * across[0, column + 1] + down[0, row + 1]
+            dy = scale[row + 1] * across[1, column + 1] + down[1, row + 1]
+            dz = scale[row + 1] * across[2, column + 1] + down[2, row + 1]
+            nearest = np.float32(np.inf)
+            for k in range(4):
+                s = surface[row + (k - 1 if k % 2 == 0 else 0), column + (k - 2 if k % 2 == 1 else 0)]
+                if s >= 0:
+                    t = _hit(forms, s, dx, dy, dz)
+                    if t < nearest:
+                        nearest = t
+                        surface[row, column] = s
+
+
+@_jit
+def unknown(surface: I32, step: int, whole: bool, out: I64) -> int:
+    """List the UNKNOWN pixels (flat indices) in every ``step``-th row and column, and in the last ones.
+
+    Without ``whole`` those are left out that lie in odd rows and columns and not at the image's border.
+
+    Returns:
+        Their number.
+    """
+    height, width = surface.shape
     count = 0
-    for row in range(0, height, step):
-        above = row - row % coarse
-        below = above if row % coarse == 0 else min(above + coarse, height - 1)
-        # The last rows have no coarse row below them, so they are cast.
-        row_open = below != above and below % coarse != 0
-        for column in range(0, width, step):
-            left = column - column % coarse
-            right = left if column % coarse == 0 else left + coarse
-            if above == row and left == column:
-                continue
-            column_open = False
-            if right >= width:
-                right = 0
-                column_open = not wraps
-            s = surface[above, left]
-            if (
-                row_open
-                or column_open
-                or s < 0
-                or surface[above, right] != s
-                or surface[below, left] != s
-                or surface[below, right] != s
-            ):
-                todo[count] = row * width + column
+    for row in range(0, height - 1 + step, step):
+        row = min(row, height - 1)
+        for column in range(0, width - 1 + step, step):
+            column = min(column, width - 1)
+            inner = row % 2 == 1 and column % 2 == 1 and 0 < row < height - 1 and 0 < column < width - 1
+            if surface[row, column] == UNKNOWN and (whole or not inner):
+                out[count] = row * width + column
                 count += 1
-                continue
-            i = row * width + column
-            nx, ny, nz = normal[s, 0], normal[s, 1], normal[s, 2]
-            along = nx * directions[i, 0] + ny * directions[i, 1] + nz * directions[i, 2]
-            height_over = offset[s] - (nx * origin[0] + ny * origin[1] + nz * origin[2])
-            surface[row, column] = s
-            range_m[row, column] = height_over / along
     return count
 
 
 @_jit
-def _bilinear(
-    texels: npt.NDArray[np.uint32], first: int, width: int, height: int, u: Scalar, v: Scalar, clamp: bool
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Bilinear colour at texture coordinates 0..1, linear · 65025 (square of the square-root-coded 0..255)."""
-    x = u * np.float32(width) - np.float32(0.5)
-    y = v * np.float32(height) - np.float32(0.5)
-    floor_x = np.floor(x)
-    floor_y = np.floor(y)
-    fx = x - floor_x
-    fy = y - floor_y
-    x0 = np.int32(floor_x)
-    y0 = np.int32(floor_y)
-    x1 = x0 + np.int32(1)
-    y1 = y0 + np.int32(1)
-    if clamp:
-        x0 = max(x0, np.int32(0))
-        y0 = max(y0, np.int32(0))
-        x1 = min(x1, np.int32(width - 1))
-        y1 = min(y1, np.int32(height - 1))
-    else:
-        if x0 < 0:
-            x0 += np.int32(width)
-        if y0 < 0:
-            y0 += np.int32(height)
-        if x1 >= width:
-            x1 -= np.int32(width)
-        if y1 >= height:
-            y1 -= np.int32(height)
-    row0 = first + np.int64(y0) * np.int64(width)
-    row1 = first + np.int64(y1) * np.int64(width)
-    a, b, c, d = texels[row0 + x0], texels[row0 + x1], texels[row1 + x0], texels[row1 + x1]
-    w11 = fx * fy
-    w10 = fx - w11
-    w01 = fy - w11
-    w00 = np.float32(1) - fx - w01
-    mask = np.uint32(255)
-    ra, rb = np.float32(np.int32(a & mask)), np.float32(np.int32(b & mask))
-    rc, rd = np.float32(np.int32(c & mask)), np.float32(np.int32(d & mask))
-    e = np.uint32(8)
-    ga, gb = np.float32(np.int32((a >> e) & mask)), np.float32(np.int32((b >> e) & mask))
-    gc, gd = np.float32(np.int32((c >> e) & mask)), np.float32(np.int32((d >> e) & mask))
-    e = np.uint32(16)
-    ba, bb = np.float32(np.int32(a >> e)), np.float32(np.int32(b >> e))
-    bc, bd = np.float32(np.int32(c >> e)), np.float32(np.int32(d >> e))
-    return (
-        w00 * ra * ra + w10 * rb * rb + w01 * rc * rc + w11 * rd * rd,
-        w00 * ga * ga + w10 * gb * gb + w01 * gc * gc + w11 * gd * gd,
-        w00 * ba * ba + w10 * bb * bb + w01 * bc * bc + w11 * bd * bd,
-    )
+def rays(pixels: I64, width: int, across: F32, down: F32, scale: F32, out: F32) -> None:
+    """Unit directions (N, 3) of pixels (N,), flat indices."""
+    for i in range(pixels.shape[0]):
+        row, column = pixels[i] // width + 1, pixels[i] % width + 1
+        x = scale[row] * across[0, column] + down[0, row]
+        y = scale[row] * across[1, column] + down[1, row]
+        z = scale[row] * across[2, column] + down[2, row]
+        part = np.float32(1) / np.sqrt(x * x + y * y + z * z)
+        out[i, 0], out[i, 1], out[i, 2] = part * x, part * y, part * z
 
 
 @_jit
-def _albedo(
-    texels: npt.NDArray[np.uint32],
-    level_offset: npt.NDArray[np.int64],
-    level_size: I32,
-    levels: I32,
-    clamps: U8,
-    t: int,
-    u: Scalar,
-    v: Scalar,
-    lod: Scalar,
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Trilinear lookup of the linear albedo of texture ``t``."""
-    clamp = clamps[t] != 0
-    if clamp:
-        u = min(max(u, np.float32(0.0)), np.float32(1.0))
-        v = min(max(v, np.float32(0.0)), np.float32(1.0))
-    else:
-        u -= np.floor(u)
-        v -= np.floor(v)
-    top = levels[t] - 1
-    lod = min(max(lod, np.float32(0.0)), np.float32(top))
-    level = int(lod)
-    part = np.float32(lod - np.float32(level))
-    r, g, b = _bilinear(texels, level_offset[t, level], level_size[t, level, 0], level_size[t, level, 1], u, v, clamp)
-    if part > np.float32(0.03) and level < top:
-        level += 1
-        r1, g1, b1 = _bilinear(
-            texels, level_offset[t, level], level_size[t, level, 0], level_size[t, level, 1], u, v, clamp
-        )
-        r += part * (r1 - r)
-        g += part * (g1 - g)
-        b += part * (b1 - b)
-    scale = np.float32(1.0 / 65025.0)
-    return r * scale, g * scale, b * scale
+def place(surface: I32, pixels: I64, face: I32, face_surface: I32) -> None:
+    """Enter the surfaces of the faces (N,) that the rays of pixels (N,), flat indices, hit."""
+    flat = surface.reshape(-1)
+    for i in range(pixels.shape[0]):
+        flat[pixels[i]] = face_surface[face[i]] if face[i] >= 0 else SKY
 
 
 @_jit
-def _log2(value: Scalar) -> Scalar:
-    """Binary logarithm of a positive float32."""
-    return np.float32(np.log2(value))
+def ranges(surface: I32, across: F32, down: F32, scale: F32, forms: F32, out: F32) -> None:
+    """Radial distance (H, W) of every pixel's surface, 0 for the sky."""
+    height, width = surface.shape
+    for row in range(height):
+        c, bx, by, bz = scale[row + 1], down[0, row + 1], down[1, row + 1], down[2, row + 1]
+        first = 0
+        while first < width:
+            s = surface[row, first]
+            end = first + 1
+            while end < width and surface[row, end] == s:
+                end += 1
+            if s < 0:
+                out[row, first:end] = 0
+            else:
+                nx, ny, nz, over = forms[s, 0, 0], forms[s, 0, 1], forms[s, 0, 2], -forms[s, 0, 3]
+                for column in range(first, end):
+                    x = c * across[0, column + 1] + bx
+                    y = c * across[1, column + 1] + by
+                    z = c * across[2, column + 1] + bz
+                    out[row, column] = over * np.sqrt(x * x + y * y + z * z) / (nx * x + ny * y + nz * z)
+            first = end
 
 
 @_jit
@@ -215,6 +180,440 @@ def _light_texel(
 
 
 @_jit
+def _light(
+    s: int, x: Scalar, y: Scalar, z: Scalar, forms: F32, light_at: I64, light_root: F32, tint_root: F32
+) -> tuple[Scalar, Scalar, Scalar]:
+    """Tone index per lookup unit (square root of light · tint) at o + (x, y, z), with o the camera."""
+    a = forms[s, 3, 0] * x + forms[s, 3, 1] * y + forms[s, 3, 2] * z + forms[s, 3, 3]
+    width = light_at[s, 1]
+    if width == 0:
+        e = np.sqrt(max(a, np.float32(0.02)))
+        return e * tint_root[s, 0], e * tint_root[s, 1], e * tint_root[s, 2]
+    b = forms[s, 4, 0] * x + forms[s, 4, 1] * y + forms[s, 4, 2] * z + forms[s, 4, 3]
+    return _light_texel(light_root, light_at[s, 0], width, light_at[s, 2], a, b)
+
+
+@_jit
+def _lookup(texels: U32, first: int, width: int, height: int, u: Scalar, v: Scalar) -> Any:
+    """Bilinear lookup at texture coordinates 0..1: three lanes of 16 bits (red, blue, green), see ``_PER_LOOKUP``."""
+    # Sixteenths of a texel: the weights of the four texels sum to 256.
+    x = np.int64(u * np.float32(16 * width) + np.float32(8.5))
+    y = np.int64(v * np.float32(16 * height) + np.float32(8.5))
+    at = first + (y >> 4) * (width + 2) + (x >> 4)
+    below = at + width + 2
+    fx = x & 15
+    fy = y & 15
+    gx = 16 - fx
+    gy = 16 - fy
+    mask = 0x00FF00FF00FF
+    a = np.int64(texels[at])
+    b = np.int64(texels[at + 1])
+    c = np.int64(texels[below])
+    d = np.int64(texels[below + 1])
+    return (
+        ((a | (a << 24)) & mask) * (gx * gy)
+        + ((b | (b << 24)) & mask) * (fx * gy)
+        + ((c | (c << 24)) & mask) * (gx * fy)
+        + ((d | (d << 24)) & mask) * (fx * fy)
+    )
+
+
+@_jit
+def _shade(
+    s: int,
+    first: int,
+    end: int,
+    ray: F32,
+    footprint: Scalar,
+    forms: F32,
+    density: F32,
+    texture: I32,
+    texels: U32,
+    level_offset: I64,
+    level_size: I32,
+    levels: I32,
+    clamps: U8,
+    light_at: I64,
+    light_root: F32,
+    tint_root: F32,
+    emission: F32,
+    work: F32,
+    bits: I32,
+    out: F32,
+) -> None:
+    """Tone indices of rays ``first`` to ``end`` of ``ray`` (3, N), which hit surface ``s``, into ``out`` (3, N).
+
+    The texture is averaged over the pixel's footprint on the surface: two lookups along its long axis at oblique view
+    angles, one elsewhere. ``footprint`` is the angle to average over; ``bits`` is the memory of ``work[0]``.
+    """
+    one = np.float32(1)
+    if s < 0:
+        # Open sky, for worlds that are not closed.
+        for i in range(first, end):
+            up = max(ray[2, i], np.float32(0.0))
+            out[0, i] = _ROOT * np.sqrt(np.float32(0.62) - np.float32(0.30) * up)
+            out[1, i] = _ROOT * np.sqrt(np.float32(0.72) - np.float32(0.22) * up)
+            out[2, i] = _ROOT * np.sqrt(np.float32(0.85) - np.float32(0.05) * up)
+        return
+    nx, ny, nz, over = forms[s, 0, 0], forms[s, 0, 1], forms[s, 0, 2], -forms[s, 0, 3]
+    ux, uy, uz, uw = forms[s, 1, 0], forms[s, 1, 1], forms[s, 1, 2], forms[s, 1, 3]
+    vx, vy, vz, vw = forms[s, 2, 0], forms[s, 2, 1], forms[s, 2, 2], forms[s, 2, 3]
+    scale = footprint * density[s]
+    fine, us, vs, du, dv, ts = work[0], work[1], work[2], work[3], work[4], work[5]
+    lr, lg, lb = work[6], work[7], work[8]
+    for i in range(first, end):
+        x, y, z = ray[0, i], ray[1, i], ray[2, i]
+        side = nx * x + ny * y + nz * z
+        t = over / side
+        ts[i] = t
+        ud = ux * x + uy * y + uz * z
+        vd = vx * x + vy * y + vz * z
+        us[i] = uw + t * ud
+        vs[i] = vw + t * vd
+        side = max(abs(side), np.float32(0.0625))
+        stretch = one / side
+        oblique = stretch > np.float32(2.0)
+        size = t * scale * (np.float32(0.5) * stretch if oblique else np.sqrt(stretch))
+        # The square of the size, rounded to the nearest half octave by its exponent.
+        fine[i] = np.float32(1.4142135) * size * size
+        reach = np.float32(0.25) * t * footprint * stretch / np.sqrt(max(one - side * side, np.float32(0.1)))
+        reach = reach if oblique else np.float32(0)
+        du[i] = ud * reach
+        dv[i] = vd * reach
+    if emission[s] > 0:
+        glow = np.sqrt(emission[s])
+        for i in range(first, end):
+            lr[i], lg[i], lb[i] = glow * tint_root[s, 0], glow * tint_root[s, 1], glow * tint_root[s, 2]
+    else:
+        i = first
+        t = ts[i]
+        r0, g0, b0 = _light(s, t * ray[0, i], t * ray[1, i], t * ray[2, i], forms, light_at, light_root, tint_root)
+        lr[i], lg[i], lb[i] = r0, g0, b0
+        while i < end - 1:
+            j = min(i + _LIGHT_STEP, end - 1)
+            t = ts[j]
+            r1, g1, b1 = _light(s, t * ray[0, j], t * ray[1, j], t * ray[2, j], forms, light_at, light_root, tint_root)
+            part = one / np.float32(j - i)
+            r0, g0, b0 = part * (r1 - r0), part * (g1 - g0), part * (b1 - b0)
+            for k in range(i + 1, j + 1):
+                lr[k], lg[k], lb[k] = lr[k - 1] + r0, lg[k - 1] + g0, lb[k - 1] + b0
+            r0, g0, b0 = r1, g1, b1
+            i = j
+    tex = texture[s]
+    top = levels[tex] - 1
+    clamp = clamps[tex] != 0
+    for i in range(first, end):
+        level = min(max((bits[i] >> 23) - 127, 0), top)
+        offset = level_offset[tex, level]
+        width, height = np.int64(level_size[tex, level, 0]), np.int64(level_size[tex, level, 1])
+        u, v = us[i] + du[i], vs[i] + dv[i]
+        if clamp:
+            u, v = min(max(u, np.float32(0)), one), min(max(v, np.float32(0)), one)
+        else:
+            u, v = u - np.floor(u), v - np.floor(v)
+        lanes = _lookup(texels, offset, width, height, u, v)
+        if du[i] != 0 or dv[i] != 0:
+            u, v = us[i] - du[i], vs[i] - dv[i]
+            if clamp:
+                u, v = min(max(u, np.float32(0)), one), min(max(v, np.float32(0)), one)
+            else:
+                u, v = u - np.floor(u), v - np.floor(v)
+            mask = 0x7FFF7FFF7FFF
+            lanes = ((lanes >> 1) & mask) + ((_lookup(texels, offset, width, height, u, v) >> 1) & mask)
+        out[0, i] = np.float32(lanes & 0xFFFF) * lr[i]
+        out[1, i] = np.float32(lanes >> 32) * lg[i]
+        out[2, i] = np.float32((lanes >> 16) & 0xFFFF) * lb[i]
+
+
+@_jit
+def _is_edge(s: int, o: int, dx: Scalar, dy: Scalar, dz: Scalar, forms: F32, texture: I32) -> bool:
+    """Whether surfaces ``s`` and ``o`` of two neighbouring pixels look different.
+
+    Adjoining surfaces of the same texture (one wall in two pieces, the triangles of a smooth mesh) do not.
+    """
+    if s < 0 or o < 0 or texture[s] != texture[o]:
+        return True
+    ax, ay, az = forms[s, 0, 0], forms[s, 0, 1], forms[s, 0, 2]
+    bx, by, bz = forms[o, 0, 0], forms[o, 0, 1], forms[o, 0, 2]
+    if ax * bx + ay * by + az * bz < np.float32(0.95):
+        return True
+    r = forms[s, 0, 3] / (ax * dx + ay * dy + az * dz)
+    q = forms[o, 0, 3] / (bx * dx + by * dy + bz * dz)
+    return abs(r - q) > np.float32(0.08) * min(abs(r), abs(q))
+
+
+@_jit
+def _around(
+    surface: I32, row: int, first: int, stride: int, wraps: bool, across: F32, down: F32, scale: F32, forms: F32,
+    texture: I32, near: I32,
+) -> tuple[int, bool]:  # fmt: skip
+    """Enter the surfaces in and around pixel (``row``, ``first * stride``) into ``near``, itself first.
+
+    Returns:
+        Their number, and whether the pixel lies on an edge.
+    """
+    height, width = surface.shape
+    count = (width + stride - 1) // stride
+    k = first * stride + 1
+    dx = scale[row + 1] * across[0, k] + down[0, row + 1]
+    dy = scale[row + 1] * across[1, k] + down[1, row + 1]
+    dz = scale[row + 1] * across[2, k] + down[2, row + 1]
+    s = surface[row, first * stride]
+    near[0] = s
+    known = 1
+    edge = False
+    for k in range(9):
+        a = row + k // 3 - 1
+        b = first + k % 3 - 1
+        if a < 0 or a >= height:
+            continue
+        if b < 0 or b >= count:
+            if not wraps:
+                continue
+            b = b % count
+        o = surface[a, b * stride]
+        new = True
+        for m in range(known):
+            new = new and near[m] != o
+        if new:
+            near[known] = o
+            known += 1
+        if k % 2 == 1 and o != s and not edge:
+            edge = _is_edge(s, o, dx, dy, dz, forms, texture)
+    return known, edge
+
+
+@_jit
+def _add_adjoining(forms: F32, adjoining: I32, near: I32, known: int) -> int:
+    """Add to ``known`` surfaces in ``near`` those that adjoin them and face the camera; return the new number.
+
+    The sides of a thin board are narrower than a pixel, so that no pixel around may show them.
+    """
+    before = known
+    for m in range(before):
+        if near[m] < 0:
+            continue
+        for k in range(adjoining.shape[1]):
+            o = adjoining[near[m], k]
+            if o < 0 or forms[o, 0, 3] <= 0 or known == _MOST:
+                continue
+            new = True
+            for n in range(known):
+                new = new and near[n] != o
+            if new:
+                near[known] = o
+                known += 1
+    return known
+
+
+@_jit
+def _sample(
+    row: int, first: int, stride: int, wraps: bool, dr: Scalar, dc: Scalar, across: F32, down: F32, scale: F32
+) -> tuple[Scalar, Scalar, Scalar]:
+    """Direction at ``dr`` rows and ``dc`` strides from the centre of pixel (``row``, ``first * stride``)."""
+    half = np.float32(0.5)
+    k = first * stride + 1
+    c = scale[row + 1] + dr * half * (scale[row + 2] - scale[row])
+    dc *= half * np.float32(stride)
+    dr *= half
+    x = c * (across[0, k] + dc * (across[0, k + 1] - across[0, k - 1])) + down[0, row + 1]
+    y = c * (across[1, k] + dc * (across[1, k + 1] - across[1, k - 1])) + down[1, row + 1]
+    z = c * (across[2, k] + dc * (across[2, k + 1] - across[2, k - 1])) + down[2, row + 1]
+    x += dr * (down[0, row + 2] - down[0, row])
+    y += dr * (down[1, row + 2] - down[1, row])
+    z += dr * (down[2, row + 2] - down[2, row])
+    part = np.float32(1) if wraps else np.float32(1) / np.sqrt(x * x + y * y + z * z)
+    return part * x, part * y, part * z
+
+
+@_jit
+def edge_rays(
+    surface: I32, across: F32, down: F32, scale: F32, strides: I32, wraps: bool, subpixels: F32, forms: F32,
+    texture: I32, out: F32,
+) -> int:  # fmt: skip
+    """Directions (N, 3) of the samples of all edge pixels, in the order of ``compose``; return N.
+
+    Nothing is written beyond the end of ``out``.
+    """
+    near = np.empty(9, np.int32)
+    count = 0
+    for row in range(surface.shape[0]):
+        for first in range((surface.shape[1] + strides[row] - 1) // strides[row]):
+            if _around(surface, row, first, strides[row], wraps, across, down, scale, forms, texture, near)[1]:
+                for n in range(subpixels.shape[0]):
+                    if count < out.shape[0]:
+                        out[count] = _sample(
+                            row, first, strides[row], wraps, subpixels[n, 0], subpixels[n, 1], across, down, scale
+                        )
+                    count += 1
+    return count
+
+
+@_jit
+def compose(
+    surface: I32,
+    across: F32,
+    down: F32,
+    scale: F32,
+    strides: I32,
+    wraps: bool,
+    subpixels: F32,
+    sampled: I32,
+    adjoining: I32,
+    footprint: Scalar,
+    edge_footprint: Scalar,
+    forms: F32,
+    density: F32,
+    texture: I32,
+    texels: U32,
+    level_offset: I64,
+    level_size: I32,
+    levels: I32,
+    clamps: U8,
+    light_at: I64,
+    light_root: F32,
+    tint_root: F32,
+    emission: F32,
+    tone: U8,
+    out: U8,
+) -> None:
+    """Shade the image (H, W, 3), sRGB, with anti-aliased edges.
+
+    In a row with a stride only every stride-th pixel is shaded; the pixels in between are interpolated. A sample of an
+    edge pixel shows its surface in ``sampled`` (N,), or if that is empty the nearest of those that the pixels around
+    it show, and of those ``adjoining`` (S, 4) them.
+    """
+    height, width = surface.shape
+    samples = subpixels.shape[0]
+    one = np.float32(1)
+    ray = np.empty((3, width), np.float32)
+    root = np.empty((3, width), np.float32)
+    work = np.empty((9, width), np.float32)
+    bits = work[0].view(np.int32)
+    line = np.empty(width, np.int32)
+    differs = np.empty(width, np.uint8)
+    near = np.empty(_MOST, np.int32)
+    weight = np.empty(_MOST, np.float32)
+    shift = np.empty((_MOST, 2), np.float32)
+    some_ray = np.empty((3, 1), np.float32)
+    some_root = np.empty((3, 1), np.float32)
+    taken = 0
+    for row in range(height):
+        stride = strides[row]
+        count = (width + stride - 1) // stride
+        above, under = surface[max(row - 1, 0)], surface[min(row + 1, height - 1)]
+        here = surface[row]
+        c, bx, by, bz = scale[row + 1], down[0, row + 1], down[1, row + 1], down[2, row + 1]
+        if stride == 1:
+            for i in range(count):
+                line[i] = here[i]
+                differs[i] = (above[i] != here[i]) | (under[i] != here[i])
+                ray[0, i] = c * across[0, i + 1] + bx
+                ray[1, i] = c * across[1, i + 1] + by
+                ray[2, i] = c * across[2, i + 1] + bz
+        else:
+            for i in range(count):
+                k = i * stride
+                line[i] = here[k]
+                differs[i] = (above[k] != here[k]) | (under[k] != here[k])
+                ray[0, i] = c * across[0, k + 1] + bx
+                ray[1, i] = c * across[1, k + 1] + by
+                ray[2, i] = c * across[2, k + 1] + bz
+        if not wraps:
+            for i in range(count):
+                part = one / np.sqrt(ray[0, i] * ray[0, i] + ray[1, i] * ray[1, i] + ray[2, i] * ray[2, i])
+                ray[0, i] *= part
+                ray[1, i] *= part
+                ray[2, i] *= part
+        for i in range(1, count):
+            differs[i] |= line[i] != line[i - 1]
+        for i in range(count - 1):
+            differs[i] |= line[i] != line[i + 1]
+        if wraps and line[0] != line[count - 1]:
+            differs[0] = differs[count - 1] = 1
+
+        first = 0
+        while first < count:
+            s = line[first]
+            known, edge = 0, False
+            if differs[first]:
+                known, edge = _around(surface, row, first, stride, wraps, across, down, scale, forms, texture, near)
+            if not edge:
+                end = first + 1
+                while end < count and line[end] == s and not differs[end]:
+                    end += 1
+                _shade(
+                    s, first, end, ray, footprint, forms, density, texture, texels, level_offset, level_size, levels,
+                    clamps, light_at, light_root, tint_root, emission, work, bits, root,
+                )  # fmt: skip
+                first = end
+                continue
+            known = _add_adjoining(forms, adjoining, near, known)
+            for m in range(known):
+                weight[m] = shift[m, 0] = shift[m, 1] = np.float32(0)
+            for n in range(samples):
+                dr, dc = subpixels[n, 0], subpixels[n, 1]
+                best = 0
+                if sampled.shape[0]:
+                    while best < known and near[best] != sampled[taken]:
+                        best += 1
+                    if best == known:
+                        near[best] = sampled[taken]
+                        weight[best] = shift[best, 0] = shift[best, 1] = np.float32(0)
+                        known += 1
+                    taken += 1
+                else:
+                    x, y, z = _sample(row, first, stride, wraps, dr, dc, across, down, scale)
+                    nearest = np.float32(np.inf)
+                    for m in range(known):
+                        if near[m] < 0:
+                            best = m if nearest == np.inf else best
+                        else:
+                            t = _hit(forms, near[m], x, y, z)
+                            if t < nearest:
+                                nearest = t
+                                best = m
+                weight[best] += one
+                shift[best, 0] += dr
+                shift[best, 1] += dc
+            for k in range(3):
+                root[k, first] = np.float32(0)
+            for m in range(known):
+                if weight[m] == 0:
+                    continue
+                part = one / weight[m]
+                x, y, z = _sample(
+                    row, first, stride, wraps, part * shift[m, 0], part * shift[m, 1], across, down, scale
+                )
+                some_ray[0, 0], some_ray[1, 0], some_ray[2, 0] = x, y, z
+                _shade(
+                    near[m], 0, 1, some_ray, edge_footprint, forms, density, texture, texels, level_offset, level_size,
+                    levels, clamps, light_at, light_root, tint_root, emission, work, bits, some_root,
+                )  # fmt: skip
+                for k in range(3):
+                    value = min(some_root[k, 0], _WHITE)
+                    root[k, first] += weight[m] / np.float32(samples) * value * value
+            for k in range(3):
+                root[k, first] = np.sqrt(root[k, first])
+            first += 1
+
+        top = np.float32(TONE_SIZE - 1)
+        if stride == 1:
+            for i in range(count):
+                out[row, i, 0] = tone[np.int32(min(root[0, i], top))]
+                out[row, i, 1] = tone[np.int32(min(root[1, i], top))]
+                out[row, i, 2] = tone[np.int32(min(root[2, i], top))]
+        else:
+            for i in range(count):
+                j = i + 1 if i + 1 < count else 0
+                for k in range(min(stride, width - i * stride)):
+                    share = np.float32(k) / np.float32(stride)
+                    for m in range(3):
+                        value = root[m, i] + share * (root[m, j] - root[m, i])
+                        out[row, i * stride + k, m] = tone[np.int32(min(value, top))]
+
+
+@_jit
 def _irradiance(
     s: int,
     x: Scalar,
@@ -234,210 +633,6 @@ def _irradiance(
     a = light_uv[s, 0, 0] * x + light_uv[s, 0, 1] * y + light_uv[s, 0, 2] * z + light_uv[s, 0, 3]
     b = light_uv[s, 1, 0] * x + light_uv[s, 1, 1] * y + light_uv[s, 1, 2] * z + light_uv[s, 1, 3]
     return _light_texel(light, light_at[s, 0], width, height, a, b)
-
-
-@_jit
-def shade(
-    surface: I32,
-    range_m: F32,
-    directions: F32,
-    origin: F32,
-    pixel_rad: Scalar,
-    normal: F32,
-    uv: F32,
-    texture: I32,
-    tint: F32,
-    emission: F32,
-    texel_per_m: F32,
-    texels: npt.NDArray[np.uint32],
-    level_offset: npt.NDArray[np.int64],
-    level_size: I32,
-    levels: I32,
-    clamps: U8,
-    light_at: npt.NDArray[np.int64],
-    light_uv: F32,
-    light_linear: F32,
-    light: F32,
-    listed: I32,
-    out: F32,
-) -> None:
-    """Compute the radiance of rays with known surface (N,) and range (N,); ``pixel_rad`` is the angle of a pixel.
-
-    Only the rays in ``listed`` are written to ``out`` (N, 3).
-
-    The texture is averaged over the pixel's footprint on the surface: two trilinear lookups along its long axis at
-    oblique view angles, one elsewhere.
-    """
-    last = np.int32(-1)
-    one = np.float32(1)
-    half = np.float32(0.5)
-    angle = np.float32(pixel_rad)
-    ox, oy, oz = origin[0], origin[1], origin[2]
-    # Surface data is reloaded only when the surface changes, which is rare along a row.
-    nx = ny = nz = ux = uy = uz = uw = vx = vy = vz = vw = np.float32(0)
-    tr = tg = tb = glow = density = np.float32(0)
-    ax = ay = az = aw = bx = by = bz = bw = np.float32(0)
-    columns = rows = np.int64(0)
-    first = np.int64(0)
-    t = np.int32(0)
-    for k in range(listed.shape[0]):
-        i = listed[k]
-        s = surface[i]
-        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
-        if s < 0:
-            # Open sky, for worlds that are not closed.
-            up = max(dz, np.float32(0.0))
-            out[i, 0] = np.float32(0.62) - np.float32(0.30) * up
-            out[i, 1] = np.float32(0.72) - np.float32(0.22) * up
-            out[i, 2] = np.float32(0.85) - np.float32(0.05) * up
-            continue
-        if s != last:
-            last = s
-            nx, ny, nz = normal[s, 0], normal[s, 1], normal[s, 2]
-            ux, uy, uz, uw = uv[s, 0, 0], uv[s, 0, 1], uv[s, 0, 2], uv[s, 0, 3]
-            vx, vy, vz, vw = uv[s, 1, 0], uv[s, 1, 1], uv[s, 1, 2], uv[s, 1, 3]
-            tr, tg, tb = tint[s, 0], tint[s, 1], tint[s, 2]
-            glow, density, t = emission[s], texel_per_m[s], texture[s]
-            first, columns, rows = light_at[s, 0], light_at[s, 1], light_at[s, 2]
-            if columns == 0:
-                ax, ay, az, aw = light_linear[s, 0], light_linear[s, 1], light_linear[s, 2], light_linear[s, 3]
-            else:
-                ax, ay, az, aw = light_uv[s, 0, 0], light_uv[s, 0, 1], light_uv[s, 0, 2], light_uv[s, 0, 3]
-                bx, by, bz, bw = light_uv[s, 1, 0], light_uv[s, 1, 1], light_uv[s, 1, 2], light_uv[s, 1, 3]
-        r = range_m[i]
-        x, y, z = ox + r * dx, oy + r * dy, oz + r * dz
-        u = ux * x + uy * y + uz * z + uw
-        v = vx * x + vy * y + vz * z + vw
-        side = nx * dx + ny * dy + nz * dz
-        minor = r * angle
-        stretch = min(one / max(abs(side), np.float32(0.02)), np.float32(16.0))
-        if stretch < np.float32(2.2):
-            lod = _log2(minor * stretch * density)
-            cr, cg, cb = _albedo(texels, level_offset, level_size, levels, clamps, t, u, v, lod)
-        else:
-            px, py, pz = dx - side * nx, dy - side * ny, dz - side * nz
-            reach = np.float32(0.25) * minor * stretch / np.sqrt(px * px + py * py + pz * pz)
-            du = (ux * px + uy * py + uz * pz) * reach
-            dv = (vx * px + vy * py + vz * pz) * reach
-            lod = _log2(minor * max(stretch * half, one) * density)
-            cr, cg, cb = _albedo(texels, level_offset, level_size, levels, clamps, t, u + du, v + dv, lod)
-            r2, g2, b2 = _albedo(texels, level_offset, level_size, levels, clamps, t, u - du, v - dv, lod)
-            cr = half * (cr + r2)
-            cg = half * (cg + g2)
-            cb = half * (cb + b2)
-        if glow > 0:
-            er = eg = eb = glow
-        elif columns == 0:
-            er = eg = eb = max(ax * x + ay * y + az * z + aw, np.float32(0.02))
-        else:
-            a = ax * x + ay * y + az * z + aw
-            b = bx * x + by * y + bz * z + bw
-            er, eg, eb = _light_texel(light, first, columns, rows, a, b)
-        out[i, 0] = cr * tr * er
-        out[i, 1] = cg * tg * eg
-        out[i, 2] = cb * tb * eb
-
-
-@_jit
-def edges(surface: I32, range_m: F32, normal: F32, texture: I32, wraps: bool, out: I32) -> int:
-    """List the pixels (flat indices) whose right or lower neighbour shows something else; return their number.
-
-    Two adjoining surfaces of the same texture (one wall in two pieces, the triangles of a smooth mesh) do not form an
-    edge.
-    """
-    height, width = surface.shape
-    count = 0
-    for row in range(height):
-        for column in range(width):
-            s = surface[row, column]
-            r = range_m[row, column]
-            found = False
-            for k in range(4):
-                a, b = row, column
-                if k == 0:
-                    b = column + 1
-                elif k == 1:
-                    a = row + 1
-                elif k == 2:
-                    b = column - 1
-                else:
-                    a = row - 1
-                if a < 0 or a >= height:
-                    continue
-                if b < 0 or b >= width:
-                    if not wraps:
-                        continue
-                    b = b % width
-                o = surface[a, b]
-                if o == s:
-                    continue
-                if s < 0 or o < 0 or texture[s] != texture[o]:
-                    found = True
-                    break
-                bend = normal[s, 0] * normal[o, 0] + normal[s, 1] * normal[o, 1] + normal[s, 2] * normal[o, 2]
-                q = range_m[a, b]
-                if bend < np.float32(0.95) or abs(r - q) > np.float32(0.08) * min(r, q):
-                    found = True
-                    break
-            if found:
-                out[count] = row * width + column
-                count += 1
-    return count
-
-
-@_jit
-def plain_pixels(strides: I32, edge: U8, out: I32) -> int:
-    """List the non-edge pixels (flat indices) at multiples of their row's stride; return their number."""
-    height, width = edge.shape
-    count = 0
-    for row in range(height):
-        for column in range(0, width, strides[row]):
-            if not edge[row, column]:
-                out[count] = row * width + column
-                count += 1
-    return count
-
-
-@_jit
-def anchored(listed: I32, strides: I32, width: int) -> int:
-    """Keep in ``listed`` only the pixels at multiples of their row's stride, in place; return their number."""
-    count = 0
-    for k in range(listed.shape[0]):
-        row = listed[k] // width
-        if (listed[k] - row * width) % strides[row] == 0:
-            listed[count] = listed[k]
-            count += 1
-    return count
-
-
-@_jit
-def fill_rows(radiance: F32, strides: I32) -> None:
-    """Interpolate linearly the pixels between multiples of their row's stride; rows wrap."""
-    height, width = radiance.shape[:2]
-    for row in range(height):
-        stride = strides[row]
-        if stride == 1:
-            continue
-        part = np.float32(1) / np.float32(stride)
-        for left in range(0, width, stride):
-            right = left + stride
-            end = min(right, width)
-            if right >= width:
-                right = 0
-            for column in range(left + 1, end):
-                share = np.float32(column - left) * part
-                for c in range(3):
-                    a = radiance[row, left, c]
-                    radiance[row, column, c] = a + share * (radiance[row, right, c] - a)
-
-
-@_jit
-def tone(radiance: F32, table: U8, out: U8) -> None:
-    """Convert radiance (N, 3) to sRGB bytes (N, 3) with the tone table."""
-    scale = np.float32((TONE_SIZE - 1) / TONE_MAX)
-    for i in range(radiance.shape[0]):
-        for k in range(3):
-            out[i, k] = table[int(min(max(radiance[i, k], np.float32(0.0)), np.float32(TONE_MAX)) * scale)]
 
 
 @_jit

@@ -13,12 +13,14 @@ from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.floating]
 
-#: Sample positions in edge pixels (rows, columns, pixels from the centre): rotated grid, one sample per row and column.
-_SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
+#: Sample positions in edge pixels (rows, columns, pixels from the centre), one sample per row and column.
+_SUBPIXELS = np.asarray([((row + 0.5) / 8 - 0.5, (3 * row % 8 + 0.5) / 8 - 0.5) for row in range(8)], np.float32)
+_CAST_SUBPIXELS = np.asarray([(-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125)], np.float32)
 
-#: Share of a pixel over which a texture is averaged; below 1 because trilinear lookup also blurs. Compared with 16
-#: samples per pixel in the corridor, 0.65 gives 41-44 dB, 1.0 gives 38-40 dB, 0.5 gives 39-43 dB and starts to alias.
+#: Share of a pixel over which a texture is averaged, in pixels on one surface and for the samples of edge pixels.
+#: It is below 1 because bilinear lookup also blurs.
 _FOOTPRINT = 0.65
+_EDGE_FOOTPRINT = 0.45
 
 
 @dataclass(frozen=True)
@@ -35,51 +37,51 @@ class Frame:
 
 
 @lru_cache(maxsize=1)
-def _tone_table() -> npt.NDArray[np.uint8]:
-    """Tone table from radiance to sRGB: linear up to 0.6, then a soft shoulder, so that lamps turn white gradually."""
-    radiance = np.linspace(0.0, kernels.TONE_MAX, kernels.TONE_SIZE)
+def _tone_table() -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
+    """Tone table from the square root of radiance to sRGB, and the mean radiance of each sRGB value (256,).
+
+    Linear up to 0.6, then a soft shoulder, so that lamps turn white gradually.
+    """
+    radiance = ((np.arange(kernels.TONE_SIZE) + 0.5) * (kernels.TONE_ROOT / (kernels.TONE_SIZE - 1))) ** 2
     knee = 0.6
     shoulder = knee + (1 - knee) * (1 - np.exp(-(radiance - knee) / (1 - knee)))
-    return np.rint(linear_to_srgb(np.where(radiance < knee, radiance, shoulder)) * 255).astype(np.uint8)
-
-
-def _equirect_rays(rows: FloatArray, columns: FloatArray, width: int, height: int) -> npt.NDArray[np.float32]:
-    """Unit vectors (N, 3) at pixel indices: centre column along x, columns clockwise, rows from +90° down."""
-    azimuth = math.pi - (columns + 0.5) * (2 * math.pi / width)
-    elevation = math.pi / 2 - (rows + 0.5) * (math.pi / height)
-    cosine = np.cos(elevation)
-    rays = np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), np.sin(elevation)], axis=-1)
-    return np.ascontiguousarray(rays, np.float32)
-
-
-def _perspective_rays(
-    rows: FloatArray, columns: FloatArray, width: int, height: int, hfov_rad: float
-) -> npt.NDArray[np.float32]:
-    focal = 0.5 * width / math.tan(0.5 * hfov_rad)
-    rays = np.stack(
-        [np.full(np.shape(columns), focal), 0.5 * (width - 1) - columns, 0.5 * (height - 1) - rows], axis=-1
-    )
-    return np.ascontiguousarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True), np.float32)
+    table = np.rint(linear_to_srgb(np.where(radiance < knee, radiance, shoulder)) * 255).astype(np.uint8)
+    count = np.bincount(table, minlength=256)
+    mean = np.bincount(table, weights=radiance, minlength=256) / np.maximum(count, 1)
+    return table, np.asarray(mean, np.float32)
 
 
 @dataclass(frozen=True)
 class _Lens:
-    """Projection of an image: width, height, and horizontal field of view (None: equirect)."""
+    """Projection of an image: width, height, and horizontal field of view (None: equirect).
+
+    The direction of a pixel is ``scale[row] * across[:, column] + down[:, row]``, to be normalised in a perspective
+    image. The tables begin one row and one column before the image and end one after it.
+    """
 
     width: int
     height: int
     hfov_rad: float | None = None
-
-    def rays(self, rows: FloatArray, columns: FloatArray) -> npt.NDArray[np.float32]:
-        if self.hfov_rad is None:
-            return _equirect_rays(rows, columns, self.width, self.height)
-        return _perspective_rays(rows, columns, self.width, self.height, self.hfov_rad)
 
     @property
     def pixel_rad(self) -> float:
         if self.hfov_rad is None:
             return math.pi / self.height
         return 2 * math.tan(0.5 * self.hfov_rad) / self.width
+
+    def tables(self, rotation: FloatArray) -> tuple[npt.NDArray[np.float32], ...]:
+        """Tables ``across`` (3, W + 2), ``down`` (3, H + 2) and ``scale`` (H + 2,) for a camera's rotation (3, 3)."""
+        columns, rows = np.arange(-1, self.width + 1), np.arange(-1, self.height + 1)
+        if self.hfov_rad is None:
+            azimuth = math.pi - (columns + 0.5) * (2 * math.pi / self.width)
+            elevation = math.pi / 2 - (rows + 0.5) * (math.pi / self.height)
+            across = rotation[:, :2] @ np.stack([np.cos(azimuth), np.sin(azimuth)])
+            down, scale = rotation[:, 2:] * np.sin(elevation), np.cos(elevation)
+        else:
+            focal = 0.5 * self.width / math.tan(0.5 * self.hfov_rad)
+            across = focal * rotation[:, :1] + rotation[:, 1:2] * (0.5 * (self.width - 1) - columns)
+            down, scale = rotation[:, 2:] * (0.5 * (self.height - 1) - rows), np.ones(len(rows))
+        return tuple(np.ascontiguousarray(table, np.float32) for table in (across, down, scale))
 
 
 @lru_cache(maxsize=8)
@@ -95,24 +97,24 @@ def _strides(lens: _Lens) -> npt.NDArray[np.int32]:
     return np.asarray(2 ** np.floor(np.log2(most)), np.int32)
 
 
-@lru_cache(maxsize=8)
-def _all_rays(lens: _Lens) -> npt.NDArray[np.float32]:
-    rows, columns = np.mgrid[0 : lens.height, 0 : lens.width].reshape(2, -1).astype(np.float64)
-    return lens.rays(rows, columns)
-
-
 class EquirectRenderer:
     """Renders a world from any pose.
 
-    Rays are cast for every fourth pixel in each direction and wherever neighbours show different surfaces. In between,
-    the range follows from the surface's plane. Pixels on edges are cast and shaded at four points. Near the poles of a
-    panorama only every second, fourth... pixel of a row is shaded, and the colours in between are interpolated.
-    Only one thread at a time may use a renderer.
+    Rays are cast for every fourth pixel in each direction, and for every second one where neighbours show different
+    surfaces; the pixels in between show one of the surfaces around them. The coverage of a pixel on an edge is sampled
+    at eight points. Near the poles of a panorama only every second, fourth... pixel of a row is shaded, and the colours
+    in between are interpolated. The world's light is read when the renderer is made.
     """
 
     def __init__(self, world: World) -> None:
         self.world = world
         self._caster = world.caster
+        per_lookup = (kernels.TONE_SIZE - 1) / kernels.TONE_ROOT / (255 * 256)
+        self._tint_root = np.asarray(per_lookup * np.sqrt(world.tint), np.float32)
+        owner = np.repeat(np.arange(len(world.light_at)), world.light_at[:, 1] * world.light_at[:, 2])
+        self._light_root = np.ones((1, 3), np.float32)
+        if len(owner):
+            self._light_root = np.asarray(np.sqrt(world.light) * self._tint_root[owner], np.float32)
 
     def render(self, map_from_camera: FloatArray, width: int, height: int, supersample: int = 1) -> Frame:
         """Render an equirect panorama: centre column along x, rows from +90° to −90°.
@@ -142,100 +144,63 @@ class EquirectRenderer:
         if supersample < 1:
             raise ValueError(f"supersample must be at least 1 (got {supersample})")
         if supersample == 1:
-            radiance, depth = self._radiance(map_from_camera, lens)
-        else:
-            n = supersample
-            fine, fine_depth = self._radiance(map_from_camera, _Lens(lens.width * n, lens.height * n, lens.hfov_rad))
-            # Averaged as radiance and clipped at white like a sensor, so that lamps keep smooth borders.
-            radiance = np.ascontiguousarray(
-                np.minimum(fine, 1.5).reshape(lens.height, n, lens.width, n, 3).mean(axis=(1, 3)), np.float32
-            )
-            depth = np.ascontiguousarray(fine_depth[n // 2 :: n, n // 2 :: n])
+            return self._frame(map_from_camera, lens)
+        n = supersample
+        fine = self._frame(map_from_camera, _Lens(lens.width * n, lens.height * n, lens.hfov_rad))
+        # Averaged as radiance and clipped at white like a sensor, so that lamps keep smooth borders.
+        table, radiance = _tone_table()
+        parts = np.minimum(radiance, 1.5)[fine.rgb].reshape(lens.height, n, lens.width, n, 3)
+        index = np.sqrt(parts.mean(axis=(1, 3))) * ((kernels.TONE_SIZE - 1) / kernels.TONE_ROOT)
+        return Frame(table[index.astype(np.int32)], np.ascontiguousarray(fine.depth_m[n // 2 :: n, n // 2 :: n]))
+
+    def _frame(self, map_from_camera: FloatArray, lens: _Lens) -> Frame:
+        world, textures = self.world, self.world.textures
+        tables = lens.tables(map_from_camera[:3, :3])
+        origin = np.asarray(map_from_camera[:3, 3], np.float32)
+        forms = world.forms.copy()
+        forms[:, :, 3] += forms[:, :, :3] @ origin
+        surface = self._visible(tables, origin, forms, lens)
         rgb = np.empty((lens.height, lens.width, 3), np.uint8)
-        kernels.tone(radiance.reshape(-1, 3), _tone_table(), rgb.reshape(-1, 3))
+        depth = np.empty((lens.height, lens.width), np.float32)
+        kernels.ranges(surface, *tables, forms, depth)
+        view = (surface, *tables, _strides(lens), lens.hfov_rad is None)
+        subpixels, sampled = _SUBPIXELS, np.empty(0, np.int32)
+        if world.two_sided:
+            # The triangles of a mesh file can be smaller than a pixel: those in an edge pixel must be cast.
+            subpixels, rays = _CAST_SUBPIXELS, np.empty((0, 3), np.float32)
+            count = kernels.edge_rays(*view, subpixels, forms, world.texture, rays)
+            rays = np.empty((count, 3), np.float32)
+            kernels.edge_rays(*view, subpixels, forms, world.texture, rays)
+            sampled = self._caster.cast(origin, rays)[1]
+            kernels.place(sampled, np.arange(count), sampled, world.face_surface)
+        kernels.compose(
+            *view, subpixels, sampled, world.adjoining,
+            np.float32(_FOOTPRINT * lens.pixel_rad), np.float32(_EDGE_FOOTPRINT * lens.pixel_rad), forms,
+            world.texel_per_m, world.texture, textures.texels, textures.level_offset, textures.level_size,
+            textures.levels, textures.clamp, world.light_at, self._light_root, self._tint_root, world.emission,
+            _tone_table()[0], rgb,
+        )  # fmt: skip
         return Frame(rgb, depth)
 
-    def _radiance(
-        self, map_from_camera: FloatArray, lens: _Lens
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Radiance (H, W, 3) with anti-aliased edges, and radial depth (H, W)."""
-        height, width = lens.height, lens.width
-        rotation = np.ascontiguousarray(map_from_camera[:3, :3], np.float32)
-        origin = np.ascontiguousarray(map_from_camera[:3, 3], np.float32)
-        directions = np.empty((height * width, 3), np.float32)
-        kernels.rotate(_all_rays(lens), rotation, directions)
-        surface, range_m = self._visible(directions, origin, lens)
-        radiance = np.empty((height * width, 3), np.float32)
-        footprint = _FOOTPRINT * lens.pixel_rad
-        strides = _strides(lens)
-
-        listed = np.empty(height * width, np.int32)
-        world = self.world
-        count = kernels.edges(surface, range_m, world.normal, world.texture, lens.hfov_rad is None, listed)
-        count = kernels.anchored(listed[:count], strides, width)
-        edge = np.zeros((height, width), np.uint8)
-        edge.reshape(-1)[listed[:count]] = 1
-        plain = np.empty(height * width, np.int32)
-        plain = plain[: kernels.plain_pixels(strides, edge, plain)]
-        self._shade(surface.ravel(), range_m.ravel(), directions, origin, footprint, plain, radiance)
-        if count:
-            at = listed[:count]
-            rows, columns = np.divmod(at, width)
-            points = [lens.rays(rows + dr, columns + dc * strides[rows]) for dr, dc in _SUBPIXELS]
-            sub = np.concatenate(points)
-            rays = np.empty_like(sub)
-            kernels.rotate(sub, rotation, rays)
-            sub_range, sub_surface = self._caster.cast(origin, rays)
-            kernels.surfaces_of(sub_surface, world.face_surface)
-            colour = np.empty((len(rays), 3), np.float32)
-            every = np.arange(len(rays), dtype=np.int32)
-            self._shade(sub_surface, sub_range, rays, origin, 0.6 * footprint, every, colour)
-            radiance[at] = np.minimum(colour, 1.5).reshape(len(_SUBPIXELS), count, 3).mean(axis=0)
-        picture = radiance.reshape(height, width, 3)
-        kernels.fill_rows(picture, strides)
-        depth = np.where(surface >= 0, range_m, 0.0).astype(np.float32)
-        return picture, depth
-
     def _visible(
-        self, directions: npt.NDArray[np.float32], origin: npt.NDArray[np.float32], lens: _Lens
-    ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-        """Surface (H, W), -1 = no hit, and range (H, W) of every pixel."""
-        height, width = lens.height, lens.width
-        world = self.world
-        surface = np.full((height, width), -1, np.int32)
-        range_m = np.zeros((height, width), np.float32)
-        wraps = lens.hfov_rad is None
-        coarse = 4
-        listed = (np.arange(0, height, coarse)[:, None] * width + np.arange(0, width, coarse)[None, :]).ravel()
-        step = coarse
-        todo = np.empty(height * width, np.int32)
-        while True:
-            r, face = self._caster.cast(origin, directions[listed])
-            kernels.surfaces_of(face, world.face_surface)
-            surface.reshape(-1)[listed] = face
-            range_m.reshape(-1)[listed] = r
-            if step == 1:
-                break
-            step //= 2
-            count = kernels.refine(surface, range_m, directions, origin, world.normal, world.offset, step, wraps, todo)
-            listed = todo[:count].astype(np.int64)
-            if count == 0 and step == 1:
-                break
-        return surface, range_m
-
-    def _shade(
         self,
-        surface: npt.NDArray[np.int32],
-        range_m: npt.NDArray[np.float32],
-        directions: npt.NDArray[np.float32],
+        tables: tuple[npt.NDArray[np.float32], ...],
         origin: npt.NDArray[np.float32],
-        footprint_rad: float,
-        listed: npt.NDArray[np.int32],
-        out: npt.NDArray[np.float32],
-    ) -> None:
-        w, t = self.world, self.world.textures
-        kernels.shade(
-            surface, range_m, directions, origin, footprint_rad, w.normal, w.uv, w.texture, w.tint, w.emission,
-            w.texel_per_m, t.texels, t.level_offset, t.level_size, t.levels, t.clamp, w.light_at, w.light_uv,
-            w.light_linear, w.light, listed, out,
-        )  # fmt: skip
+        forms: npt.NDArray[np.float32],
+        lens: _Lens,
+    ) -> npt.NDArray[np.int32]:
+        """Surface (H, W) of every pixel, SKY = no hit."""
+        width = lens.width
+        surface = np.full((lens.height, width), kernels.UNKNOWN, np.int32)
+        todo = np.empty(surface.size, np.int64)
+        for step, whole in ((4, True), (2, True), (1, False), (1, True)):
+            count = kernels.unknown(surface, step, whole, todo)
+            rays = np.empty((count, 3), np.float32)
+            kernels.rays(todo[:count], width, *tables, rays)
+            _, face = self._caster.cast(origin, rays)
+            kernels.place(surface, todo[:count], face, self.world.face_surface)
+            if step > 1:
+                kernels.fill_cells(surface, step, lens.hfov_rad is None)
+            elif not whole:
+                kernels.fill_guessed(surface, *tables, forms)
+        return surface

@@ -1,9 +1,10 @@
 """Procedural textures and their mip pyramids.
 
 Every texture is periodic and has enough high-frequency detail for depth and view synthesis. Lookups are always filtered
-(trilinear in a pyramid that is averaged in linear light), like the optics of a camera.
+(bilinear in the nearest level of a pyramid that is averaged in linear light), like the optics of a camera.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -15,7 +16,8 @@ from instant_ic.sim.kept import Arrays, kept
 
 FloatArray = npt.NDArray[np.floating]
 
-MAX_LEVELS = 12
+#: Two levels an octave.
+MAX_LEVELS = 24
 
 
 @dataclass(frozen=True)
@@ -23,9 +25,10 @@ class TextureSet:
     """Mip pyramids of several textures in one buffer, in the layout that the kernels read.
 
     Attributes:
-        texels: (N,) uint32, one texel each: red, green, blue in bytes 0..2, as square root of linear albedo · 255.
-        level_offset: (T, MAX_LEVELS) int64, index of a level's first entry in ``texels``.
-        level_size: (T, MAX_LEVELS, 2) int32, width and height of a level.
+        texels: (N,) uint32, one texel each: red, green, blue in bytes 0..2, as square root of linear albedo · 255. Each
+            level has a border of one texel, wrapped or clamped, so that a lookup needs no test at the texture's end.
+        level_offset: (T, MAX_LEVELS) int64, index of a level's first entry in ``texels``, the corner of its border.
+        level_size: (T, MAX_LEVELS, 2) int32, width and height of a level without the border.
         levels: (T,) int32, number of levels.
         clamp: (T,) uint8, 1 where the texture ends at its border instead of repeating.
         mean: (T, 3) float32, mean linear albedo.
@@ -63,14 +66,20 @@ def _halve(image: FloatArray) -> npt.NDArray[np.float32]:
 
 
 def pyramid(albedo: FloatArray) -> list[npt.NDArray[np.float32]]:
-    """Mip levels of a linear-light image (H, W, 3), each half the size of the previous one, down to one texel."""
+    """Mip levels of a linear-light image (H, W, 3), two an octave, down to one texel."""
+    import cv2
+
     levels = [np.asarray(albedo, np.float32)]
-    while max(levels[-1].shape[:2]) > 1 and len(levels) < MAX_LEVELS:
-        levels.append(_halve(levels[-1]))
+    while max(levels[-1].shape[:2]) > 1 and len(levels) < MAX_LEVELS - 1:
+        whole = levels[-1]
+        height, width = (max(1, round(size * math.sqrt(0.5))) for size in whole.shape[:2])
+        between = cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA).reshape(height, width, 3)
+        levels += [np.asarray(between, np.float32), _halve(whole)]
     return levels
 
 
-def _pack(image: FloatArray) -> npt.NDArray[np.uint32]:
+def _pack(image: FloatArray, clamp: bool) -> npt.NDArray[np.uint32]:
+    image = np.pad(image, ((1, 1), (1, 1), (0, 0)), "edge" if clamp else "wrap")
     root: npt.NDArray[np.uint32] = np.rint(np.sqrt(np.clip(image, 0.0, 1.0)) * 255.0).astype(np.uint32)
     shift = np.asarray([0, 8, 16], np.uint32)
     return np.asarray(np.bitwise_or.reduce(root << shift, axis=-1).ravel(), np.uint32)
@@ -79,21 +88,21 @@ def _pack(image: FloatArray) -> npt.NDArray[np.uint32]:
 @cache
 def _packed_named(name: str) -> tuple[list[npt.NDArray[np.uint32]], list[tuple[int, int]], tuple[float, ...]]:
     def make() -> Arrays:
-        levels, sizes, mean = _packed(make_texture(name))
+        levels, sizes, mean = _packed(make_texture(name), is_clamped(name))
         return {"texels": np.concatenate(levels), "sizes": np.asarray(sizes), "mean": np.asarray(mean)}
 
     arrays = kept("texture", [name], make)
     sizes = [(int(width), int(height)) for width, height in arrays["sizes"]]
-    ends = np.cumsum([width * height for width, height in sizes])
+    ends = np.cumsum([(width + 2) * (height + 2) for width, height in sizes])
     return np.split(arrays["texels"], ends[:-1]), sizes, tuple(arrays["mean"].tolist())
 
 
 def _packed(
-    albedo: FloatArray,
+    albedo: FloatArray, clamp: bool
 ) -> tuple[list[npt.NDArray[np.uint32]], list[tuple[int, int]], tuple[float, ...]]:
     levels = pyramid(albedo)
     mean = tuple(float(c) for c in levels[0].reshape(-1, 3).mean(axis=0))
-    return [_pack(level) for level in levels], [(lv.shape[1], lv.shape[0]) for lv in levels], mean
+    return [_pack(level, clamp) for level in levels], [(lv.shape[1], lv.shape[0]) for lv in levels], mean
 
 
 def texture_set(sources: list[str | FloatArray], clamped: list[bool]) -> TextureSet:
@@ -106,7 +115,10 @@ def texture_set(sources: list[str | FloatArray], clamped: list[bool]) -> Texture
     parts: list[npt.NDArray[np.uint32]] = []
     at = 0
     for index, source in enumerate(sources):
-        packed, sizes, mean[index] = _packed_named(source) if isinstance(source, str) else _packed(source)
+        if isinstance(source, str):
+            packed, sizes, mean[index] = _packed_named(source)
+        else:
+            packed, sizes, mean[index] = _packed(source, clamped[index])
         levels[index] = len(packed)
         for level, (part, level_size) in enumerate(zip(packed, sizes, strict=True)):
             offset[index, level] = at

@@ -70,6 +70,50 @@ class World:
         gradient = np.linalg.norm(self.uv[:, :, :3], axis=2)
         return np.asarray((gradient * self.textures.level_size[self.texture, 0]).max(axis=1), np.float32)
 
+    @cached_property
+    def forms(self) -> npt.NDArray[np.float32]:
+        """Affine functions of a point on each surface (S, 9, 4), each as (x, y, z, 1) coefficients.
+
+        0: distance from the plane; 1, 2: texture coordinates; 3, 4: coordinates in the light map, or 3: the light;
+        5-8: distances from the borders, positive inside.
+        """
+        count = len(self.normal)
+        corners = self.vertices.reshape(count, -1, 3).astype(np.float64)
+        sides = np.roll(corners, -1, axis=1) - corners
+        inward = np.cross(self.normal[:, None], sides)
+        inward /= np.maximum(np.linalg.norm(inward, axis=2, keepdims=True), 1e-12)
+        depth = np.einsum("ski,ski->sk", inward, corners.mean(axis=1, keepdims=True) - corners)
+        inward *= np.sign(depth)[..., None]
+        forms = np.zeros((count, 9, 4), np.float32)
+        forms[:, 0, :3], forms[:, 0, 3] = self.normal, -self.offset
+        forms[:, 1:3] = self.uv
+        forms[:, 3:5] = self.light_uv
+        without_map = self.light_at[:, 1] == 0
+        forms[without_map, 3] = self.light_linear[without_map]
+        which = np.arange(4) % corners.shape[1]  # a triangle has its first border twice
+        forms[:, 5:, :3] = inward[:, which]
+        forms[:, 5:, 3] = -np.einsum("ski,ski->sk", inward, corners)[:, which]
+        return forms
+
+    @cached_property
+    def adjoining(self) -> npt.NDArray[np.int32]:
+        """Surfaces (S, 4) that share a border with a surface of rectangles, -1 = none; (S, 0) for triangles."""
+        corners = np.rint(self.vertices.reshape(len(self.normal), -1, 3) * 1e4).astype(np.int64)
+        if corners.shape[1] != 4:
+            return np.zeros((len(corners), 0), np.int32)
+        owners: dict[frozenset[tuple[int, ...]], list[int]] = {}
+        borders = [
+            [frozenset((tuple(a), tuple(b))) for a, b in zip(loop, loop[1:] + loop[:1], strict=True)]
+            for loop in corners.tolist()
+        ]
+        for s, loop in enumerate(borders):
+            for border in loop:
+                owners.setdefault(border, []).append(s)
+        others = [
+            [next((o for o in owners[border] if o != s), -1) for border in loop] for s, loop in enumerate(borders)
+        ]
+        return np.asarray(others, np.int32)
+
     @property
     def bounds(self) -> FloatArray:
         """Lowest and highest corner (2, 3)."""
