@@ -25,6 +25,8 @@ _MAX_LAG_S = 0.25
 """Most simulated time to catch up on at once after a stall."""
 ACCEPTABLE_LAG_S = 0.15
 """Lag of the simulation with which the stack still works as on a fast machine."""
+_VISIBLE_MOTION = 1e-4
+"""Least motion that is rendered, metres and radians: a thirtieth of a pixel of the largest preview, 0.5 m ahead."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class SimulatedDevices:
         self.camera: ThetaServer | None = None
         self._base: RoboClawServer | None = None
         self._simulation = simulation
+        self._seen: npt.NDArray[np.uint8] = np.empty((0, 0, 3), np.uint8)
+        self._seen_from = simulation.robot.pose
         try:
             self._open(config, serial_folder, log)
         except BaseException:
@@ -91,7 +95,11 @@ class SimulatedDevices:
                 device.close()
 
     def _see(self, width: int, height: int) -> npt.NDArray[np.uint8]:
-        return self._simulation.panorama(width, height).rgb
+        """Camera's view; the same array as before if the robot has not moved visibly."""
+        pose, rgb = self._simulation.robot.pose, self._seen
+        if rgb.shape != (height, width, 3) or np.abs(pose - self._seen_from).max() > _VISIBLE_MOTION:
+            self._seen, self._seen_from = self._simulation.panorama(width, height).rgb, pose
+        return self._seen
 
 
 class RealTimeLoop:

@@ -64,7 +64,8 @@ class ThetaConfig:
         check_ranges(self)
 
 
-#: Returns the camera's current view for a width and height: panorama (H, W, 3), sRGB.
+#: Returns the camera's current view for a width and height: panorama (H, W, 3), sRGB. While the view does not change it
+#: returns the same array, which the camera does not encode again.
 PictureSource = Callable[[int, int], npt.NDArray[np.uint8]]
 
 
@@ -110,7 +111,7 @@ class ThetaServer:
     Attributes:
         port: listening port.
         rate_hz: recent frame rate; 0 without a viewer and for the first four frames.
-        frames: number of rendered images.
+        frames: number of delivered images.
         late_s: recent delay of the images behind their plan, in the stack's seconds; 0 without a viewer.
     """
 
@@ -171,11 +172,23 @@ class ThetaServer:
 
     # --- images -------------------------------------------------------------------------------------
 
-    def _make_frames(self) -> None:
+    def _jpeg(self, rgb: npt.NDArray[np.uint8]) -> bytes:
         import cv2
 
+        if self.config.noise > 0:
+            grain = self.config.noise * self._rng.standard_normal(rgb.shape[:2], np.float32)
+            rgb = np.clip(np.rint(rgb + grain[..., None]), 0, 255).astype(np.uint8)
+        bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+        ok, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])
+        if not ok:
+            raise RuntimeError(f"OpenCV could not encode an image of {rgb.shape[1]}x{rgb.shape[0]}")
+        return encoded.tobytes()
+
+    def _make_frames(self) -> None:
         due = current().steady_s()
         made, period_s = 0, 0.0
+        shown: npt.NDArray[np.uint8] | None = None
+        jpeg = b""
         while True:
             with self._changed:
                 while self._viewers == 0 and not self._stopping:
@@ -187,18 +200,12 @@ class ThetaServer:
                 width, height, promised = self._format
             began = current().steady_s()
             rgb = self.source(width, height)
-            if self.config.noise > 0:
-                grain = self._rng.normal(0, self.config.noise, rgb.shape[:2]).astype(np.float32)
-                rgb = np.clip(np.rint(rgb + grain[..., None]), 0, 255).astype(np.uint8)
-            ok, encoded = cv2.imencode(
-                ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, self.config.quality]
-            )
-            if not ok:
-                raise RuntimeError(f"OpenCV could not encode an image of {width}x{height}")
+            if rgb is not shown or self.config.noise > 0:
+                shown, jpeg = rgb, self._jpeg(rgb)
             self._sleep(began + self.config.latency_s)
             late_s = current().steady_s() - began - self.config.latency_s
             with self._changed:
-                self._frame = encoded.tobytes()
+                self._frame = jpeg
                 self._number += 1
                 self.frames += 1
                 self._changed.notify_all()

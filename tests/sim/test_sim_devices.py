@@ -1,6 +1,7 @@
 """Camera and motor controller over their real protocols: read by independent clients, and by the stack's drivers."""
 
 import json
+import logging
 import re
 import socket
 import threading
@@ -18,9 +19,13 @@ from requests.auth import HTTPDigestAuth
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.roboclaw import Roboclaw
 from instant_ic.camera.preview import PreviewParser
+from instant_ic.sim.real_time import DevicesConfig, SimulatedDevices
 from instant_ic.sim.roboclaw import RoboClawServer
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
+from instant_ic.sim.simulation import BaseConfig, Simulation
 from instant_ic.sim.theta import ThetaConfig, ThetaServer, panorama_file
+from instant_ic.sim.vlp16 import Vlp16Config
+from instant_ic.sim.world import World
 
 TIMEOUT_S = 20.0
 
@@ -107,6 +112,45 @@ def test_pictures_are_made_only_while_somebody_watches(camera: ThetaServer) -> N
     while camera.watched and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not camera.watched, "a viewer that closed its connection is noticed at the next picture"
+
+
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+def test_an_unchanged_view_is_encoded_once_without_noise(noise: float) -> None:
+    view = grey_ramp(640, 320)
+    config = ThetaConfig(port=0, width=640, height=320, rate=30.0, latency_s=0.0, noise=noise)
+    server = ThetaServer(config, lambda width, height: view)
+    try:
+        first, second, third = (jpeg for _, jpeg in raw_preview(server, 3)[1])
+        assert (first == second == third) == (noise == 0.0)
+        # A new array is a new view.
+        view = 255 - view
+        assert raw_preview(server, 2)[1][1][1] != first
+    finally:
+        server.close()
+
+
+def test_a_standing_robot_sees_the_same_image_until_it_moves(box_room: World, tmp_path: Path) -> None:
+    config = DevicesConfig(
+        camera=ThetaConfig(port=0, width=640, height=320),
+        lidar=Vlp16Config(enabled=False),
+        base=BaseConfig(enabled=False),
+    )
+    simulation = Simulation(config, world=box_room)
+    devices = SimulatedDevices(config, simulation, tmp_path, logging.getLogger("test"))
+    try:
+        assert devices.camera is not None
+        source = devices.camera.source
+        still = source(640, 320)
+        simulation.step(0.1)
+        assert source(640, 320) is still
+        assert source(1024, 512).shape == (512, 1024, 3)
+        seen = source(640, 320)
+        simulation.drive(0.3, 0.0)
+        simulation.step(0.2)
+        moved = source(640, 320)
+        assert moved is not seen and (moved != seen).any()
+    finally:
+        devices.close()
 
 
 def test_state_and_info(camera: ThetaServer) -> None:
