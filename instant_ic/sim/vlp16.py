@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated
 
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -17,6 +18,7 @@ from instant_ic.lidar import packets as wire
 from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.float64]
+F32 = npt.NDArray[np.float32]
 #: Returns x, y, yaw (N, 3) of base_link at simulated times (N,) in seconds.
 PoseAt = Callable[[FloatArray], FloatArray]
 
@@ -50,6 +52,72 @@ class Vlp16Config:
         require(self, "min_range", self.min_range < self.max_range, "below max_range")
 
 
+@numba.njit(cache=True, nogil=True)
+def _place_beams(
+    beams: F32, azimuth_rad: FloatArray, pose: FloatArray, base_from_lidar: FloatArray, origins: F32, directions: F32
+) -> None:
+    """World origins and directions (P · B, 3) of the beams of P packets.
+
+    Args:
+        beams: (B, 5) direction in the sensor's frame at azimuth 0, share of the packet's time, height over the origin.
+        azimuth_rad: (P,) azimuth at the start of each packet.
+        pose: (P + 1, 3) x, y, yaw of base_link at the start of each packet and the end of the last one.
+        base_from_lidar: (4, 4) mount.
+        origins, directions: output.
+    """
+    mount = base_from_lidar.astype(np.float32)
+    for p in range(azimuth_rad.shape[0]):
+        c0, s0 = np.float32(math.cos(pose[p, 2])), np.float32(math.sin(pose[p, 2]))
+        # A packet takes 1.3 ms: the chord instead of the arc is exact to a micrometre at 10 m.
+        c1 = np.float32(math.cos(pose[p + 1, 2])) - c0
+        s1 = np.float32(math.sin(pose[p + 1, 2])) - s0
+        x0, y0 = np.float32(pose[p, 0]), np.float32(pose[p, 1])
+        x1, y1 = np.float32(pose[p + 1, 0] - pose[p, 0]), np.float32(pose[p + 1, 1] - pose[p, 1])
+        ca, sa = np.float32(math.cos(azimuth_rad[p])), np.float32(math.sin(azimuth_rad[p]))
+        for j in range(beams.shape[0]):
+            i = p * beams.shape[0] + j
+            part = beams[j, 3]
+            c, s = c0 + part * c1, s0 + part * s1
+            bx = ca * beams[j, 0] + sa * beams[j, 1]
+            by = ca * beams[j, 1] - sa * beams[j, 0]
+            bz = beams[j, 2]
+            x = mount[0, 0] * bx + mount[0, 1] * by + mount[0, 2] * bz
+            y = mount[1, 0] * bx + mount[1, 1] * by + mount[1, 2] * bz
+            directions[i, 0] = c * x - s * y
+            directions[i, 1] = s * x + c * y
+            directions[i, 2] = mount[2, 0] * bx + mount[2, 1] * by + mount[2, 2] * bz
+            origins[i, 0] = x0 + part * x1 + c * mount[0, 3] - s * mount[1, 3]
+            origins[i, 1] = y0 + part * y1 + s * mount[0, 3] + c * mount[1, 3]
+            origins[i, 2] = mount[2, 3] + beams[j, 4]
+
+
+@numba.njit(cache=True, nogil=True)
+def _measure(
+    range_m: F32,
+    face: npt.NDArray[np.int32],
+    directions: F32,
+    noise_m: F32,
+    min_m: float,
+    max_m: float,
+    face_surface: npt.NDArray[np.int32],
+    normal: F32,
+    reflectance: F32,
+    distance: npt.NDArray[np.uint16],
+    reflectivity: npt.NDArray[np.uint8],
+) -> None:
+    """Measured distance (N,), in units of 2 mm, and reflectivity (N,) of beams; both stay 0 without a return."""
+    for i in range(range_m.shape[0]):
+        if range_m[i] < min_m or range_m[i] > max_m:
+            continue
+        s = face_surface[face[i]]
+        units = (range_m[i] + noise_m[i]) / wire.DISTANCE_UNIT_M
+        distance[i] = np.uint16(min(max(np.rint(units), 0.0), 65535.0))
+        incidence = abs(
+            normal[s, 0] * directions[i, 0] + normal[s, 1] * directions[i, 1] + normal[s, 2] * directions[i, 2]
+        )
+        reflectivity[i] = np.uint8(np.rint(reflectance[s] * (0.35 + 0.65 * incidence)))
+
+
 class Vlp16:
     """Optics and clock of the scanner: produces packets for intervals of simulated time.
 
@@ -78,15 +146,25 @@ class Vlp16:
         self._epoch_ns = epoch_ns
         self._rng = np.random.default_rng([37, seed])
         self.packets = 0
-        omega = np.radians(wire.LASER_ELEVATION_DEG)
-        self._cos, self._sin = np.cos(omega), np.sin(omega)
         self._reflectance = (
             100.0 * np.clip((world.textures.mean[world.texture] * world.tint).mean(axis=1), 0, 1)
         ).astype(np.float32)
         block = np.arange(wire.BLOCKS)[:, None, None] * wire.BLOCK_PERIOD_US
         firing = np.arange(wire.FIRINGS)[None, :, None] * wire.FIRING_PERIOD_US
         laser = np.arange(wire.LASERS)[None, None, :] * wire.LASER_PERIOD_US
-        self._firing_s = (block + firing + laser) * 1e-6
+        after_us = block + firing + laser
+        # Azimuth is clockwise when viewed from above, 0 ahead (the sensor's x in ROS axes).
+        turned = -np.radians(after_us * 1e-6 * config.rpm * 6.0)
+        elevation = np.radians(wire.LASER_ELEVATION_DEG)
+        #: Beams of a packet that begins at azimuth 0: direction in the sensor's frame, share of the packet's time, and
+        #: height over the sensor's origin.
+        beams = np.empty((wire.BLOCKS, wire.FIRINGS, wire.LASERS, 5), np.float32)
+        beams[..., 0] = np.cos(elevation) * np.cos(turned)
+        beams[..., 1] = np.cos(elevation) * np.sin(turned)
+        beams[..., 2] = np.sin(elevation)
+        beams[..., 3] = after_us / wire.PACKET_PERIOD_US
+        beams[..., 4] = wire.LASER_VERTICAL_OFFSET_M
+        self._beams = beams.reshape(-1, 5)
 
     @property
     def next_packet_end_s(self) -> float:
@@ -108,50 +186,43 @@ class Vlp16:
         """Make the next ``count`` data packets; the poses up to the end of the last one must be known."""
         if count < 1:
             return []
-        config = self.config
-        first_s = (self.packets + np.arange(count)) * (wire.PACKET_PERIOD_US * 1e-6)
+        config, period_s = self.config, wire.PACKET_PERIOD_US * 1e-6
+        times_s = (self.packets + np.arange(count + 1)) * period_s
         self.packets += count
-        times = first_s[:, None, None, None] + self._firing_s
-        degrees_per_s = config.rpm * 6.0
-        # Azimuth is clockwise when viewed from above, 0 ahead (the sensor's x in ROS axes).
-        alpha = np.radians((times * degrees_per_s) % 360.0)
-        pose = self._pose_at(times.ravel()).reshape(*times.shape, 3)
-        beams = np.stack([self._cos * np.cos(alpha), -self._cos * np.sin(alpha), self._sin + 0 * alpha], axis=-1)
-        beams = beams @ self._base_from_lidar[:3, :3].T
-        c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-        directions = np.empty((*times.shape, 3), np.float32)
-        directions[..., 0] = c * beams[..., 0] - s * beams[..., 1]
-        directions[..., 1] = s * beams[..., 0] + c * beams[..., 1]
-        directions[..., 2] = beams[..., 2]
-        mx, my, mz = self._base_from_lidar[:3, 3]
-        origins = np.empty_like(directions)
-        origins[..., 0] = pose[..., 0] + c * mx - s * my
-        origins[..., 1] = pose[..., 1] + s * mx + c * my
-        origins[..., 2] = mz + wire.LASER_VERTICAL_OFFSET_M
-        flat = directions.reshape(-1, 3)
-        range_m, face = self._world.caster.cast(origins.reshape(-1, 3), flat)
-        seen = (range_m >= config.min_range) & (range_m <= config.max_range)
-        measured = np.where(seen, range_m, 0.0)
-        if config.range_noise > 0:
-            measured += np.where(seen, self._rng.normal(0, config.range_noise, len(measured)), 0.0)
-        surface = self._world.face_surface[np.maximum(face, 0)]
-        incidence = np.abs(np.einsum("ij,ij->i", self._world.normal[surface], flat))
-        reflectivity = np.where(seen, self._reflectance[surface] * (0.35 + 0.65 * incidence), 0.0)
+        azimuth_deg = times_s[:-1] * (config.rpm * 6.0) % 360.0
+        size = count * len(self._beams)
+        origins, directions = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
+        pose = np.asarray(self._pose_at(times_s), np.float64)
+        _place_beams(
+            self._beams,
+            np.asarray(np.radians(azimuth_deg), np.float64),
+            pose,
+            self._base_from_lidar,
+            origins,
+            directions,
+        )
+        range_m, face = self._world.caster.cast(origins, directions)
+        noise_m = np.float32(config.range_noise) * self._rng.standard_normal(size, np.float32)
+        distance, reflectivity = np.zeros(size, np.uint16), np.zeros(size, np.uint8)
+        _measure(
+            range_m, face, directions, noise_m, config.min_range, config.max_range, self._world.face_surface,
+            self._world.normal, self._reflectance, distance, reflectivity,
+        )  # fmt: skip
 
         out = np.zeros(count, wire.PACKET_DTYPE)
         blocks = out["blocks"]
         blocks["flag"] = wire.BLOCK_FLAG
-        azimuth = np.rint(np.degrees(alpha[:, :, 0, 0]) * 100.0).astype(np.int64) % 36000
-        blocks["azimuth"] = azimuth
-        units = np.clip(np.rint(measured / wire.DISTANCE_UNIT_M), 0, 0xFFFF).astype(np.uint16)
-        blocks["returns"]["distance"] = units.reshape(times.shape)
-        blocks["returns"]["reflectivity"] = np.rint(reflectivity).astype(np.uint8).reshape(times.shape)
-        out["timestamp_us"] = [self._epoch_ns(second) // 1000 % wire.HOUR_US for second in first_s]
+        block_deg = azimuth_deg[:, None] + np.arange(wire.BLOCKS) * (wire.BLOCK_PERIOD_US * 1e-6 * config.rpm * 6.0)
+        blocks["azimuth"] = np.rint(block_deg * 100.0).astype(np.int64) % 36000
+        shape = (count, wire.BLOCKS, wire.FIRINGS, wire.LASERS)
+        blocks["returns"]["distance"] = distance.reshape(shape)
+        blocks["returns"]["reflectivity"] = reflectivity.reshape(shape)
+        out["timestamp_us"] = [self._epoch_ns(second) // 1000 % wire.HOUR_US for second in times_s[:-1]]
         out["return_mode"] = wire.RETURN_STRONGEST
         out["product"] = wire.PRODUCT_VLP16
         data = out.tobytes()
-        size = wire.DATA_PACKET_BYTES
-        return [data[i * size : (i + 1) * size] for i in range(count)]
+        length = wire.DATA_PACKET_BYTES
+        return [data[i * length : (i + 1) * length] for i in range(count)]
 
     def position_packet(self, time_s: float) -> bytes:
         """Position packet of a sensor whose clock is locked to GPS time."""
