@@ -11,7 +11,7 @@ import numpy as np
 from instant_ic.bus import ERROR, LATCHED, RELIABLE, SENSOR, WARN, Node, NodeError, QoS, main
 from instant_ic.diagnosis import Diagnosis
 from instant_ic.geometry.poses import matrix_from_pose2, planar_covariance, pose2_from_matrix
-from instant_ic.geometry.transforms import TransformError
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import (
     LaserScan,
     OccupancyGrid,
@@ -20,11 +20,13 @@ from instant_ic.msg import (
     PoseWithCovariance,
     PoseWithCovarianceStamped,
     String,
+    TFMessage,
     grid_message,
     header,
     matrix_from_pose,
     pose_message,
     stamp_ns,
+    transform_matrix,
 )
 from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.config import GridSlamConfig
@@ -36,6 +38,8 @@ from instant_ic.slam.scan_queue import QueuedScan, ScanError, ScanQueue, level_m
 
 ODOMETRY_QUEUE = QoS("sensor", depth=100)
 """Deep, because scans are placed between two odometry messages."""
+_POLL_S = 0.05
+"""Odometry comes more often than this. Where it does not, a scan is placed up to this much after its wait."""
 
 
 class GridSlamNode(Node[GridSlamConfig]):
@@ -47,6 +51,7 @@ class GridSlamNode(Node[GridSlamConfig]):
 
     def setup(self) -> None:
         warm_up(self.config)
+        self.poll: Any = None  # timer while scans wait for odometry, which may have gone silent
         self.worker = self.background(work, self.take_over)
         self.queue = ScanQueue(self.config)
         self.limiter = CorrectionLimiter(self.config.correction_speed_mps, self.config.correction_yaw_rate_radps)
@@ -55,10 +60,11 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.saved_out = self.publisher("/slam/saved", String, qos=RELIABLE)
         self.pose_out = self.publisher("/pose", PoseWithCovarianceStamped, qos=SENSOR)
         self.restart()
-        self.tf  # noqa: B018 - listens from here on, so that the laser's mount is known when the first scan arrives
+        # The laser's mount is fixed: /tf, which carries a message per odometry, is not needed.
+        self.mounts = TransformBuffer()
+        self.subscribe("/tf_static", TFMessage, self.on_mounts, qos=LATCHED)
         if self.config.use_wheel_odom:
             self.subscribe("/wheel/odom", Odometry, self.on_odometry, qos=ODOMETRY_QUEUE)
-            self.timer(0.02, self.place_ready)
         self.subscribe("/scan", LaserScan, self.on_scan, qos=SENSOR)
         self.subscribe("/slam/save", String, self.on_save, qos=RELIABLE)
         self.subscribe("/initialpose", PoseWithCovarianceStamped, self.on_initial_pose, qos=RELIABLE)
@@ -83,6 +89,11 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.queue.restart()
         self.limiter.reset()
 
+    def on_mounts(self, message: Any) -> None:
+        for mount in message.transforms:
+            parent, child = mount.header.frame_id, mount.child_frame_id
+            self.mounts.set(parent, child, stamp_ns(mount), transform_matrix(mount), static=True)
+
     def on_odometry(self, message: Any) -> None:
         if self.queue.add_odometry(stamp_ns(message), pose2_from_matrix(matrix_from_pose(message))):
             self.place_ready()
@@ -96,7 +107,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             if back_s > 0:
                 self.diagnose("time", WARN, f"time went back by {back_s:.1f} s: a new map begins")
                 self.restart()
-            mount = level_mount(self.tf.lookup(self.config.base_frame, message.header.frame_id))
+            mount = level_mount(self.mounts.lookup(self.config.base_frame, message.header.frame_id))
             angles = (float(message.angle_min), float(message.angle_increment))
             limits = (float(message.range_min), float(message.range_max))
             scan = Scan(np.asarray(message.ranges), *angles, *limits, stamp)
@@ -115,6 +126,11 @@ class GridSlamNode(Node[GridSlamConfig]):
         """Place the scans whose odometry has arrived or has been waited for long enough."""
         for queued, odometry in self.queue.ready(self.clock.now_ns()):
             self.place(queued, odometry)
+        if self.queue.waiting and self.poll is None:
+            self.poll = self.timer(_POLL_S, self.place_ready)
+        elif self.poll is not None and not self.queue.waiting:
+            self.poll.cancel()
+            self.poll = None
 
     def place(self, queued: QueuedScan, odometry: np.ndarray | None) -> None:
         """Call the library for one scan and publish the result."""

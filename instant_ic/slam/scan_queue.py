@@ -96,6 +96,11 @@ class ScanQueue:
         self.state = Diagnosis("scan", Level.OK, "fresh", {"dropped": self.dropped})
         self._waiting.append(QueuedScan(scan, base_from_laser, now_ns))
 
+    @property
+    def waiting(self) -> bool:
+        """Whether scans wait for odometry."""
+        return bool(self._waiting)
+
     def ready(self, now_ns: int) -> Iterator[tuple[QueuedScan, FloatArray | None]]:
         """Yield the scans that need not wait longer, each with odom_from_base (3,), or None without odometry."""
         while self._waiting:
