@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits, move
+from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.planner import Plan
 from instant_ic.geometry.poses import relative2, wrap_angle
 
@@ -224,10 +224,10 @@ class PathFollower:
             return True
         count = max(2, math.ceil(abs(length_m) / 0.05))
         along = length_m * np.arange(count + 1) / count
-        # One metre of arc per second; backwards it bends the other way.
-        turn = curvature * (-1.0 if length_m < 0 else 1.0)
-        poses = np.array([move(pose, math.copysign(1.0, length_m), turn, abs(s)) for s in along])
-        return self._is_free(poses, costmap)
+        turn = curvature * along
+        chord, heading = along * np.sinc(turn / (2.0 * math.pi)), pose[2] + 0.5 * turn
+        x, y = pose[0] + chord * np.cos(heading), pose[1] + chord * np.sin(heading)
+        return self._is_free(np.stack([x, y, pose[2] + turn], axis=1), costmap)
 
     def _straight_is_free(self, pose: NDArray[np.float64], goal: NDArray[np.float64], costmap: Costmap | None) -> bool:
         if costmap is None:

@@ -28,11 +28,10 @@ def accelerate(
 def move(pose: NDArray[np.float64], linear: float, angular: float, dt_s: float) -> NDArray[np.float64]:
     """Pose (x, y, yaw) after ``dt_s`` of a constant twist: the exact arc, not a straight step."""
     x, y, yaw = float(pose[0]), float(pose[1]), float(pose[2])
-    turn = angular * dt_s
-    # sin(t/2)/(t/2) is chord over arc; numpy's sinc handles the limit at zero.
-    chord = linear * dt_s * float(np.sinc(turn / (2.0 * math.pi)))
-    heading = yaw + 0.5 * turn
-    return np.array([x + chord * math.cos(heading), y + chord * math.sin(heading), wrap_angle(yaw + turn)])
+    half = 0.5 * angular * dt_s
+    # sin(t/2)/(t/2) is chord over arc.
+    chord = linear * dt_s * (math.sin(half) / half if half else 1.0)
+    return np.array([x + chord * math.cos(yaw + half), y + chord * math.sin(yaw + half), wrap_angle(yaw + 2.0 * half)])
 
 
 def extrapolate(pose: NDArray[np.float64], velocity: tuple[float, float], age_s: float) -> NDArray[np.float64]:

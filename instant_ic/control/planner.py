@@ -302,14 +302,18 @@ class _Grid:
         """Mask (H, W) of the cells that the robot's centre can reach from one."""
         import cv2
 
-        rows, columns = np.ogrid[: self.weights.shape[0], : self.weights.shape[1]]
-        away = np.hypot(rows - row, columns - column) * self.costmap.resolution
         escape = self.config.escape_radius_m
-        costs = self.costmap.costs
-        open_ = (self.weights > 0) | ((costs == INSCRIBED) & (away <= escape))
-        open_ |= (costs == LETHAL) & (away <= 0.25 * escape)
-        open_[row, column] = True
-        _, labels = cv2.connectedComponents(open_.astype(np.uint8), connectivity=8)
+        open_ = (self.weights > 0).astype(np.uint8)
+        reach = math.ceil(escape / self.costmap.resolution)
+        near = slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
+        costs = self.costmap.costs[near]
+        rows, columns = np.ogrid[
+            near[0].start : near[0].start + costs.shape[0], near[1].start : near[1].start + costs.shape[1]
+        ]
+        away = np.hypot(rows - row, columns - column) * self.costmap.resolution
+        open_[near] |= ((costs == INSCRIBED) & (away <= escape)) | ((costs == LETHAL) & (away <= 0.25 * escape))
+        open_[row, column] = 1
+        _, labels = cv2.connectedComponents(open_, connectivity=8)
         reached: NDArray[np.bool_] = labels == labels[row, column]
         return reached
 

@@ -6,12 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from instant_ic.config.ranges import NotNegative, Positive, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits, accelerate, move
+from instant_ic.control.kinematics import MotionLimits
 
 
 @dataclass(frozen=True)
@@ -106,16 +107,18 @@ class Predictor:
         faster = command if _speed(command, self.reach_m) >= _speed(velocity, self.reach_m) else velocity
         length = self.horizon(*faster)
         length += extra_m if length > 0 else 0.0
-        poses, travelled = [np.asarray(pose, dtype=np.float64)], [0.0]
-        v = velocity
-        for k in range(math.ceil(self.config.max_horizon_s / step)):
-            if k * step >= self.config.latency_s:
-                v = accelerate(v, command, self.limits, step)
-            if travelled[-1] >= length or (v == command == (0.0, 0.0)):
-                break
-            poses.append(move(poses[-1], v[0], v[1], step))
-            travelled.append(travelled[-1] + _speed(v, self.reach_m) * step)
-        path = np.array(poses)
+        rates = np.array([self.limits.max_linear_accel_m_s2, self.limits.max_angular_accel_rad_s2])
+        path, travelled = _roll_out(
+            np.array(pose, dtype=np.float64),
+            np.array(velocity, dtype=np.float64),
+            np.array(command, dtype=np.float64),
+            rates * step,
+            step,
+            math.ceil(self.config.latency_s / step - 1e-9),
+            math.ceil(self.config.max_horizon_s / step),
+            length,
+            self.reach_m,
+        )
         times: NDArray[np.float64] = step * np.arange(len(path), dtype=np.float64)
         hit = None
         if costmap is not None:
@@ -126,8 +129,48 @@ class Predictor:
             # A robot that stands on an obstacle already (after a map jump) must not be blocked for good.
             worse = np.flatnonzero(overlap > overlap[0])
             hit = int(worse[0]) if worse.size else None
-        return Prediction(times, path, hit, math.inf if hit is None else travelled[hit])
+        return Prediction(times, path, hit, math.inf if hit is None else float(travelled[hit]))
 
 
 def _speed(velocity: tuple[float, float], reach_m: float) -> float:
     return abs(velocity[0]) + reach_m * abs(velocity[1])
+
+
+@njit(cache=True)
+def _roll_out(
+    pose: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    command: NDArray[np.float64],
+    steepest: NDArray[np.float64],
+    step_s: float,
+    late_steps: int,
+    most_steps: int,
+    length_m: float,
+    reach_m: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Poses (N, 3) under a command, and how far the farthest corner has travelled at each, (N,).
+
+    As ``kinematics.accelerate`` and ``move``, step by step: the command takes effect after ``late_steps``, and changes
+    the velocity by at most ``steepest`` (2,) per step.
+    """
+    poses, travelled = np.empty((most_steps + 1, 3)), np.zeros(most_steps + 1)
+    poses[0] = pose
+    v = velocity.copy()
+    count = 0
+    for k in range(most_steps):
+        if k >= late_steps:
+            for i in range(2):
+                v[i] += min(max(command[i] - v[i], -steepest[i]), steepest[i])
+        stands = v[0] == 0.0 and v[1] == 0.0 and command[0] == 0.0 and command[1] == 0.0
+        if travelled[k] >= length_m or stands:
+            break
+        half = 0.5 * v[1] * step_s
+        chord = v[0] * step_s * (math.sin(half) / half if half != 0.0 else 1.0)
+        heading = poses[k, 2] + half
+        yaw = heading + half
+        poses[k + 1, 0] = poses[k, 0] + chord * math.cos(heading)
+        poses[k + 1, 1] = poses[k, 1] + chord * math.sin(heading)
+        poses[k + 1, 2] = yaw - 2.0 * math.pi * math.floor(yaw / (2.0 * math.pi) + 0.5)
+        travelled[k + 1] = travelled[k] + (abs(v[0]) + reach_m * abs(v[1])) * step_s
+        count += 1
+    return poses[: count + 1], travelled[: count + 1]

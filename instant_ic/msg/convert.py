@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from instant_ic.geometry.poses import (
     Matrix,
-    matrix_from_pose2,
     matrix_from_quaternion,
     pose2_from_matrix,
     quaternion_from_matrix,
+    wrap_angle,
 )
 from instant_ic.msg.types import MessageError, message_type
 
@@ -130,7 +131,7 @@ def compressed_image_message(
 
 
 def cloud_message(points: NDArray[Any], frame_id: str, stamp: int) -> Any:
-    """sensor_msgs/PointCloud2 from a structured array (N,), whose layout becomes the message's layout."""
+    """sensor_msgs/PointCloud2 from a structured array (N,), whose layout becomes the message's; not copied."""
     if points.dtype.fields is None or points.ndim != 1:
         raise MessageError(f"a point cloud needs a structured array (N,), got {points.dtype} {points.shape}")
     field_type = message_type("PointField")
@@ -147,7 +148,7 @@ def cloud_message(points: NDArray[Any], frame_id: str, stamp: int) -> Any:
         is_bigendian=False,
         point_step=points.dtype.itemsize,
         row_step=points.dtype.itemsize * len(points),
-        data=np.frombuffer(data.tobytes(), np.uint8),
+        data=np.frombuffer(data, np.uint8),
         is_dense=True,
     )
 
@@ -257,11 +258,21 @@ def grid_array(message: Any) -> tuple[NDArray[np.int8], float, tuple[float, floa
 
 def pose_message(matrix: Matrix) -> Any:
     """geometry_msgs/Pose from a 4×4 matrix."""
-    x, y, z = (float(value) for value in matrix[:3, 3])
-    qx, qy, qz, qw = (float(value) for value in quaternion_from_matrix(matrix))
+    x, y, z = matrix[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_from_matrix(matrix).tolist()
     return message_type("Pose")(
         position=message_type("Point")(x=x, y=y, z=z),
         orientation=message_type("Quaternion")(x=qx, y=qy, z=qz, w=qw),
+    )
+
+
+def pose2_message(pose: ArrayLike) -> Any:
+    """geometry_msgs/Pose from a planar pose (x, y, yaw)."""
+    x, y, yaw = np.asarray(pose, np.float64).tolist()
+    half = 0.5 * wrap_angle(yaw)
+    return message_type("Pose")(
+        position=message_type("Point")(x=x, y=y, z=0.0),
+        orientation=message_type("Quaternion")(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
     )
 
 
@@ -384,10 +395,10 @@ def odometry_message(
 
 def path_message(poses: ArrayLike, frame_id: str, stamp: int) -> Any:
     """nav_msgs/Path from planar poses (N, 3)."""
-    array = np.asarray(poses, np.float64).reshape(-1, 3)
+    array, shared = np.asarray(poses, np.float64).reshape(-1, 3), header(frame_id, stamp)
+    stamped = message_type("PoseStamped")
     return message_type("Path")(
-        header=header(frame_id, stamp),
-        poses=[pose_stamped(matrix_from_pose2(pose), frame_id, stamp) for pose in array],
+        header=shared, poses=[stamped(header=shared, pose=pose2_message(pose)) for pose in array]
     )
 
 
