@@ -15,21 +15,21 @@ from instant_ic.control.estop import KeptEstop
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import extrapolate
 from instant_ic.control.operator_view import OperatorView, PageReport
-from instant_ic.control.snapshot import ArbiterInputs, Vspace
+from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Vspace
+from instant_ic.control.states import Mode
 from instant_ic.control.surroundings import Cloud, Scan, Surroundings
 from instant_ic.control.walls import WallMap
-from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
+from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import (
     ControlState,
     MessageError,
     Odometry,
-    Pose,
     ShownPictures,
     VspaceStatus,
     cloud_array,
     header,
     matrix_from_pose,
-    pose_message,
+    pose2_message,
     stamp_ns,
     twist_message,
     twist_values,
@@ -73,27 +73,35 @@ class ArbiterInbox:
             return None
         return Cloud(message.header.frame_id, stamp_ns(message), self._arrived_ns(self.points), points)
 
+    def rests(self, mode: Mode) -> bool:
+        """Whether the robot stands and nobody wants it to move: nothing then depends on the newest scan."""
+        still = self._twist("command") == NO_MOTION == self._twist("odometry")
+        return still and mode in (Mode.REAL, Mode.STOPPED)
+
     def operator_gone(self) -> bool:
         """Whether the console has lost its driver since the newest command."""
         shown, command = self.shown.message, self.sources["command"].message
         return shown is not None and command is not None and stamp_ns(command) <= stamp_ns(shown.operator_lost)
 
-    def ages(self, timeouts: TimeoutConfig) -> dict[str, float]:
+    def ages(self, timeouts: TimeoutConfig, points_every_s: float = 0.0) -> dict[str, float]:
         """Seconds since the newest message of each source, as ``ArbiterInputs.ages``."""
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
         ages = {key: _age_s(latest) for key, latest in self.sources.items()} | {"vspace": self.vspace.age_s}
         ages |= self.view.ages(page_report(self.shown.message), self.shown.age_s, steady_ns)
         if self.points is not None and self.surroundings.points_seen:
-            ages["points"] = max(_age_s(self.points), self.surroundings.used_age_s("points", now_ns, steady_ns))
+            used_s = self.surroundings.used_age_s("points", now_ns, steady_ns) - points_every_s
+            ages["points"] = max(_age_s(self.points), used_s)
         if self.button_ns is not None and timeouts.estop_input > 0:
             ages["estop_input"] = (steady_ns - self.button_ns) / 1e9
         return ages
 
-    def inputs(self, latch: KeptEstop, walls: WallMap | None, timeouts: TimeoutConfig) -> ArbiterInputs:
-        """Inputs of a step now."""
+    def inputs(
+        self, latch: KeptEstop, walls: WallMap | None, timeouts: TimeoutConfig, points_every_s: float = 0.0
+    ) -> ArbiterInputs:
+        """Inputs of a step now; of the 3D points, the costmap takes a sweep every ``points_every_s`` (0: each)."""
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
         view, surroundings = self.view, self.surroundings
-        ages, near = self.ages(timeouts), surroundings.near_points(self.scan())
+        ages, near = self.ages(timeouts, points_every_s), surroundings.near_points(self.scan())
         used_s = math.inf if near is None else surroundings.used_age_s("scan", now_ns, steady_ns)
         ages["scan"] = max(ages["scan"], used_s)
         pose, velocity = surroundings.robot_pose(), self._twist("odometry")
@@ -154,9 +162,9 @@ def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> Con
         estop=decision.estop,
         blocked=decision.blocked,
         transitions=decision.transitions,
-        robot_pose=_pose(np.zeros(3) if inputs.robot_pose is None else inputs.robot_pose),
-        vbot_start=_pose(decision.vbot_start),
-        vbot_pose=_pose(decision.vbot_pose),
+        robot_pose=pose2_message(np.zeros(3) if inputs.robot_pose is None else inputs.robot_pose),
+        vbot_start=pose2_message(decision.vbot_start),
+        vbot_pose=pose2_message(decision.vbot_pose),
         operator_command=twist_message(*decision.operator_command),
         applied_command=twist_message(*decision.command),
         pose_gap_m=decision.pose_gap_m,
@@ -164,15 +172,11 @@ def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> Con
         time_to_obstacle_s=decision.time_to_obstacle_s,
         shown=ControlState.SHOWN_VIRTUAL if decision.mode.shows_vbot else ControlState.SHOWN_REAL,
         vbot_action=int(decision.vbot_action),
-        vbot_target=_pose(decision.vbot_target),
+        vbot_target=pose2_message(decision.vbot_target),
         robot_twist=twist_message(*inputs.robot_velocity),
         vbot_limit_m_s=decision.vbot_limit_m_s,
         reason_code=int(decision.reason_code),
     )
-
-
-def _pose(pose: NDArray[np.float64]) -> Pose:
-    return pose_message(matrix_from_pose2(pose))
 
 
 def _age_s(latest: Latest) -> float:

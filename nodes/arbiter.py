@@ -24,13 +24,18 @@ from instant_ic.estop_state import EstopStateError
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import ControlState, twist_values
 
+_REST_COSTMAP_S = 0.5
+"""Period of the costmap while the robot rests; the command that ends the rest updates it at once."""
+_REST_STEP_S = 0.1
+"""Longest time between two steps while the robot rests: well below every receiver's time-out."""
+
 
 @dataclass(frozen=True)
 class ArbiterNodeConfig(ArbiterConfig):
     """Parameters of the node ``arbiter``: the library's, and the node's own.
 
     Attributes:
-        rate_hz: steps of the state machine and messages on /cmd_vel, per second.
+        rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
         wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
         wall_period_s: s; walls are searched for in a changed /map at most this often, on a separate thread.
         map_jump_m: m; a correction of map→odom larger than this makes the costmap forget its marks.
@@ -74,6 +79,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.early = False  # a step was made ahead of its time since the last timer
         self.was_gone = False  # a step was made for the loss of the driver
         self.ticks = 0
+        self.stepped_ns = 0  # last step, steady clock
+        self.rests = False  # the robot rested at the last step
+        self.costmap_ns = 0  # last update, steady clock
         self.cmd_vel = self.publisher("/cmd_vel", msg.TwistStamped, qos=SENSOR)
         self.state = self.publisher("/ic/state", ControlState, qos=LATCHED)
         self.subgoal = self.publisher("/ic/subgoal", msg.PoseStamped, qos=SENSOR)
@@ -85,14 +93,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             "pose": self.latest("/pose", msg.PoseWithCovarianceStamped, 10.0),
             "vbot": self.latest("/vbot/odom", msg.Odometry, 10.0),
             "nav": self.latest("/nav/cmd_vel", msg.TwistStamped, 10.0),
-            "command": self.latest("/operator/cmd_vel", msg.TwistStamped, 10.0),
+            "command": self.latest("/operator/cmd_vel", msg.TwistStamped, 10.0, callback=self.on_command),
         }
         points = self.latest("/lidar/points", msg.PointCloud2, 10.0) if c.costmap.points.enabled else None
-        shown = self.latest("/view/shown", msg.ShownPictures, 1.0)
+        shown = self.latest("/view/shown", msg.ShownPictures, 1.0, callback=self.on_shown)
         vspace = self.latest("/vspace/status", msg.VspaceStatus, 60.0, qos=LATCHED)
         self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace)
-        self.subscribe("/operator/cmd_vel", msg.TwistStamped, self.on_command, qos=SENSOR)
-        self.subscribe("/view/shown", msg.ShownPictures, self.on_shown, qos=SENSOR)
         self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=msg.Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=msg.Bool)
@@ -143,7 +149,10 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
     def on_timer(self) -> None:
         self.early = False
-        self.tick()
+        since_s = (self.clock.steady_ns() - self.stepped_ns) / 1e9
+        # Timers jitter: at 20 Hz every second one is meant.
+        if not 0.0 <= since_s < 0.9 * _REST_STEP_S or not self.inbox.rests(self.arbiter.mode):
+            self.tick()
 
     def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
         self.view.camera_image(self.clock.steady_ns())
@@ -158,6 +167,10 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.tick()
 
     def update_costmap(self) -> None:
+        since_s = (self.clock.steady_ns() - self.costmap_ns) / 1e9
+        if 0.0 <= since_s < _REST_COSTMAP_S and self.inbox.rests(self.arbiter.mode):
+            return
+        self.costmap_ns = self.clock.steady_ns()
         scan = self.inbox.scan()
         costmap = self.surroundings.update_costmap(scan, self.inbox.cloud(), self.walls.map)
         self.diagnose_surroundings()
@@ -174,8 +187,13 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.diagnose(name, OK if found.ok else WARN, found.text, **found.values)
 
     def tick(self) -> None:
+        self.stepped_ns = self.clock.steady_ns()
+        rested, self.rests = self.rests, self.inbox.rests(self.arbiter.mode)
+        if rested and not self.rests:
+            self.update_costmap()  # the first command of a drive is checked against what is there now
         now_ns = self.clock.now_ns()
-        inputs = self.inbox.inputs(self.latch, self.walls.found, self.config.timeouts)
+        points_every_s = _REST_COSTMAP_S if self.rests else 0.0
+        inputs = self.inbox.inputs(self.latch, self.walls.found, self.config.timeouts, points_every_s)
         self.obeyed = inputs.operator_command
         # Steady time: setting the clock back must not make a stale source look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
@@ -186,7 +204,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         # One more step if the next timer may be later than a time-out: time-outs are exact.
         self.cancel_extra()
         stale_in_s = self.arbiter.stale_in_s(inputs, self.clock.steady_ns())
-        if stale_in_s < 1.0 / self.config.rate_hz:
+        if stale_in_s < max(_REST_STEP_S, 1.0 / self.config.rate_hz):
             self.cancel_extra = self.timer(stale_in_s + STEP_AFTER_S, self.tick).cancel
 
     def publish_decision(self, decision: Decision, inputs: ArbiterInputs, now_ns: int) -> None:

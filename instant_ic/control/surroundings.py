@@ -118,7 +118,7 @@ class Surroundings:
         if self._sweep is not None:
             near = np.concatenate([near, self._sweep.nearest])
         try:
-            base_from_odom = np.linalg.inv(self._tf.lookup("odom", "base_link"))
+            base_from_odom = self._tf.lookup("base_link", "odom")
         except TransformError as error:
             self._find("scan", False, f"scan cannot be placed: {error}")
             return None

@@ -4,7 +4,7 @@ import pytest
 
 from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.msg import ControlState, compressed_image_message
+from instant_ic.msg import ControlState, compressed_image_message, stamp_ns
 from nodes.arbiter import ArbiterNode
 from nodes.virtual_robot import VirtualRobotNode
 
@@ -37,8 +37,8 @@ def test_silent_sources_stop_the_robot_after_the_clock_was_set(jump_s: int) -> N
     assert arbiter.inbox.ages(arbiter.config.timeouts)["camera"] == pytest.approx(3.0)
     state = bus.last("/ic/state")
     assert state.mode == ControlState.STOPPED and "no camera image for 3.0 s" in state.reason
-    assert state.header.stamp.sec == clock.now_ns() // S  # stamps are those of the clock as it is now
-    assert len(bus.messages("/cmd_vel")) >= 50  # 20 a second, none left out and none made up for
+    assert 0 <= clock.now_ns() - stamp_ns(state) < S // 5  # stamps are those of the clock as it is now
+    assert len(bus.messages("/cmd_vel")) >= 25  # 10 a second for a robot that stands, none left out
     assert all(message.twist.linear.x == 0.0 for message in bus.messages("/cmd_vel"))
 
 
@@ -48,6 +48,6 @@ def test_v_bot_makes_no_leap_when_the_clock_is_set() -> None:
     node = bus.add(VirtualRobotNode)
     before_ns = node.stepped_ns
     clock.set_by = -3600 * S
-    clock.set(clock.steady_ns() + S // 20)
+    clock.set(clock.steady_ns() + S // 5)
     node.spin_once()
-    assert node.stepped_ns - before_ns == S // 20
+    assert node.stepped_ns - before_ns == S // 5

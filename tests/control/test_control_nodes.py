@@ -16,6 +16,7 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.transport import Received
 from instant_ic.config import params
 from instant_ic.console.drive import DriveConfig, DriveGate
+from instant_ic.control.costmap import LETHAL
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.states import Reason
 from instant_ic.geometry.poses import pose2_from_matrix
@@ -582,3 +583,53 @@ def test_points_without_coordinates_hold_the_robot_and_are_told() -> None:
     stack.drive(2.5, (0.0, 0.0))
     assert arbiter.diagnoses()["points"][0] == OK
     assert twist_values(stack.drive(0.5, (0.4, 0.0))[-1].applied_command)[0] > 0.3
+
+
+def test_at_rest_the_arbiter_works_rarely_and_a_start_is_checked_against_what_stands_there_now() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.cloud = np.zeros((0, 3))
+    stack.drive(2.0, None)
+    updates = count_calls(stack.arbiter.surroundings, "update_costmap")
+    before = len(stack.bus.messages("/cmd_vel"))
+    assert {state.mode for state in stack.drive(4.0, None)} == {ControlState.REAL}
+    assert 35 <= len(stack.bus.messages("/cmd_vel")) - before <= 41  # 10 a second: no receiver times out
+    assert 7 <= len(updates) <= 9  # 2 a second, and no source counts as stale
+    # A box 0.1 m high, 0.6 m ahead, that only 3D points see, appears between two updates.
+    stack.cloud = np.array([[0.62, y, z] for y in np.arange(-0.2, 0.2, 0.02) for z in (0.08, 0.1)])
+    stack.step(None)
+    stack.step(None)
+    seen = len(updates)
+    state = stack.step((0.4, 0.0))
+    assert len(updates) > seen
+    costmap = stack.arbiter.surroundings.costmap
+    assert costmap is not None and costmap.cost_at(np.array([0.62, 0.0])) == LETHAL
+    assert state.blocked and twist_values(state.applied_command)[0] < 0.4
+    before = len(updates)
+    stack.drive(1.0, (0.0, 0.5))
+    assert len(updates) - before >= 19  # in motion, each timer
+
+
+def test_the_navigator_works_only_in_the_virtual_space() -> None:
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    navigator = next(node for node in stack.bus.nodes if isinstance(node, NavigatorNode))
+    stack.drive(2.0, None)
+    assert navigator.follow_timer is None and not stack.bus.messages("/nav/cmd_vel")
+    assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
+    assert navigator.follow_timer is not None
+    assert stack.drive(14.0, (0.4, 0.0))[-1].mode == ControlState.REAL
+    sent = len(stack.bus.messages("/nav/cmd_vel"))
+    stack.drive(0.5, (0.4, 0.0))
+    assert navigator.follow_timer is None and len(stack.bus.messages("/nav/cmd_vel")) == sent
+
+
+def count_calls(thing: object, name: str) -> list[object]:
+    """Results of a method from now on, one for each call."""
+    results: list[object] = []
+    method = getattr(thing, name)
+
+    def counted(*arguments: object) -> object:
+        results.append(method(*arguments))
+        return results[-1]
+
+    setattr(thing, name, counted)
+    return results
