@@ -69,6 +69,8 @@ class CommandRules:
             notice = Notice(Reason.ROBOT_CANNOT_FOLLOW, text)
         elif sent.action != "free":
             notice = Notice(Reason.DRIVE_VBOT, text + "; the robot slows down near an obstacle")
+        elif slowed := self.sources.slowed(s.inputs, s.mode, abs(s.command[0])):
+            notice = Notice(Reason.DRIVE_VBOT, text + slowed)
         elif s.slow_s > _SLOW_S:
             notice = Notice(Reason.DRIVE_VBOT, text + "; slowed: a wall is ahead, or the robot must catch up")
         return DriveCommand(sent.command, notice, hard=hard or sent.action == "stop")
@@ -90,8 +92,8 @@ class CommandRules:
         elif s.mode == Mode.RETURNING:
             notice = Notice(Reason.SWITCHING_TO_CAMERA, "you drive the robot; switching back to the camera")
         paced = self._paced(command, s)
-        if paced != command and not blocked:
-            notice = Notice(notice.reason, notice.text + "; slowed: the image rate is low")
+        if not blocked:
+            notice = Notice(notice.reason, notice.text + self.sources.slowed(s.inputs, s.mode, abs(command[0])))
         sent = self.monitored(paced, s.inputs)
         if sent.action in ("approach", "stop") and not blocked:
             blocked = True
@@ -103,7 +105,7 @@ class CommandRules:
     def monitored(self, command: Twist2, inputs: ArbiterInputs) -> MonitoredCommand:
         """The command after the collision monitor, which gets all points seen and remembered near the robot."""
         points = inputs.scan_points
-        if inputs.costmap is not None and inputs.robot_pose is not None:
+        if command != NO_MOTION and inputs.costmap is not None and inputs.robot_pose is not None:
             config = self.config.collision_monitor
             memory = inputs.costmap.memory_near(inputs.robot_pose, config.blind_radius_m, config.memory_range_m)
             points = np.concatenate([points, np.repeat(memory, self.monitor.most_points_needed, axis=0)])

@@ -94,10 +94,11 @@ class TimeoutConfig:
 class Rhythm:
     """Usual age of a source when its next message arrives: its period, plus its delay where age counts from the stamp.
 
-    The median of the last messages; inf until ``_NEEDED`` have arrived.
+    The median of the last messages; inf until ``_NEEDED`` have arrived. Where the newest ones come more slowly, their
+    median counts: after two late images the robot drives slower, instead of stopping at each of the next ten.
     """
 
-    _NEEDED, _KEPT = 5, 20
+    _NEEDED, _KEPT, _NEWEST = 5, 20, 3
 
     def __init__(self) -> None:
         self._ages: deque[float] = deque(maxlen=self._KEPT)
@@ -110,4 +111,7 @@ class Rhythm:
     @property
     def usual_s(self) -> float:
         """Seconds; inf while unknown."""
-        return statistics.median(self._ages) if len(self._ages) >= self._NEEDED else math.inf
+        ages = list(self._ages)
+        if len(ages) < self._NEEDED:
+            return math.inf
+        return max(statistics.median(ages), statistics.median(ages[-self._NEWEST :]))

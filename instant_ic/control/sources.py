@@ -64,6 +64,19 @@ class SourceMonitor:
         most = self.config.limits.max_linear_m_s
         return min(most, self.config.timeouts.image_travel_m / longest_s) if longest_s > 0 else most
 
+    def slowed(self, inputs: ArbiterInputs, mode: Mode, speed_m_s: float) -> str:
+        """Text for the operator while rare images keep ``speed_m_s`` from being driven; empty while they do not."""
+        limit = self.speed_limit_m_s(inputs, mode)
+        if speed_m_s <= limit:
+            return ""
+        rare = max(
+            (source for source in self._required(mode) if source.key in IMAGES),
+            key=lambda source: self._allowed_s(source, inputs),
+        )
+        usual_s = inputs.usual.get(rare.key, math.inf)
+        every = f"one {rare.name} in {usual_s:.1f} s" if math.isfinite(usual_s) else f"{rare.name}s just began"
+        return f"; slowed to {limit:.2f} m/s: {every}"
+
     def vbot_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
         """Speed limit of the v-bot; below full speed it is slow enough for the r-bot to catch up."""
         limit = self.speed_limit_m_s(inputs, mode)

@@ -79,6 +79,8 @@ class RateWorld:
 
     def __init__(self, boxes: list[tuple[float, float, float, float]], rates: Rates, length_m: float = 20.0) -> None:
         self.rates = rates
+        self.one_image_of = 1  # 5: only each fifth image comes
+        self.exposed = 0
         self.rng = np.random.default_rng([17, rates.seed])
         walls = corridor(length_m)
         self.world = World(np.concatenate([walls, *(rectangle(*box) for box in boxes)]))
@@ -235,7 +237,8 @@ class RateWorld:
 
     def _expose(self) -> None:
         rates, now = self.rates, self.now
-        if self.rng.random() < rates.lost:
+        self.exposed += 1
+        if self.rng.random() < rates.lost or self.exposed % self.one_image_of:
             return
         delay_s = rates.camera_delay_s * (1 + rates.jitter * self.rng.random())
         delay_s += rates.jitter * self.rng.random() / rates.camera_hz

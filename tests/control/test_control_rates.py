@@ -84,7 +84,7 @@ def test_nothing_depends_on_the_pace_of_the_process(world: Callable[..., RateWor
     ]
 
 
-@pytest.mark.parametrize("camera_hz", [1, 2, 5, 30])
+@pytest.mark.parametrize("camera_hz", [1, 2, 5, 10, 30])
 def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_distance(
     world: Callable[..., RateWorld], camera_hz: float
 ) -> None:
@@ -92,6 +92,10 @@ def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_di
     made.drive(FORWARD, 3.0)
     assert made.base.v > 0.2  # driveable, without a stop at each image
     assert all(speed > 0.2 for t, speed in made.speeds if t > made.time_s - 1.5)
+    limit_m_s = TimeoutConfig().image_travel_m / TimeoutConfig().allowed_s("camera", 1.0 / camera_hz)
+    assert made.base.v <= min(FORWARD[0], limit_m_s) + 0.01
+    # A slow camera slows the robot, and the operator reads why.
+    assert (f"one camera image in {1 / camera_hz:.1f} s" in made.state.reason) == (limit_m_s < FORWARD[0])
     # Right after an image: the next never comes.
     newest = made.console.feed.display.image_stamp_ns
     assert made.run(1.5 / camera_hz + 0.1, lambda: made.console.feed.display.image_stamp_ns != newest)
@@ -105,6 +109,25 @@ def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_di
     travel_m, speed = TimeoutConfig().image_travel_m, FORWARD[0]
     braking_m = speed * 0.15 + speed**2 / (2 * MotionLimits().max_linear_accel_m_s2)
     assert made.base.pose[0] - began_x <= travel_m + braking_m
+
+
+@pytest.mark.parametrize("one_image_of", [4, 5])
+def test_a_camera_that_becomes_slow_slows_the_robot_after_two_late_images(
+    world: Callable[..., RateWorld], one_image_of: int
+) -> None:
+    made = world(boxes=(), camera_hz=5)
+    made.drive(FORWARD, 3.0)
+    made.one_image_of = one_image_of
+    made.drive(FORWARD, 3.5 * one_image_of / 5)
+    began = len(made.speeds)
+    made.drive(FORWARD, 5.0)
+    assert made.modes == ["STOPPED", "REAL"], made.changes
+    assert min(speed for _, speed in made.speeds[began:]) > 0.2  # slower, without a stop at each image
+    assert "slowed to" in made.state.reason
+    made.one_image_of = 1
+    made.drive(FORWARD, 5.0)
+    assert made.base.v == pytest.approx(FORWARD[0], abs=0.01)
+    assert "slowed" not in made.state.reason
 
 
 def test_lost_views_stop_both_robots_in_the_virtual_space_at_one_view_per_second(
