@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +13,12 @@ from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.navigator import Navigator, RecoveryConfig, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import pose2_from_matrix
-from instant_ic.geometry.transforms import TransformError
 from instant_ic.msg import (
     ControlState,
     OccupancyGrid,
@@ -29,6 +29,7 @@ from instant_ic.msg import (
     grid_array,
     matrix_from_pose,
     path_message,
+    stamp_ns,
     twist_stamped,
     twist_values,
 )
@@ -74,14 +75,14 @@ class NavigatorNode(Node[NavigatorConfig]):
         c = self.config
         self.navigator = self.made(c)
         self.speed = 0.0
+        self.grid: tuple[Any, Any] = (None, None)  # the newest costmap's message, and the costmap
+        self.follow_timer: Any = None  # runs while the operator drives the v-bot
         self.cmd_vel = self.publisher("/nav/cmd_vel", TwistStamped, qos=SENSOR)
         self.path = self.publisher("/nav/path", Path, qos=SENSOR)
         self.subgoal = self.latest("/ic/subgoal", PoseStamped, c.subgoal_timeout_s)
         self.costmap = self.latest("/costmap", OccupancyGrid, c.costmap_timeout_s)
         self.vbot = self.latest("/vbot/odom", Odometry, 0.3)
-        self.state = self.latest("/ic/state", ControlState, c.state_timeout_s, qos=LATCHED)
-        _ = self.tf  # listens from here on
-        self.timer(1.0 / c.controller_frequency, self.tick)
+        self.state = self.latest("/ic/state", ControlState, c.state_timeout_s, qos=LATCHED, callback=self.on_state)
 
     def made(self, c: NavigatorConfig) -> Navigator:
         follower = PathFollower(c.follower, c.limits, c.footprint)
@@ -91,12 +92,26 @@ class NavigatorNode(Node[NavigatorConfig]):
         super().reconfigure(config)
         self.navigator = self.made(config)  # plans again at once
 
+    def on_state(self, state: ControlState) -> None:
+        """Follow at the controller's rate while the operator drives the v-bot; otherwise nothing runs."""
+        if state.mode != Mode.VIRTUAL:
+            self.rest()
+        elif self.follow_timer is None:
+            self.follow_timer = self.timer(1.0 / self.config.controller_frequency, self.tick)
+            self.tick()
+
+    def rest(self) -> None:
+        if self.follow_timer is not None:
+            self.follow_timer.cancel()
+            self.follow_timer = None
+            self.navigator.reset()
+        self.speed = 0.0
+        self.diagnose("follow", OK, "waiting: the operator drives the robot")
+
     def tick(self) -> None:
         state = self.state.message
-        if state is None or state.mode != Mode.VIRTUAL:
-            self.navigator.reset()
-            self.speed = 0.0
-            self.diagnose("follow", OK, "waiting: the operator drives the robot")
+        if state is None:
+            self.rest()
             return
         command = self.command(state)
         self.speed = command[0]
@@ -108,14 +123,15 @@ class NavigatorNode(Node[NavigatorConfig]):
         if grid is None or goal is None:
             missing = "costmap" if grid is None else "subgoal"
             return self.stand(f"no {missing} within its time-out")
-        try:
-            pose = pose2_from_matrix(self.tf.lookup("map", "base_link"))
-        except TransformError as error:
-            return self.stand(str(error))
-        occupancy, resolution, origin = grid_array(grid)
-        costmap = Costmap.from_occupancy(occupancy, resolution, np.array(origin))
+        age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
+        pose = extrapolate(
+            pose2_from_matrix(matrix_from_pose(state.robot_pose)), twist_values(state.robot_twist), age_s
+        )
+        if self.grid[0] is not grid:
+            occupancy, resolution, origin = grid_array(grid)
+            self.grid = grid, Costmap.from_occupancy(occupancy, resolution, np.array(origin))
         subgoal, velocity = self.moving(pose2_from_matrix(matrix_from_pose(goal)), state)
-        step = self.navigator.step(pose, self.speed, subgoal, costmap, self.clock.steady_ns(), velocity)
+        step = self.navigator.step(pose, self.speed, subgoal, self.grid[1], self.clock.steady_ns(), velocity)
         if step.replanned and (self.path.subscriber_count or self.lockstep):
             self.path.publish(path_message(step.plan.poses, "map", self.clock.now_ns()))
         self.diagnose("follow", OK if step.plan.reached else WARN, step.plan.reason or step.state, state=step.state)
