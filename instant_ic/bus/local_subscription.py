@@ -31,8 +31,7 @@ _QUEUE = 256  # messages that ZeroMQ keeps in this process; the publisher keeps 
 _LARGE_FROM_BYTES = 64 << 10
 _RECONNECT_MS = 20
 _GRACE_S = 2.0  # the last messages of a publisher that has left the registry may still be on the way
-_FULL_LOOK_S = 5.0  # the leftovers of a killed process change no folder
-_UNKNOWN_S = 1.0  # between two looks for the same unknown publisher
+_FULL_LOOK_S = 1.0
 _MOST_UNKNOWN = 64
 _NOBLOCK = int(zmq.NOBLOCK)
 _new = tuple.__new__  # what Received(...) calls in the end, without a Python call in between
@@ -234,7 +233,7 @@ class LocalSubscription:
                     self._sources[publisher] = source = _Source(info)
                     return source
             if len(self._looked_up) < _MOST_UNKNOWN:
-                self._looked_up[publisher] = now + _UNKNOWN_S
+                self._looked_up[publisher] = now + _FULL_LOOK_S
         raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")
 
     def _forget(self, publisher: bytes) -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from instant_ic.bus import registry
 
-_FULL_LOOK_S = 5.0  # the leftovers of a killed process change no folder
+_FULL_LOOK_S = 1.0  # the leftovers of a killed process change no folder
 
 
 class TopicWatch:
-    """Topics of a run directory, read again when one of their folders changes, and every 5 s.
+    """Topics of a run directory, read again when one of their folders changes, and once a second.
 
     Args:
         run_dir: the run directory.
