@@ -101,6 +101,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.last_ns: int | None = None  # stamp of the newest depth
         self.image_ns = 0
         self.request = self.publisher("/depth/request", Header, qos=LATCHED)
+        self.request.publish(header("", 0))  # any image: from now on depth_estimator waits for requests
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
         self.warn_of_method()

@@ -243,8 +243,9 @@ def test_a_standing_robot_needs_one_depth_and_a_moving_one_at_once(model_file: P
         assert [k.id for k in bus.messages("/keyframe")] == [1]
         # 0.12 m an image: the fifth is the first at 0.6 m from the keyframe, and its own depth makes the next one.
         stamps = images(bus, [0.12 * n + 1e-6 for n in range(1, 8)], START + 6 * S, cloud)
-        for topic in ("/depth/request", "/depth/raw", "/depth/scaled", "/keyframe"):
+        for topic in ("/depth/raw", "/depth/scaled", "/keyframe"):
             assert stamp_ns(bus.last(topic)) == stamps[4] and len(bus.messages(topic)) == 2, topic
+        assert stamp_ns(bus.last("/depth/request")) == stamps[4]
         assert estimator.diagnoses()["depth"][0] == 0
 
 
@@ -264,12 +265,23 @@ def test_a_request_is_repeated_until_depth_arrives() -> None:
         bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated")))
         publish_mounts(bus)
         stamps = images(bus, [0.0] * 16, START)
-        assert [stamp_ns(m) for m in bus.messages("/depth/request")] == [stamps[0], stamps[10]]
+        assert [stamp_ns(m) for m in bus.messages("/depth/request")] == [0, stamps[0], stamps[10]]
         depth = room_depth(BASE_FROM_CAMERA)
         bus.publish("/depth/raw", image_message(depth, "32FC1", "camera", stamps[10]), stamp_ns=stamps[15] + 1)
         assert [stamp_ns(k) for k in bus.messages("/keyframe")] == [stamps[10]]
         images(bus, [0.0] * 16, START + 4 * S)
-        assert len(bus.messages("/depth/request")) == 2
+        assert len(bus.messages("/depth/request")) == 3
+
+
+def test_without_poses_one_depth_is_computed(model_file: Path) -> None:
+    """The estimator waits for requests as soon as there is someone who requests."""
+    with LockstepBus(START) as bus:
+        bus.add(DepthEstimatorNode, DepthEstimatorConfig(model=str(model_file)))
+        bus.add(DepthScalerNode)
+        for number in range(20):
+            stamp = START + number * S // 5
+            bus.publish("/camera/image/compressed", compressed_image_message(jpeg(1), "camera", stamp), stamp_ns=stamp)
+        assert len(bus.messages("/depth/raw")) == 1
 
 
 def test_time_that_goes_back_makes_a_new_keyframe() -> None:
