@@ -15,7 +15,7 @@ from instant_ic.msg import ControlState, Odometry, TwistStamped, stamp_ns, twist
 
 pytestmark = [pytest.mark.system, pytest.mark.xdist_group("stack"), pytest.mark.timeout(900)]
 ARGUMENTS = {"headless": True, "vspace": False, "world": "corridor-free"}
-DRIVE_S = 15.0
+DRIVE_S = 5.0
 
 
 @pytest.fixture
@@ -41,7 +41,8 @@ def test_a_busy_machine_slows_a_simulated_stack_and_stops_nothing(busy_loops):
             out.publish(twist_stamped(0.3, 0.0, clock.now_ns()))
             return states and states[-1].reason_code == ControlState.REASON_DRIVE_ROBOT
 
-        stack.wait_for(driving, 240, "drive")
+        stack.wait_for(lambda: states and states[-1].mode == ControlState.REAL, 240, "real mode")
+        stack.wait_for(driving, 30, "drive")
         states.clear(), truth.clear()
         end_s, paces = clock.steady_s() + DRIVE_S, set()
 
