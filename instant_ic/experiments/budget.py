@@ -41,7 +41,8 @@ def usage(run_dir: Path) -> Usage:
     """The usage of all processes that were started with this run directory."""
     import psutil
 
-    cpu_s, rss_mb = {}, {}
+    cpu_s: dict[str, float] = {}
+    rss_mb: dict[str, float] = {}
     now = time.monotonic()
     for process in processes_of(run_dir):
         try:

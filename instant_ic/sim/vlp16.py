@@ -187,7 +187,7 @@ class Vlp16:
         if count < 1:
             return []
         config, period_s = self.config, wire.PACKET_PERIOD_US * 1e-6
-        times_s = (self.packets + np.arange(count + 1)) * period_s
+        times_s = np.asarray((self.packets + np.arange(count + 1)) * period_s, np.float64)
         self.packets += count
         azimuth_deg = times_s[:-1] * (config.rpm * 6.0) % 360.0
         size = count * len(self._beams)
