@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from instant_ic.experiments.budget import Usage, cpu_percent, reference_loop_s, usage
+from instant_ic.experiments.budget import Usage, cpu_percent, reference_loop, usage
 from instant_ic.experiments.drive import DriveRecorder, drive_through_obstacle
 from instant_ic.experiments.stack import Stack, free_ports
 from instant_ic.msg import ControlState, message_type
@@ -35,9 +35,9 @@ def main() -> int:
     args = parser.parse_args()
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     try:
-        with Stack("sim.yaml", run_dir, free_ports(), args.log, pace=args.pace) as stack:
-            result = {"pace": args.pace, "reference_loop_ms": round(1e3 * reference_loop_s(), 1)}
-            result.update(measure(stack, run_dir, args))
+        with Stack("sim.yaml", run_dir, free_ports(), args.log, pace=args.pace) as stack, reference_loop() as loop:
+            result = measure(stack, run_dir, args)
+            result["pace"], result["reference_loop_ms"] = args.pace, round(loop.million_ms, 1)
     finally:
         shutil.rmtree(run_dir, ignore_errors=True)
     text = json.dumps(result, indent=2)

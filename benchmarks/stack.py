@@ -27,9 +27,8 @@ from typing import Any
 
 import psutil
 
-from instant_ic import pace
 from instant_ic.bus import LATCHED, RELIABLE
-from instant_ic.experiments.budget import Usage, cpu_percent, reference_loop_s, usage
+from instant_ic.experiments.budget import Usage, cpu_percent, reference_loop, usage
 from instant_ic.experiments.drive import DriveRecorder
 from instant_ic.experiments.stack import Stack, StackError, free_ports, processes_of
 from instant_ic.msg import ControlState, message_type, twist_values
@@ -108,6 +107,7 @@ class Watch:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeat", type=int, default=1, help="number of drives, each with a new stack (default 1)")
+    parser.add_argument("--pace", type=float, default=None, help="fixed pace (default: what the machine can do)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument("--screenshots", type=Path, metavar="DIR", help="screenshots of the page in each mode")
     parser.add_argument("--width", type=int, default=1280)
@@ -122,7 +122,6 @@ def main() -> int:
         note(json.dumps({key: drives[-1].get(key) for key in SHOWN}))
         result = {
             "cores": os.cpu_count(),
-            "reference_loop_ms": round(1e3 * reference_loop_s(), 1),
             "completed": f"{sum(drive['completed'] for drive in drives)} of {len(drives)}",
             "drives": drives,
         }
@@ -141,11 +140,13 @@ def one_drive(args: argparse.Namespace) -> dict[str, Any]:
     ports = free_ports()
     result: dict[str, Any] = {"completed": False}
     try:
-        with Stack("sim.yaml", run_dir, {**ports, "recordings": run_dir / "recordings"}, args.log) as stack:
+        arguments = {**ports, "recordings": run_dir / "recordings"}
+        with Stack("sim.yaml", run_dir, arguments, args.log, pace=args.pace) as stack, reference_loop() as loop:
             try:
                 drive(stack, run_dir, f"http://127.0.0.1:{ports['console_port']}/", args, result)
             except StackError as error:
                 result["error"] = str(error).splitlines()[0]
+            result["reference_loop_ms"] = round(loop.million_ms, 1)
             began = time.monotonic()
             result["exit_status"] = stack.stop()
             result["stop_s"] = round(time.monotonic() - began, 2)
@@ -195,7 +196,7 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
         try:
 
             def inside() -> bool:
-                paces.append(pace.current().factor)
+                paces.append(stack.pace)
                 return watch.mode == ControlState.VIRTUAL
 
             hold(inside, 120, "VIRTUAL")
@@ -204,7 +205,7 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
 
             def past() -> bool:
                 nonlocal shots
-                paces.append(pace.current().factor)
+                paces.append(stack.pace)
                 x = 0.0 if recorder.vbot_pose is None else float(recorder.vbot_pose[0])
                 if shots < 3 and x > (2.6, 3.3, 4.9)[shots]:
                     shots += 1

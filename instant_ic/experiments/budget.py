@@ -2,24 +2,56 @@
 
 from __future__ import annotations
 
+import contextlib
+import statistics
+import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from instant_ic.experiments.stack import processes_of
 
-_REFERENCE_LOOPS = 1_000_000
+_LOOPS = 100_000
+_REFERENCE_PERIOD_S = 0.5
 
 
-def reference_loop_s() -> float:
-    """CPU seconds of one million empty loops in Python: the measure of a machine's speed. The best of five."""
-    best = float("inf")
-    for _ in range(5):
+class ReferenceLoop:
+    """CPU time of an empty loop in Python while a stack runs: the speed of this machine under the same load."""
+
+    def __init__(self) -> None:
+        self._samples: list[float] = []
+
+    def sample(self) -> None:
+        """Time a hundred thousand iterations."""
         began = time.thread_time()
-        for _ in range(_REFERENCE_LOOPS):
+        for _ in range(_LOOPS):
             pass
-        best = min(best, time.thread_time() - began)
-    return best
+        self._samples.append(time.thread_time() - began)
+
+    @property
+    def million_ms(self) -> float:
+        """Milliseconds of CPU for one million iterations: the median of the samples."""
+        return 1e3 * statistics.median(self._samples) * 1e6 / _LOOPS
+
+
+@contextlib.contextmanager
+def reference_loop() -> Iterator[ReferenceLoop]:
+    """Time the reference loop twice a second on a thread, until the end of the block."""
+    loop, ended = ReferenceLoop(), threading.Event()
+
+    def run() -> None:
+        loop.sample()
+        while not ended.wait(_REFERENCE_PERIOD_S):
+            loop.sample()
+
+    thread = threading.Thread(target=run, name="reference loop", daemon=True)
+    thread.start()
+    try:
+        yield loop
+    finally:
+        ended.set()
+        thread.join()
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from instant_ic.bus import registry
+from instant_ic.experiments.budget import cpu_percent, reference_loop, usage
 from instant_ic.experiments.drive import DriveRecord, DriveRecorder, drive_through_obstacle, footprint_clearance
 from instant_ic.experiments.stack import Stack, free_ports, machine_pace, processes_of
 from instant_ic.msg import ControlState
@@ -39,6 +40,9 @@ class Outcome:
     left_processes: list[str]
     left_sockets: list[Path]
     log: str
+    loops: dict[str, float]
+    """CPU of each process per second of the stack's time, from ready to the end of the drive, in units of the time of
+    one million iterations of an empty loop, measured at the same time."""
 
 
 @pytest.fixture(scope="module")
@@ -48,17 +52,23 @@ def outcome(tmp_path_factory):
     ports = free_ports()
     try:
         # One recorder is enough: the page's would write into the working directory.
-        with Stack("sim.yaml", run_dir, {**ports, "record": bag, "recorder": False}, pace=machine_pace()) as stack:
+        arguments = {**ports, "record": bag, "recorder": False}
+        with Stack("sim.yaml", run_dir, arguments, pace=machine_pace()) as stack, reference_loop() as loop:
             recorder = DriveRecorder(stack)
+            stack.wait_for(lambda: recorder.ready, 240, "virtual space that is fit to show")
+            before = usage(run_dir)
             url = f"http://127.0.0.1:{ports['console_port']}/"
             asyncio.run(drive_through_obstacle(stack, recorder, url, beyond_x_m=5.6))
+            after = usage(run_dir)
+            percent = cpu_percent(before, after, (after.monotonic_s - before.monotonic_s) * stack.pace)
+            loops = {name: 10.0 * value / loop.million_ms for name, value in percent.items()}
             topics = {t.topic: t.type_name for t in registry.list_topics(run_dir)}
             nodes = {n.name for n in registry.list_nodes(run_dir)}
             status = stack.stop(60.0)  # raises StackError after that; 5 s on a free machine
             left = [" ".join(p.cmdline()) for p in processes_of(run_dir)]
             log = stack.log_path.read_text(errors="replace")
         sockets = list(run_dir.glob("topics/*/*.sock"))
-        yield Outcome(recorder.record, bag, topics, nodes, status, left, sockets, log)
+        yield Outcome(recorder.record, bag, topics, nodes, status, left, sockets, log, loops)
     finally:
         shutil.rmtree(run_dir, ignore_errors=True)
 
@@ -70,6 +80,24 @@ def test_control_passes_to_the_virtual_robot_and_back_once(outcome):
     # No flicker: each passage is the only one since the start or since a stop by a late sensor on a busy machine.
     stops_in_virtual = sum(pair == (ControlState.VIRTUAL, ControlState.STOPPED) for pair in pairwise(modes))
     assert Counter(modes)[ControlState.VIRTUAL] == 1 + stops_in_virtual, outcome.record.reasons
+
+
+RECORDED_LOOPS = {
+    "simulator": 0.0,
+}
+"""``Outcome.loops`` of 2026-11-23. Renew it when a node needs more for a reason, or less."""
+
+
+def test_no_process_needs_half_again_as_much_cpu(outcome):
+    measured = {name: round(value, 1) for name, value in sorted(outcome.loops.items())}
+    assert measured.keys() - {"reaper.py"} == RECORDED_LOOPS.keys(), measured
+    # What a process of a few loops needs is mostly the machine's scheduling, which differs between machines.
+    over = {
+        name: f"{measured[name]} of {limit}"
+        for name, limit in RECORDED_LOOPS.items()
+        if measured[name] > 1.5 * limit + 0.5
+    }
+    assert not over, measured
 
 
 def test_obstacle_stands_where_these_tests_think():
