@@ -82,10 +82,8 @@ class _Silence:
         """Record the newest heartbeat."""
         if beat_s is None or beat_s != self.beat_s:
             self.beat_s, self.lasts_s, self.told = beat_s, 0.0, False
-            self._active_s = 0.0
-            return
-        if self.lasts_s == 0.0:
             self._active_s = _active_s(pid)
+            return
         # If the launcher itself was held up (stopped, swapped out), the nodes are not to blame.
         self.lasts_s += min(since_last_look_s, 0.5)
 

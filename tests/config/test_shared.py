@@ -79,8 +79,10 @@ def test_shipped_files_have_no_mistakes_and_each_value_a_comment() -> None:
     renamed = {"operator_recorder": "bag_recorder", "fleet_gateway": "zenoh_gateway"}
     wanted = {  # what is not the default of the code
         ("nerf", "space.geometry.body_below_deg"),
+        ("nerf", "space.source"),
         *(("host_bridge", key) for key in ("to_station", "to_robot")),
         *(("operator_recorder", key) for key in ("path", "snapshot", "snapshot_seconds", "max_cache_mb", "exclude")),
+        ("operator_recorder", "discovery_period_s"),
         *(("zenoh_gateway", key) for key in ("publish", "subscribe", "commands")),
         ("fleet_gateway", "subscribe"),
     }
