@@ -83,7 +83,20 @@ def test_control_passes_to_the_virtual_robot_and_back_once(outcome):
 
 
 RECORDED_LOOPS = {
-    "simulator": 0.0,
+    "arbiter": 9.0,
+    "bag_recorder": 7.8,
+    "console": 7.1,
+    "crawler_base": 2.6,
+    "depth_estimator": 1.9,
+    "depth_scaler": 3.9,
+    "grid_slam": 2.7,
+    "launcher": 0.9,
+    "navigator": 1.9,
+    "nerf": 7.9,
+    "simulator": 24.2,
+    "theta_camera": 0.3,
+    "virtual_robot": 1.8,
+    "vlp16_driver": 5.2,
 }
 """``Outcome.loops`` of 2026-11-23. Renew it when a node needs more for a reason, or less."""
 
@@ -95,7 +108,7 @@ def test_no_process_needs_half_again_as_much_cpu(outcome):
     over = {
         name: f"{measured[name]} of {limit}"
         for name, limit in RECORDED_LOOPS.items()
-        if measured[name] > 1.5 * limit + 0.5
+        if measured[name] > 1.5 * limit + 1.0
     }
     assert not over, measured
 
