@@ -29,7 +29,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def are_compiled() -> bool:
     """Whether :func:`compile_all` has finished for these sources, this numba and this CPU."""
     try:
-        return (_folder() / "kernels.txt").read_text() == _key()
+        # The key first: it imports, and Python can lose a Ctrl-C during an import. The caller reports its start later.
+        return _key() == (_folder() / "kernels.txt").read_text()
     except OSError:
         return False
 
