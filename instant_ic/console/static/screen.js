@@ -50,6 +50,8 @@ export class Screen {
     this._requested = this._wanted = false;
     this._timer = 0;
     this._latencyAt = this._mapAt = this._lookAt = 0;
+    /** Rotation and field of view of the last drawn image. @type {number[]} */
+    this._direction = [];
     this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
     link.addEventListener("open", () => { this._sentLook = ""; });
     document.addEventListener("visibilitychange", () => { this._steppedAt = performance.now(); });
@@ -158,12 +160,16 @@ export class Screen {
    */
   _renderView(scene) {
     const { viewer, images, look } = this;
-    const moved = scene.blend > 0 ? rounded(scene.moved, 3) : "";
-    const key = rounded([...scene.mapFromLook, look.yaw, look.vfov, scene.blend], 4) + moved;
     const resized = fit(viewer.canvas, viewer.slow ? (scene.blend === 1 ? SLOW_VIEW_PIXELS : SLOW_PIXELS) : 1);
-    const moves = key !== this._viewKey;
+    const key = rounded([scene.blend], 4) + (scene.blend > 0 ? rounded(scene.moved, 3) : "");
+    const direction = [...scene.mapFromLook, look.vfov];
+    // A standing robot's pose is never still: SLAM turns it by parts of a milliradian with every scan.
+    const halfPixel = this._tanHalf()[0] / viewer.canvas.width;
+    const turned = this._direction.some((value, index) => Math.abs(value - direction[index]) > halfPixel);
+    const moves = turned || key !== this._viewKey;
     if (viewer.lost || !(resized || images.changed || moves)) return false;
     this._viewKey = key;
+    this._direction = direction;
     images.changed = false;
     viewer.render(scene);
     // For measurements: the rendered image and its position.
