@@ -147,6 +147,9 @@ def load(file: Path, problems: list[Problem]) -> Value | None:
     except yaml.YAMLError as error:
         problems.append(Problem(file, 1, f"not YAML: {error}"))
         return None
+    except RecursionError:
+        problems.append(Problem(file, 1, "lists or mappings are nested too deeply"))
+        return None
     if node is None:
         problems.append(Problem(file, 1, "the file is empty"))
         return None

@@ -236,6 +236,7 @@ def test_all_mistakes_at_once_with_their_lines(tmp_path: Path, program: Path) ->
     ("text", "expected"),
     [
         ("launch: [\n", "2: not YAML"),
+        ("launch: " + 2000 * "[", "1: lists or mappings are nested too deeply"),
         ("", "1: the file is empty"),
         ("nodes: []\n", "1: unknown key 'nodes'"),
         ("launch:\n- node: {exec: talker.py}\n- node: {exec: talker.py}\n", "3: a node named 'talker'"),
