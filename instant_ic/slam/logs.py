@@ -1,6 +1,7 @@
 """Readers of 2D laser logs: CARMEN (`FLASER`, `ROBOTLASER1`) and the mines recordings of BreezySLAM.
 
-A log is an iterable of `LogEntry`. Errors are raised as `LogError`, with file and line.
+A log is an iterable of `LogEntry`. A line that cannot be read is an error with file and line: the reader raises it as
+`LogError`, or counts it in a `BadLines` and leaves the line out.
 """
 
 from __future__ import annotations
@@ -8,8 +9,9 @@ from __future__ import annotations
 import gzip
 import io
 import math
+import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import IO, Any
@@ -25,6 +27,23 @@ _MOST_LOG = 8 << 30
 
 class LogError(ValueError):
     """A log cannot be read: ``path:line: what is wrong``."""
+
+
+@dataclass
+class BadLines:
+    """What a reader left out of a log: the number of bad lines, and the errors of the first few."""
+
+    count: int = 0
+    errors: list[str] = field(default_factory=list)
+
+    def add(self, error: LogError) -> None:
+        """Count one line."""
+        self.count += 1
+        if len(self.errors) < _NAMED_ERRORS:
+            self.errors.append(str(error))
+
+
+_NAMED_ERRORS = 5
 
 
 @dataclass(frozen=True)
@@ -47,12 +66,16 @@ class LogEntry:
 class _Lines(io.TextIOWrapper):
     """Lines of a text file, limited in length: a few kilobytes of gzip can hold one line of gigabytes."""
 
-    def __init__(self, raw: Any, path: Path) -> None:
+    def __init__(self, raw: Any, path: Path, bad: BadLines | None) -> None:
         super().__init__(raw, encoding="ascii", errors="replace")
-        self._path, self._left = path, _MOST_LOG
+        self._path, self._left, self._bad = path, _MOST_LOG, bad
 
     def __next__(self) -> str:  # type: ignore[override]
-        line = self.readline(_MOST_LINE + 1)
+        try:
+            line = self.readline(_MOST_LINE + 1)
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            refuse(LogError(f"{self._path}: the gzip file is cut or damaged: {error}"), self._bad)
+            raise StopIteration from None
         self._left -= len(line)
         if not line:
             raise StopIteration
@@ -61,26 +84,41 @@ class _Lines(io.TextIOWrapper):
         return line
 
 
-def open_log(path: str | Path) -> IO[str]:
-    """Open a text log; gzip is detected from the first two bytes."""
+def refuse(error: LogError, bad: BadLines | None) -> None:
+    """Count a bad line, or raise its error if nobody counts.
+
+    Raises:
+        LogError: ``bad`` is None.
+    """
+    if bad is None:
+        raise error
+    bad.add(error)
+
+
+def open_log(path: str | Path, bad: BadLines | None = None) -> IO[str]:
+    """Open a text log; gzip is detected from the first two bytes. A cut gzip file gives the lines that it holds."""
     path = Path(path)
     with path.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
-    return _Lines(gzip.open(path, "rb") if packed else path.open("rb"), path)
+    return _Lines(gzip.open(path, "rb") if packed else path.open("rb"), path, bad)
 
 
-def read_log(path: str | Path) -> Iterator[LogEntry]:
+def read_log(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
     """Scans of a log of either format: a line of 24 or more bare numbers is the mines format.
+
+    Args:
+        path: the log, gzip or not.
+        bad: counts lines that cannot be read, which are left out; None: the first one raises.
 
     Raises:
         LogError: a line cannot be read, or the log has no scan.
         OSError: no such file.
     """
-    with open_log(path) as lines:
+    with open_log(path, BadLines()) as lines:  # what is damaged is reported when it is read
         first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     fields = first.split()
     mines = len(fields) > _MINES_FIRST_RANGE and fields[0].lstrip("-").isdigit()
-    yield from read_mines(path) if mines else read_carmen(path)
+    yield from read_mines(path, bad) if mines else read_carmen(path, bad=bad)
 
 
 @dataclass(frozen=True)
@@ -103,7 +141,7 @@ _SICK_RANGE_MAX_M = 80.0
 _SURVEYED_SCANS = 400
 
 
-def read_carmen(path: str | Path, range_max: float | None = None) -> Iterator[LogEntry]:
+def read_carmen(path: str | Path, range_max: float | None = None, bad: BadLines | None = None) -> Iterator[LogEntry]:
     """Scans of a CARMEN log.
 
     ``FLASER n r0..rn-1 x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``, right to left, with
@@ -116,13 +154,14 @@ def read_carmen(path: str | Path, range_max: float | None = None) -> Iterator[Lo
         path: the log, gzip or not.
         range_max: FLASER readings at or above it, in metres, mean "no return". None: the log's own ``PARAM``, or the
             value at which readings pile up, or 80 m.
+        bad: as `read_log`.
 
     Raises:
         LogError: a line cannot be read, or the log has no scan.
     """
     survey = _survey(path, range_max)
     scans = 0
-    with open_log(path) as lines:
+    with open_log(path, bad) as lines:
         for number, line in enumerate(lines, start=1):
             kind, *fields = line.split() or [""]
             if kind not in _CARMEN_SCANS:
@@ -130,18 +169,24 @@ def read_carmen(path: str | Path, range_max: float | None = None) -> Iterator[Lo
             try:
                 entry = _flaser(fields, survey) if kind == "FLASER" else _robotlaser(fields, survey)
             except (ValueError, IndexError, OverflowError) as error:
-                raise LogError(f"{path}:{number}: {kind}: {error}") from None
+                refuse(LogError(f"{path}:{number}: {kind}: {error}"), bad)
+                continue
             scans += 1
             yield entry
     if scans == 0:
-        raise LogError(f"{path}: no FLASER or ROBOTLASER1 line: is this a CARMEN log?")
+        raise _nothing(LogError(f"{path}: no FLASER or ROBOTLASER1 line: is this a CARMEN log?"), bad)
+
+
+def _nothing(error: LogError, bad: BadLines | None) -> LogError:
+    """The error of a log without a scan: that of its first bad line, if it has any."""
+    return LogError(f"{bad.errors[0]} (and no line can be read)") if bad and bad.errors else error
 
 
 def _survey(path: str | Path, range_max: float | None) -> _Survey:
     """Read a whole CARMEN log once; malformed lines are skipped here and reported by the reader."""
     poses: list[FloatArray] = []
     readings: list[FloatArray] = []
-    with open_log(path) as lines:
+    with open_log(path, BadLines()) as lines:
         for line in lines:
             kind, *fields = line.split() or [""]
             try:
@@ -285,12 +330,12 @@ _MINES_RANGE_MIN_M = 0.06
 _MINES_RANGE_MAX_M = 4.0
 
 
-def read_mines(path: str | Path) -> Iterator[LogEntry]:
+def read_mines(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
     """Scans of a BreezySLAM `exp*.dat` recording (MinesRover: wheel ticks and a Hokuyo URG-04LX).
 
     Columns: 0 is the time in µs, 2 and 3 the left and right ticks, from 24 on 682 ranges in mm over 240°, right to
     left. The outer 70 on each side are unusable. 0 and the sensor's small error codes are erroneous (NaN). The odometry
-    is integrated from the ticks with differential drive kinematics and starts at the origin.
+    is integrated from the ticks with differential drive kinematics and starts at the origin. ``bad``: as `read_log`.
 
     Raises:
         LogError: a line cannot be read, or the log has no scan.
@@ -300,7 +345,7 @@ def read_mines(path: str | Path) -> Iterator[LogEntry]:
     metres_per_tick = 2 * math.pi * _MINES_WHEEL_RADIUS_M / _MINES_TICKS_PER_TURN
     pose = np.zeros(3)
     last_ticks: tuple[int, int] | None = None
-    with open_log(path) as lines:
+    with open_log(path, bad) as lines:
         for number, line in enumerate(lines, start=1):
             fields = line.split()
             if not fields:
@@ -312,8 +357,9 @@ def read_mines(path: str | Path) -> Iterator[LogEntry]:
                 ticks = int(fields[2]), int(fields[3])
                 columns = fields[_MINES_FIRST_RANGE + _MINES_MARGIN :][: _MINES_RANGES - 2 * _MINES_MARGIN]
                 ranges = np.array([int(text) for text in columns]) * 1e-3
-            except ValueError as error:
-                raise LogError(f"{path}:{number}: {error}") from None
+            except (ValueError, OverflowError) as error:
+                refuse(LogError(f"{path}:{number}: {error}"), bad)
+                continue
             if last_ticks is not None:
                 left = (ticks[0] - last_ticks[0]) * metres_per_tick
                 right = (ticks[1] - last_ticks[1]) * metres_per_tick
@@ -333,4 +379,4 @@ def read_mines(path: str | Path) -> Iterator[LogEntry]:
             )
             yield LogEntry(scan, pose.copy(), np.array([_MINES_LASER_FORWARD_M, 0.0, 0.0]))
     if last_ticks is None:
-        raise LogError(f"{path}: contains no scan")
+        raise _nothing(LogError(f"{path}: contains no scan"), bad)

@@ -141,7 +141,7 @@ class OccupancyMap:
 
     Attributes:
         version: grows with every change.
-        clipped: number of points dropped because they lie outside ``max_size_m``.
+        clipped: number of points dropped because they lie outside ``max_size_m`` about the first pose.
     """
 
     def __init__(self, config: MapConfig) -> None:
@@ -150,6 +150,7 @@ class OccupancyMap:
         self.clipped = 0
         self._mark = 0
         self._log_odds = [_log_odds(probability) for probability in (HIT, MISS, LOW, HIGH)]
+        self._centre: NDArray[np.int64] | None = None  # cell of the first pose
         self._first = np.zeros(2, dtype=np.int64)  # cell index of the corner; the corner is first·resolution
         self._cells = np.zeros((0, 0), dtype=np.float32)
         self._seen = np.zeros((0, 0), dtype=np.int32)
@@ -175,7 +176,7 @@ class OccupancyMap:
         return OccupancyGrid(_percentages(self._cells, self._seen), self.config.resolution_m, self.origin)
 
     def _grow(self, pose: FloatArray, scan: ScanPoints) -> None:
-        """Extend the grid to cover the scan, in steps of GROW_CELLS, up to ``max_size_m`` about the map's origin."""
+        """Extend the grid to cover the scan, in steps of GROW_CELLS, up to ``max_size_m`` about the first pose."""
         cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
         rotation = np.array([[cos_yaw, -sin_yaw], [sin_yaw, cos_yaw]])
         rays = np.concatenate([scan.points, scan.clear_ends, scan.origin[None]]) - scan.origin
@@ -185,7 +186,9 @@ class OccupancyMap:
         resolution = self.config.resolution_m
         limit = int(self.config.max_size_m / 2 / resolution)
         cells = np.floor(places / resolution).astype(np.int64)
-        inside = (np.abs(cells) < limit).all(axis=1)
+        if self._centre is None:
+            self._centre = np.floor(pose[:2] / resolution).astype(np.int64)
+        inside = (np.abs(cells - self._centre) < limit).all(axis=1)
         self.clipped += int((~inside).sum())
         cells = cells[inside]
         if len(cells) == 0:

@@ -80,7 +80,11 @@ def test_figures_trajectory_and_plot(
     assert report["translation_mean_m"] < 0.03 and report["rotation_mean_deg"] < 0.5
     assert report["translation_median_m"] <= report["translation_max_m"]
     assert 0 < report["cpu_ms_per_scan_mean"] < report["cpu_ms_per_scan_p99"] * 10 and report["peak_rss_mb"] > 50
-    rows = np.loadtxt(tmp_path / "made.trajectory.txt")
+    folder = Path(report["output"])
+    assert report["bad_lines"] == 0 and sorted(file.name for file in tmp_path.iterdir() if file.is_dir()) == ["runs"]
+    assert json.loads((folder / "figures.json").read_text()) == report
+    assert (folder / "map.png").read_bytes() == (tmp_path / "map.png").read_bytes()
+    rows = np.loadtxt(folder / "trajectory.txt")
     assert rows.shape == (len(journey.entries), 4)
     assert [f"{t:.6f}" for t in rows[:, 0]] == [stamp(e) for e in journey.entries]
     rest = relative2(relative2(journey.truth[0], journey.truth[-1]), relative2(rows[0, 1:], rows[-1, 1:]))
@@ -91,11 +95,11 @@ def test_figures_trajectory_and_plot(
 def test_the_particle_filter_by_name(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     start = tmp_path / "start.log"  # a filter costs many times what the graph does
     start.write_bytes(b"".join(gzip.decompress(log.read_bytes()).splitlines(keepends=True)[:60]))
-    words = ["evaluate", "slam", str(start), "--backend", "rbpf", "--trajectory", str(tmp_path / "t")]
+    words = ["evaluate", "slam", str(start), "--backend", "rbpf", "-o", str(tmp_path / "out")]
     assert main([*words, "--particles", "5"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["backend"] == "rbpf" and report["updates"] > 3
-    assert len(np.loadtxt(tmp_path / "t")) == report["scans"]
+    assert len(np.loadtxt(tmp_path / "out" / "trajectory.txt")) == report["scans"]
 
 
 @pytest.mark.parametrize(
@@ -113,9 +117,29 @@ def test_a_bad_log_is_told_by_its_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bad.log").write_text(text)
-    assert main(["evaluate", "slam", "bad.log"]) == 1
+    assert main(["evaluate", "slam", "bad.log", "--strict"]) == 1
     assert what in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["bad.log"]
+
+
+def test_bad_lines_are_counted_and_left_out(
+    log: Path, journey: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = gzip.decompress(log.read_bytes()).decode().splitlines(keepends=True)[:40]
+    good = len(lines)
+    lines.insert(3, lines[3].replace(lines[3].split()[2], "nan", 1))
+    lines.insert(9, lines[9][:200] + "\n")
+    lines.insert(20, lines[20].replace(lines[20].split()[5], "inf", 1))
+    cut = tmp_path / "cut.log.gz"
+    cut.write_bytes(gzip.compress("".join(lines).encode())[:-12])  # without its last bytes and its check sum
+    assert main(["evaluate", "slam", str(cut), "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    report = json.loads(said.out)
+    assert good - 2 <= report["scans"] <= good
+    assert report["bad_lines"] in (4, 5)  # three lines, the end of the file, and perhaps a line cut by it
+    assert "cut.log.gz:4: " in said.err and "the gzip file is cut" in said.err
+    assert main(["evaluate", "slam", str(cut), "--strict"]) == 1
+    assert "cut.log.gz:4: " in capsys.readouterr().err
 
 
 def test_what_is_missing_is_told(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -126,10 +150,7 @@ def test_what_is_missing_is_told(log: Path, tmp_path: Path, capsys: pytest.Captu
     assert main(["evaluate", "slam", str(log), "--plot", str(tmp_path / "no" / "x.png")]) == 2
     assert "does not exist" in capsys.readouterr().err
     (tmp_path / "r").write_text("5 6 0 0 0 0 0 0\n")
-    assert (
-        main(["evaluate", "slam", str(log), "--relations", str(tmp_path / "r"), "--trajectory", str(tmp_path / "t")])
-        == 1
-    )
+    assert main(["evaluate", "slam", str(log), "--relations", str(tmp_path / "r"), "-o", str(tmp_path / "t")]) == 1
     assert "within the trajectory's time" in capsys.readouterr().err
     (tmp_path / "b").mkdir()
     assert main(["evaluate", "slam", str(tmp_path / "b")]) == 1
@@ -163,7 +184,7 @@ def test_a_bag_is_a_log_too(journey: Drive, tmp_path: Path, capsys: pytest.Captu
     assert entries[7].odom_pose == pytest.approx(journey.entries[7].odom_pose)
     assert entries[7].base_from_laser == pytest.approx([0.1, 0.0, 0.0])
     assert np.array_equal(np.isinf(entries[7].scan.ranges), np.isinf(journey.entries[7].scan.ranges))
-    assert main(["evaluate", "slam", str(bag), "--trajectory", str(tmp_path / "t")]) == 0
+    assert main(["evaluate", "slam", str(bag), "-o", str(tmp_path / "t")]) == 0
     assert json.loads(capsys.readouterr().out)["statuses"]["tracked"] == len(entries) - 1
 
 

@@ -91,10 +91,13 @@ def test_the_map_grows_and_keeps_its_place() -> None:
 
 
 def test_what_lies_beyond_the_largest_map_is_counted() -> None:
-    occupancy = OccupancyMap(MapConfig(max_range_m=5.0, max_size_m=10.0))
-    occupancy.insert(np.array([4.0, 0.0, 0.0]), hits((3.0, 0.0), (0.52, 0.0)))
-    assert occupancy.clipped == 1
-    assert value(occupancy.grid(), 4.51, 0.01) == 70
+    for x in (0.0, 576.0):  # the limit is about the start, wherever the odometry begins
+        occupancy = OccupancyMap(MapConfig(max_range_m=5.0, max_size_m=10.0))
+        occupancy.insert(np.array([x, 0.0, 0.0]), hits((0.52, 0.0)))
+        assert occupancy.clipped == 0
+        occupancy.insert(np.array([x + 4.0, 0.0, 0.0]), hits((3.0, 0.0), (0.52, 0.0)))
+        assert occupancy.clipped == 1
+        assert value(occupancy.grid(), x + 4.51, 0.01) == 70
 
 
 def test_a_room_is_drawn_where_it_is() -> None:

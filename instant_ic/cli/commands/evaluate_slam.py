@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,8 +23,9 @@ def add_kind(kinds: Any) -> None:
         help="run SLAM on a 2D laser log",
         description=(
             "Run the grid SLAM on a log as fast as possible. LOG is a CARMEN log (FLASER or ROBOTLASER1 lines, gzip or "
-            "plain), a BreezySLAM exp*.dat, or a bag with LaserScan. Writes the final trajectory, one line "
-            "'t x y yaw' per scan, and prints the figures as JSON; with relations also the error against them."
+            "plain), a BreezySLAM exp*.dat, or a bag with LaserScan. Writes a folder with the final trajectory "
+            "(trajectory.txt, one line 't x y yaw' per scan), the map (map.png) and the figures (figures.json), and "
+            "prints the figures; with relations also the error against them."
         ),
         epilog="example: ic evaluate slam intel.log.gz --relations intel.relations --stamps intel.exact_stamps",
     )
@@ -37,11 +39,11 @@ def add_kind(kinds: Any) -> None:
         "--backend", choices=("graph", "rbpf"), default="graph", help="graph: grid SLAM; rbpf: particle filter"
     )
     parser.add_argument("--particles", type=int, default=30, metavar="N", help="of rbpf (default: %(default)d)")
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="default: runs/slam_LOG_DATE_TIME")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write an image of map and trajectory here")
-    parser.add_argument(
-        "--trajectory", type=Path, metavar="FILE", help="trajectory file (default: LOG's name + .trajectory.txt, here)"
-    )
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="also write the map here")
+    parser.add_argument("--trajectory", type=Path, metavar="FILE", help="also write the trajectory here")
+    parser.add_argument("--strict", action="store_true", help="refuse a log with a line that cannot be read")
     parser.add_argument("--scan-topic", metavar="TOPIC", help="scan topic, for a bag with several")
     parser.add_argument("--params-file", type=Path, action="append", metavar="F", help="parameters of grid_slam")
     parser.add_argument(
@@ -69,7 +71,7 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         write_trajectory,
     )
     from instant_ic.experiments.slam_bag import is_bag, read_bag
-    from instant_ic.slam.logs import LogError, read_log
+    from instant_ic.slam.logs import BadLines, LogError, read_log
 
     if args.stamps and not args.relations:
         raise UserError("--stamps selects relations: give --relations too", 2)
@@ -80,11 +82,12 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     overrides = [f"grid_slam.{override}" for override in args.param]
     config = make_node("grid_slam", args.params_file or [], overrides).config
     particles = ParticleConfig(particles=args.particles) if args.backend == "rbpf" else None
-    trajectory_file = args.trajectory or Path(_stem(args.log) + ".trajectory.txt")
-    for file in (args.json, args.plot, trajectory_file):
+    folder = args.output or Path(f"runs/slam_{_stem(args.log)}_{time.strftime('%Y%m%d_%H%M%S')}")
+    for file in (args.json, args.plot, args.trajectory):
         if file is not None and not file.parent.is_dir():
             raise UserError(f"{file}: the folder {file.parent} does not exist", 2)
     console = Console(stderr=True)
+    bad = None if args.strict else BadLines()
     try:
         relations = read_relations(args.relations) if args.relations else None
         if relations is not None and args.stamps:
@@ -100,7 +103,7 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         )
         with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
             task = progress.add_task(f"reading {args.log.name}", total=None)
-            read = read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log)
+            read = read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log, bad)
             entries: list[LogEntry] = list(read)
             progress.update(task, description=args.log.name, total=len(entries))
             source = entries if args.perturb_odometry is None else perturb_odometry(entries, args.perturb_odometry)
@@ -110,15 +113,28 @@ def evaluate_slam(args: argparse.Namespace) -> int:
             )  # fmt: skip
     except (LogError, OSError, ValueError) as error:
         raise UserError(f"evaluate slam: {error}") from None
-    write_trajectory(trajectory_file, run.trajectory)
-    report = {"log": args.log.name, "backend": args.backend, **report, "trajectory": str(trajectory_file)}
-    if args.plot:
-        _plot(args.plot, run)
-        report["plot"] = str(args.plot)
-    text = json.dumps(report, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    sys.stdout.write(text + "\n")
+    report = {"log": args.log.name, "backend": args.backend, **report, "output": str(folder)}
+    if bad is not None:
+        report["bad_lines"] = bad.count
+        for line in bad.errors:
+            console.print(f"left out: {line}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+        if bad.count > len(bad.errors):
+            console.print(f"left out: {bad.count - len(bad.errors)} more lines", style="yellow", highlight=False)
+    text = json.dumps(report, indent=2) + "\n"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in (folder / "trajectory.txt", args.trajectory):
+            if file is not None:
+                write_trajectory(file, run.trajectory)
+        for file in (folder / "map.png", args.plot):
+            if file is not None:
+                _plot(file, run)
+        for file in (folder / "figures.json", args.json):
+            if file is not None:
+                file.write_text(text)
+    except OSError as error:
+        raise UserError(f"evaluate slam: {error}") from None
+    sys.stdout.write(text)
     return 0
 
 
