@@ -20,10 +20,18 @@ def share_dir(name: str) -> Path:
     raise FileNotFoundError(f"{name}/ is missing beside the package at {_PACKAGE}: reinstall instant-ic")
 
 
+def is_file(path: Path) -> bool:
+    """Whether a file is there; false also for a name that no file can have (``Path.is_file`` raises for a long one)."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def shipped_file(folder: str, name: str) -> Path:
     """Path of a file in ``launch``, ``config`` or ``models``; a missing file raises an error that lists the others."""
     path = share_dir(folder) / name
-    if not path.is_file():
+    if not is_file(path):
         have = ", ".join(sorted(entry.name for entry in share_dir(folder).iterdir())) or "nothing"
         raise FileNotFoundError(f"{path} does not exist ({folder}/ holds: {have})")
     return path

@@ -145,7 +145,7 @@ def find_launch_file(name: str) -> Path:
         FileNotFoundError: neither; the message lists the shipped ones.
     """
     path = Path(name)
-    if path.is_file():
+    if paths.is_file(path):
         return path.resolve()
     if path.name == name:
         return paths.shipped_file("launch", name if path.suffix else f"{name}.yaml")

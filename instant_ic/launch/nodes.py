@@ -193,7 +193,7 @@ def _process(fields: Mapping[str, Value], scope: Scope, body: Value) -> dict[str
 def _program(value: Value, executable: str, context: Context) -> tuple[str, ...] | None:
     if executable.endswith(".py"):
         file = context.launch_file.parent / executable
-        if file.is_file():
+        if paths.is_file(file):
             return (sys.executable, str(file.resolve()))
         value.problem(f"program {executable} does not exist beside the launch file")
         return None
@@ -231,7 +231,7 @@ def parameter_file(value: Value, context: Context) -> list[str]:
     if name is None:
         return []
     path = context.launch_file.parent / name  # an absolute path replaces the folder
-    if not path.is_file():
+    if not paths.is_file(path):
         value.problem(f"parameter file {path} does not exist")
         return []
     root = load(path, value.problems)

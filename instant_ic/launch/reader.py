@@ -300,7 +300,7 @@ class _Actions:
 
     def _find(self, name: str) -> Path | None:
         beside = self.context.launch_file.parent / name
-        if beside.is_file():
+        if paths.is_file(beside):
             return beside.resolve()
         try:
             return find_launch_file(name)
