@@ -26,6 +26,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import yaml
 
 from instant_ic.config.ranges import Range, check_ranges, range_of
+from instant_ic.config.yaml_text import checked, read_yaml
 
 ConfigT = TypeVar("ConfigT")
 
@@ -228,15 +229,11 @@ def _flatten(node: yaml.Node, prefix: str, path: Path, out: Values, shared: bool
             out[prefix + key] = Value(_construct(value, prefix + key, where), where, path, shared)
 
 
-_YAML_FAULTS = (yaml.YAMLError, ValueError, AttributeError)
-"""What PyYAML raises for an invalid value: 2001-13-45 is a ValueError, ``!!timestamp x`` an AttributeError."""
-
-
 def _construct(node: yaml.Node, key: str, where: str) -> Any:
     loader = yaml.SafeLoader("")
     try:
-        return loader.construct_object(node, deep=True)
-    except _YAML_FAULTS as error:
+        return checked(lambda: loader.construct_object(node, deep=True))
+    except yaml.YAMLError as error:
         raise ParameterError(Problem(f"{key}: the value is not YAML: {_one_line(error)}", where, key)) from error
     finally:
         loader.dispose()
@@ -257,11 +254,9 @@ def yaml_value(text: str, what: str) -> Any:
         ParameterError: the text is not YAML.
     """
     try:
-        return yaml.safe_load(text)
-    except _YAML_FAULTS as error:
+        return read_yaml(text)
+    except yaml.YAMLError as error:
         raise ParameterError(Problem(f"the value is not YAML: {_one_line(error)}", what)) from error
-    except RecursionError:
-        raise ParameterError(Problem("the value is nested too deeply", what)) from None
 
 
 def parse_override(word: str) -> tuple[str, Value]:

@@ -9,9 +9,14 @@ from typing import Any
 
 import yaml
 
+from instant_ic.config.yaml_text import checked, read_yaml
+
 OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
 """``metric``: metres. ``scale_invariant``: metres up to one factor. ``relative``: metres up to factor and shift.
 ``disparity``: inverse metres up to factor and shift."""
+
+MOST_PIXELS = 16384
+"""Largest side of a network's input."""
 
 CHOICES: dict[str, tuple[str, ...]] = {
     "channels": ("rgb", "bgr"),
@@ -95,8 +100,8 @@ class ModelManifest:
                 raise ValueError(f"{key} must not be empty")
         for key in ("input_height", "input_width"):
             value = getattr(self, key)
-            if not isinstance(value, int) or isinstance(value, bool) or value < 16:
-                raise ValueError(f"{key} must be a whole number, 16 or more (got {_shown(value)})")
+            if not isinstance(value, int) or isinstance(value, bool) or not 16 <= value <= MOST_PIXELS:
+                raise ValueError(f"{key} must be a whole number from 16 to {MOST_PIXELS} (got {_shown(value)})")
         if not 1.5 <= self.input_width / self.input_height <= 2.5:
             raise ValueError(f"input_width must be about twice input_height: 360° by 180° (got {self.input_width} x "
                              f"{self.input_height})")  # fmt: skip
@@ -159,9 +164,9 @@ def load_manifest(path: str | Path) -> ModelManifest:
         raise ManifestError(f"{path}: no manifest; a depth model needs one beside it (docs/depth.md)")
     try:
         text = path.read_text(encoding="utf-8")
-        root = yaml.compose(text, yaml.SafeLoader)
-        values = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, AttributeError, TypeError, RecursionError) as error:
+        root = checked(lambda: yaml.compose(text, yaml.SafeLoader))
+        values = read_yaml(text)
+    except (yaml.YAMLError, ValueError) as error:
         raise ManifestError(f"{path}: not YAML: {error}") from error
     except OSError as error:
         raise ManifestError(f"{path}: cannot be read: {error.strerror}") from error

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import yaml
 
+from instant_ic.config.yaml_text import checked
+
 _NO_VALUE = "tag:yaml.org,2002:null"
 
 
@@ -117,10 +119,13 @@ class Value:
         return found
 
     def plain(self) -> object:
-        """The value as plain Python objects."""
+        """The value as plain Python objects; None, with the problem noted, if it does not fit its type."""
         loader = yaml.SafeLoader("")
         try:
-            return loader.construct_document(self.node)
+            return checked(lambda: loader.construct_document(self.node))
+        except yaml.YAMLError as error:
+            self.problem(f"not YAML: {error}")
+            return None
         finally:
             loader.dispose()
 
@@ -139,16 +144,13 @@ def load(file: Path, problems: list[Problem]) -> Value | None:
         problems.append(Problem(file, 1, f"cannot be read: {reason}"))
         return None
     try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        node = checked(lambda: yaml.compose(text, Loader=yaml.SafeLoader))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problems.append(Problem(file, mark.line + 1 if mark else 1, f"not YAML: {error.problem}"))
         return None
     except yaml.YAMLError as error:
         problems.append(Problem(file, 1, f"not YAML: {error}"))
-        return None
-    except RecursionError:
-        problems.append(Problem(file, 1, "lists or mappings are nested too deeply"))
         return None
     if node is None:
         problems.append(Problem(file, 1, "the file is empty"))

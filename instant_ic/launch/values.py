@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 
 import yaml
 
+from instant_ic.config.yaml_text import read_yaml
 from instant_ic.launch.source import Value
 from instant_ic.launch.substitutions import Context, SubstitutionError, has_substitution, substitute, truth
 
@@ -117,7 +118,7 @@ def parameter_value(value: Value, kind: str, context: Context) -> object:
         "int": int,
         "float": float,
         "bool": truth,
-        "": yaml.safe_load,
+        "": read_yaml,
     }
     if kind not in readers:
         value.problem(f"unknown type {kind!r} (types: str, int, float, bool)")

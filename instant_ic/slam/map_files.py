@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.config.yaml_text import read_yaml
 from instant_ic.limits import check_arrays, load_image
 from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.occupancy import OccupancyGrid
@@ -91,8 +92,8 @@ def load_grid(path: Path) -> OccupancyGrid:
 
     path = path if path.suffix in (".yaml", ".yml") else path.with_name(path.name + ".yaml")
     try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, AttributeError, TypeError, RecursionError, yaml.YAMLError) as error:
+        content = read_yaml(path.read_text())
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise MapError(f"map {path} cannot be read: {error}") from None
     if not isinstance(content, dict):
         raise MapError(f"{path}: must have the keys image, resolution and origin")

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from instant_ic.vspace.layer_kernels import corner_values, count_triangles, lattice_errors, write_triangles
 
 TOLERANCE = 0.004
-"""Largest error of the inverse depth, in 1/m: a view from 0.5 m aside, 90° wide and of 640 pixels, moves by 0.6 pixels."""
+"""Largest error of the inverse depth, in 1/m: it moves a view from 0.5 m aside, 640 pixels wide, by 0.6 pixels."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,14 @@ def layer_mesh(
     """
     height, width = inverse_depth.shape
     if width != 2 * height or height < 2 or depth_edge.shape != shown.shape or shown.shape != (height, width):
-        raise ValueError(f"inverse depth {inverse_depth.shape}, edges {depth_edge.shape} and mask {shown.shape} do not fit")
+        raise ValueError(
+            f"inverse depth {inverse_depth.shape}, edges {depth_edge.shape} and mask {shown.shape} do not fit"
+        )
     if not (np.isfinite(inverse_depth).all() and (inverse_depth > 0).all()):
         raise ValueError("inverse depth must be finite and > 0")
     inverse = np.ascontiguousarray(inverse_depth, np.float32)
     torn = np.zeros((height + 1, width), np.bool_)  # by corner
-    torn[1:height] = np.roll(np.asarray(depth_edge[:-1]) > 0, 1, 1)
+    torn[1:height] = np.roll(depth_edge[:-1].astype(np.bool_), 1, 1)
     gone = ~shown
     left = np.roll(gone, 1, 1)
     torn[:-1] |= gone | left

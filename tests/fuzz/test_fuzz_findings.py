@@ -89,7 +89,7 @@ def test_parameter_file_that_is_no_utf8_is_an_error_with_its_name(tmp_path: Path
         load_file(path, "node")
 
 
-@pytest.mark.parametrize("value", ["1" * 5000, "2001-13-45", "!!timestamp x", "{[]: 1}", "[" * 3000])
+@pytest.mark.parametrize("value", ["1" * 5000, "2001-13-45", "!!timestamp x", "{[]: 1}", "[" * 3000, '!!int "_"'])
 def test_manifest_with_a_value_that_is_none_is_an_error(tmp_path: Path, value: str) -> None:
     path = tmp_path / "model.yaml"
     path.write_text(f"name: {value}\n")
@@ -121,6 +121,13 @@ def test_map_origin_that_no_float_can_hold_is_an_error(tmp_path: Path) -> None:
     path.write_text(f"image: m.pgm\nresolution: 0.05\norigin: [{'1' * 400}, 0]\n")
     with pytest.raises(MapError, match="origin"):
         load_grid(path)
+
+
+def test_manifest_of_a_network_with_an_endless_input_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text(f"model: m.onnx\nname: n\nlicence: l\ninput_height: 16\ninput_width: {10**400}\n")
+    with pytest.raises(ManifestError, match="input_width must be a whole number from 16 to 16384"):
+        load_manifest(path)
 
 
 def test_manifest_number_that_no_float_can_hold_is_refused() -> None:

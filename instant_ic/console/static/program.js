@@ -35,8 +35,8 @@ export class Program {
   };
 }
 
-/** @param {WebGL2RenderingContext} gl @param {string} vertexSource @param {string} fragmentSource */
-function link(gl, vertexSource, fragmentSource) {
+/** Compiles and links. @param {WebGL2RenderingContext} gl @param {string} vertexSource @param {string} fragmentSource */
+export function link(gl, vertexSource, fragmentSource) {
   const program = gl.createProgram();
   for (const { type, source } of [
     { type: gl.VERTEX_SHADER, source: vertexSource }, { type: gl.FRAGMENT_SHADER, source: fragmentSource }]) {

@@ -1,0 +1,224 @@
+// @ts-check
+// The virtual space in WebGL 2: layers of triangles round a keyframe, rendered from any place (Python: vspace/layers.py).
+
+/** @import { Mat3, Vec3 } from "./math.js" */
+import { link } from "./program.js";
+
+/**
+ * A layer as it arrives. The vertices are corners of the panorama's pixels; `size` is height and width of that lattice.
+ * @typedef {object} Layer
+ * @property {ImageBitmap} image colours, equirectangular
+ * @property {ImageBitmap | null} confidence grey image: white was seen, black is a guess; null: all of it was seen
+ * @property {[number, number]} size
+ * @property {Uint16Array} corners column and row of each vertex
+ * @property {Float32Array} inverse inverse depth of each vertex, 1/m
+ * @property {Uint32Array} triangles
+ * @property {Vec3} gain factors of the colours
+ */
+/**
+ * @typedef {object} Camera
+ * @property {Mat3} panoramaFromLook rotation of the view in the keyframe's frame
+ * @property {Vec3} position of the view in the keyframe's frame, m
+ * @property {[number, number]} tanHalf tangents of half the field of view
+ */
+/** @typedef {{vertices: WebGLVertexArrayObject, count: number, image: WebGLTexture, confidence: WebGLTexture, layer: Layer, buffers: WebGLBuffer[]}} Loaded */
+
+const NEAR_M = 0.02;
+const BEYOND_LEVEL = 4; // mipmap level of what no layer covers
+
+// Homogeneous coordinates are divided by the vertex's distance: what is endlessly far needs no large numbers.
+const VERTEX = `#version 300 es
+in vec2 corner;
+in float inverse;
+uniform vec2 size;
+uniform mat3 lookFromPanorama;
+uniform vec3 position;
+uniform vec2 tanHalf;
+out vec3 direction; // in the keyframe's frame; its length varies as the interpolation needs it
+void main() {
+  float azimuth = ${Math.PI} * (1.0 - 2.0 * corner.x / size.y), elevation = ${Math.PI} * (0.5 - corner.y / size.x);
+  direction = vec3(cos(elevation) * vec2(cos(azimuth), sin(azimuth)), sin(elevation));
+  vec3 place = lookFromPanorama * (direction - position * inverse);
+  gl_Position = vec4(-place.y / tanHalf.x, place.z / tanHalf.y, place.x - 2.0 * ${NEAR_M} * inverse, place.x);
+}`;
+
+const FRAGMENT = `
+precision highp float;
+in vec3 direction;
+out vec4 colour;
+uniform sampler2D image, confidence;
+uniform vec3 gain;
+uniform bool soft; // what nobody has seen is blurred and paler
+const vec3 GREY = vec3(0.30, 0.59, 0.11);
+const float PI = ${Math.PI};
+void main() {
+  vec3 d = normalize(direction);
+  vec2 uv = vec2(0.5 - atan(d.y, d.x) / (2.0 * PI), acos(clamp(d.z, -1.0, 1.0)) / PI);
+  if (SHARP) {
+    vec2 across = dFdx(uv), down = dFdy(uv);
+    across.x -= round(across.x); // over the seam at the back
+    down.x -= round(down.x);
+    colour = vec4(textureGrad(image, uv, across * SHARPNESS, down * SHARPNESS).rgb, 1.0);
+  } else colour = vec4(textureLod(image, uv, 0.0).rgb, 1.0);
+  if (soft) {
+    float seen = textureLod(confidence, uv, 0.0).r;
+    if (seen < 1.0) {
+      vec3 guess = textureLod(image, uv, 2.0).rgb;
+      colour.rgb = mix(mix(guess, vec3(dot(guess, GREY)), 0.5), colour.rgb, seen);
+    }
+  }
+  colour.rgb *= gain;
+}`;
+
+// Where no layer has a surface: the colours of the direction, blurred.
+const BEYOND = `
+precision highp float;
+in vec2 screen;
+out vec4 colour;
+uniform sampler2D image;
+uniform mat3 panoramaFromLook;
+uniform vec2 tanHalf;
+uniform vec3 gain;
+void main() {
+  vec3 d = panoramaFromLook * normalize(vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y));
+  vec2 uv = vec2(0.5 - atan(d.y, d.x) / ${2 * Math.PI}, acos(clamp(d.z, -1.0, 1.0)) / ${Math.PI});
+  colour = vec4(gain * textureLod(image, uv, ${BEYOND_LEVEL}.0).rgb, 1.0);
+}`;
+const FULL = `#version 300 es
+out vec2 screen;
+void main() {
+  screen = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2) * 2.0 - 1.0;
+  gl_Position = vec4(screen, 0.0, 1.0);
+}`;
+
+/** Renders layers into the bound framebuffer, which needs depth and stencil. */
+export class LayerRenderer {
+  /** @param {WebGL2RenderingContext} gl @param {boolean} slow software rendering: plain look-ups */
+  constructor(gl, slow) {
+    this._gl = gl;
+    const sharp = `#version 300 es\nconst bool SHARP = ${!slow};\nconst float SHARPNESS = 0.7;\n`;
+    this._program = link(gl, VERTEX, sharp + FRAGMENT);
+    this._beyond = link(gl, FULL, `#version 300 es\n${BEYOND}`);
+    this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
+    /** @type {Loaded[]} The nearest first. */
+    this._layers = [];
+    this._empty = this._texture(null);
+  }
+
+  /** Replaces the layers, from the first one that differs. @param {Layer[]} layers */
+  load(layers) {
+    const same = layers.findIndex((layer, i) => this._layers[i]?.layer !== layer);
+    const keep = same < 0 ? layers.length : same;
+    for (const old of this._layers.splice(keep)) this._forget(old);
+    for (const layer of layers.slice(keep)) this._layers.push(this._upload(layer));
+  }
+
+  get ready() {
+    return this._layers.length > 0;
+  }
+
+  /** Number of triangles of all layers. */
+  get triangles() {
+    return this._layers.reduce((sum, { count }) => sum + count / 3, 0);
+  }
+
+  /** @param {Camera} camera @param {number} width @param {number} height @param {boolean} soft see the shader */
+  render(camera, width, height, soft) {
+    const gl = this._gl, program = this._program;
+    /** @param {string} name */
+    const at = (name) => gl.getUniformLocation(program, name);
+    gl.viewport(0, 0, width, height);
+    gl.useProgram(program);
+    gl.uniformMatrix3fv(at("lookFromPanorama"), false, camera.panoramaFromLook); // transposed: row-major read by columns
+    gl.uniform3fv(at("position"), camera.position);
+    gl.uniform2fv(at("tanHalf"), camera.tanHalf);
+    gl.uniform1i(at("image"), 0);
+    gl.uniform1i(at("confidence"), 1);
+    gl.enable(gl.DEPTH_TEST);
+    gl.enable(gl.STENCIL_TEST);
+    gl.depthFunc(gl.LESS);
+    gl.stencilMask(0xff);
+    gl.clear(gl.STENCIL_BUFFER_BIT);
+    // Stencil bit k: layer k shows a surface here. A surface seen from behind hides, but shows the layers below.
+    this._layers.forEach(({ vertices, count, image, confidence, layer }, k) => {
+      gl.clear(gl.DEPTH_BUFFER_BIT);
+      gl.stencilMask(1 << k);
+      gl.stencilFunc(gl.EQUAL, 1 << k, (1 << k) - 1);
+      gl.stencilOpSeparate(gl.FRONT, gl.KEEP, gl.KEEP, gl.REPLACE);
+      gl.stencilOpSeparate(gl.BACK, gl.KEEP, gl.KEEP, gl.ZERO);
+      gl.activeTexture(gl.TEXTURE1);
+      gl.bindTexture(gl.TEXTURE_2D, confidence);
+      gl.activeTexture(gl.TEXTURE0);
+      gl.bindTexture(gl.TEXTURE_2D, image);
+      gl.uniform2fv(at("size"), layer.size);
+      gl.uniform3fv(at("gain"), layer.gain);
+      gl.uniform1i(at("soft"), Number(soft && layer.confidence !== null));
+      gl.bindVertexArray(vertices);
+      gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
+    });
+    gl.bindVertexArray(null);
+    gl.disable(gl.DEPTH_TEST);
+    this._renderBeyond(camera);
+    gl.disable(gl.STENCIL_TEST);
+  }
+
+  /** @param {Camera} camera */
+  _renderBeyond(camera) {
+    const gl = this._gl, program = this._beyond, last = this._layers[this._layers.length - 1];
+    if (!last) return;
+    gl.useProgram(program);
+    gl.stencilFunc(gl.EQUAL, 0, 0xff);
+    gl.stencilOp(gl.KEEP, gl.KEEP, gl.KEEP);
+    gl.bindTexture(gl.TEXTURE_2D, last.image);
+    gl.uniform1i(gl.getUniformLocation(program, "image"), 0);
+    gl.uniformMatrix3fv(gl.getUniformLocation(program, "panoramaFromLook"), true, camera.panoramaFromLook);
+    gl.uniform2fv(gl.getUniformLocation(program, "tanHalf"), camera.tanHalf);
+    gl.uniform3fv(gl.getUniformLocation(program, "gain"), last.layer.gain);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** @param {Layer} layer @returns {Loaded} */
+  _upload(layer) {
+    const gl = this._gl, vertices = gl.createVertexArray(), buffers = [0, 1, 2].map(() => gl.createBuffer());
+    gl.bindVertexArray(vertices);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffers[0]);
+    gl.bufferData(gl.ARRAY_BUFFER, layer.corners, gl.STATIC_DRAW);
+    const corner = gl.getAttribLocation(this._program, "corner"), inverse = gl.getAttribLocation(this._program, "inverse");
+    gl.enableVertexAttribArray(corner);
+    gl.vertexAttribPointer(corner, 2, gl.UNSIGNED_SHORT, false, 0, 0);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffers[1]);
+    gl.bufferData(gl.ARRAY_BUFFER, layer.inverse, gl.STATIC_DRAW);
+    gl.enableVertexAttribArray(inverse);
+    gl.vertexAttribPointer(inverse, 1, gl.FLOAT, false, 0, 0);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers[2]);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, layer.triangles, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    const confidence = layer.confidence ? this._texture(layer.confidence) : this._empty;
+    return { vertices, count: layer.triangles.length, image: this._texture(layer.image), confidence, layer, buffers };
+  }
+
+  /** @param {Loaded} old */
+  _forget({ vertices, image, confidence, buffers }) {
+    const gl = this._gl;
+    gl.deleteVertexArray(vertices);
+    gl.deleteTexture(image);
+    if (confidence !== this._empty) gl.deleteTexture(confidence);
+    for (const buffer of buffers) gl.deleteBuffer(buffer);
+  }
+
+  /** @param {ImageBitmap | null} bitmap */
+  _texture(bitmap) {
+    const gl = this._gl, texture = gl.createTexture(), extension = this._anisotropy;
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    if (bitmap) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, bitmap);
+    else gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, 1, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, new Uint8Array([255, 255, 255]));
+    gl.generateMipmap(gl.TEXTURE_2D);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+    if (extension) gl.texParameterf(gl.TEXTURE_2D, extension.TEXTURE_MAX_ANISOTROPY_EXT, 8);
+    return texture;
+  }
+}
