@@ -43,7 +43,6 @@ void main() {
 }`;
 
 const FRAGMENT = `
-precision highp float;
 in vec3 direction;
 out vec4 colour;
 uniform sampler2D image, confidence;
@@ -96,7 +95,7 @@ export class LayerRenderer {
   /** @param {WebGL2RenderingContext} gl @param {boolean} slow software rendering: plain look-ups */
   constructor(gl, slow) {
     this._gl = gl;
-    const sharp = `#version 300 es\nconst bool SHARP = ${!slow};\nconst float SHARPNESS = 0.7;\n`;
+    const sharp = `#version 300 es\nprecision highp float;\nconst bool SHARP = ${!slow};\nconst float SHARPNESS = 0.7;\n`;
     this._program = link(gl, VERTEX, sharp + FRAGMENT);
     this._beyond = link(gl, FULL, `#version 300 es\n${BEYOND}`);
     this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
