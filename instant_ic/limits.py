@@ -109,14 +109,15 @@ def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
 
 
 def _chunks_fit(data: bytes | bytearray) -> bool:
-    """Whether a PNG contains its chunks in full: OpenCV allocates what a chunk declares, up to 1 GB for 120 bytes."""
+    """Whether a PNG contains its chunks in full: OpenCV allocates what a chunk declares, up to 1 GB for 40 bytes."""
     view, at = memoryview(data), len(_PNG)
     for _ in range(_MOST_CHUNKS):
-        if at + 12 > len(view):
-            return True
+        kind = bytes(view[at + 4 : at + 8])
         at += 12 + int.from_bytes(view[at : at + 4], "big")
         if at > len(view):
             return False
+        if kind == b"IEND":
+            return True
     return False
 
 

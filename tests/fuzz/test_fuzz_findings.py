@@ -44,6 +44,8 @@ def test_png_whose_chunk_declares_a_gigabyte_is_not_decoded(tmp_path: Path) -> N
     assert decode_image(good, cv2.IMREAD_COLOR) is not None
     bomb = good[:33] + struct.pack(">I", 0x40000000) + good[37:]
     assert decode_image(bomb, cv2.IMREAD_COLOR) is None
+    assert decode_image(bomb[:41], cv2.IMREAD_COLOR) is None  # the chunk's header alone
+    assert decode_image(good + b"trailing", cv2.IMREAD_COLOR) is not None
     (tmp_path / "bomb.png").write_bytes(bomb)
     assert load_image(tmp_path / "bomb.png", cv2.IMREAD_COLOR) is None
 
