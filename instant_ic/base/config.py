@@ -90,7 +90,7 @@ class RoboclawConfig:
         retries: repeats of a command before the link counts as lost.
         watchdog_s: the controller itself stops the motors after this time without a packet; steps of 0.1 s.
         reconnect_min_s: first wait before the port is reopened.
-        reconnect_max_s: longest wait before the port is reopened.
+        reconnect_max_s: longest wait before the port is reopened; waits double up to it, at the start only after 15 s.
     """
 
     port: str = "/dev/ttyACM0"

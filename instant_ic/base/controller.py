@@ -12,6 +12,7 @@ from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_counts
 from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
 from instant_ic.pace import current
+from instant_ic.reconnect import Backoff
 
 _COUNTED_SINCE_M = 0.2
 """Largest count, in metres of track, that a restarted controller can reach before the next reading."""
@@ -92,7 +93,7 @@ class BaseController:
         self._last_step_ns: int | None = None
         self._next_health_ns = 0
         self._next_connect_ns = 0
-        self._backoff_s = config.roboclaw.reconnect_min_s
+        self._backoff = Backoff(config.roboclaw.reconnect_min_s, config.roboclaw.reconnect_max_s)
 
     def command(self, v: float, w: float, given_ns: int, hard: bool = False) -> None:
         """Set the command that the base follows from now on.
@@ -146,7 +147,8 @@ class BaseController:
             restarted = isinstance(error, ControllerRestarted)
             if restarted:
                 self.odometry.forget_counts()
-            self._lost(now_ns, 0.0 if restarted else self._backoff_s)
+            wait_s = self._backoff.fail(now_ns * 1e-9)
+            self._lost(now_ns, 0.0 if restarted else wait_s)
             return BaseState(connected=False, link=str(error))
         if self.roboclaw.counters.stops != stops:
             self.limiter.reset()  # a reply was missing, so the motors were stopped
@@ -223,12 +225,12 @@ class BaseController:
         try:
             version = self.roboclaw.connect()
         except LinkError as error:
-            self._lost(now_ns, self._backoff_s)
+            self._lost(now_ns, self._backoff.fail(now_ns * 1e-9))
             return BaseState(connected=False, link=str(error))
         if self.roboclaw.restarted:
             self.odometry.forget_counts()
         self._encoders = None
-        self._backoff_s = self.config.roboclaw.reconnect_min_s
+        self._backoff.succeed()
         self._last_step_ns = now_ns
         return BaseState(connected=True, link=f"connected to {version} at {self.config.roboclaw.port}")
 
@@ -236,7 +238,6 @@ class BaseController:
         self.roboclaw.close()
         self.limiter.reset()
         self._next_connect_ns = now_ns + int(wait_s * 1e9)
-        self._backoff_s = min(2.0 * self._backoff_s, self.config.roboclaw.reconnect_max_s)
 
 
 class ControllerThread(threading.Thread):

@@ -1,11 +1,13 @@
 """Runs a camera on its own thread: connects, reads, and reconnects with growing waits."""
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.reconnect import Backoff
 
 
 @dataclass(frozen=True)
@@ -14,10 +16,10 @@ class ReconnectConfig:
 
     Attributes:
         min_s: first wait.
-        max_s: longest wait; waits double up to it.
+        max_s: longest wait; waits double up to it, at the start only after 15 s.
     """
 
-    min_s: Positive = 0.5
+    min_s: Positive = 0.25
     max_s: Positive = 2.0
 
     def __post_init__(self) -> None:
@@ -62,7 +64,7 @@ class CameraLoop(threading.Thread):
 
     def run(self) -> None:
         """Connect and read until `end`."""
-        wait_s = self._reconnect.min_s
+        backoff = Backoff(self._reconnect.min_s, self._reconnect.max_s)
         try:
             while not self._end.is_set():
                 try:
@@ -71,15 +73,15 @@ class CameraLoop(threading.Thread):
                     while not self._end.is_set():
                         frame = self._camera.read()
                         # Only an image proves that the connection works.
-                        wait_s = self._reconnect.min_s
+                        backoff.succeed()
                         self.frames += 1
                         self._on_frame(frame)
                 except Exception as error:  # noqa: BLE001 - nothing else reports an exception of this thread
                     self.failures += 1
+                    wait_s = backoff.fail(time.monotonic())
                     text = str(error) if isinstance(error, CameraError) else f"unexpected {error!r}"
-                    self._on_event(False, f"{text.rstrip('.')}. Reconnecting in {wait_s:.1f} s")
+                    self._on_event(False, f"{text.rstrip('.')}. Reconnecting in {wait_s:g} s")
                     self._end.wait(wait_s)
-                    wait_s = min(2.0 * wait_s, self._reconnect.max_s)
         finally:
             self._camera.close()
 

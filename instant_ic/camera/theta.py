@@ -4,7 +4,7 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,6 +138,18 @@ class ThetaClient:
         results = reply.get("results", {})
         return results if isinstance(results, dict) else {}
 
+    def options(self, names: Sequence[str]) -> dict[str, Any]:
+        """``camera.getOptions``; empty if the camera refuses the command.
+
+        Raises:
+            CameraError: no answer.
+        """
+        try:
+            options = self.execute("camera.getOptions", {"optionNames": list(names)}).get("options")
+        except ThetaError:
+            return {}
+        return options if isinstance(options, dict) else {}
+
     def set_options(self, options: Mapping[str, Any]) -> None:
         """``camera.setOptions``.
 
@@ -240,7 +252,7 @@ class ThetaCamera(Camera):
         self._parser = PreviewParser()
 
     def connect(self) -> str:
-        """Set the camera up and start its preview.
+        """Set the camera up, if it is not set up already, and start its preview.
 
         Returns:
             Model, firmware and preview format.
@@ -251,15 +263,15 @@ class ThetaCamera(Camera):
         self._end_preview()
         config = self.config
         info = self.client.info()
-        self.client.set_options(
-            {
-                "sleepDelay": NEVER,
-                "offDelay": NEVER,
-                "previewFormat": {"width": config.width, "height": config.height, "framerate": config.rate_hz},
-            }
-        )
-        # If started sooner, the preview has the previous format or stops at once.
-        self._sleep(config.settle_s)
+        wanted = {
+            "sleepDelay": NEVER,
+            "offDelay": NEVER,
+            "previewFormat": {"width": config.width, "height": config.height, "framerate": config.rate_hz},
+        }
+        if self.client.options(list(wanted)) != wanted:
+            self.client.set_options(wanted)
+            # If started sooner, the preview has the previous format or stops at once.
+            self._sleep(config.settle_s)
         self._session, self._response = self.client.open_preview()
         found = re.search(r"boundary=\"?([^\";]+)", self._response.headers.get("Content-Type", ""))
         self._parser = PreviewParser(found.group(1) if found else "")

@@ -122,7 +122,8 @@ class ThetaServer:
         self.frames = 0
         self.late_s = 0.0
         self._format = next(f for f in PREVIEW_FORMATS if f[:2] == (config.width, config.height))
-        self._options: dict[str, Any] = {"captureMode": "image", "sleepDelay": 180, "offDelay": 600}
+        # As the driver left them when it last ran: a camera that stays on keeps its options.
+        self._options: dict[str, Any] = {"captureMode": "image", "sleepDelay": 65535, "offDelay": 65535}
         self._options_set_s = -1e9
         self._began_s = time.monotonic()
         self._nonce = secrets.token_hex(16)

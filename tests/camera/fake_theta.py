@@ -113,6 +113,8 @@ class _Handler(BaseHTTPRequestHandler):
                 self._json(200, {"name": name, "state": "inProgress", "id": "7"})
             else:
                 self._json(200, {"name": name, "state": "done"})
+        elif name == "camera.getOptions":
+            self._json(200, {"name": name, "state": "done", "results": {"options": behaviour.options}})
         elif name == "camera.getLivePreview":
             if behaviour.previews:
                 self._preview(behaviour.previews.pop(0))

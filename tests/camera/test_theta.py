@@ -39,7 +39,7 @@ def test_options_are_set_then_a_second_is_waited_then_the_preview_starts() -> No
         camera = ThetaCamera(theta.url, ThetaConfig(), sleep=lambda s: waits.append(s))
         text = camera.connect()
         camera.close()
-        assert theta.behaviour.commands == ["camera.setOptions", "camera.getLivePreview"]
+        assert theta.behaviour.commands == ["camera.getOptions", "camera.setOptions", "camera.getLivePreview"]
     assert waits == [1.0]
     assert theta.behaviour.options == {
         "sleepDelay": NEVER,
@@ -47,6 +47,17 @@ def test_options_are_set_then_a_second_is_waited_then_the_preview_starts() -> No
         "previewFormat": {"width": 1024, "height": 512, "framerate": 30},
     }
     assert text.startswith("RICOH THETA Z1 (firmware 3.10.2)")
+
+
+def test_a_camera_with_the_right_options_starts_its_preview_at_once() -> None:
+    waits: list[float] = []
+    with FakeTheta(Behaviour(previews=[[part(FRAMES[0])], [part(FRAMES[1])]])) as theta:
+        camera = ThetaCamera(theta.url, ThetaConfig(), sleep=lambda s: waits.append(s))
+        camera.connect()
+        camera.connect()
+        camera.close()
+        assert theta.behaviour.commands[3:] == ["camera.getOptions", "camera.getLivePreview"]
+    assert waits == [1.0]  # of the first connection
 
 
 def test_digest_authentication_for_commands_and_preview() -> None:
