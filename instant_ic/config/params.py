@@ -26,7 +26,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import yaml
 
 from instant_ic.config.ranges import Range, check_ranges, range_of
-from instant_ic.config.yaml_text import checked, read_yaml
+from instant_ic.config.yaml_text import checked, compose_yaml, read_yaml
 
 ConfigT = TypeVar("ConfigT")
 
@@ -179,7 +179,7 @@ def load_sections(path: Path) -> dict[str, Values]:
     except UnicodeDecodeError as error:
         raise ParameterError(f"{path}: cannot be read as UTF-8: {error}") from error
     try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
+        root = compose_yaml(text)
         return {} if root is None else _sections(root, path)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from instant_ic.config.yaml_text import checked
+from instant_ic.config.yaml_text import checked, compose_yaml
 
 _NO_VALUE = "tag:yaml.org,2002:null"
 
@@ -80,7 +80,7 @@ class Value:
     @property
     def is_quoted(self) -> bool:
         """Whether it is quoted (or block) text, and so never a number or a boolean."""
-        return isinstance(self.node, yaml.ScalarNode) and self.node.style is not None
+        return isinstance(self.node, yaml.ScalarNode) and bool(self.node.style)
 
     def text(self) -> str | None:
         """The scalar as written; None, with a problem noted, for lists and mappings."""
@@ -144,7 +144,7 @@ def load(file: Path, problems: list[Problem]) -> Value | None:
         problems.append(Problem(file, 1, f"cannot be read: {reason}"))
         return None
     try:
-        node = checked(lambda: yaml.compose(text, Loader=yaml.SafeLoader))
+        node = compose_yaml(text)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         problems.append(Problem(file, mark.line + 1 if mark else 1, f"not YAML: {error.problem}"))

@@ -1,4 +1,4 @@
-"""Type store: ROS 2 Jazzy's messages from `rosbags`, and our own from the ``.msg`` files beside this module."""
+"""Message types: ROS 2 Jazzy's from `rosbags`, and our own from the ``.msg`` files beside this module."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from instant_ic.msg.store import TypeIndex, entries_of, read_entries
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -30,7 +32,10 @@ class MessageError(ValueError):
 
 @functools.cache
 def typestore() -> Typestore:
-    """Jazzy's types and our own; created once per process (about 0.1 s)."""
+    """Store of rosbags with Jazzy's types and our own, for tools; created once per process (about 0.1 s).
+
+    Its classes are not those of :func:`message_type`.
+    """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -39,6 +44,11 @@ def typestore() -> Typestore:
         types.update(get_types_from_msg(path.read_text(), f"{path.parent.name}/msg/{path.stem}"))
     store.register(types)
     return store
+
+
+@functools.cache
+def _index() -> TypeIndex:
+    return TypeIndex(read_entries(DEFINITIONS, typestore))
 
 
 def register_type(name: str, definition: str) -> None:
@@ -53,14 +63,16 @@ def register_type(name: str, definition: str) -> None:
     Raises:
         MessageError: the text is not a definition.
     """
-    if name in typestore().fielddefs:
+    if name in _index().entries:
         return
     from rosbags.typesys import TypesysError, get_types_from_msg
 
     try:
         found = get_types_from_msg(definition, name)
         known = typestore().fielddefs
-        typestore().register({inner: fields for inner, fields in found.items() if inner not in known})
+        new = {inner: fields for inner, fields in found.items() if inner not in known}
+        typestore().register(new)
+        _index().entries.update(entries_of(typestore(), set(new)))
     except TypesysError as error:
         raise MessageError(f"the definition of {name} cannot be read: {error}") from None
 
@@ -72,7 +84,7 @@ def message_type(name: str) -> Any:
     Raises:
         MessageError: no such type.
     """
-    types = typestore().types
+    types = _index().entries
     parts = name.split("/")
     if len(parts) == 1:
         full = _PREFERRED.get(name) or next((t for t in types if t.rsplit("/", 1)[1] == name), name)
@@ -80,7 +92,7 @@ def message_type(name: str) -> Any:
         full = f"{parts[0]}/msg/{parts[-1]}"
     if full not in types:
         raise MessageError(f"no message type {name!r} in ROS 2 Jazzy or {DEFINITIONS}")
-    return types[full]
+    return _index().get_msgdef(full).cls
 
 
 def type_name(message_or_class: Any) -> str:
@@ -98,7 +110,7 @@ def type_name(message_or_class: Any) -> str:
 @functools.cache
 def type_hash(name: str) -> str:
     """RIHS01 hash of a type, as ROS 2 computes it."""
-    return typestore().hash_rihs01(name)
+    return str(_index().entries[name]["hash"])
 
 
 def serialize(message: Any) -> memoryview:
@@ -122,7 +134,7 @@ def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
         MessageError: a field has a value of the wrong type or length; the function raises it too.
     """
     name = type_name(message)
-    store = typestore()
+    store = _index()
     definition = store.get_msgdef(name)
     try:
         size = 4 + definition.getsize_cdr(0, message, store)
@@ -161,14 +173,14 @@ def deserialize(data: bytes | bytearray | memoryview, name: str) -> Any:
     full = type_name(message_type(name))
     view = data if isinstance(data, (bytes, memoryview)) else memoryview(data)
     try:
-        return typestore().deserialize_cdr(view, full)
+        return _index().deserialize_cdr(view, full)
     except Exception as error:  # generated code may raise struct, index, unicode or value errors on foreign bytes
         raise MessageError(f"{len(data)} bytes are not a {full}: {type(error).__name__}: {error}") from error
 
 
 def _first_bad_field(message: Any) -> str | None:
     """Describe the field that cannot be serialized, for the error message."""
-    for field in typestore().get_msgdef(type_name(message)).fields:
+    for field in _index().get_msgdef(type_name(message)).fields:
         value = getattr(message, field[0], None)
         if value is None:
             return f"field {field[0]} is missing"

@@ -4,10 +4,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from instant_ic.config import params
+from instant_ic.config.yaml_text import compose_yaml
 
 
 @dataclass(frozen=True)
@@ -168,3 +170,18 @@ def test_all_mistakes_at_once_each_at_the_value_without_which_it_disappears():
 def test_a_huge_number_is_refused():
     with pytest.raises(params.ParameterError, match="rate must be a finite number"):
         params.build(Config, {"rate": params.Value(10**400, "here")})
+
+
+@pytest.mark.parametrize("text", ["", "a: {b: [1, two], c: ~}\n'd': \"x\"\ne: |\n  y\n", "a: &x {b: 1}\nc: *x\n"])
+def test_the_fast_parser_gives_the_nodes_and_lines_of_the_python_parser(text: str) -> None:
+    def flat(node: yaml.Node | None) -> object:
+        if isinstance(node, yaml.ScalarNode):
+            return node.tag, node.value, node.style or None, node.start_mark.line
+        children = (
+            []
+            if node is None
+            else [part for entry in node.value for part in (entry if isinstance(entry, tuple) else (entry,))]
+        )
+        return getattr(node, "tag", None), [flat(child) for child in children]
+
+    assert flat(compose_yaml(text)) == flat(yaml.compose(text, Loader=yaml.SafeLoader))

@@ -1,0 +1,175 @@
+"""The types that a process uses: classes and CDR code are made at their first use, from a cache of all definitions.
+
+`rosbags` makes several hundred classes at its import, and twelve functions for each type used. A node needs a few
+dozen classes and two or three functions each, so this saves a third of the CPU of its start.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from instant_ic import paths
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+Entry = Mapping[str, Any]
+"""Definition of a type: ``constants`` (name → value), ``fields`` (name, description of rosbags), ``hints`` (of the
+fields, as text), ``hash`` (RIHS01)."""
+
+
+class Definition:
+    """Class and CDR code of a type, as rosbags' generated code asks for them."""
+
+    def __init__(self, name: str, entry: Entry, store: TypeIndex) -> None:
+        self.fields: list[tuple[str, Any]] = entry["fields"]
+        self._name, self._entry, self._store = name, entry, store
+
+    @functools.cached_property
+    def cls(self) -> Any:
+        """The dataclass."""
+        names = [name for name, _ in self.fields]
+        body = {
+            "__doc__": f"Class for {self._name}.",
+            "__module__": __name__,
+            "__msgtype__": self._name,
+            "__annotations__": dict(zip(names, self._entry["hints"], strict=True)),
+            **self._entry["constants"],
+        }
+        if names == ["structure_needs_at_least_one_member"]:
+            body[names[0]] = 0
+        return dataclass(type(self._name.replace("/", "__"), (), body))
+
+    @functools.cached_property
+    def _size(self) -> tuple[Callable[..., int], int]:
+        from rosbags.serde.cdr import generate_getsize_cdr
+
+        function, size = generate_getsize_cdr(self.fields, self._store)
+        return function, size
+
+    @property
+    def getsize_cdr(self) -> Callable[..., int]:
+        """Function that returns the position after a message."""
+        return self._size[0]
+
+    @property
+    def size_cdr(self) -> int:
+        """Size of every message; 0 if it varies."""
+        return self._size[1]
+
+    @functools.cached_property
+    def serialize_cdr_le(self) -> Callable[..., int]:
+        """Function that writes a message."""
+        from rosbags.serde.cdr import generate_serialize_cdr
+
+        return generate_serialize_cdr(self.fields, self._store, "le")
+
+    @functools.cached_property
+    def deserialize_cdr_le(self) -> Callable[..., tuple[Any, int]]:
+        """Function that reads a little-endian message."""
+        from rosbags.serde.cdr import generate_deserialize_cdr
+
+        return generate_deserialize_cdr(self.fields, self._store, "le")
+
+    @functools.cached_property
+    def deserialize_cdr_be(self) -> Callable[..., tuple[Any, int]]:
+        """Function that reads a big-endian message."""
+        from rosbags.serde.cdr import generate_deserialize_cdr
+
+        return generate_deserialize_cdr(self.fields, self._store, "be")
+
+
+class TypeIndex:
+    """Definitions by full name."""
+
+    max_sequence_length = 2**32 - 1
+
+    def __init__(self, entries: dict[str, Entry]) -> None:
+        self.entries = entries
+        self._definitions: dict[str, Definition] = {}
+
+    def get_msgdef(self, name: str) -> Definition:
+        """Return the definition of a type.
+
+        Raises:
+            KeyError: no such type.
+        """
+        found = self._definitions.get(name)
+        if found is None:
+            found = self._definitions[name] = Definition(name, self.entries[name], self)
+        return found
+
+    def deserialize_cdr(self, data: bytes | memoryview, name: str) -> Any:
+        """Return the message in CDR bytes; raises what generated code raises on wrong bytes."""
+        if len(data) < 4 or bytes(data[:2]) not in (b"\x00\x00", b"\x00\x01"):
+            raise ValueError("no header of plain CDR")
+        definition = self.get_msgdef(name)
+        read = definition.deserialize_cdr_le if data[1] else definition.deserialize_cdr_be
+        message, end = read(data[4:], 0, definition.cls, self)
+        if end + 4 + 3 < len(data):  # CDR may pad by up to 3 bytes
+            raise ValueError(f"{len(data) - end - 4} bytes are left over")
+        return message
+
+
+def entries_of(store: Typestore, names: set[str] | None = None) -> dict[str, Entry]:
+    """Definitions of a store's types.
+
+    Args:
+        store: with all nested types.
+        names: the wanted ones; None: all.
+    """
+    from rosbags.typesys.base import normalize_fieldname
+    from rosbags.typesys.codegen import get_typehint
+
+    return {
+        name: {
+            "constants": {normalize_fieldname(constant): value for constant, _, value in constants},
+            "fields": [(normalize_fieldname(field), description) for field, description in fields],
+            "hints": [get_typehint(description) for _, description in fields],
+            "hash": store.hash_rihs01(name),
+        }
+        for name, (constants, fields) in store.fielddefs.items()
+        if names is None or name in names
+    }
+
+
+def read_entries(definitions: Path, make: Callable[[], Typestore]) -> dict[str, Entry]:
+    """All definitions, from the cache if it belongs to this rosbags and these files.
+
+    Args:
+        definitions: folder of our own ``.msg`` files.
+        make: creates the store to read them from otherwise. An unusable cache costs only time.
+    """
+    key, file = _key(definitions), paths.cache_dir() / "message_types.json"
+    with suppress(OSError, ValueError):
+        found = json.loads(file.read_bytes())
+        if isinstance(found, dict) and found.get("key") == key and isinstance(found.get("types"), dict):
+            types: dict[str, Entry] = found["types"]
+            return types
+    types = entries_of(make())
+    scratch = file.with_suffix(f".{os.getpid()}")
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        scratch.write_text(json.dumps({"key": key, "types": types}))
+        scratch.replace(file)
+    return types
+
+
+def _key(definitions: Path) -> str:
+    """Text that changes with whatever the definitions depend on."""
+    import rosbags
+
+    digest = hashlib.sha256(Path(__file__).read_bytes())
+    for file in sorted(definitions.glob("*/*.msg")):
+        digest.update(f"{file.parent.name}/{file.name}".encode() + file.read_bytes())
+    for file in sorted(Path(rosbags.__path__[0], "typesys", "stores").glob("*.py")):
+        digest.update(f"{file} {(status := file.stat()).st_mtime_ns} {status.st_size}".encode())
+    return digest.hexdigest()
