@@ -51,8 +51,9 @@ from instant_ic.bus import registry
 from instant_ic.bus.control import ControlError, NodeControl
 from instant_ic.console.client import ConsoleClient
 from instant_ic.experiments.drive import pump
-from instant_ic.experiments.stack import StackError, machine_pace, processes_of
+from instant_ic.experiments.stack import StackError, processes_of
 from instant_ic.launch.nodes import NODE_MAIN
+from instant_ic.launch.pacing import machine_pace
 from instant_ic.launch.process import dies_with_us
 from instant_ic.msg import ControlState
 from instant_ic.paths import node_file

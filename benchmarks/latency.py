@@ -42,9 +42,10 @@ import numpy as np
 
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.console import demo_world
-from instant_ic.experiments.stack import Stack, free_port, machine_pace
+from instant_ic.experiments.stack import Stack, free_port
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
+from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import (
     ControlState,
     Keyframe,

@@ -115,6 +115,8 @@ def main() -> int:
     parser.add_argument("--full-quality", action="store_true", help="the page draws at full resolution (screenshots)")
     parser.add_argument("--log", type=Path, default=None, help="where the output of the last stack goes")
     args = parser.parse_args()
+    if args.repeat < 1:
+        parser.error(f"--repeat must be at least 1 (got {args.repeat})")
     drives = []
     for number in range(args.repeat):
         note(f"drive {number + 1} of {args.repeat}")

@@ -51,8 +51,9 @@ from instant_ic.console.client import ConsoleClient
 from instant_ic.control.states import Reason
 from instant_ic.experiments.drive import pump
 from instant_ic.experiments.impaired_link import ImpairedLink
-from instant_ic.experiments.stack import Stack, StackError, free_port, machine_pace
+from instant_ic.experiments.stack import Stack, StackError, free_port
 from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState, matrix_from_pose, message_type, stamp_ns, twist_values
 from instant_ic.paths import share_dir
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator

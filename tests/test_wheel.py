@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from instant_ic.bus import registry
-from instant_ic.experiments.stack import free_ports, machine_pace, processes_of
+from instant_ic.experiments.stack import free_ports, processes_of
+from instant_ic.launch.pacing import machine_pace
 
 ROOT = Path(__file__).resolve().parents[1]
 PURELIB = "import sysconfig; print(sysconfig.get_paths()['purelib'])"

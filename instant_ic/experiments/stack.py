@@ -22,9 +22,6 @@ from instant_ic.launch.process import dies_with_us
 from instant_ic.pace import read as read_pace
 
 T = TypeVar("T")
-_ENOUGH_PER_S = 33e6
-"""Empty-loop iterations per second, on each of two cores, above which a stack runs in real time with margin."""
-_SLOWEST_PACE = 0.1
 
 
 class StackError(RuntimeError):
@@ -80,21 +77,6 @@ def observer(run_dir: Path) -> Iterator[Observer]:
         yield watching
     finally:
         watching.close()
-
-
-def machine_pace() -> float:
-    """Pace at which this machine can run a whole simulated stack, under its current load: 1.0 at most.
-
-    Two processes count for one and a half seconds: the momentary speed of one core says little about two cores under
-    continuous load.
-    """
-    count = (
-        "import time\nn, began = 0, time.perf_counter()\n"
-        "while time.perf_counter() - began < 1.5:\n for _ in range(100_000): pass\n n += 1\nprint(n)"
-    )
-    counters = [subprocess.Popen([sys.executable, "-c", count], stdout=subprocess.PIPE, text=True) for _ in range(2)]
-    slowest_per_s = min(int(counter.communicate(timeout=60)[0]) for counter in counters) * 1e5 / 1.5
-    return min(1.0, max(_SLOWEST_PACE, slowest_per_s / _ENOUGH_PER_S))
 
 
 class Stack:

@@ -95,6 +95,7 @@ class _Output:
         self._ending = False
         self._left_out = 0  # lines not shown on the terminal
         self._next_view_s = 0.0
+        self._reached = 0
         self._address: str | None = None
 
     def make_health(self) -> HealthMonitor:
@@ -114,10 +115,12 @@ class _Output:
         self._outlet.put(self._screen.event, text, bad, always=True)
 
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
-        """Adapt the pace, and update the view at most twice a second."""
+        """Adapt the pace, and update the view twice a second and at each step of the start."""
         if self.pacing is not None and self._health is not None and not self._ending:
             self.pacing.step(self._health)
-        if time.monotonic() >= self._next_view_s:
+        reached = self._health.reached if self._health is not None and not self._ending else self._reached
+        if time.monotonic() >= self._next_view_s or reached > self._reached:
+            self._reached = reached
             self._next_view_s = time.monotonic() + _VIEW_PERIOD_S
             self._outlet.put(self._screen.refresh, self._view(processes))
 

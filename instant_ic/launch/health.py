@@ -196,6 +196,11 @@ class HealthMonitor:
         health = self.nodes.get(spec.label)
         return health.seen_s if health is not None and health.pid == pid and health.state in _UP else None
 
+    @property
+    def reached(self) -> int:
+        """Steps of the start so far: nodes that run, and what :meth:`waiting_for` no longer lists."""
+        return len(self._reached) + sum(health.state in _UP for health in self.nodes.values())
+
     def nodes_missing(self) -> list[str]:
         """Nodes that have not reported yet that they run."""
         return [s.label for s in self._specs if s.label not in self.nodes or self.nodes[s.label].state not in _UP]

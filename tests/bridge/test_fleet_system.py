@@ -12,8 +12,9 @@ import pytest
 
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.registry import list_topics
-from instant_ic.experiments.stack import Stack, free_port, free_ports, machine_pace, observer
+from instant_ic.experiments.stack import Stack, free_port, free_ports, observer
 from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState, Odometry, TwistStamped, matrix_from_pose, twist_stamped
 from instant_ic.pace import read as read_pace
 

@@ -10,7 +10,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from instant_ic.experiments.recordings import evaluate_recordings
-from instant_ic.experiments.stack import machine_pace
+from instant_ic.launch.pacing import machine_pace
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 PCAP, PHOTO = DATA / "vlp16" / "einride_recording.pcap", DATA / "pano" / "library_a.jpg"

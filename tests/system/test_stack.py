@@ -19,7 +19,8 @@ from rosbags.highlevel import AnyReader
 from instant_ic.bus import registry
 from instant_ic.experiments.budget import cpu_percent, reference_loop, usage
 from instant_ic.experiments.drive import DriveRecord, DriveRecorder, drive_through_obstacle, footprint_clearance
-from instant_ic.experiments.stack import Stack, free_ports, machine_pace, processes_of
+from instant_ic.experiments.stack import Stack, free_ports, processes_of
+from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import corridor_world

@@ -13,8 +13,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from instant_ic.bag import BagReader
-from instant_ic.experiments.stack import machine_pace
 from instant_ic.geometry.poses import pose2_from_matrix, relative2
+from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import deserialize, grid_array, matrix_from_pose, stamp_ns
 
 pytestmark = [pytest.mark.system, pytest.mark.xdist_group("stack"), pytest.mark.timeout(900)]
