@@ -65,7 +65,7 @@ def test_only_training_and_experiments_import_the_simulator(folder):
 def test_geometry_msg_config_and_bus_import_only_downwards():
     allowed = {
         "geometry": {"geometry", "limits"},
-        "msg": {"msg", "geometry"},
+        "msg": {"msg", "geometry", "paths"},
         "config": {"config", "geometry", "paths"},
         "bus": {"bus", "config", "msg", "geometry", "pace", "paths", "private"},
     }

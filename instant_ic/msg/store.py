@@ -31,7 +31,8 @@ class Definition:
 
     def __init__(self, name: str, entry: Entry, store: TypeIndex) -> None:
         self.fields: list[tuple[str, Any]] = entry["fields"]
-        self._name, self._entry, self._store = name, entry, store
+        self._name, self._entry = name, entry
+        self._store: Any = store  # has what the generated code asks of rosbags' Typestore
 
     @functools.cached_property
     def cls(self) -> Any:
