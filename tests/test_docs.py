@@ -1,16 +1,19 @@
 """The examples in the docs run as they are printed."""
 
 import itertools
+import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from instant_ic.cli.main import build_parser
+from instant_ic.cli.main import build_parser, main
+from instant_ic.launch import parameters
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -70,3 +73,41 @@ def test_commands_of_a_page_make_what_the_later_ones_read_and_nothing_twice(page
 @pytest.mark.parametrize("page", PAGES)
 def test_pages_name_the_command_in_one_way(page):
     assert ".venv/bin/ic" not in (ROOT / page).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_launch_commands_of_a_page_pass_the_check_in_the_order_given(page, tmp_path, monkeypatch, capsys):
+    """All of ``ic launch`` except the start: file, arguments and every node's parameters."""
+    monkeypatch.setattr(parameters, "check_parameters_quickly", parameters.check_parameters)  # in this process
+    monkeypatch.chdir(tmp_path)
+    mount = {"theta_camera": {"ros__parameters": {"camera_mount": {"xyz": [0.0, 0.0, 1.2]}}}}
+    (tmp_path / "mount.yaml").write_text(json.dumps(mount))  # by the page's `ic calibrate`
+    (tmp_path / "tls.yaml").write_text("{}")
+    for folder in ("drive", "tests/data/corridor_drive"):
+        shutil.copytree(ROOT / "tests/data/corridor_drive", tmp_path / folder)
+    for command in dict.fromkeys(commands(page)):
+        words = shlex.split(command)[1:]
+        if words[0] == "launch" and "FILE" not in words:
+            for made in (word.removeprefix("record:=") for word in words if word.startswith("record:=")):
+                shutil.rmtree(tmp_path / made, ignore_errors=True)  # other commands of the page read one that exists
+            words += [] if "--show-args" in words else ["--check"]
+            assert main(words) == 0, f"{page}: {command}: {capsys.readouterr().err}"
+
+
+QUICK = ("info", "reindex", "diff", "convert", "recover")
+"""Verbs of ``ic bag`` that need no stack."""
+
+
+def test_the_bag_commands_of_the_page_that_need_no_stack_run_in_the_order_given(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("drive", "again", "broken"):  # of `ic bag record`, of `ic replay`, and of a machine that failed
+        shutil.copytree(ROOT / "tests/data/corridor_drive", tmp_path / folder)
+    (tmp_path / "broken" / "metadata.yaml").unlink()
+    (tmp_path / "old.bag").symlink_to(tmp_path / "drive")
+    ran = []
+    for command in commands("docs/bags.md"):
+        words = shlex.split(command)[1:]
+        if words[0] == "bag" and words[1] in QUICK:
+            assert main(words) == 0, f"{command}: {capsys.readouterr().err}"
+            ran.append(words[1])
+    assert set(ran) == set(QUICK)

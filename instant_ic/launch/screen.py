@@ -199,7 +199,9 @@ class Screen:
         if now >= self._next_progress_s:
             self._next_progress_s = now + self._progress_period_s
             if not self._told_ready:
-                self.event(f"waiting for {', '.join(view.missing or view.waiting)}")
+                up = len(self._colours) - len(view.missing)
+                progress = f"{up} of {len(self._colours)} nodes are up, " if view.missing else ""
+                self.event(f"{progress}waiting for {', '.join(view.missing or view.waiting)}")
             self._tell_faults(view.faults)
 
     def _tell_faults(self, faults: tuple[str, ...]) -> None:

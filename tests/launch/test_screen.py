@@ -40,7 +40,7 @@ def test_plain_lines_tell_what_is_waited_for(out: io.StringIO) -> None:
         screen.refresh(View(waiting=("map",), ending=True))
     lines = out.getvalue().splitlines()
     assert lines[0] == "  slam │ hello red"
-    assert lines[1] == "launch │ waiting for slam, page"
+    assert lines[1] == "launch │ 0 of 2 nodes are up, waiting for slam, page"
     assert lines[2].startswith("launch │ all 2 nodes are up after ")
     assert lines[3] == "launch │ waiting for map"
     assert lines[4] == "launch │ console: http://127.0.0.1:8080"
