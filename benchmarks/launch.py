@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
-"""Start and stop of a stack: seconds until all nodes are RUNNING, CPU of the start and of the launcher; prints JSON.
+"""Start and stop of a stack: seconds until all nodes are RUNNING and until "ready", CPU of both; prints JSON.
 
 python benchmarks/launch.py                     launch/sim.yaml without the page
+python benchmarks/launch.py headless:=false     with the page
 python benchmarks/launch.py --file replay bag:=drive
 """
 
@@ -62,11 +63,16 @@ def measure(file: str, arguments: dict[str, str], steady_s: float) -> dict[str, 
         with Stack(file, run_dir, arguments) as stack:
             stack.observer.subscribe("/heartbeat", message_type("NodeStatus"), on_status, RELIABLE)
             stack.wait_for(lambda: nodes <= set(up), 180, f"RUNNING of {', '.join(sorted(nodes))}")
+            result: dict[str, Any] = {}
+            if file == "sim":
+                stack.wait_for(lambda: "ready after" in stack.log_path.read_text(errors="replace"), 180, "ready")
+                result["ready_s"] = round(time.monotonic() - began, 2)
+                result["cpu_s_to_ready"] = round(sum(cpu_s(process) for process in processes_of(run_dir)), 2)
             assert stack.process is not None
             launcher = psutil.Process(stack.process.pid)
             before, since = cpu_s(launcher), time.monotonic()
             stack.wait_for(lambda: time.monotonic() > since + steady_s, steady_s + 30, "end of the steady time")
-            result: dict[str, Any] = {
+            result |= {
                 "all_running_s": max(times["running_s"] for times in up.values()),
                 "cpu_s_to_running": round(sum(times["cpu_s"] for times in up.values()), 2),
                 "nodes": dict(sorted(up.items())),

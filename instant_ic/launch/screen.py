@@ -199,8 +199,8 @@ class Screen:
         if now >= self._next_progress_s:
             self._next_progress_s = now + self._progress_period_s
             if not self._told_ready:
-                up = len(self._colours) - len(view.missing)
-                progress = f"{up} of {len(self._colours)} nodes are up, " if view.missing else ""
+                running = len(self._colours) - len(view.missing)
+                progress = f"{running} of {len(self._colours)} nodes are up, " if view.missing else ""
                 self.event(f"{progress}waiting for {', '.join(view.missing or view.waiting)}")
             self._tell_faults(view.faults)
 
