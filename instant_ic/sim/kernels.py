@@ -1,6 +1,6 @@
 """Compiled loops of the renderer: visibility, filtered texture lookup, shading. All release the GIL."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -24,6 +24,8 @@ _WHITE = np.float32(_ROOT * np.sqrt(1.5))
 _PER_LOOKUP = np.float32(_ROOT / (255 * 256))
 #: Pixels between two light lookups; light is interpolated in between.
 _LIGHT_STEP = 4
+#: Rays that are shaded together.
+_SPAN = 256
 #: Most surfaces that an edge pixel is sampled from.
 _MOST = 32
 #: A surface's border is widened by this, so that no ray slips through between two surfaces, metres.
@@ -32,10 +34,75 @@ _GAP_M = np.float32(1e-4)
 UNKNOWN = -2
 SKY = -1
 
-_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+#: Samples of an edge pixel (rows, columns, pixels from its centre), one per row and column of eighths.
+_SAMPLES = 8
+_SAMPLE_ROWS = (np.arange(_SAMPLES, dtype=np.float32) + np.float32(0.5)) / 8 - np.float32(0.5)
+_SAMPLE_COLUMNS = (np.arange(0, 3 * _SAMPLES, 3, dtype=np.float32) % 8 + np.float32(0.5)) / 8 - np.float32(0.5)
+SUBPIXELS = np.stack([_SAMPLE_ROWS, _SAMPLE_COLUMNS], axis=1)
 
 
-@_jit
+class Projection(NamedTuple):
+    """Directions of an image's pixels.
+
+    Attributes:
+        across, down, scale: tables of the lens, see ``render._Lens``.
+        strides: (H,) columns per shaded pixel.
+        wraps: whether the image is a panorama.
+    """
+
+    across: F32
+    down: F32
+    scale: F32
+    strides: I32
+    wraps: bool
+
+
+class Scene(NamedTuple):
+    """Surfaces with textures and light.
+
+    Attributes:
+        forms: (S, 9, 4) affine functions of a point relative to the camera, see ``World.forms``.
+        looks: (S, 5) texels per metre; root of the tint, in tone indices per lookup; root of the emission.
+        owns: (S, 6) texture, its last level, whether it is clamped, first texel of the light map, its width and height.
+        levels: (T, L, 3) first texel, width and height of each level of each texture.
+        texels: texels of all textures.
+        light: (L, 3) square root of light times tint, in tone indices per lookup.
+    """
+
+    forms: F32
+    looks: F32
+    owns: I64
+    levels: I64
+    texels: U32
+    light: F32
+
+
+_FLAGS = {
+    "cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp", "nsz", "reassoc"},
+}  # fmt: skip
+_jit = numba.njit(**_FLAGS)
+#: Without reference counts of arrays, which cost more than the lookups; such a function cannot make arrays.
+_bare = numba.njit(_nrt=False, **_FLAGS)
+
+
+@_bare
+def _along(forms: F32, s: int, k: int, d: tuple[Scalar, Scalar, Scalar]) -> Scalar:
+    """Rate of change of form ``k`` of surface ``s`` along ``d``."""
+    return forms[s, k, 0] * d[0] + forms[s, k, 1] * d[1] + forms[s, k, 2] * d[2]
+
+
+@_bare
+def _border(forms: F32, s: int, k: int, q: Any, ray: Any, by_row: Any, by_column: Any) -> tuple[Scalar, Scalar, Scalar]:
+    """Position relative to border ``k`` divided by the range: at a pixel's centre, per row and per column."""
+    w = forms[s, k, 3] + _GAP_M
+    return (
+        w * q[0] + _along(forms, s, k, ray),
+        w * q[1] + _along(forms, s, k, by_row),
+        w * q[2] + _along(forms, s, k, by_column),
+    )
+
+
+@_bare
 def _hit(forms: F32, s: int, dx: Scalar, dy: Scalar, dz: Scalar) -> Scalar:
     """Distance along a ray to surface ``s``, in units of the direction's length; infinite if the ray misses it."""
     along = forms[s, 0, 0] * dx + forms[s, 0, 1] * dy + forms[s, 0, 2] * dz
@@ -48,7 +115,7 @@ def _hit(forms: F32, s: int, dx: Scalar, dy: Scalar, dz: Scalar) -> Scalar:
     return t
 
 
-@_jit
+@_bare
 def fill_cells(surface: I32, step: int, wraps: bool) -> None:
     """Fill in the UNKNOWN pixels of the cells between every ``step``-th row and column that one surface covers.
 
@@ -62,13 +129,16 @@ def fill_cells(surface: I32, step: int, wraps: bool) -> None:
             end = min(left + step, width if wraps else width - 1)
             right = end if end < width else 0
             s = surface[top, left]
-            if s >= 0 and surface[top, right] == s and surface[bottom, left] == s and surface[bottom, right] == s:
-                for row in range(top, bottom + 1):
-                    for column in range(left, min(end + 1, width)):
-                        surface[row, column] = s
+            if s < 0 or surface[top, right] != s or surface[bottom, left] != s or surface[bottom, right] != s:
+                continue
+            if surface[min(top + 1, height - 1), min(left + 1, width - 1)] != UNKNOWN:
+                continue  # part of a larger cell
+            for row in range(np.uint64(top), np.uint64(bottom + 1)):
+                for column in range(np.uint64(left), np.uint64(min(end + 1, width))):
+                    surface[row, column] = s
 
 
-@_jit
+@_bare
 def fill_guessed(surface: I32, across: F32, down: F32, scale: F32, forms: F32) -> None:
     """Fill in the UNKNOWN pixels with the nearest of the surfaces at their four neighbours that their ray hits."""
     height, width = surface.shape
@@ -89,7 +159,7 @@ def fill_guessed(surface: I32, across: F32, down: F32, scale: F32, forms: F32) -
                         surface[row, column] = s
 
 
-@_jit
+@_bare
 def unknown(surface: I32, step: int, whole: bool, out: I64) -> int:
     """List the UNKNOWN pixels (flat indices) in every ``step``-th row and column, and in the last ones.
 
@@ -101,17 +171,17 @@ def unknown(surface: I32, step: int, whole: bool, out: I64) -> int:
     height, width = surface.shape
     count = 0
     for row in range(0, height - 1 + step, step):
-        row = min(row, height - 1)
+        row = np.uint64(min(row, height - 1))
+        between = not whole and row % 2 == 1 and row < height - 1
         for column in range(0, width - 1 + step, step):
-            column = min(column, width - 1)
-            inner = row % 2 == 1 and column % 2 == 1 and 0 < row < height - 1 and 0 < column < width - 1
-            if surface[row, column] == UNKNOWN and (whole or not inner):
-                out[count] = row * width + column
+            column = np.uint64(min(column, width - 1))
+            if surface[row, column] == UNKNOWN and not (between and column % 2 == 1 and column < width - 1):
+                out[count] = row * np.uint64(width) + column
                 count += 1
     return count
 
 
-@_jit
+@_bare
 def rays(pixels: I64, width: int, across: F32, down: F32, scale: F32, out: F32) -> None:
     """Unit directions (N, 3) of pixels (N,), flat indices."""
     for i in range(pixels.shape[0]):
@@ -123,7 +193,7 @@ def rays(pixels: I64, width: int, across: F32, down: F32, scale: F32, out: F32) 
         out[i, 0], out[i, 1], out[i, 2] = part * x, part * y, part * z
 
 
-@_jit
+@_bare
 def place(surface: I32, pixels: I64, face: I32, face_surface: I32) -> None:
     """Enter the surfaces of the faces (N,) that the rays of pixels (N,), flat indices, hit."""
     flat = surface.reshape(-1)
@@ -131,7 +201,7 @@ def place(surface: I32, pixels: I64, face: I32, face_surface: I32) -> None:
         flat[pixels[i]] = face_surface[face[i]] if face[i] >= 0 else SKY
 
 
-@_jit
+@_bare
 def ranges(surface: I32, across: F32, down: F32, scale: F32, forms: F32, out: F32) -> None:
     """Radial distance (H, W) of every pixel's surface, 0 for the sky."""
     height, width = surface.shape
@@ -147,15 +217,16 @@ def ranges(surface: I32, across: F32, down: F32, scale: F32, forms: F32, out: F3
                 out[row, first:end] = 0
             else:
                 nx, ny, nz, over = forms[s, 0, 0], forms[s, 0, 1], forms[s, 0, 2], -forms[s, 0, 3]
-                for column in range(first, end):
-                    x = c * across[0, column + 1] + bx
-                    y = c * across[1, column + 1] + by
-                    z = c * across[2, column + 1] + bz
+                for column in range(np.uint64(first), np.uint64(end)):
+                    k = column + np.uint64(1)
+                    x = c * across[0, k] + bx
+                    y = c * across[1, k] + by
+                    z = c * across[2, k] + bz
                     out[row, column] = over * np.sqrt(x * x + y * y + z * z) / (nx * x + ny * y + nz * z)
             first = end
 
 
-@_jit
+@_bare
 def _light_texel(
     light: F32, first: int, width: int, height: int, a: Scalar, b: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
@@ -166,50 +237,52 @@ def _light_texel(
     j = np.int32(b)
     fa = a - np.float32(i)
     fb = b - np.float32(j)
-    at = first + np.int64(j) * width + np.int64(i)
-    below = at + width
+    at = np.uint64(first + np.int64(j) * width + np.int64(i))
+    below = at + np.uint64(width)
+    at1, below1 = at + np.uint64(1), below + np.uint64(1)
     w11 = fa * fb
     w10 = fa - w11
     w01 = fb - w11
     w00 = np.float32(1) - fa - w01
     return (
-        w00 * light[at, 0] + w10 * light[at + 1, 0] + w01 * light[below, 0] + w11 * light[below + 1, 0],
-        w00 * light[at, 1] + w10 * light[at + 1, 1] + w01 * light[below, 1] + w11 * light[below + 1, 1],
-        w00 * light[at, 2] + w10 * light[at + 1, 2] + w01 * light[below, 2] + w11 * light[below + 1, 2],
+        w00 * light[at, 0] + w10 * light[at1, 0] + w01 * light[below, 0] + w11 * light[below1, 0],
+        w00 * light[at, 1] + w10 * light[at1, 1] + w01 * light[below, 1] + w11 * light[below1, 1],
+        w00 * light[at, 2] + w10 * light[at1, 2] + w01 * light[below, 2] + w11 * light[below1, 2],
     )
 
 
-@_jit
-def _light(
-    s: int, x: Scalar, y: Scalar, z: Scalar, forms: F32, light_at: I64, light_root: F32, tint_root: F32
-) -> tuple[Scalar, Scalar, Scalar]:
+@_bare
+def _light(s: int, x: Scalar, y: Scalar, z: Scalar, scene: Scene) -> tuple[Scalar, Scalar, Scalar]:
     """Tone index per lookup unit (square root of light · tint) at o + (x, y, z), with o the camera."""
-    a = forms[s, 3, 0] * x + forms[s, 3, 1] * y + forms[s, 3, 2] * z + forms[s, 3, 3]
-    width = light_at[s, 1]
-    if width == 0:
+    forms, looks, owns = scene.forms, scene.looks, scene.owns
+    e = looks[s, 4]
+    if e == 0:
+        a = forms[s, 3, 0] * x + forms[s, 3, 1] * y + forms[s, 3, 2] * z + forms[s, 3, 3]
+        if owns[s, 4] > 0:
+            b = forms[s, 4, 0] * x + forms[s, 4, 1] * y + forms[s, 4, 2] * z + forms[s, 4, 3]
+            return _light_texel(scene.light, owns[s, 3], owns[s, 4], owns[s, 5], a, b)
         e = np.sqrt(max(a, np.float32(0.02)))
-        return e * tint_root[s, 0], e * tint_root[s, 1], e * tint_root[s, 2]
-    b = forms[s, 4, 0] * x + forms[s, 4, 1] * y + forms[s, 4, 2] * z + forms[s, 4, 3]
-    return _light_texel(light_root, light_at[s, 0], width, light_at[s, 2], a, b)
+    return e * looks[s, 1], e * looks[s, 2], e * looks[s, 3]
 
 
-@_jit
+@_bare
 def _lookup(texels: U32, first: int, width: int, height: int, u: Scalar, v: Scalar) -> Any:
     """Bilinear lookup at texture coordinates 0..1: three lanes of 16 bits (red, blue, green), see ``_PER_LOOKUP``."""
     # Sixteenths of a texel: the weights of the four texels sum to 256.
     x = np.int64(u * np.float32(16 * width) + np.float32(8.5))
     y = np.int64(v * np.float32(16 * height) + np.float32(8.5))
-    at = first + (y >> 4) * (width + 2) + (x >> 4)
-    below = at + width + 2
+    at = np.uint64(first + (y >> 4) * (width + 2) + (x >> 4))
+    below = at + np.uint64(width + 2)
+    one = np.uint64(1)
     fx = x & 15
     fy = y & 15
     gx = 16 - fx
     gy = 16 - fy
     mask = 0x00FF00FF00FF
     a = np.int64(texels[at])
-    b = np.int64(texels[at + 1])
+    b = np.int64(texels[at + one])
     c = np.int64(texels[below])
-    d = np.int64(texels[below + 1])
+    d = np.int64(texels[below + one])
     return (
         ((a | (a << 24)) & mask) * (gx * gy)
         + ((b | (b << 24)) & mask) * (fx * gy)
@@ -218,120 +291,146 @@ def _lookup(texels: U32, first: int, width: int, height: int, u: Scalar, v: Scal
     )
 
 
-@_jit
-def _shade(
-    s: int,
-    first: int,
-    end: int,
-    ray: F32,
-    footprint: Scalar,
-    forms: F32,
-    density: F32,
-    texture: I32,
-    texels: U32,
-    level_offset: I64,
-    level_size: I32,
-    levels: I32,
-    clamps: U8,
-    light_at: I64,
-    light_root: F32,
-    tint_root: F32,
-    emission: F32,
-    work: F32,
-    bits: I32,
-    out: F32,
-) -> None:
-    """Tone indices of rays ``first`` to ``end`` of ``ray`` (3, N), which hit surface ``s``, into ``out`` (3, N).
+@_bare
+def _texel(texture: tuple[int, int, bool], fine: Scalar, u: Scalar, v: Scalar, levels: I64, texels: U32) -> Any:
+    """Filtered lookup in a texture (number, last level, clamped) at the level of texels of size sqrt(``fine``)."""
+    one = np.float32(1)
+    number, last, clamped = texture
+    level = np.uint64(min(max(np.int64(np.float32(fine).view(np.int32) >> 23) - 127, 0), last))
+    if clamped:
+        u, v = min(max(u, np.float32(0)), one), min(max(v, np.float32(0)), one)
+    else:
+        u, v = u - np.floor(u), v - np.floor(v)
+    return _lookup(texels, levels[number, level, 0], levels[number, level, 1], levels[number, level, 2], u, v)
 
-    The texture is averaged over the pixel's footprint on the surface: two lookups along its long axis at oblique view
-    angles, one elsewhere. ``footprint`` is the angle to average over; ``bits`` is the memory of ``work[0]``.
+
+@_bare
+def _albedo(
+    texture: tuple[int, int, bool], fine: Scalar, u: Scalar, v: Scalar, du: Scalar, dv: Scalar, levels: I64, texels: U32
+) -> Any:
+    """Lookup averaged over a footprint: at (u, v), or along its long axis at (u ± du, v ± dv)."""
+    lanes = _texel(texture, fine, u + du, v + dv, levels, texels)
+    if du != 0 or dv != 0:
+        mask = 0x7FFF7FFF7FFF
+        lanes = ((lanes >> 1) & mask) + ((_texel(texture, fine, u - du, v - dv, levels, texels) >> 1) & mask)
+    return lanes
+
+
+@_bare
+def _texture(scene: Scene, s: int) -> tuple[int, int, bool]:
+    """Texture of surface ``s``: number, last level, whether it is clamped."""
+    return np.uint64(scene.owns[s, 0]), scene.owns[s, 1], scene.owns[s, 2] != 0
+
+
+@_bare
+def _plane(s: int, f: F32) -> Any:
+    """Coefficients of surface ``s``: normal and distance, texture coordinates u and v, from ``Scene.forms``."""
+    return (
+        f[s, 0, 0], f[s, 0, 1], f[s, 0, 2], -f[s, 0, 3],
+        f[s, 1, 0], f[s, 1, 1], f[s, 1, 2], f[s, 1, 3],
+        f[s, 2, 0], f[s, 2, 1], f[s, 2, 2], f[s, 2, 3],
+    )  # fmt: skip
+
+
+@_bare
+def _meet(plane: Any, size: Scalar, footprint: Scalar, x: Scalar, y: Scalar, z: Scalar) -> Any:
+    """Where a ray meets a plane: range, texture coordinates, half the footprint's long axis, squared texel size.
+
+    The long axis is 0 at steep view angles, where one lookup covers the footprint. ``size`` is the footprint in texels
+    at 1 m.
     """
     one = np.float32(1)
+    nx, ny, nz, over, ux, uy, uz, uw, vx, vy, vz, vw = plane
+    side = nx * x + ny * y + nz * z
+    t = over / side
+    ud = ux * x + uy * y + uz * z
+    vd = vx * x + vy * y + vz * z
+    side = abs(side)
+    side = side if side > np.float32(0.0625) else np.float32(0.0625)
+    stretch = one / side
+    oblique = stretch > np.float32(2.0)
+    across = t * size
+    # The square of the size, rounded to the nearest half octave by its exponent.
+    fine = np.float32(1.4142135) * across * across * (np.float32(0.25) * stretch * stretch if oblique else stretch)
+    flat = one - side * side
+    flat = flat if flat > np.float32(0.1) else np.float32(0.1)
+    reach = np.float32(0.25) * t * footprint * stretch / np.sqrt(flat)
+    reach = reach if oblique else np.float32(0)
+    return t, uw + t * ud, vw + t * vd, ud * reach, vd * reach, fine
+
+
+@_bare
+def _sky(z: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Tone indices of the open sky, for worlds that are not closed."""
+    up = max(z, np.float32(0.0))
+    return (
+        _ROOT * np.sqrt(np.float32(0.62) - np.float32(0.30) * up),
+        _ROOT * np.sqrt(np.float32(0.72) - np.float32(0.22) * up),
+        _ROOT * np.sqrt(np.float32(0.85) - np.float32(0.05) * up),
+    )
+
+
+@_bare
+def _shade(s: int, first: int, end: int, ray: F32, footprint: Scalar, scene: Scene, work: F32, out: F32) -> None:
+    """Tone indices of rays ``first`` to ``end`` of ``ray`` (3, N), which hit surface ``s``, into ``out`` (3, N).
+
+    The texture is averaged over the angle ``footprint``; ``work`` holds six values for each of ``_SPAN`` rays.
+    """
     if s < 0:
-        # Open sky, for worlds that are not closed.
         for i in range(first, end):
-            up = max(ray[2, i], np.float32(0.0))
-            out[0, i] = _ROOT * np.sqrt(np.float32(0.62) - np.float32(0.30) * up)
-            out[1, i] = _ROOT * np.sqrt(np.float32(0.72) - np.float32(0.22) * up)
-            out[2, i] = _ROOT * np.sqrt(np.float32(0.85) - np.float32(0.05) * up)
+            out[0, i], out[1, i], out[2, i] = _sky(ray[2, i])
         return
-    nx, ny, nz, over = forms[s, 0, 0], forms[s, 0, 1], forms[s, 0, 2], -forms[s, 0, 3]
-    ux, uy, uz, uw = forms[s, 1, 0], forms[s, 1, 1], forms[s, 1, 2], forms[s, 1, 3]
-    vx, vy, vz, vw = forms[s, 2, 0], forms[s, 2, 1], forms[s, 2, 2], forms[s, 2, 3]
-    scale = footprint * density[s]
-    fine, us, vs, du, dv, ts = work[0], work[1], work[2], work[3], work[4], work[5]
-    lr, lg, lb = work[6], work[7], work[8]
-    for i in range(first, end):
-        x, y, z = ray[0, i], ray[1, i], ray[2, i]
-        side = nx * x + ny * y + nz * z
-        t = over / side
-        ts[i] = t
-        ud = ux * x + uy * y + uz * z
-        vd = vx * x + vy * y + vz * z
-        us[i] = uw + t * ud
-        vs[i] = vw + t * vd
-        side = max(abs(side), np.float32(0.0625))
-        stretch = one / side
-        oblique = stretch > np.float32(2.0)
-        size = t * scale * (np.float32(0.5) * stretch if oblique else np.sqrt(stretch))
-        # The square of the size, rounded to the nearest half octave by its exponent.
-        fine[i] = np.float32(1.4142135) * size * size
-        reach = np.float32(0.25) * t * footprint * stretch / np.sqrt(max(one - side * side, np.float32(0.1)))
-        reach = reach if oblique else np.float32(0)
-        du[i] = ud * reach
-        dv[i] = vd * reach
-    if emission[s] > 0:
-        glow = np.sqrt(emission[s])
-        for i in range(first, end):
-            lr[i], lg[i], lb[i] = glow * tint_root[s, 0], glow * tint_root[s, 1], glow * tint_root[s, 2]
-    else:
-        i = first
-        t = ts[i]
-        r0, g0, b0 = _light(s, t * ray[0, i], t * ray[1, i], t * ray[2, i], forms, light_at, light_root, tint_root)
-        lr[i], lg[i], lb[i] = r0, g0, b0
-        while i < end - 1:
-            j = min(i + _LIGHT_STEP, end - 1)
-            t = ts[j]
-            r1, g1, b1 = _light(s, t * ray[0, j], t * ray[1, j], t * ray[2, j], forms, light_at, light_root, tint_root)
-            part = one / np.float32(j - i)
-            r0, g0, b0 = part * (r1 - r0), part * (g1 - g0), part * (b1 - b0)
-            for k in range(i + 1, j + 1):
-                lr[k], lg[k], lb[k] = lr[k - 1] + r0, lg[k - 1] + g0, lb[k - 1] + b0
-            r0, g0, b0 = r1, g1, b1
-            i = j
-    tex = texture[s]
-    top = levels[tex] - 1
-    clamp = clamps[tex] != 0
-    for i in range(first, end):
-        level = min(max((bits[i] >> 23) - 127, 0), top)
-        offset = level_offset[tex, level]
-        width, height = np.int64(level_size[tex, level, 0]), np.int64(level_size[tex, level, 1])
-        u, v = us[i] + du[i], vs[i] + dv[i]
-        if clamp:
-            u, v = min(max(u, np.float32(0)), one), min(max(v, np.float32(0)), one)
-        else:
-            u, v = u - np.floor(u), v - np.floor(v)
-        lanes = _lookup(texels, offset, width, height, u, v)
-        if du[i] != 0 or dv[i] != 0:
-            u, v = us[i] - du[i], vs[i] - dv[i]
-            if clamp:
-                u, v = min(max(u, np.float32(0)), one), min(max(v, np.float32(0)), one)
-            else:
-                u, v = u - np.floor(u), v - np.floor(v)
-            mask = 0x7FFF7FFF7FFF
-            lanes = ((lanes >> 1) & mask) + ((_lookup(texels, offset, width, height, u, v) >> 1) & mask)
-        out[0, i] = np.float32(lanes & 0xFFFF) * lr[i]
-        out[1, i] = np.float32(lanes >> 32) * lg[i]
-        out[2, i] = np.float32((lanes >> 16) & 0xFFFF) * lb[i]
+    plane, texture, size = _plane(s, scene.forms), _texture(scene, s), footprint * scene.looks[s, 0]
+    while first < end:
+        count = min(end - first, _SPAN)
+        start = np.uint64(first)
+        for k in range(np.uint64(count)):
+            i = start + k
+            t, u, v, du, dv, fine = _meet(plane, size, footprint, ray[0, i], ray[1, i], ray[2, i])
+            work[k], work[_SPAN + k], work[2 * _SPAN + k] = t, u, v
+            work[3 * _SPAN + k], work[4 * _SPAN + k], work[5 * _SPAN + k] = du, dv, fine
+        t = work[0]
+        r, g, b = _light(s, t * ray[0, first], t * ray[1, first], t * ray[2, first], scene)
+        at = 0
+        while at < count:
+            to = min(at + _LIGHT_STEP, count - 1)
+            dr = dg = db = np.float32(0)
+            if to > at:
+                i, t, part = first + to, work[to], np.float32(1) / np.float32(to - at)
+                dr, dg, db = _light(s, t * ray[0, i], t * ray[1, i], t * ray[2, i], scene)
+                dr, dg, db = part * (dr - r), part * (dg - g), part * (db - b)
+            to = max(to, at + 1)
+            for k in range(np.uint64(at), np.uint64(to)):
+                lanes = _albedo(
+                    texture, work[5 * _SPAN + k], work[_SPAN + k], work[2 * _SPAN + k], work[3 * _SPAN + k],
+                    work[4 * _SPAN + k], scene.levels, scene.texels,
+                )  # fmt: skip
+                out[0, start + k] = np.float32(lanes & 0xFFFF) * r
+                out[1, start + k] = np.float32(lanes >> 32) * g
+                out[2, start + k] = np.float32((lanes >> 16) & 0xFFFF) * b
+                r, g, b = r + dr, g + dg, b + db
+            at = to
+        first += count
 
 
-@_jit
-def _is_edge(s: int, o: int, dx: Scalar, dy: Scalar, dz: Scalar, forms: F32, texture: I32) -> bool:
+@_bare
+def _point(s: int, footprint: Scalar, x: Scalar, y: Scalar, z: Scalar, scene: Scene) -> tuple[Scalar, Scalar, Scalar]:
+    """Tone indices of one ray, which hits surface ``s``."""
+    if s < 0:
+        return _sky(z)
+    t, u, v, du, dv, fine = _meet(_plane(s, scene.forms), footprint * scene.looks[s, 0], footprint, x, y, z)
+    lanes = _albedo(_texture(scene, s), fine, u, v, du, dv, scene.levels, scene.texels)
+    r, g, b = _light(s, t * x, t * y, t * z, scene)
+    return np.float32(lanes & 0xFFFF) * r, np.float32(lanes >> 32) * g, np.float32((lanes >> 16) & 0xFFFF) * b
+
+
+@_bare
+def _is_edge(s: int, o: int, dx: Scalar, dy: Scalar, dz: Scalar, forms: F32, owns: I64) -> bool:
     """Whether surfaces ``s`` and ``o`` of two neighbouring pixels look different.
 
     Adjoining surfaces of the same texture (one wall in two pieces, the triangles of a smooth mesh) do not.
     """
-    if s < 0 or o < 0 or texture[s] != texture[o]:
+    if s < 0 or o < 0 or owns[s, 0] != owns[o, 0]:
         return True
     ax, ay, az = forms[s, 0, 0], forms[s, 0, 1], forms[s, 0, 2]
     bx, by, bz = forms[o, 0, 0], forms[o, 0, 1], forms[o, 0, 2]
@@ -342,17 +441,18 @@ def _is_edge(s: int, o: int, dx: Scalar, dy: Scalar, dz: Scalar, forms: F32, tex
     return abs(r - q) > np.float32(0.08) * min(abs(r), abs(q))
 
 
-@_jit
+@_bare
 def _around(
-    surface: I32, row: int, first: int, stride: int, wraps: bool, across: F32, down: F32, scale: F32, forms: F32,
-    texture: I32, near: I32,
-) -> tuple[int, bool]:  # fmt: skip
-    """Enter the surfaces in and around pixel (``row``, ``first * stride``) into ``near``, itself first.
+    surface: I32, row: int, first: int, projection: Projection, forms: F32, owns: I64, near: I32
+) -> tuple[int, bool]:
+    """Enter the surfaces in and around pixel (``row``, ``first`` strides) into ``near``, itself first.
 
     Returns:
         Their number, and whether the pixel lies on an edge.
     """
+    across, down, scale, strides, wraps = projection
     height, width = surface.shape
+    stride = strides[row]
     count = (width + stride - 1) // stride
     k = first * stride + 1
     dx = scale[row + 1] * across[0, k] + down[0, row + 1]
@@ -379,11 +479,11 @@ def _around(
             near[known] = o
             known += 1
         if k % 2 == 1 and o != s and not edge:
-            edge = _is_edge(s, o, dx, dy, dz, forms, texture)
+            edge = _is_edge(s, o, dx, dy, dz, forms, owns)
     return known, edge
 
 
-@_jit
+@_bare
 def _add_adjoining(forms: F32, adjoining: I32, near: I32, known: int) -> int:
     """Add to ``known`` surfaces in ``near`` those that adjoin them and face the camera; return the new number.
 
@@ -406,12 +506,11 @@ def _add_adjoining(forms: F32, adjoining: I32, near: I32, known: int) -> int:
     return known
 
 
-@_jit
-def _sample(
-    row: int, first: int, stride: int, wraps: bool, dr: Scalar, dc: Scalar, across: F32, down: F32, scale: F32
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Direction at ``dr`` rows and ``dc`` strides from the centre of pixel (``row``, ``first * stride``)."""
-    half = np.float32(0.5)
+@_bare
+def _sample(row: int, first: int, dr: Scalar, dc: Scalar, projection: Projection) -> tuple[Scalar, Scalar, Scalar]:
+    """Direction at ``dr`` rows and ``dc`` strides from the centre of pixel (``row``, ``first`` strides)."""
+    across, down, scale, strides, wraps = projection
+    stride, half = strides[row], np.float32(0.5)
     k = first * stride + 1
     c = scale[row + 1] + dr * half * (scale[row + 2] - scale[row])
     dc *= half * np.float32(stride)
@@ -427,76 +526,127 @@ def _sample(
 
 
 @_jit
-def edge_rays(
-    surface: I32, across: F32, down: F32, scale: F32, strides: I32, wraps: bool, subpixels: F32, forms: F32,
-    texture: I32, out: F32,
-) -> int:  # fmt: skip
+def edge_rays(surface: I32, projection: Projection, subpixels: F32, forms: F32, owns: I64, out: F32) -> int:
     """Directions (N, 3) of the samples of all edge pixels, in the order of ``compose``; return N.
 
     Nothing is written beyond the end of ``out``.
     """
-    near = np.empty(9, np.int32)
+    near = np.empty(_MOST, np.int32)
     count = 0
     for row in range(surface.shape[0]):
-        for first in range((surface.shape[1] + strides[row] - 1) // strides[row]):
-            if _around(surface, row, first, strides[row], wraps, across, down, scale, forms, texture, near)[1]:
+        stride = projection.strides[row]
+        for first in range((surface.shape[1] + stride - 1) // stride):
+            if _around(surface, row, first, projection, forms, owns, near)[1]:
                 for n in range(subpixels.shape[0]):
                     if count < out.shape[0]:
-                        out[count] = _sample(
-                            row, first, strides[row], wraps, subpixels[n, 0], subpixels[n, 1], across, down, scale
-                        )
+                        out[count] = _sample(row, first, subpixels[n, 0], subpixels[n, 1], projection)
                     count += 1
     return count
 
 
+@_bare
+def _cover(
+    row: int, first: int, projection: Projection, forms: F32, near: I32, known: int, inverse: F32, shown: I32
+) -> None:
+    """Index in ``near`` of the nearest surface at each sample of pixel (``row``, ``first`` strides) into ``shown``.
+
+    Over a pixel, the inverse of the range and the position relative to each border, divided by the range, are affine.
+    """
+    across, down, scale, strides, _ = projection
+    stride, half = strides[row], np.float32(0.5)
+    k = first * stride + 1
+    c, dc = scale[row + 1], half * np.float32(stride) * scale[row + 1]
+    dr = half * (scale[row + 2] - scale[row])
+    ray = (
+        c * across[0, k] + down[0, row + 1],
+        c * across[1, k] + down[1, row + 1],
+        c * across[2, k] + down[2, row + 1],
+    )
+    by_row = (
+        dr * across[0, k] + half * (down[0, row + 2] - down[0, row]),
+        dr * across[1, k] + half * (down[1, row + 2] - down[1, row]),
+        dr * across[2, k] + half * (down[2, row + 2] - down[2, row]),
+    )
+    by_column = (
+        dc * (across[0, k + 1] - across[0, k - 1]),
+        dc * (across[1, k + 1] - across[1, k - 1]),
+        dc * (across[2, k + 1] - across[2, k - 1]),
+    )
+    fallback = np.int32(0)
+    for m in range(known):
+        if near[m] < 0:
+            fallback = np.int32(m)
+    for n in range(_SAMPLES):
+        inverse[n] = np.float32(0)
+        shown[n] = fallback
+    for m in range(known):
+        s = near[m]
+        if s < 0:
+            continue
+        part = np.float32(-1) / forms[s, 0, 3]
+        q0, q1, q2 = (
+            part * _along(forms, s, 0, ray), part * _along(forms, s, 0, by_row), part * _along(forms, s, 0, by_column)
+        )  # fmt: skip
+        a0, a1, a2 = _border(forms, s, 5, (q0, q1, q2), ray, by_row, by_column)
+        b0, b1, b2 = _border(forms, s, 6, (q0, q1, q2), ray, by_row, by_column)
+        c0, c1, c2 = _border(forms, s, 7, (q0, q1, q2), ray, by_row, by_column)
+        d0, d1, d2 = _border(forms, s, 8, (q0, q1, q2), ray, by_row, by_column)
+        for n in range(_SAMPLES):
+            y, x = _SAMPLE_ROWS[n], _SAMPLE_COLUMNS[n]
+            q = q0 + y * q1 + x * q2
+            hit = (q > inverse[n]) & (a0 + y * a1 + x * a2 >= 0) & (b0 + y * b1 + x * b2 >= 0)
+            hit &= (c0 + y * c1 + x * c2 >= 0) & (d0 + y * d1 + x * d2 >= 0)
+            inverse[n] = q if hit else inverse[n]
+            shown[n] = np.int32(m) if hit else shown[n]
+
+
 @_jit
 def compose(
-    surface: I32,
-    across: F32,
-    down: F32,
-    scale: F32,
-    strides: I32,
-    wraps: bool,
-    subpixels: F32,
-    sampled: I32,
-    adjoining: I32,
-    footprint: Scalar,
-    edge_footprint: Scalar,
-    forms: F32,
-    density: F32,
-    texture: I32,
-    texels: U32,
-    level_offset: I64,
-    level_size: I32,
-    levels: I32,
-    clamps: U8,
-    light_at: I64,
-    light_root: F32,
-    tint_root: F32,
-    emission: F32,
-    tone: U8,
-    out: U8,
-) -> None:
+    surface: I32, projection: Projection, subpixels: F32, sampled: I32, adjoining: I32, footprint: Scalar,
+    edge_footprint: Scalar, scene: Scene, tone: U8, out: U8,
+) -> None:  # fmt: skip
     """Shade the image (H, W, 3), sRGB, with anti-aliased edges.
 
     In a row with a stride only every stride-th pixel is shaded; the pixels in between are interpolated. A sample of an
     edge pixel shows its surface in ``sampled`` (N,), or if that is empty the nearest of those that the pixels around
     it show, and of those ``adjoining`` (S, 4) them.
     """
+    width = surface.shape[1]
+    _compose(
+        surface,
+        projection,
+        subpixels,
+        sampled,
+        adjoining,
+        footprint,
+        edge_footprint,
+        scene,
+        tone,
+        out,
+        np.empty((3, width), np.float32),
+        np.empty((3, width), np.float32),
+        np.empty(6 * _SPAN, np.float32),
+        np.empty(width, np.int32),
+        np.empty(width, np.uint8),
+        np.empty(_MOST, np.int32),
+        np.empty(_MOST, np.float32),
+        np.empty((_MOST, 2), np.float32),
+        np.empty(_SAMPLES, np.float32),
+        np.empty(_SAMPLES, np.int32),
+    )
+
+
+@_bare
+def _compose(
+    surface: I32, projection: Projection, subpixels: F32, sampled: I32, adjoining: I32, footprint: Scalar,
+    edge_footprint: Scalar, scene: Scene, tone: U8, out: U8, ray: F32, root: F32, work: F32, line: I32, differs: U8,
+    near: I32, weight: F32, shift: F32, inverse: F32, shown: I32,
+) -> None:  # fmt: skip
+    across, down, scale, strides, wraps = projection
+    forms, owns = scene.forms, scene.owns
     height, width = surface.shape
     samples = subpixels.shape[0]
     one = np.float32(1)
-    ray = np.empty((3, width), np.float32)
-    root = np.empty((3, width), np.float32)
-    work = np.empty((9, width), np.float32)
-    bits = work[0].view(np.int32)
-    line = np.empty(width, np.int32)
-    differs = np.empty(width, np.uint8)
-    near = np.empty(_MOST, np.int32)
-    weight = np.empty(_MOST, np.float32)
-    shift = np.empty((_MOST, 2), np.float32)
-    some_ray = np.empty((3, 1), np.float32)
-    some_root = np.empty((3, 1), np.float32)
     taken = 0
     for row in range(height):
         stride = strides[row]
@@ -537,64 +687,43 @@ def compose(
             s = line[first]
             known, edge = 0, False
             if differs[first]:
-                known, edge = _around(surface, row, first, stride, wraps, across, down, scale, forms, texture, near)
+                known, edge = _around(surface, row, first, projection, forms, owns, near)
             if not edge:
                 end = first + 1
                 while end < count and line[end] == s and not differs[end]:
                     end += 1
-                _shade(
-                    s, first, end, ray, footprint, forms, density, texture, texels, level_offset, level_size, levels,
-                    clamps, light_at, light_root, tint_root, emission, work, bits, root,
-                )  # fmt: skip
+                _shade(s, first, end, ray, footprint, scene, work, root)
                 first = end
                 continue
-            known = _add_adjoining(forms, adjoining, near, known)
+            if sampled.shape[0]:
+                for n in range(samples):
+                    best = 0
+                    while best < known and near[best] != sampled[taken]:
+                        best += 1
+                    near[best] = sampled[taken]
+                    known = max(known, best + 1)
+                    shown[n] = best
+                    taken += 1
+            else:
+                known = _add_adjoining(forms, adjoining, near, known)
+                _cover(row, first, projection, forms, near, known, inverse, shown)
             for m in range(known):
                 weight[m] = shift[m, 0] = shift[m, 1] = np.float32(0)
             for n in range(samples):
-                dr, dc = subpixels[n, 0], subpixels[n, 1]
-                best = 0
-                if sampled.shape[0]:
-                    while best < known and near[best] != sampled[taken]:
-                        best += 1
-                    if best == known:
-                        near[best] = sampled[taken]
-                        weight[best] = shift[best, 0] = shift[best, 1] = np.float32(0)
-                        known += 1
-                    taken += 1
-                else:
-                    x, y, z = _sample(row, first, stride, wraps, dr, dc, across, down, scale)
-                    nearest = np.float32(np.inf)
-                    for m in range(known):
-                        if near[m] < 0:
-                            best = m if nearest == np.inf else best
-                        else:
-                            t = _hit(forms, near[m], x, y, z)
-                            if t < nearest:
-                                nearest = t
-                                best = m
-                weight[best] += one
-                shift[best, 0] += dr
-                shift[best, 1] += dc
-            for k in range(3):
-                root[k, first] = np.float32(0)
+                weight[shown[n]] += one
+                shift[shown[n], 0] += subpixels[n, 0]
+                shift[shown[n], 1] += subpixels[n, 1]
+            red = green = blue = np.float32(0)
             for m in range(known):
                 if weight[m] == 0:
                     continue
                 part = one / weight[m]
-                x, y, z = _sample(
-                    row, first, stride, wraps, part * shift[m, 0], part * shift[m, 1], across, down, scale
-                )
-                some_ray[0, 0], some_ray[1, 0], some_ray[2, 0] = x, y, z
-                _shade(
-                    near[m], 0, 1, some_ray, edge_footprint, forms, density, texture, texels, level_offset, level_size,
-                    levels, clamps, light_at, light_root, tint_root, emission, work, bits, some_root,
-                )  # fmt: skip
-                for k in range(3):
-                    value = min(some_root[k, 0], _WHITE)
-                    root[k, first] += weight[m] / np.float32(samples) * value * value
-            for k in range(3):
-                root[k, first] = np.sqrt(root[k, first])
+                x, y, z = _sample(row, first, part * shift[m, 0], part * shift[m, 1], projection)
+                r, g, b = _point(near[m], edge_footprint, x, y, z, scene)
+                r, g, b = min(r, _WHITE), min(g, _WHITE), min(b, _WHITE)
+                part = weight[m] / np.float32(samples)
+                red, green, blue = red + part * r * r, green + part * g * g, blue + part * b * b
+            root[0, first], root[1, first], root[2, first] = np.sqrt(red), np.sqrt(green), np.sqrt(blue)
             first += 1
 
         top = np.float32(TONE_SIZE - 1)

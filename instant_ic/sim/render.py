@@ -13,8 +13,7 @@ from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.floating]
 
-#: Sample positions in edge pixels (rows, columns, pixels from the centre), one sample per row and column.
-_SUBPIXELS = np.asarray([((row + 0.5) / 8 - 0.5, (3 * row % 8 + 0.5) / 8 - 0.5) for row in range(8)], np.float32)
+#: Samples of the edge pixels of a mesh file (rows, columns, pixels from the centre), whose rays are cast.
 _CAST_SUBPIXELS = np.asarray([(-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125)], np.float32)
 
 #: Share of a pixel over which a texture is averaged, in pixels on one surface and for the samples of edge pixels.
@@ -109,12 +108,21 @@ class EquirectRenderer:
     def __init__(self, world: World) -> None:
         self.world = world
         self._caster = world.caster
+        textures = world.textures
         per_lookup = (kernels.TONE_SIZE - 1) / kernels.TONE_ROOT / (255 * 256)
-        self._tint_root = np.asarray(per_lookup * np.sqrt(world.tint), np.float32)
+        tint_root = per_lookup * np.sqrt(world.tint)
         owner = np.repeat(np.arange(len(world.light_at)), world.light_at[:, 1] * world.light_at[:, 2])
-        self._light_root = np.ones((1, 3), np.float32)
-        if len(owner):
-            self._light_root = np.asarray(np.sqrt(world.light) * self._tint_root[owner], np.float32)
+        light = np.sqrt(world.light) * tint_root[owner] if len(owner) else np.ones((1, 3))
+        looks = np.column_stack([world.texel_per_m, tint_root, np.sqrt(world.emission)])
+        owns = np.column_stack(
+            [world.texture, textures.levels[world.texture] - 1, textures.clamp[world.texture], world.light_at]
+        )
+        levels = np.concatenate([textures.level_offset[..., None], textures.level_size], axis=2)
+        #: The fields of ``kernels.Scene`` after ``forms``.
+        self._scene = (
+            np.asarray(looks, np.float32), owns.astype(np.int64), levels.astype(np.int64), textures.texels,
+            np.asarray(light, np.float32),
+        )  # fmt: skip
 
     def render(self, map_from_camera: FloatArray, width: int, height: int, supersample: int = 1) -> Frame:
         """Render an equirect panorama: centre column along x, rows from +90° to −90°.
@@ -154,7 +162,7 @@ class EquirectRenderer:
         return Frame(table[index.astype(np.int32)], np.ascontiguousarray(fine.depth_m[n // 2 :: n, n // 2 :: n]))
 
     def _frame(self, map_from_camera: FloatArray, lens: _Lens) -> Frame:
-        world, textures = self.world, self.world.textures
+        world = self.world
         tables = lens.tables(map_from_camera[:3, :3])
         origin = np.asarray(map_from_camera[:3, 3], np.float32)
         forms = world.forms.copy()
@@ -163,22 +171,21 @@ class EquirectRenderer:
         rgb = np.empty((lens.height, lens.width, 3), np.uint8)
         depth = np.empty((lens.height, lens.width), np.float32)
         kernels.ranges(surface, *tables, forms, depth)
-        view = (surface, *tables, _strides(lens), lens.hfov_rad is None)
-        subpixels, sampled = _SUBPIXELS, np.empty(0, np.int32)
+        projection = kernels.Projection(*tables, _strides(lens), lens.hfov_rad is None)
+        subpixels, sampled = kernels.SUBPIXELS, np.empty(0, np.int32)
         if world.two_sided:
             # The triangles of a mesh file can be smaller than a pixel: those in an edge pixel must be cast.
             subpixels, rays = _CAST_SUBPIXELS, np.empty((0, 3), np.float32)
-            count = kernels.edge_rays(*view, subpixels, forms, world.texture, rays)
+            view = (surface, projection, subpixels, forms, self._scene[1])
+            count = kernels.edge_rays(*view, rays)
             rays = np.empty((count, 3), np.float32)
-            kernels.edge_rays(*view, subpixels, forms, world.texture, rays)
+            kernels.edge_rays(*view, rays)
             sampled = self._caster.cast(origin, rays)[1]
             kernels.place(sampled, np.arange(count), sampled, world.face_surface)
+        footprint, edge_footprint = np.float32([_FOOTPRINT * lens.pixel_rad, _EDGE_FOOTPRINT * lens.pixel_rad])
         kernels.compose(
-            *view, subpixels, sampled, world.adjoining,
-            np.float32(_FOOTPRINT * lens.pixel_rad), np.float32(_EDGE_FOOTPRINT * lens.pixel_rad), forms,
-            world.texel_per_m, world.texture, textures.texels, textures.level_offset, textures.level_size,
-            textures.levels, textures.clamp, world.light_at, self._light_root, self._tint_root, world.emission,
-            _tone_table()[0], rgb,
+            surface, projection, subpixels, sampled, world.adjoining, footprint, edge_footprint,
+            kernels.Scene(forms, *self._scene), _tone_table()[0], rgb,
         )  # fmt: skip
         return Frame(rgb, depth)
 
