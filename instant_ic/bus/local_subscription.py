@@ -31,7 +31,9 @@ _QUEUE = 256  # messages that ZeroMQ keeps in this process; the publisher keeps 
 _LARGE_FROM_BYTES = 64 << 10
 _RECONNECT_MS = 20
 _GRACE_S = 2.0  # the last messages of a publisher that has left the registry may still be on the way
-_FULL_LOOK_S = 1.0
+# The leftovers of a killed process change no folder. Every second its process is looked for, now and then its lock.
+_LOOK_S = 1.0
+_FULL_LOOK_S = 5.0
 _MOST_UNKNOWN = 64
 _NOBLOCK = int(zmq.NOBLOCK)
 _new = tuple.__new__  # what Received(...) calls in the end, without a Python call in between
@@ -93,9 +95,10 @@ class LocalSubscription:
         self._folder = str(registry.topic_dir(host.run_dir, topic))
         registry.own_folder(Path(self._folder))
         self._seen_mtime = -1
-        self._next_full_look = 0.0
+        self._next_look = self._next_full_look = 0.0
         self._sources: dict[bytes, _Source] = {}
-        self._connected: dict[str, float] = {}  # path of a publisher's socket: when it was last seen in the registry
+        self._connected: set[str] = set()  # paths of publishers' sockets
+        self._left: dict[str, float] = {}  # of these, those that have left the registry: when this was noticed
         self._looked_up: dict[bytes, float] = {}  # identities that are not in the registry: when they were looked up
         self._told: set[object] = set()
         self._socket = host.context.socket(zmq.SUB)
@@ -117,14 +120,20 @@ class LocalSubscription:
         """
         mtime = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - five times a second for each topic
         now = time.monotonic()
-        if mtime == self._seen_mtime and now < self._next_full_look:
+        if mtime == self._seen_mtime and now < self._next_look:
             return
-        self._seen_mtime, self._next_full_look = mtime, now + _FULL_LOOK_S
+        self._next_look = now + _LOOK_S
+        complete = len(self._connected) == len(self.publishers)  # none to connect again, none in its grace
+        known = mtime == self._seen_mtime and now < self._next_full_look and complete
+        if known and all(registry.running(info) for info in self.publishers):
+            return
+        self._seen_mtime, self._next_full_look = mtime if registry.settled(mtime) else -1, now + _FULL_LOOK_S
         self._look_up(now)
-        for path in [path for path, seen_s in self._connected.items() if now - seen_s > _GRACE_S]:
+        for path in [path for path, left_s in self._left.items() if now - left_s > _GRACE_S]:
             self.read()
             self._socket.disconnect(f"ipc://{path}")
-            del self._connected[path]
+            self._connected.discard(path)
+            del self._left[path]
         present = {bytes.fromhex(info.id) for info in self.publishers}
         for identity, source in list(self._sources.items()):
             if identity not in present and str(source.info.socket) not in self._connected:
@@ -142,7 +151,9 @@ class LocalSubscription:
                 except zmq.ZMQError as error:
                     self._complain(path, f"{path} cannot be connected: {error}")
                     continue
-            self._connected[path] = now
+            self._connected.add(path)
+        present = {str(info.socket) for info in self.publishers}
+        self._left = {path: self._left.get(path, now) for path in self._connected - present}
 
     def read_rest(self) -> None:
         """Read what :meth:`read` of one message has left; usually nothing."""
@@ -233,7 +244,7 @@ class LocalSubscription:
                     self._sources[publisher] = source = _Source(info)
                     return source
             if len(self._looked_up) < _MOST_UNKNOWN:
-                self._looked_up[publisher] = now + _FULL_LOOK_S
+                self._looked_up[publisher] = now + _LOOK_S
         raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")
 
     def _forget(self, publisher: bytes) -> None:

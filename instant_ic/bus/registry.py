@@ -29,6 +29,7 @@ from instant_ic.private import make_folder, open_file
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
+_FILE_TIME_STEP_NS = 50_000_000  # more than the kernel's
 _MAX_IPC_PATH = 107  # sockaddr_un.sun_path less its final zero
 
 
@@ -304,6 +305,25 @@ def _publisher(entry: dict[str, Any]) -> PublisherInfo:
         id=entry["id"],
         started_ns=entry["started_ns"],
     )
+
+
+def settled(mtime_ns: int) -> bool:
+    """Whether a folder with this time of change can be trusted to show its next change by another time.
+
+    The kernel's file times advance in steps of up to 10 ms: a change soon after a look leaves the time as it was.
+    """
+    return not -_FILE_TIME_STEP_NS < time.time_ns() - mtime_ns < _FILE_TIME_STEP_NS
+
+
+def running(publisher: PublisherInfo) -> bool:
+    """Whether a publisher's process exists: a cheap look between those at its lock, which are certain."""
+    try:
+        os.kill(publisher.pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # another user's process has the number
+        return True
+    return True
 
 
 def list_topics(run_dir: Path) -> list[TopicInfo]:

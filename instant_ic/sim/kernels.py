@@ -38,7 +38,7 @@ SKY = -1
 _SAMPLES = 8
 _SAMPLE_ROWS = (np.arange(_SAMPLES, dtype=np.float32) + np.float32(0.5)) / 8 - np.float32(0.5)
 _SAMPLE_COLUMNS = (np.arange(0, 3 * _SAMPLES, 3, dtype=np.float32) % 8 + np.float32(0.5)) / 8 - np.float32(0.5)
-SUBPIXELS = np.stack([_SAMPLE_ROWS, _SAMPLE_COLUMNS], axis=1)
+SUBPIXELS: F32 = np.stack([_SAMPLE_ROWS, _SAMPLE_COLUMNS], axis=1).astype(np.float32)
 
 
 class Projection(NamedTuple):
@@ -170,11 +170,11 @@ def unknown(surface: I32, step: int, whole: bool, out: I64) -> int:
     """
     height, width = surface.shape
     count = 0
-    for row in range(0, height - 1 + step, step):
-        row = np.uint64(min(row, height - 1))
+    for top in range(0, height - 1 + step, step):
+        row = np.uint64(min(top, height - 1))
         between = not whole and row % 2 == 1 and row < height - 1
-        for column in range(0, width - 1 + step, step):
-            column = np.uint64(min(column, width - 1))
+        for left in range(0, width - 1 + step, step):
+            column = np.uint64(min(left, width - 1))
             if surface[row, column] == UNKNOWN and not (between and column % 2 == 1 and column < width - 1):
                 out[count] = row * np.uint64(width) + column
                 count += 1
@@ -292,7 +292,7 @@ def _lookup(texels: U32, first: int, width: int, height: int, u: Scalar, v: Scal
 
 
 @_bare
-def _texel(texture: tuple[int, int, bool], fine: Scalar, u: Scalar, v: Scalar, levels: I64, texels: U32) -> Any:
+def _texel(texture: tuple[Any, Any, bool], fine: Scalar, u: Scalar, v: Scalar, levels: I64, texels: U32) -> Any:
     """Filtered lookup in a texture (number, last level, clamped) at the level of texels of size sqrt(``fine``)."""
     one = np.float32(1)
     number, last, clamped = texture
@@ -306,7 +306,7 @@ def _texel(texture: tuple[int, int, bool], fine: Scalar, u: Scalar, v: Scalar, l
 
 @_bare
 def _albedo(
-    texture: tuple[int, int, bool], fine: Scalar, u: Scalar, v: Scalar, du: Scalar, dv: Scalar, levels: I64, texels: U32
+    texture: tuple[Any, Any, bool], fine: Scalar, u: Scalar, v: Scalar, du: Scalar, dv: Scalar, levels: I64, texels: U32
 ) -> Any:
     """Lookup averaged over a footprint: at (u, v), or along its long axis at (u ± du, v ± dv)."""
     lanes = _texel(texture, fine, u + du, v + dv, levels, texels)
@@ -317,7 +317,7 @@ def _albedo(
 
 
 @_bare
-def _texture(scene: Scene, s: int) -> tuple[int, int, bool]:
+def _texture(scene: Scene, s: int) -> tuple[Any, Any, bool]:
     """Texture of surface ``s``: number, last level, whether it is clamped."""
     return np.uint64(scene.owns[s, 0]), scene.owns[s, 1], scene.owns[s, 2] != 0
 
@@ -385,8 +385,8 @@ def _shade(s: int, first: int, end: int, ray: F32, footprint: Scalar, scene: Sce
         count = min(end - first, _SPAN)
         start = np.uint64(first)
         for k in range(np.uint64(count)):
-            i = start + k
-            t, u, v, du, dv, fine = _meet(plane, size, footprint, ray[0, i], ray[1, i], ray[2, i])
+            n = start + k
+            t, u, v, du, dv, fine = _meet(plane, size, footprint, ray[0, n], ray[1, n], ray[2, n])
             work[k], work[_SPAN + k], work[2 * _SPAN + k] = t, u, v
             work[3 * _SPAN + k], work[4 * _SPAN + k], work[5 * _SPAN + k] = du, dv, fine
         t = work[0]

@@ -22,6 +22,9 @@ _FOOTPRINT = 0.65
 _EDGE_FOOTPRINT = 0.45
 
 
+_Tables = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float32]]
+
+
 @dataclass(frozen=True)
 class Frame:
     """Image with depth.
@@ -68,7 +71,7 @@ class _Lens:
             return math.pi / self.height
         return 2 * math.tan(0.5 * self.hfov_rad) / self.width
 
-    def tables(self, rotation: FloatArray) -> tuple[npt.NDArray[np.float32], ...]:
+    def tables(self, rotation: FloatArray) -> _Tables:
         """Tables ``across`` (3, W + 2), ``down`` (3, H + 2) and ``scale`` (H + 2,) for a camera's rotation (3, 3)."""
         columns, rows = np.arange(-1, self.width + 1), np.arange(-1, self.height + 1)
         if self.hfov_rad is None:
@@ -80,7 +83,7 @@ class _Lens:
             focal = 0.5 * self.width / math.tan(0.5 * self.hfov_rad)
             across = focal * rotation[:, :1] + rotation[:, 1:2] * (0.5 * (self.width - 1) - columns)
             down, scale = rotation[:, 2:] * (0.5 * (self.height - 1) - rows), np.ones(len(rows))
-        return tuple(np.ascontiguousarray(table, np.float32) for table in (across, down, scale))
+        return across.astype(np.float32), down.astype(np.float32), scale.astype(np.float32)
 
 
 @lru_cache(maxsize=8)
@@ -175,14 +178,14 @@ class EquirectRenderer:
         subpixels, sampled = kernels.SUBPIXELS, np.empty(0, np.int32)
         if world.two_sided:
             # The triangles of a mesh file can be smaller than a pixel: those in an edge pixel must be cast.
-            subpixels, rays = _CAST_SUBPIXELS, np.empty((0, 3), np.float32)
+            subpixels = _CAST_SUBPIXELS
             view = (surface, projection, subpixels, forms, self._scene[1])
-            count = kernels.edge_rays(*view, rays)
+            count = kernels.edge_rays(*view, np.empty((0, 3), np.float32))
             rays = np.empty((count, 3), np.float32)
             kernels.edge_rays(*view, rays)
             sampled = self._caster.cast(origin, rays)[1]
             kernels.place(sampled, np.arange(count), sampled, world.face_surface)
-        footprint, edge_footprint = np.float32([_FOOTPRINT * lens.pixel_rad, _EDGE_FOOTPRINT * lens.pixel_rad])
+        footprint, edge_footprint = (np.float32(part * lens.pixel_rad) for part in (_FOOTPRINT, _EDGE_FOOTPRINT))
         kernels.compose(
             surface, projection, subpixels, sampled, world.adjoining, footprint, edge_footprint,
             kernels.Scene(forms, *self._scene), _tone_table()[0], rgb,
@@ -191,7 +194,7 @@ class EquirectRenderer:
 
     def _visible(
         self,
-        tables: tuple[npt.NDArray[np.float32], ...],
+        tables: _Tables,
         origin: npt.NDArray[np.float32],
         forms: npt.NDArray[np.float32],
         lens: _Lens,

@@ -7,11 +7,12 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from local_bus import BYTES
 
-from instant_ic.bus import LATCHED, RELIABLE, SENSOR, RegistryError, registry
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, RegistryError, local_subscription, registry
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import Node, Publisher
 from instant_ic.msg import String, deserialize, serialize
@@ -107,6 +108,51 @@ def test_publisher_killed_and_restarted_is_heard_again(transport, talker, run_di
     talker("-p", "text:=again")
     wait_for(lambda: [t for t in inbox.poll()[heard:] if t.startswith("again")])
     assert inbox.raw.stats.lost == 0
+
+
+def test_publisher_that_leaves_the_registry_long_after_the_last_look_is_heard_for_the_grace(
+    transport, run_dir, monkeypatch
+):
+    def say(text: str) -> None:
+        publisher.send(serialize(String(data=text)))
+
+    ahead_s = 0.0
+    clock = SimpleNamespace(**vars(time) | {"monotonic": lambda: time.monotonic() + ahead_s})
+    monkeypatch.setattr(local_subscription, "time", clock)
+    monkeypatch.setattr(local_subscription, "_GRACE_S", 60.0)
+    sender = LocalTransport(run_dir, "sender", time.time_ns)
+    try:
+        publisher = sender.advertise("/chatter", "std_msgs/msg/String", RELIABLE)
+        inbox = Inbox(transport, "/chatter")
+        wait_for(lambda: publisher.subscriber_count)
+        say("known")
+        wait_for(lambda: inbox.poll() == ["known"])
+        ahead_s = 1000.0
+        next(run_dir.glob("topics/chatter/*.json")).unlink()
+        wait_for(lambda: inbox.raw.publishers == [])
+        say("late")
+        wait_for(lambda: inbox.poll() == ["known", "late"])
+        ahead_s = 2000.0
+        wait_for(lambda: publisher.subscriber_count == 0)
+    finally:
+        sender.close()
+
+
+def test_killed_publisher_is_noticed_without_a_look_at_its_lock(transport, talker, monkeypatch):
+    monkeypatch.setattr(local_subscription, "_FULL_LOOK_S", 1e6)
+    inbox = Inbox(transport, "/chatter")
+    process = talker()
+    wait_for(lambda: len(inbox.poll()) >= 3)
+    process.kill()
+    process.wait(10)
+    wait_for(lambda: inbox.raw.publishers == [])
+
+
+def test_folder_that_just_changed_is_not_settled():
+    now_ns = time.time_ns()
+    assert not registry.settled(now_ns)
+    assert registry.settled(now_ns - 1_000_000_000)
+    assert registry.settled(now_ns + 1_000_000_000)  # the clock was set back: no look five times a second until then
 
 
 def test_sweep_clears_what_the_dead_left_and_nothing_else(transport, talker, run_dir):
