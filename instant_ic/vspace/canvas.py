@@ -1,12 +1,8 @@
-"""Composition of a view: the keyframes' warped panoramas, the field and the background.
-
-One interface, chosen by device: here with numpy and numba on the CPU, in ``torch_canvas`` on a GPU.
-"""
+"""Composition of a view on the CPU: the keyframes' warped panoramas, the field and the background."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,97 +14,78 @@ from instant_ic.vspace.store import KeyframeSet
 from instant_ic.vspace.view import continue_unseen
 from instant_ic.vspace.warp import dissolve
 
-Drawing = tuple[Any, Any, Any]
-"""Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,), in arrays of the canvas' kind."""
+Drawing = tuple[Floats, Floats, Floats]
+"""Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,)."""
 Painted = tuple[NDArray[np.uint8], Floats, Floats]
 """A finished image: (H, W, 3) uint8, depth (P,) and confidence (P,)."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendered view (P, …) in arrays of its canvas; ``guessed``: unseen parts of the background."""
+    """A rendered view (P, …); ``guessed``: unseen parts of the background."""
 
-    colour: Any
-    depth: Any
-    confidence: Any
-    guessed: Any
-
-
-class Canvas(Protocol):
-    """A backend's composition of views."""
-
-    def draw(
-        self,
-        rays: Rays,
-        shown: KeyframeSet | None,
-        panorama_share: float,
-        field: Drawing | None,
-        layers: dict[int, Drawing],
-    ) -> Picture:
-        """Compose a view: warped panoramas blended with the field, and the background in unseen places.
-
-        Args:
-            rays: of a perspective view; of any where ``shown`` is None.
-            shown: the keyframes; None: the field alone, nothing is warped.
-            panorama_share: of the warped panoramas, 0..1.
-            field: the view as the field has it, as ``field.Device.drawn`` gives it; None: the panoramas alone.
-            layers: in and out, the warps of keyframes that have been rendered for this view.
-        """
-
-    def continued(self, picture: Picture, shape: tuple[int, int], wraps: bool) -> Any:
-        """The image (H, W, 3) with unknown parts filled from their surroundings and the guesses blended in."""
-
-    def painted(self, picture: Picture, image: Any) -> Painted:
-        """The image of ``continued``, or a blend of several, in 8 bit; depth and confidence of ``picture``."""
+    colour: Floats
+    depth: Floats
+    confidence: Floats
+    guessed: NDArray[np.bool_]
 
 
-class CpuCanvas:
-    """See ``Canvas``; its arrays are numpy's. Warping needs numba."""
+def draw(
+    rays: Rays,
+    shown: KeyframeSet | None,
+    panorama_share: float,
+    field: Drawing | None,
+    layers: dict[int, Drawing],
+) -> Picture:
+    """Compose a view: warped panoramas blended with the field, and the background in unseen places.
 
-    def draw(
-        self,
-        rays: Rays,
-        shown: KeyframeSet | None,
-        panorama_share: float,
-        field: Drawing | None,
-        layers: dict[int, Drawing],
-    ) -> Picture:
-        if field is None:
-            assert shown is not None, "neither keyframes nor a field to render"
-            picture = self._warped(rays, shown, layers)
-        elif shown is not None and panorama_share > 0:
-            picture = dissolve(self._warped(rays, shown, layers), field, panorama_share)
-        else:
-            picture = field
-        colour, depth, confidence = picture
-        guessed = np.zeros(len(depth), bool)
-        for keyframe, gain in () if shown is None else zip(shown.keyframes, shown.gains, strict=True):
-            wanted = (confidence == 0) & ~guessed
-            if keyframe.background is None or not wanted.any():
-                break
-            guessed |= keyframe.background.draw(rays, gain, wanted, picture)
-        return Picture(colour, depth, confidence, guessed)
+    Args:
+        rays: of a perspective view; of any where ``shown`` is None.
+        shown: the keyframes; None: the field alone, nothing is warped. Warping needs numba.
+        panorama_share: of the warped panoramas, 0..1.
+        field: the view as the field has it, as ``field.Device.draw`` gives it; None: the panoramas alone.
+        layers: in and out, the warps of keyframes that have been rendered for this view.
+    """
+    if field is None:
+        assert shown is not None, "neither keyframes nor a field to render"
+        picture = _warped(rays, shown, layers)
+    elif shown is not None and panorama_share > 0:
+        picture = dissolve(_warped(rays, shown, layers), field, panorama_share)
+    else:
+        picture = field
+    colour, depth, confidence = picture
+    guessed = np.zeros(len(depth), bool)
+    for keyframe, gain in () if shown is None else zip(shown.keyframes, shown.gains, strict=True):
+        wanted = (confidence == 0) & ~guessed
+        if keyframe.background is None or not wanted.any():
+            break
+        guessed |= keyframe.background.draw(rays, gain, wanted, picture)
+    return Picture(colour, depth, confidence, guessed)
 
-    @staticmethod
-    def _warped(rays: Rays, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawing:
-        """Compose the keyframes' panoramas, warped by their depth."""
-        drawn = []
-        for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
-            assert keyframe.warp is not None
-            if id(keyframe.warp) not in layers:
-                layers[id(keyframe.warp)] = keyframe.warp.draw(rays)
-            drawn.append(Layer(keyframe.prior, gain, *layers[id(keyframe.warp)]))
-        if len(drawn) > 1:
-            return compose(drawn, rays)
-        colour, depth, confidence = layers[id(shown.keyframes[0].warp)]
-        return colour.copy(), depth.copy(), confidence.copy()
 
-    def continued(self, picture: Picture, shape: tuple[int, int], wraps: bool) -> Floats:
-        drawn = picture.colour.reshape(*shape, 3)
-        depth, confidence = picture.depth.reshape(shape), picture.confidence.reshape(shape)
-        image = continue_unseen(drawn, depth, confidence, wraps)
-        return mixed_in(image, drawn, picture.guessed.reshape(shape)) if picture.guessed.any() else image
+def _warped(rays: Rays, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawing:
+    """Compose the keyframes' panoramas, warped by their depth."""
+    drawn = []
+    for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
+        assert keyframe.warp is not None
+        if id(keyframe.warp) not in layers:
+            layers[id(keyframe.warp)] = keyframe.warp.draw(rays)
+        drawn.append(Layer(keyframe.prior, gain, *layers[id(keyframe.warp)]))
+    if len(drawn) > 1:
+        return compose(drawn, rays)
+    colour, depth, confidence = layers[id(shown.keyframes[0].warp)]
+    return colour.copy(), depth.copy(), confidence.copy()
 
-    def painted(self, picture: Picture, image: Floats) -> Painted:
-        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        return rgb, picture.depth, picture.confidence
+
+def continued(picture: Picture, shape: tuple[int, int], wraps: bool) -> Floats:
+    """The image (H, W, 3) with unknown parts filled from their surroundings and the guesses blended in."""
+    drawn = picture.colour.reshape(*shape, 3)
+    depth, confidence = picture.depth.reshape(shape), picture.confidence.reshape(shape)
+    image = continue_unseen(drawn, depth, confidence, wraps)
+    return mixed_in(image, drawn, picture.guessed.reshape(shape)) if picture.guessed.any() else image
+
+
+def painted(picture: Picture, image: Floats) -> Painted:
+    """The image of ``continued``, or a blend of several, in 8 bit; depth and confidence of ``picture``."""
+    rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+    return rgb, picture.depth, picture.confidence

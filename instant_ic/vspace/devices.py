@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from instant_ic.vspace.canvas import Canvas
 from instant_ic.vspace.config import FieldConfig, GeometryConfig, TrainConfig, VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import Device, Lattice, Rays, Scene
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import prepare
-from instant_ic.vspace.store import KeyframeSet, ready
 from instant_ic.vspace.view import perspective_rays
-from instant_ic.vspace.warp import Pyramid
 
 MakeDevice = Callable[[FieldConfig, TrainConfig], Device]
 AGREEMENT = 0.1
@@ -127,35 +123,6 @@ def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfi
     alike = np.isclose(depths[0], depths[1], rtol=0.02) & np.all(np.abs(colours[0] - colours[1]) < 0.05, axis=1)
     if alike.mean() < 0.9:
         raise DeviceError(f"only {alike.mean():.0%} of an image's pixels are as plain torch renders them")
-    if importlib.util.find_spec("numba") is not None:  # without it nothing is warped
-        check_canvas(ours.canvas, theirs.canvas)
-
-
-def check_canvas(ours: Canvas, theirs: Canvas, size: tuple[int, int] = (160, 90)) -> None:
-    """Compare views of a scratch keyframe's warp from two poses with another canvas'.
-
-    Raises:
-        DeviceError: the images are not alike.
-    """
-    rgb = np.zeros((32, 64, 3), np.uint8)
-    rgb[:, ::8] = (250, 120, 30)
-    depth = np.full((32, 64), 2.0, np.float32)
-    depth[10:20, 28:40] = 1.0  # something with edges, and with a background that nobody has seen
-    prior = prepare(rgb, depth, np.eye(4), 0.05, GeometryConfig(), 64)
-    shown = KeyframeSet((ready(0, prior, Pyramid.of(prior.rgb)),), np.ones((1, 3), np.float32))
-    for x, y in ((0.3, 0.4), (1.9, 0.0)):  # from near a wall few quads cover the whole image
-        pose = np.eye(4)
-        pose[:2, 3] = x, y
-        rays = perspective_rays(pose, *size, 1.5)
-        painted = []
-        for canvas in (ours, theirs):
-            picture = canvas.draw(rays, shown, 1.0, None, {})
-            painted.append(canvas.painted(picture, canvas.continued(picture, rays.shape, False)))
-        colours, depths, confidences = zip(*painted, strict=True)
-        alike = np.abs(colours[0].astype(int) - colours[1]).max(axis=2).reshape(-1) < 12
-        alike &= np.isclose(depths[0], depths[1], rtol=0.02) & (confidences[0] == confidences[1])
-        if alike.mean() < 0.97:
-            raise DeviceError(f"only {alike.mean():.0%} of a warped image's pixels are as plain torch renders them")
 
 
 def _scratch(field: FieldConfig) -> tuple[Scene, Rays]:

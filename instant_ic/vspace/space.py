@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
-from instant_ic.vspace.canvas import CpuCanvas, Drawing, Painted, Picture
+from instant_ic.vspace import canvas
+from instant_ic.vspace.canvas import Drawing, Painted, Picture
 from instant_ic.vspace.compose import exposure_gains, moved
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_out_of_memory, make_device
@@ -128,7 +129,7 @@ class VirtualSpace(Drawn):
         self._device, self._warning = make_device(self.config)
         self._can_warp = importlib.util.find_spec("numba") is not None
         if self.config.source == "auto":
-            source = "warp" if self._can_warp and isinstance(self._device.canvas, CpuCanvas) else "field"
+            source = "warp" if self._can_warp and not self._device.on_gpu else "field"
             self.config = dataclasses.replace(self.config, source=source)
         # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
         self._store = KeyframeStore(self.config.keyframes + 2)
@@ -368,7 +369,7 @@ class VirtualSpace(Drawn):
 
         def draw(device: Device) -> Painted:
             picture = self._drawn(device, rays, shown, self._can_warp, {})
-            return device.canvas.painted(picture, picture.colour)
+            return canvas.painted(picture, picture.colour)
 
         _, depth, confidence = self._on_device(draw)
         return self._judge(rays, depth, confidence)
@@ -406,7 +407,7 @@ class VirtualSpace(Drawn):
     def _painted(self, device: Device, rays: Rays, around: bool) -> Painted:
         """Render the shown keyframes, blended with those shown before; ``around``: a panorama, not warped."""
         assert self._shown is not None
-        canvas, warps = device.canvas, self._can_warp and not around
+        warps = self._can_warp and not around
         layers: dict[int, Drawing] = {}  # a keyframe of both sets is rendered once
         picture = self._drawn(device, rays, self._shown, warps, layers)
         image = canvas.continued(picture, rays.shape, around)
@@ -423,8 +424,8 @@ class VirtualSpace(Drawn):
         share, depth_share = self._panorama_share, self.config.picture.depth_share(self._psnr_db)
         field = None
         if share < 1 or not warps:
-            field = device.drawn(rays, 0.0 if warps else share, depth_share)
-        return device.canvas.draw(rays, shown if warps else None, share, field, layers)
+            field = device.draw(rays, 0.0 if warps else share, depth_share)
+        return canvas.draw(rays, shown if warps else None, share, field, layers)
 
     @property
     def _panorama_share(self) -> float:

@@ -10,11 +10,9 @@ import torch
 
 from instant_ic.experiments import box_room
 from instant_ic.vspace import FieldConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig, devices
-from instant_ic.vspace.canvas import CpuCanvas
-from instant_ic.vspace.devices import DeviceError, check_canvas, check_device, make_device
+from instant_ic.vspace.devices import DeviceError, check_device, make_device
 from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.torch_device import TorchDevice
-from instant_ic.vspace.torch_canvas import TorchCanvas
 
 CONFIG = VirtualSpaceConfig(
     field=FieldConfig(levels=2, log2_table=10, hidden=8), train=TrainConfig(ray_columns=16, ray_rows=16)
@@ -140,19 +138,3 @@ def test_the_check_compares_pictures_too():
     check_device(Broken, plain, CONFIG.field)
     with pytest.raises(DeviceError, match="of an image's pixels"):
         check_device(WrongColours, plain, CONFIG.field)
-
-
-def test_the_check_compares_warped_pictures_too():
-    class WrongCanvas(TorchCanvas):
-        fault = "colour"
-
-        def draw(self, *arguments):
-            picture = super().draw(*arguments)
-            return dataclasses.replace(picture, **{self.fault: 0.5 * getattr(picture, self.fault)})
-
-    check_canvas(TorchCanvas("cpu"), CpuCanvas())  # plain torch's own are right
-    for fault in ("colour", "depth", "confidence"):
-        wrong = WrongCanvas("cpu")
-        wrong.fault = fault
-        with pytest.raises(DeviceError, match="of a warped image's pixels"):
-            check_canvas(wrong, CpuCanvas(), (48, 27))

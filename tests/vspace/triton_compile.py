@@ -6,7 +6,6 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from instant_ic.vspace import triton_warp
 from instant_ic.vspace.nerf import triton_kernels
 from instant_ic.vspace.nerf.triton_device import ENTRIES, TILE, TRAIN_BLOCK
 
@@ -17,16 +16,12 @@ KERNELS = [
     (triton_kernels.adam_table, {"F": 4, "B": ENTRIES}),
     (triton_kernels.adam_network, {"COUNT": 1188, "B": 2048}),
     (triton_kernels.draw, {**FIELD, "B": TILE}),
-    (triton_warp._draw_patches, {"QUARTERS": False, "B": triton_warp.PATCHES, "MOST": triton_warp.SMALL}),
-    (triton_warp._draw_patches, {"QUARTERS": True, "B": triton_warp.PATCHES, "MOST": triton_warp.SMALL}),
-    (triton_warp._look_up, {"B": triton_warp.PIXELS}),
 ]
 NUMBERS = {
-    "i32": "columns rows width height w h keyframes count size nx ny nz levels panorama_width",
-    "fp32": "cell panorama_share depth_share beta1 beta2 epsilon half pixel",
-    "*u8": "rgb depth_edge usable known grid marks texels",
-    "*i32": "sources items buffer",
-    "*i64": "starts sizes",
+    "i32": "columns rows width height w h keyframes count size nx ny nz",
+    "fp32": "cell panorama_share depth_share beta1 beta2 epsilon",
+    "*u8": "rgb depth_edge usable known grid",
+    "*i32": "sources",
     "*fp16": "half_table",
 }
 KINDS = {name: kind for kind, names in NUMBERS.items() for name in names.split()}
@@ -37,8 +32,6 @@ def kind_of(kernel, name, constants):
         return "constexpr"
     if name == "table" and kernel is not triton_kernels.adam_table:
         return "*fp16"  # as the others read it
-    if name in ("rows", "columns") and kernel is triton_warp._draw_patches:
-        return "*fp32"
     return KINDS.get(name, "*fp32")
 
 

@@ -216,11 +216,12 @@ class Device(Protocol):
     """A backend that trains and renders: ``numba_device``, ``torch_device`` or ``triton_device``.
 
     Attributes:
-        canvas: what puts its images together, a ``canvas.Canvas``.
+        name: of the hardware and the backend, for the status.
+        on_gpu: whether it computes on a GPU.
     """
 
     name: str
-    canvas: Any
+    on_gpu: bool
 
     def load(self, parameters: FieldParameters) -> None:
         """Load parameters and reset the optimiser's moments."""
@@ -244,9 +245,6 @@ class Device(Protocol):
                 field's. With 1 the colour of surfaces without confidence is not worked out.
             depth_share: of the keyframe's depth in the signed distance; the rest is the field's.
         """
-
-    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Any, Any, Any]:
-        """As ``draw``, in arrays as ``canvas`` takes them."""
 
     def parameters(self) -> FieldParameters:
         """A copy of the present parameters."""

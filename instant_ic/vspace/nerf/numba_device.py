@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.vspace.canvas import CpuCanvas
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf import kernels, march, volume
 from instant_ic.vspace.nerf.field import (
@@ -47,10 +46,10 @@ class NumbaDevice:
     """See ``field.Device``. Not thread-safe: one thread at a time."""
 
     name = "cpu (numba)"
+    on_gpu = False
 
     def __init__(self, field: FieldConfig, train: TrainConfig) -> None:
         self.first_stride = FIRST_STRIDE
-        self.canvas = CpuCanvas()
         self._train = train
         self._density = field.geometry == "density"
         self._losses = np.array([train.depth_weight, train.opacity_weight, train.distortion_weight], np.float32)
@@ -154,8 +153,6 @@ class NumbaDevice:
                 priors.band, rays.origin, rays.directions, guide, confidence, np.float32(panorama_share), colour,
             )  # fmt: skip
         return colour, depth, confidence
-
-    drawn = draw
 
     @staticmethod
     def _query(drawn: DrawnField, rays: Rays, depth: Floats, colour: Floats) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from instant_ic.vspace.canvas import Canvas, CpuCanvas
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf import reference, volume_reference
 from instant_ic.vspace.nerf.field import (
@@ -23,7 +22,6 @@ from instant_ic.vspace.nerf.field import (
     volume_rays,
 )
 from instant_ic.vspace.nerf.reference import TorchField, TorchGrid, TorchPrior, TrainState
-from instant_ic.vspace.torch_canvas import TorchCanvas
 from instant_ic.vspace.view import LensRays
 
 RAYS_AT_ONCE = 1 << 18
@@ -64,8 +62,7 @@ class TorchDevice:
         self._colour_weight, self._distance_weight = weights
         self._level_rates = torch.from_numpy(level_rates(train, field.levels)).to(device)[:, None, None]
         self._newest_lens: tuple[Floats, Tensor] | None = None
-        # On the CPU numba's is faster by far.
-        self.canvas: Canvas = TorchCanvas(device) if device == "cuda" else CpuCanvas()
+        self.on_gpu = device == "cuda"
         self.load(FieldParameters.random(field, train.seed))
 
     def load(self, parameters: FieldParameters) -> None:
@@ -124,22 +121,14 @@ class TorchDevice:
         error = sum((w * loss for w, loss in zip(weights, losses, strict=True)), torch.zeros((), device=self._device))
         return error, losses[0] / share[0], losses[1] / share[1]
 
-    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        colour, depth, confidence = self._drawn(rays, panorama_share, depth_share)
-        return colour.cpu().numpy(), depth.cpu().numpy(), confidence.cpu().numpy()
-
-    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Any, Any, Any]:
-        draw = self._drawn if isinstance(self.canvas, TorchCanvas) else self.draw
-        return draw(rays, panorama_share, depth_share)
-
     @torch.no_grad()
-    def _drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Tensor, Tensor, Tensor]:
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         drawn = self._field, self._priors, self._grid
         origin, directions = torch.from_numpy(rays.origin).to(self._device), self._directions(rays)
         shares = panorama_share, depth_share
         draw = self._draw_density if self._density else self._draw
         parts = [draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
-        colour, depth, confidence = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
+        colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
 
     def _directions(self, rays: Rays) -> Tensor:

@@ -27,13 +27,11 @@ from instant_ic.vspace.nerf.field import (
     ray_sources,
     sample_weights,
 )
-from instant_ic.vspace.torch_canvas import TorchCanvas
 from instant_ic.vspace.view import LensRays
 
 # Compiled kernels stay with what else the project keeps; has to be set before triton is imported.
 os.environ.setdefault("TRITON_CACHE_DIR", str(paths.cache_dir() / "triton"))
 
-from instant_ic.vspace import triton_warp
 from instant_ic.vspace.nerf import triton_kernels as kernels
 
 TRAIN_BLOCK = 64
@@ -99,8 +97,8 @@ class TritonDevice:
         if field.geometry != "distance":
             raise ValueError(f"the Triton kernels know geometry distance only (got {field.geometry!r})")
         self._train, self._device = train, device
-        self._graphs = device == "cuda"
-        self.name = f"{torch.cuda.get_device_name()} (triton)" if self._graphs else f"{device} (triton)"
+        self.on_gpu = device == "cuda"
+        self.name = f"{torch.cuda.get_device_name()} (triton)" if self.on_gpu else f"{device} (triton)"
         features, inputs = field.features, field.levels * field.features
         self._shape = {
             "LEVELS": field.levels,
@@ -115,7 +113,6 @@ class TritonDevice:
         self._level_rates = level_rates(train, field.levels)
         self._scene: _GpuScene | None = None
         self._newest_lens: tuple[Floats, Tensor] | None = None
-        self.canvas = TorchCanvas(device, triton_warp.KERNELS)
         self._p = self._uploaded(FieldParameters.random(field, train.seed))
         self._buffers = self._new_buffers()
         self._steps = 0
@@ -139,7 +136,7 @@ class TritonDevice:
         if scene.keyframes > 1 or self._steps == 1:
             b.sources.copy_(torch.from_numpy(ray_sources(scene.keyframes, len(b.sources), self._steps)))
         # The first step compiles, which a capture does not allow; from the second on it is the graph.
-        if self._graphs and b.graph is None and self._steps == 2:
+        if self.on_gpu and b.graph is None and self._steps == 2:
             b.graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(b.graph):
                 self._launch_step(scene)
@@ -179,10 +176,6 @@ class TritonDevice:
         )  # fmt: skip
 
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        colour, depth, confidence = self.drawn(rays, panorama_share, depth_share)
-        return colour.cpu().numpy(), depth.cpu().numpy(), confidence.cpu().numpy()
-
-    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Tensor, Tensor, Tensor]:
         assert self._scene is not None, "set_scene first"
         p, scene = self._p, self._scene
         q = scene.priors
@@ -203,7 +196,9 @@ class TritonDevice:
             *scene.grid.shape, scene.cell_m, float(panorama_share), float(depth_share), colour, depth, confidence,
             **self._shape, B=TILE,
         )  # fmt: skip
-        return colour[: 3 * pixels].view(pixels, 3), depth[:pixels], confidence[:pixels]
+        fetched = out.cpu().numpy()
+        colours = fetched[: 3 * pixels].reshape(pixels, 3)
+        return colours, fetched[3 * room : 3 * room + pixels], fetched[4 * room : 4 * room + pixels]
 
     def _lens(self, rays: Rays) -> tuple[Tensor, Floats]:
         """Directions of a view on the GPU, and how they are turned into the map; a lens is uploaded once."""
