@@ -14,6 +14,8 @@ MOST_SIGMA = 0.5
 """Relative standard deviation above which depth counts as filled in; views of it are less confident."""
 
 
+MOST_COORDINATE_M = 100_000.0
+"""Places farther from the map's origin have no centimetres in float32."""
 EDGE_RAD = 0.05
 """Distance to each side of an edge within which depth may belong to either surface."""
 
@@ -146,6 +148,9 @@ def _check_pose(map_from_camera: NDArray[np.floating]) -> None:
     pose = np.asarray(map_from_camera, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise KeyframeError(f"pose must be a finite 4x4 matrix (got shape {pose.shape})")
+    far = float(np.abs(pose[:3, 3]).max())
+    if far > MOST_COORDINATE_M:
+        raise KeyframeError(f"pose lies {far:.3g} m from the map's origin (at most {MOST_COORDINATE_M:.0f} m)")
     rotation = pose[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise KeyframeError("pose has no rotation matrix in it")
@@ -164,9 +169,8 @@ def _checked_depth(
         raise KeyframeError(f"depth is negative (smallest {float(depth_m.min()):.3f} m)")
     # Geometry does not gain from more than 0.35° a pixel, and tears and occupancy cost by the pixel.
     step = max(1, depth_m.shape[1] // 1024)
-    depth = np.ascontiguousarray(depth_m[::step, ::step], np.float32)
-    if depth.shape[1] != 2 * depth.shape[0]:
-        depth = depth[: depth.shape[1] // 2, : 2 * depth.shape[0]]
+    rows = depth_m.shape[0] // step
+    depth = np.minimum(depth_m[::step, ::step][:rows, : 2 * rows], config.max_depth_m).astype(np.float32, order="C")
     content = np.full(depth.shape, ROOM, np.uint8)
     content[sky_region(depth == 0, config.sky_share)] = SKY
     content[robot_region(depth.shape[0], config.body_below_deg, robot)] = ROBOT

@@ -41,8 +41,8 @@ class Occupancy:
 def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
     """Points of the prior's surfaces in the map frame, dense enough to leave no gap of a cell, (N, 3).
 
-    Quads without a depth edge are divided where their corners are further apart than a cell (slanted planes), up to
-    16 × 16 parts. Along a quad the inverse depth is linear. An infinite ``cell_m`` gives the pixels' own points.
+    Quads of the room without a depth edge are divided where their corners are further apart than a cell (slanted
+    planes), up to 16 × 16 parts. Along a quad the inverse depth is linear. An infinite ``cell_m`` gives the pixels' own points.
     """
     height, width = prior.inverse_depth.shape
     directions = equirect_directions(width, height)
@@ -57,7 +57,9 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
     across = np.linalg.norm(np.roll(points, -1, 1) - points, axis=2)[:-1]
     parts = np.ceil(np.maximum(down, across) / cell_m)
     parts = 2 ** np.ceil(np.log2(np.clip(parts, 1, _MAX_PARTS))).astype(np.intp)
-    parts[(prior.depth_edge[:-1] > 0) | ~room[:-1]] = 1
+    right = np.roll(room, -1, 1)
+    whole = room[:-1] & right[:-1] & room[1:] & right[1:]  # a corner in the sky may lie outside of all rooms
+    parts[(prior.depth_edge[:-1] > 0) | ~whole] = 1
     for count in np.unique(parts):
         if count == 1:
             continue
