@@ -42,7 +42,8 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
     """Points of the prior's surfaces in the map frame, dense enough to leave no gap of a cell, (N, 3).
 
     Quads of the room without a depth edge are divided where their corners are further apart than a cell (slanted
-    planes), up to 16 × 16 parts. Along a quad the inverse depth is linear. An infinite ``cell_m`` gives the pixels' own points.
+    planes), up to 16 × 16 parts. Along a quad the inverse depth is linear. An infinite ``cell_m`` gives the pixels'
+    own points.
     """
     height, width = prior.inverse_depth.shape
     directions = equirect_directions(width, height)
