@@ -150,8 +150,22 @@ class TritonDevice:
         return colour, distance / max(sure / count, 1e-3) / self._train.distance_weight
 
     def _launch_step(self, scene: _GpuScene) -> None:
-        b, p, q, train = self._buffers, self._p, scene.priors, self._train
+        self._launch_gradient(scene)
+        b, p = self._buffers, self._p
         levels, size, features = self._table_shape
+        kernels.adam_table[(levels * size // ENTRIES,)](
+            p.master, p.table, b.table_grad, *b.table_moments, b.rates, size, BETA1, BETA2, EPSILON,
+            F=features, B=ENTRIES,
+        )  # fmt: skip
+        kernels.adam_network[(1,)](
+            p.network, b.network_grad, *b.network_moments, b.rates[-1:], BETA1, BETA2, EPSILON,
+            COUNT=len(p.network), B=_power_of_two(len(p.network)),
+        )  # fmt: skip
+
+    def _launch_gradient(self, scene: _GpuScene) -> None:
+        """Sample the batch's rays and add its gradients to the buffers, which Adam clears."""
+        b, p, q, train = self._buffers, self._p, scene.priors, self._train
+        size = self._table_shape[1]
         height, width = q["rgb"].shape[1:3]
         h, w = q["inverse_depth"].shape[1:]
         b.sums.zero_()
@@ -165,14 +179,6 @@ class TritonDevice:
             p.table, size, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.keyframes,
             b.points, b.target, b.weight, self._colour_weight, self._distance_weight, count,
             b.table_grad, b.network_grad, b.sums, **self._shape, B=TRAIN_BLOCK,
-        )  # fmt: skip
-        kernels.adam_table[(levels * size // ENTRIES,)](
-            p.master, p.table, b.table_grad, *b.table_moments, b.rates, size, BETA1, BETA2, EPSILON,
-            F=features, B=ENTRIES,
-        )  # fmt: skip
-        kernels.adam_network[(1,)](
-            p.network, b.network_grad, *b.network_moments, b.rates[-1:], BETA1, BETA2, EPSILON,
-            COUNT=len(p.network), B=_power_of_two(len(p.network)),
         )  # fmt: skip
 
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:

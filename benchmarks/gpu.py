@@ -1,0 +1,386 @@
+"""Measures on an NVIDIA GPU what a CPU cannot answer for the virtual space, in steps that run apart; writes JSON.
+
+    python benchmarks/gpu.py [--step kernels,train,views,field-or-warp] [--out runs/gpu] [--dry-run]
+
+- kernels: values and gradients of the Triton kernels against plain torch on the same samples, and the time of both.
+- train: time until views of the field are within 1 dB of its last. The paper needs 3 to 4 s; goal: at most 1 s.
+- views: views a second, alone and while training. The paper has 10; goal: at least 60 at 1280 × 720.
+- field-or-warp: PSNR and SSIM of the field against the warped panoramas, with one and with several keyframes, on views
+  of the places of keyframes that were left out, in the corridor and in generated worlds.
+
+Each step takes less than 10 minutes (``--seconds`` limits a training) and writes OUT/STEP.json, train and field-or-warp
+OUT/STEP.png as well. Wall time; every call ends with a copy to the CPU, so nothing is still running. ``--dry-run`` does
+the same at tiny sizes on the CPU: its figures say only that the script works. Otherwise an NVIDIA GPU, torch's CUDA
+build and `pip install 'instant-ic[triton]'` are needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib.util
+import json
+import math
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from instant_ic.geometry.image_quality import psnr_db, ssim
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.vspace import FieldConfig, GeometryConfig, PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.nerf import reference
+from instant_ic.vspace.nerf.field import Device, Lattice, Scene, sample_weights
+from instant_ic.vspace.nerf.occupancy import build_occupancy
+from instant_ic.vspace.nerf.torch_device import TorchDevice
+from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.view import perspective_rays
+
+FOV = math.pi / 2
+FIELD_ONLY = PictureConfig(panorama_until_db=0.0, field_from_db=0.0)
+TARGETS = {
+    "kernels": {"gradient_error": "at most 0.01 of the largest", "same_depth": "at least 0.96"},
+    "train": {"within_1_db_s": "at most 1 (paper: 3 to 4)"},
+    "views": {"fps_1280x720": "at least 60 (paper: 10)", "fps_training_1280x720": "at least 30", "first_view_s": "0.3"},
+    "field-or-warp": {"gain_db": "field over warp, above 0 with three keyframes"},
+}
+KEYFRAMES = {"one": (0.0,), "three": (-1.5, -0.75, 0.0), "three, one ahead": (-1.5, 3.0, 0.0)}
+"""Places of the keyframes along x in metres, in order of arrival."""
+LEFT_OUT = {0.5: (0.5, 0.0, 0.0), 1.0: (1.0, -0.2, 0.3), 1.5: (1.5, 0.2, -0.4), 2.0: (2.0, 0.0, 0.0)}
+"""Places of the judged views by distance from the newest keyframe: x, y in metres, yaw."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Sizes of a run. ``devices``: names as in ``VirtualSpaceConfig.device``, the first is the one to judge."""
+
+    dry: bool
+    out: Path
+    devices: tuple[str, ...]
+    seconds: float
+    panorama: int = 1024
+    sizes: tuple[tuple[int, int], ...] = ((320, 180), (640, 360), (1280, 720))
+    view: tuple[int, int] = (640, 360)
+    worlds: tuple[str, ...] = ("corridor", "random:11", "random:12")  # nothing was tuned on these two
+    repeats: int = 15
+    steps: int = 50
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+    geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
+
+    @classmethod
+    def tiny(cls, out: Path) -> Setup:
+        """Sizes of a dry run."""
+        small = FieldConfig(levels=2, log2_table=10, hidden=16)
+        train = TrainConfig(ray_columns=16, ray_rows=16, iterations=20)
+        return cls(
+            *(True, out, ("cpu", "torch-cpu"), 0.2, 64, ((32, 18), (48, 27), (64, 36)), (48, 27), ("corridor",), 2, 2),
+            *(small, train, GeometryConfig(cell_m=0.2)),
+        )
+
+    def config(self, device: str, **changes: Any) -> VirtualSpaceConfig:
+        return VirtualSpaceConfig(device=device, field=self.field, train=self.train, geometry=self.geometry, **changes)
+
+
+class Place:
+    """A simulated world seen from its start; poses are relative to that."""
+
+    def __init__(self, name: str, setup: Setup) -> None:
+        from instant_ic.sim.render import EquirectRenderer
+        from instant_ic.sim.worlds import corridor_world, make_world
+
+        # A dry run needs no soft light, which takes seconds.
+        world = corridor_world(light_cell_m=1.0) if setup.dry else make_world(name)
+        x, y, _ = world.spawn
+        self._renderer, self._setup = EquirectRenderer(world), setup
+        # Along the longest free way: keyframes and views lie on it.
+        free_m = self._renderer.render(pose_matrix(x, y, 1.2), 64, 32).depth_m[14:18].min(axis=0)
+        ways = np.minimum(free_m, np.roll(free_m, 32) + 1.5)  # ahead, and half as far behind
+        self.start = pose_matrix(x, y, 1.2, yaw=math.pi - (int(np.argmax(ways)) + 0.5) * (2 * math.pi / 64))
+
+    def keyframe(self, x: float) -> tuple[Any, ...]:
+        """Arguments of ``VirtualSpace.set_keyframe``."""
+        pose, width = self.start @ pose_matrix(x), self._setup.panorama
+        picture = self._renderer.render(pose, width, width // 2, supersample=2)
+        return picture.rgb, picture.depth_m, pose, 0.02
+
+    def truth(self, pose: Any) -> Any:
+        """The world from a pose, (H, W, 3) uint8."""
+        return self._renderer.render_perspective(self.start @ pose, *self._setup.view, FOV, supersample=2).rgb
+
+    def shown(self, space: VirtualSpace, pose: Any) -> Any:
+        """The same in a space."""
+        return space.render(self.start @ pose, *self._setup.view, FOV).rgb
+
+
+def median_s(call: Callable[[], object], repeats: int) -> float:
+    """Median wall time of a call, seconds, after one that does not count."""
+    call()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def has_triton() -> bool:
+    return importlib.util.find_spec("triton") is not None
+
+
+def kernels(setup: Setup) -> dict[str, Any]:
+    """Errors, gradients, parameters after some steps and views, with one keyframe and with three."""
+    place = Place(setup.worlds[0], setup)
+    result: dict[str, Any] = {}
+    for name in ("one", "three"):
+        priors = [prepare(*place.keyframe(x), setup.geometry, setup.panorama) for x in reversed(KEYFRAMES[name])]
+        lattice = Lattice.for_prior(priors[0], setup.field)
+        gains = np.array([[1, 1, 1], [0.9, 1.1, 1.2], [1.1, 1.0, 0.9]], np.float32)[: len(priors)]
+        result[name] = _compared(Scene(tuple(priors), lattice, build_occupancy(priors, setup.geometry), gains), setup)
+    return result
+
+
+def _compared(scene: Scene, setup: Setup) -> dict[str, Any]:
+    torch_name = "cpu" if setup.dry else "cuda"
+    peer = TorchDevice(setup.field, setup.train, torch_name)
+    ours, result = _judged(setup), {}
+    for device in (ours, peer):
+        device.set_scene(scene)
+    rng = np.random.default_rng(5)
+    shape = (setup.train.ray_columns * setup.train.ray_rows, 3)
+    result["gradient_error"] = _gradient_error(ours, peer, rng.random(shape, np.float32), setup)
+    errors = []
+    for _ in range(setup.steps):
+        uniform = rng.random(shape, np.float32)
+        errors.append([device.step(uniform, 0.02, 0.01) for device in (ours, peer)])
+    result["step_errors"] = {"first": errors[0], "last": errors[-1]}
+    tables = [device.parameters().table.reshape(-1) for device in (ours, peer)]
+    result["correlation_of_tables"] = round(float(np.corrcoef(*tables)[0, 1]), 5)
+    ours.load(peer.parameters())
+    ours.set_scene(scene)
+    rays = perspective_rays(scene.prior.map_from_camera @ pose_matrix(0.8, 0.2, yaw=0.2), *setup.view, FOV)
+    for shares in ((0.0, 0.0), (0.6, 0.5), (1.0, 1.0)):
+        (colour, depth, sure), (colours, depths, sures) = (device.draw(rays, *shares) for device in (ours, peer))
+        same = np.isclose(depth, depths, rtol=0.01)
+        result[f"view, panorama {shares[0]:g}, depth {shares[1]:g}"] = {
+            "same_depth": round(float(same.mean()), 4),
+            "same_confidence": round(float(np.mean(sure[same] == sures[same])), 4),
+            "colour_error_p98": round(float(np.quantile(np.abs(colour[same] - colours[same]), 0.98)), 4),
+        }
+    uniform = rng.random(shape, np.float32)
+    for name, device in (("ours", ours), ("torch", peer)):
+        step_s = median_s(lambda d=device: d.step(uniform, 1e-4, 1e-4), setup.repeats)
+        view_s = median_s(lambda d=device: d.draw(rays, 0.0, 0.5), setup.repeats)
+        result[name] = {"step_ms": round(1e3 * step_s, 3), "view_ms": round(1e3 * view_s, 3)}
+    return result
+
+
+def _judged(setup: Setup) -> Device:
+    if not setup.dry or has_triton():
+        from instant_ic.vspace.nerf.triton_device import TritonDevice
+
+        return TritonDevice(setup.field, setup.train, "cpu" if setup.dry else "cuda")
+    from instant_ic.vspace.nerf.numba_device import NumbaDevice
+
+    device = NumbaDevice(setup.field, setup.train)
+    device.first_stride = 1  # interpolates nothing, as the others
+    return device
+
+
+def _gradient_error(ours: Any, peer: TorchDevice, uniform: Any, setup: Setup) -> dict[str, float] | str:
+    """Largest difference of the gradients of one batch, as a share of the largest gradient: table and network."""
+    if not hasattr(ours, "_launch_gradient"):
+        return "not measured: triton is not installed"
+    ours.step(uniform, 1e-9, 1e-9)  # uploads the batch, and compiles
+    peer.load(ours.parameters())
+    b = ours._buffers
+    for grad in (b.table_grad, b.network_grad):
+        grad.zero_()
+    ours._launch_gradient(ours._scene)
+    to = peer._device
+    points, target, weight = (tensor.to(to) for tensor in (b.points, b.target, b.weight))
+    colour, distance = (torch.from_numpy(w).to(to) for w in sample_weights(setup.train))
+    scene = ours._scene
+    field = dataclasses.replace(
+        peer._field, cells_per_m=scene.cells_per_m.to(to), origin=scene.origin.to(to), focus=scene.focus.to(to)
+    )
+    loss = reference.loss(reference.query(field, points), target, colour * weight[:, 0], distance * weight[:, 1])
+    expected = torch.autograd.grad(sum(loss), field.parameters())
+    network = torch.cat([grad.reshape(-1) for grad in expected[1:]])
+    found = {"table": (b.table_grad, expected[0].reshape(-1)), "network": (b.network_grad, network)}
+    error = {key: float((a.to(to) - e).abs().max() / e.abs().max()) for key, (a, e) in found.items()}
+    for grad in (b.table_grad, b.network_grad):
+        grad.zero_()
+    return {key: round(value, 6) for key, value in error.items()}
+
+
+def train(setup: Setup) -> dict[str, Any]:
+    """Curve of views of the field by training time; rendering in between is not counted."""
+    result: dict[str, Any] = {}
+    rows = []
+    for world in setup.worlds:
+        place = Place(world, setup)
+        poses = [pose_matrix(), pose_matrix(1.0), pose_matrix(0.5, 0.4, yaw=0.35)]
+        truth, keyframe = [place.truth(pose) for pose in poses], place.keyframe(0.0)
+        images = {}
+        for device in setup.devices:
+            space = VirtualSpace(setup.config(device, picture=FIELD_ONLY))
+            space.set_keyframe(*keyframe)
+            space.train(iterations=3)  # compiles
+            space.set_keyframe(*keyframe)
+            spent, curve = 0.0, []
+            while spent < setup.seconds and not space.status.converged:
+                start = time.perf_counter()
+                space.train(iterations=10)
+                spent += time.perf_counter() - start
+                images[device] = [place.shown(space, pose) for pose in poses]
+                values = [psnr_db(view, real) for view, real in zip(images[device], truth, strict=True)]
+                curve.append((round(spent, 4), round(statistics.mean(values), 3)))
+            final = curve[-1][1]
+            result.setdefault(world, {})[device] = {
+                "device": space.status.device,
+                "within_1_db_s": next(at for at, db in curve if db >= final - 1),
+                "within_3_db_s": next(at for at, db in curve if db >= final - 3),
+                "final_psnr_db": final,
+                "iterations": space.status.iterations,
+                "ms_per_iteration": round(1e3 * spent / space.status.iterations, 3),
+                "curve_s_db": curve[:: max(1, len(curve) // 40)],
+            }
+        rows += [np.hstack(some) for some in (truth, *(images[device] for device in setup.devices))]
+    write_image(setup.out / "train.png", np.vstack(rows))
+    return result
+
+
+def views(setup: Setup) -> dict[str, Any]:
+    """First view after a keyframe and views a second, of the field and as shown (the panoramas' warp first)."""
+    place, result = Place(setup.worlds[0], setup), {}
+    first_keyframe, keyframe = place.keyframe(-0.3), place.keyframe(0.0)
+    pose = place.start @ pose_matrix(1.0, 0.1, yaw=0.1)
+    for device in setup.devices:
+        for name, picture in (("field", FIELD_ONLY), ("as shown", PictureConfig())):
+            start = time.perf_counter()
+            space = VirtualSpace(setup.config(device, picture=picture))
+            found: dict[str, Any] = {"device": space.status.device, "start_s": round(time.perf_counter() - start, 2)}
+            space.set_keyframe(*first_keyframe)
+            space.train(iterations=3)
+            for size in setup.sizes:
+                space.render(pose, *size, FOV)  # compiles
+            start = time.perf_counter()
+            space.set_keyframe(*keyframe)
+            space.render(pose, *setup.sizes[-1], FOV)
+            found["first_view_s"] = round(time.perf_counter() - start, 3)
+            space.train(iterations=10 if setup.dry else 200)
+            for width, height in setup.sizes:
+
+                def frame(space: VirtualSpace = space, w: int = width, h: int = height) -> None:
+                    space.render(pose, w, h, FOV)
+
+                def while_training(space: VirtualSpace = space, frame: Callable[[], None] = frame) -> None:
+                    space.train(iterations=10)
+                    frame()
+
+                found[f"fps_{width}x{height}"] = round(1 / median_s(frame, setup.repeats), 1)
+                found[f"fps_training_{width}x{height}"] = round(1 / median_s(while_training, setup.repeats), 1)
+            if not setup.dry:
+                found["gpu_memory_mb"] = round(torch.cuda.max_memory_allocated() / 2**20)
+            result.setdefault(device, {})[name] = found
+    return result
+
+
+def field_or_warp(setup: Setup) -> dict[str, Any]:
+    """Left-out views of the warp, of the field alone and as shown after the training, by world and keyframes."""
+    result: dict[str, Any] = {}
+    rows = []
+    device = setup.devices[0]
+    sources = {
+        "warp": setup.config(device, source="warp", keyframes=3),
+        "field": setup.config(device, keyframes=3, picture=FIELD_ONLY),
+        "as shown": setup.config(device, keyframes=3),
+    }
+    for world in setup.worlds:
+        place = Place(world, setup)
+        poses = {distance: pose_matrix(x, y, yaw=yaw) for distance, (x, y, yaw) in LEFT_OUT.items()}
+        truth = {distance: place.truth(pose) for distance, pose in poses.items()}
+        for name, places in KEYFRAMES.items():
+            taken, found, images = [place.keyframe(x) for x in places], {}, []
+            for source, config in sources.items():
+                space = VirtualSpace(config)
+                for keyframe in taken:
+                    space.set_keyframe(*keyframe)
+                start = time.perf_counter()
+                while source != "warp" and not space.status.converged and time.perf_counter() - start < setup.seconds:
+                    space.train(iterations=10)
+                seconds = time.perf_counter() - start
+                shown = {distance: place.shown(space, pose) for distance, pose in poses.items()}
+                images.append(np.hstack(list(shown.values())))
+                found[source] = {
+                    "psnr_db": {f"{d:g} m": round(psnr_db(view, truth[d]), 2) for d, view in shown.items()},
+                    "ssim": {f"{d:g} m": round(ssim(view, truth[d]), 4) for d, view in shown.items()},
+                    "seconds": round(seconds, 2),
+                }
+            means = {source: statistics.mean(values["psnr_db"].values()) for source, values in found.items()}
+            gain = {"gain_db": round(means["field"] - means["warp"], 2)}
+            result.setdefault(world, {})[name] = found | gain
+            if name == "three":
+                rows += [np.hstack(list(truth.values())), *images]
+    write_image(setup.out / "field-or-warp.png", np.vstack(rows))
+    return result
+
+
+def write_image(path: Path, rgb: Any) -> None:
+    """Rows of images, at most 2560 pixels wide."""
+    rgb = rgb[:, :, ::-1]
+    if rgb.shape[1] > 2560:
+        rgb = cv2.resize(rgb, (2560, round(rgb.shape[0] * 2560 / rgb.shape[1])), interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(path), rgb)
+
+
+STEPS = {"kernels": kernels, "train": train, "views": views, "field-or-warp": field_or_warp}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--step", default=",".join(STEPS), help="steps, by commas (default: all)")
+    parser.add_argument("--out", type=Path, default=Path("runs/gpu"), help="folder of the results (default runs/gpu)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each training at most (default 10)")
+    parser.add_argument("--dry-run", action="store_true", help="tiny sizes on the CPU")
+    arguments = parser.parse_args()
+    steps = arguments.step.split(",")
+    if unknown := sorted(set(steps) - set(STEPS)):
+        parser.error(f"--step: no such step: {', '.join(unknown)}; there are {', '.join(STEPS)}")
+    if not arguments.dry_run and not torch.cuda.is_available():
+        parser.error("torch finds no CUDA device; --dry-run checks the script without one")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if arguments.dry_run:
+        os.environ["TRITON_INTERPRET"] = "1"  # before triton is imported
+        torch.set_num_threads(1)  # of tiny work threads wait for each other
+        setup = Setup.tiny(arguments.out)
+    else:
+        setup = Setup(False, arguments.out, ("triton", "torch-cuda"), arguments.seconds)
+    machine = "dry run on the CPU" if setup.dry else torch.cuda.get_device_name()
+    failed = False
+    for step in steps:
+        start = time.perf_counter()
+        try:
+            found: dict[str, Any] = STEPS[step](setup)
+        except RuntimeError as error:  # one step's failure must not hide the others' figures
+            found, failed = {"error": f"{type(error).__name__}: {error}"}, True
+        about = {"step": step, "machine": machine, "python": platform.python_version(), "torch": torch.__version__}
+        result = about | {"targets": TARGETS[step], "took_s": round(time.perf_counter() - start, 1), "result": found}
+        text = json.dumps(result, indent=1)
+        (arguments.out / f"{step}.json").write_text(text + "\n")
+        print(text, flush=True)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
