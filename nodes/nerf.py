@@ -17,6 +17,7 @@ from instant_ic.msg import (
     Keyframe,
     RenderedView,
     ViewRequest,
+    VspaceLayers,
     VspaceStatus,
     compressed_image_message,
     header,
@@ -35,7 +36,9 @@ from instant_ic.vspace.jobs import (
     decode_panorama,
     load_robot_mask,
 )
+from instant_ic.vspace.layers import Layers
 from instant_ic.vspace.schedule import JobSchedule, Turns
+from instant_ic.vspace_messages import layers_message
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,7 @@ class NerfNode(Node[NerfConfig]):
         self.view_out = self.publisher("/vspace/view", RenderedView, qos=SENSOR)
         self.image_out = self.publisher("/vspace/image/compressed", CompressedImage, qos=SENSOR)
         self.status_out = self.publisher("/vspace/status", VspaceStatus, qos=LATCHED)
+        self.layers_out = self.publisher("/vspace/layers", VspaceLayers, qos=LATCHED)
         self.work = self.worker_class(config.space, robot, config.train_nice, warm=not self.lockstep)
         renderer = self.background(self.work.run, self.on_rendered)
         preparer = self.background(self.work.run, self.on_prepared)
@@ -111,7 +115,7 @@ class NerfNode(Node[NerfConfig]):
         self.schedule.start()
         self.subscribe("/keyframe", Keyframe, self.on_keyframe, qos=LATCHED)
         self.subscribe("/view/request", ViewRequest, self.on_request, qos=SENSOR)
-        self.timer(config.status_period_s, self.publish_status)
+        self.timer(config.status_period_s, self.on_timer)
         if self.lockstep:
             self.timer(config.lockstep_period_s, lambda: self.schedule.train(self.config.lockstep_iterations))
         self.publish_status()
@@ -123,7 +127,8 @@ class NerfNode(Node[NerfConfig]):
 
     def on_keyframe(self, keyframe: Any) -> None:
         decode = functools.partial(decode_keyframe, keyframe)
-        self.schedule.offer_keyframe(Incoming(keyframe.id, keyframe, self.clock.now_ns(), decode))
+        image = np.asarray(keyframe.panorama.data, np.uint8).tobytes()
+        self.schedule.offer_keyframe(Incoming(keyframe.id, keyframe, self.clock.now_ns(), decode, image))
 
     def on_request(self, request: Any) -> None:
         most = self.config.max_view_pixels
@@ -140,7 +145,14 @@ class NerfNode(Node[NerfConfig]):
     def on_prepared(self, outcome: Outcome) -> None:
         self.schedule.take_prepared(outcome)
         self.report(outcome)
+        if isinstance(outcome.made, Layers):
+            self.layers_out.publish(layers_message(outcome.made, self.clock.now_ns()))
         self.schedule.next()
+
+    def on_timer(self) -> None:
+        self.schedule.wants_layers = self.layers_out.subscriber_count > 0
+        self.schedule.next()
+        self.publish_status()
 
     def on_rendered(self, outcome: Outcome) -> None:
         changed = self.schedule.take(outcome, self.clock.now_ns())

@@ -20,6 +20,7 @@ from instant_ic.geometry.depth_picture import encode_depth
 from instant_ic.limits import decode_image, load_image
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_device_fault
+from instant_ic.vspace.layers import LayerEncoder
 from instant_ic.vspace.mesh_file import MeshError
 from instant_ic.vspace.mesh_space import Space, make_space
 from instant_ic.vspace.prior import KeyframeError
@@ -32,11 +33,14 @@ KeyframeArrays = tuple[NDArray[np.uint8], NDArray[np.floating], NDArray[np.float
 
 
 class JobKind(enum.Enum):
-    """What a job does. ``PREPARE`` and ``SCENE`` belong to the preparing thread, the others to the rendering thread."""
+    """What a job does. ``PREPARE``, ``LAYERS`` and ``SCENE`` belong to the preparing thread, the others to the
+    rendering thread.
+    """
 
     WARM_UP = "warm_up"
     PREPARE = "keyframe"
     SHOW = "show"
+    LAYERS = "layers"
     SCENE = "scene"
     LEARN = "learn"
     RENDER = "view"
@@ -53,12 +57,15 @@ _INPUT_JOBS = (JobKind.PREPARE, JobKind.SHOW, JobKind.RENDER)
 
 @dataclass(frozen=True)
 class Incoming:
-    """A keyframe and its arrival time; ``decode`` runs on the preparing thread and may raise ``KeyframeError``."""
+    """A keyframe and its arrival time; ``decode`` runs on the preparing thread and may raise ``KeyframeError``;
+    ``image``: the camera's encoded panorama, None where there is none.
+    """
 
     id: int
     message: Any
     arrival_ns: int
     decode: Callable[[], KeyframeArrays]
+    image: bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -147,6 +154,8 @@ class SpaceWorker:
         self.space: Space | None = None
         self._robot, self._nice, self._warm = robot, nice, warm
         self._newest: EncodedView | None = None  # view of the space as it is
+        self._encoder = LayerEncoder()
+        self._sources: dict[int, Incoming] = {}  # of the keyframes by their place in the store
 
     def run(self, job: Job) -> Outcome:
         """Do a job; errors are part of the outcome."""
@@ -178,7 +187,15 @@ class SpaceWorker:
             if self._warm:
                 self._yield_to_others()
             arrays = job.keyframe.decode()
-            return Outcome(job, space.prepare(*arrays) if isinstance(space, VirtualSpace) else arrays)
+            if not isinstance(space, VirtualSpace):
+                return Outcome(job, arrays)
+            prepared = space.prepare(*arrays)
+            self._sources[prepared.keyframes[0].place] = job.keyframe
+            return Outcome(job, prepared)
+        if job.kind is JobKind.LAYERS:
+            sources = [self._sources[keyframe.place] for keyframe in job.made.keyframes]
+            ids, images = [source.id for source in sources], [source.image for source in sources]
+            return Outcome(job, self._encoder.encode(job.made, ids, images))
         if job.kind is JobKind.SCENE and isinstance(space, VirtualSpace):
             return Outcome(job, space.scene_of(job.made))
         if job.kind is JobKind.SHOW and isinstance(space, VirtualSpace):

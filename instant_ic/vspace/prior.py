@@ -110,8 +110,7 @@ def prepare(
     _check_pose(map_from_camera)
     depth, content = _checked_depth(depth_m, config, robot)
     sigma, each = _checked_sigma(relative_sigma, depth_m, depth)
-    if rgb.shape[1] > panorama_width:
-        rgb = _shrunk(rgb, panorama_width // 2, panorama_width)
+    rgb = shrunk(rgb, panorama_width)
     sky = content == SKY
     known: NDArray[np.bool_] = depth > 0
     with np.errstate(divide="ignore"):
@@ -227,13 +226,18 @@ def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.boo
     return sky
 
 
-def _shrunk(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """``area_average`` by OpenCV where it is installed: ten times as fast for ratios that are not integers."""
+def shrunk(rgb: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """A panorama (H, 2 H, 3) area-averaged to ``width`` where it is wider.
+
+    By OpenCV where it is installed: ten times as fast for ratios that are not integers.
+    """
+    if rgb.shape[1] <= width:
+        return rgb
     try:
         import cv2
     except ImportError:
-        return area_average(rgb, height, width)
-    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        return area_average(rgb, width // 2, width)
+    return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _checked_sigma(

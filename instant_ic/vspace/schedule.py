@@ -123,12 +123,15 @@ class JobSchedule:
         self.status: Status | None = None
         self.failure = ""
         self.preparing = False
+        self.wants_layers = False  # somebody receives them
         self._render, self._prepare, self._lockstep = render, prepare, lockstep
         self._waiting_keyframe: Incoming | None = None
         self._waiting_view: ViewOrder | None = None
         self._busy = False  # the rendering thread
         self._todo: deque[Job] = deque()  # the rendering thread's jobs for the keyframe in preparation
         self._learns = False  # the field has something to learn
+        self._shown: Job | None = None  # the newest one that has shown a keyframe
+        self._layers_due = self._scene_due = False  # of that
         self._is_ready, self._ready_seconds = False, 0.0
         self._warned = False  # about the device
         self._frame_rate = FrameRate()
@@ -151,10 +154,8 @@ class JobSchedule:
 
     def next(self) -> None:
         """Give idle threads their next jobs; they stay idle when there is nothing to prepare, render or train."""
-        if self.status is not None and self._waiting_keyframe is not None and not self.preparing:
-            waiting, self._waiting_keyframe = self._waiting_keyframe, None
-            self.preparing = True
-            self._prepare(Job(JobKind.PREPARE, waiting))
+        if self.status is not None and not self.preparing:
+            self._prepare_next()
         if self._busy or self.status is None:
             return
         trains = self._trains and not self._lockstep
@@ -165,6 +166,22 @@ class JobSchedule:
             self._start(Job(JobKind.RENDER, view=order))
         elif trains:
             self._start(Job(JobKind.TRAIN, budget_ms=self.turns.budget_ms()))
+
+    def _prepare_next(self) -> None:
+        """The preparing thread's next job: what the shown keyframe still needs, then the next keyframe."""
+        shown = self._shown
+        if shown is not None and self._layers_due and self.wants_layers:
+            self._layers_due = False
+            job = Job(JobKind.LAYERS, shown.keyframe, made=shown.made)
+        elif shown is not None and self._scene_due:
+            self._scene_due = False
+            job = Job(JobKind.SCENE, shown.keyframe, made=shown.made)
+        elif self._waiting_keyframe is not None:
+            job, self._waiting_keyframe = Job(JobKind.PREPARE, self._waiting_keyframe), None
+        else:
+            return
+        self.preparing = True
+        self._prepare(job)
 
     def train(self, iterations: int) -> None:
         """Train now, unless a job runs or nothing is left to train."""
@@ -183,7 +200,7 @@ class JobSchedule:
     def take_prepared(self, outcome: Outcome) -> None:
         """Pass the preparing thread's result to the rendering thread."""
         job = outcome.job
-        if outcome.error is not None or outcome.refused:
+        if outcome.error is not None or outcome.refused or job.kind is JobKind.LAYERS:
             self.preparing = False
         else:
             kind = JobKind.SHOW if job.kind is JobKind.PREPARE else JobKind.LEARN
@@ -203,10 +220,9 @@ class JobSchedule:
         elif job.kind is JobKind.SHOW:
             self.keyframe, self.failure, self._is_ready = job.keyframe, "", False
             changed = True
-            if self.status is not None and self.status.source == "field":
-                self._prepare(Job(JobKind.SCENE, job.keyframe, made=job.made))
-            else:
-                self.preparing = False
+            self.preparing, self._shown = False, job
+            self._layers_due = self.status is not None and self.status.source != "mesh"
+            self._scene_due = self.status is not None and self.status.source == "field"
         elif outcome.encoded is not None:
             view = outcome.encoded.view
             self._render_ms = 0.0 if self._lockstep else outcome.encoded.render_ms

@@ -5,12 +5,17 @@ import numpy as np
 import pytest
 import trimesh
 
+from instant_ic.bag import BagWriter
 from instant_ic.cli.main import main
 from instant_ic.experiments import box_room
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.vspace import VirtualSpace
+from instant_ic.msg import Empty, serialize, type_name
+from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.export import flight, surface, write_ply
+from instant_ic.vspace.layers import LayerEncoder
 from instant_ic.vspace.space import NotReadyError
+from instant_ic.vspace_messages import layers_message
 
 
 def write_rgb(path, rgb):
@@ -36,6 +41,23 @@ def folder(tmp_path_factory):
 
 def run(folder, verb, *words):
     return main(["vspace", verb, str(folder / "space"), *map(str, words)])
+
+
+def test_the_newest_layers_of_a_bag_are_rendered(tmp_path, capsys):
+    space, picture = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu")), box_room.panorama(np.eye(4), 96)
+    space.set_keyframe(picture.rgb, picture.depth_m, np.eye(4), 0.02)
+    image = cv2.imencode(".png", picture.rgb[..., ::-1])[1].tobytes()
+    message = layers_message(LayerEncoder().encode(space._shown, [3], [image]), 5)
+    view = ["--size", "96x64", "--pose", "0.4,0,0,20", "-o", str(tmp_path / "a.png")]
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.write("/vspace/layers", type_name(message), serialize(message), 5)
+    assert main(["vspace", "render", str(tmp_path / "bag"), *view]) == 0
+    expected = space.render(pose_matrix(0.4, yaw=np.radians(20)), 96, 64, np.pi / 2).rgb
+    assert psnr_db(read_rgb(tmp_path / "a.png"), expected) > 45
+    with BagWriter(tmp_path / "other") as writer:
+        writer.write("/vspace/status", "std_msgs/msg/Empty", serialize(Empty()), 5)
+    assert main(["vspace", "render", str(tmp_path / "other"), *view]) == 1
+    assert "holds no /vspace/layers" in capsys.readouterr().err
 
 
 def test_training_leaves_a_space_and_a_picture_of_it(folder, capsys):

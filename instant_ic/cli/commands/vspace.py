@@ -24,6 +24,7 @@ DEVICES = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
 """Same values as in ``VirtualSpaceConfig``; its module is too heavy to import here."""
 PREVIEW = "preview.png"
 PREVIEW_S = 1.0
+_LAYERS = "/vspace/layers"
 _SIZES = {"perspective": (640, 360), "equirect": (1024, 512), "cube": (512, 512)}
 _TRUE_SIGMA, _MODEL_SIGMA = 0.02, 0.1
 _LITTLE = 0.1
@@ -83,7 +84,8 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _folder(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("space", type=Path, metavar="DIR", help="folder written by ic vspace train")
+    parser.add_argument("space", type=Path, metavar="DIR", help="folder written by ic vspace train; to render or "
+                        f"export, also a bag with {_LAYERS}, of which the newest counts")  # fmt: skip
     parser.add_argument("--device", choices=DEVICES, help="(default: as in training)")
 
 
@@ -298,10 +300,34 @@ def _train(space: VirtualSpace, args: argparse.Namespace, advance: Any) -> bool:
 
 
 def open_space(args: argparse.Namespace) -> VirtualSpace:
-    """Load the saved space given on the command line."""
+    """Load the space given on the command line: a saved one, or the newest layers of a bag."""
     from instant_ic.vspace import VirtualSpace
 
+    if args.space.suffix == ".mcap" or (args.space / "metadata.yaml").exists():
+        return _space_of_bag(args.space)
     return VirtualSpace.load(args.space, args.device)
+
+
+def _space_of_bag(path: Path) -> VirtualSpace:
+    from instant_ic.bag import BagReader
+    from instant_ic.msg import MessageError, deserialize
+    from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
+    from instant_ic.vspace.layers import LayersError, decode
+    from instant_ic.vspace_messages import layers_of
+
+    with BagReader(path) as bag:
+        newest = None
+        for newest in bag.messages([_LAYERS]):  # noqa: B007
+            pass
+    if newest is None:
+        raise UserError(f"{path} holds no {_LAYERS}: record it while the stack runs, with ic bag record")
+    space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))
+    try:
+        layers = layers_of(deserialize(newest.payload, newest.type_name))
+        space.show(decode(layers, space.config.panorama_width, space.config.geometry))
+    except (LayersError, MessageError) as error:
+        raise UserError(f"{path}, newest message of {_LAYERS}: {error}") from error
+    return space
 
 
 def placed(space: VirtualSpace, pose: list[float]) -> NDArray[np.float64]:

@@ -1,0 +1,282 @@
+"""The virtual space as a stack of panoramic layers, which any renderer can show: encoding, and decoding to keyframes.
+
+Each keyframe gives two layers: what the camera saw, in the camera's own image, and what becomes visible behind it.
+``VspaceLayer.msg`` describes the encoding.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.limits import decode_image
+from instant_ic.vspace.background import Background
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.nerf.field import Floats
+from instant_ic.vspace.prior import MOST_SIGMA, MOVED, ROBOT, ROOM, SKY, PanoramaPrior, edge_quads, shrunk
+from instant_ic.vspace.store import Keyframe, KeyframeSet
+from instant_ic.vspace.warp import PanoramaWarp
+
+_CODES = 65535
+_QUALITY = 90
+"""JPEG quality of what has no camera image."""
+
+
+class Kind(enum.IntEnum):
+    """Numbers as in VspaceLayer.msg."""
+
+    SEEN = 0
+    BEHIND = 1
+
+
+class Content(enum.IntEnum):
+    """Content of a pixel (``SEEN``) or of a quad (``BEHIND``); numbers as in VspaceLayer.msg."""
+
+    NOTHING = 0
+    SKY = 1
+    MOVED = 2
+    FILLED = 3
+    MEASURED = 4
+    GUESSED = 5
+
+
+CONTENT, EDGE = np.uint8(15), np.uint8(128)
+"""Bits of the geometry's blue channel."""
+_OF_PRIOR = {ROBOT: Content.NOTHING, SKY: Content.SKY, MOVED: Content.MOVED, ROOM: Content.FILLED}
+
+
+class LayersError(ValueError):
+    """Layers that cannot be decoded; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One panorama with depth, encoded; fields as in VspaceLayer.msg, whose ``pose`` is ``map_from_camera`` (4, 4)."""
+
+    kind: Kind
+    keyframe_id: int
+    map_from_camera: NDArray[np.float64]
+    gain: Floats
+    relative_sigma: float
+    colour: bytes
+    near_m: float
+    geometry_png: bytes
+    colour_version: int
+    geometry_version: int
+
+
+@dataclass(frozen=True)
+class Layers:
+    """One version of the space: of each keyframe what was seen and what lies behind, newest first."""
+
+    version: int
+    layers: tuple[Layer, ...]
+
+    def since(self, version: int) -> Layers:
+        """What a receiver of ``version`` does not have: colours and geometries that are older are empty."""
+        return Layers(
+            self.version,
+            tuple(
+                replace(
+                    layer,
+                    colour=layer.colour if layer.colour_version > version else b"",
+                    geometry_png=layer.geometry_png if layer.geometry_version > version else b"",
+                )
+                for layer in self.layers
+            ),
+        )
+
+    def completed(self, before: Layers) -> Layers:
+        """The whole version, from what ``since`` left and the version before.
+
+        Raises:
+            LayersError: a part is missing in both.
+        """
+        known = {(layer.kind, layer.keyframe_id): layer for layer in before.layers}
+        layers = []
+        for layer in self.layers:
+            old = known.get((layer.kind, layer.keyframe_id), layer)
+            colour = old.colour if old.colour_version == layer.colour_version else b""
+            png = old.geometry_png if old.geometry_version == layer.geometry_version else b""
+            whole = replace(layer, colour=layer.colour or colour, geometry_png=layer.geometry_png or png)
+            if not (whole.colour and whole.geometry_png):
+                text = f"layer {layer.kind.name} of keyframe {layer.keyframe_id} refers to a version that is not here"
+                raise LayersError(f"{text}: ask for the whole version")
+            layers.append(whole)
+        return Layers(self.version, tuple(layers))
+
+
+class LayerEncoder:
+    """Encodes what a space shows; what has not changed since the last call is not encoded again."""
+
+    def __init__(self) -> None:
+        self._version = 0
+        self._before: dict[tuple[Kind, int], tuple[Keyframe, Layer]] = {}
+
+    def encode(self, shown: KeyframeSet, ids: Sequence[int], images: Sequence[bytes | None]) -> Layers:
+        """The next version.
+
+        Args:
+            shown: the keyframes, prepared for rendering by the warp.
+            ids: of the keyframes.
+            images: the camera's encoded image of each; None: the panorama is encoded here.
+        """
+        self._version += 1
+        made: list[tuple[Keyframe, Layer]] = []
+        for keyframe, gain, number, image in zip(shown.keyframes, shown.gains, ids, images, strict=True):
+            for kind in Kind:
+                if kind is Kind.BEHIND and keyframe.background is None:
+                    continue
+                made.append((keyframe, self._layer(kind, keyframe, gain, number, image)))
+        self._before = {(layer.kind, layer.keyframe_id): (keyframe, layer) for keyframe, layer in made}
+        return Layers(self._version, tuple(layer for _, layer in made))
+
+    def _layer(self, kind: Kind, keyframe: Keyframe, gain: Floats, number: int, image: bytes | None) -> Layer:
+        before, old = self._before.get((kind, number), (None, None))
+        if old is not None and before is keyframe:
+            return replace(old, gain=gain)
+        background = keyframe.background
+        if kind is Kind.SEEN:
+            near_m, png = _encoded_geometry(keyframe.prior.inverse_depth, _marks(keyframe))
+            colour = image or _jpeg(keyframe.prior.rgb)
+        else:
+            assert background is not None
+            marks = np.zeros(background.inverse.shape, np.uint8)
+            for quads, content in ((background.guessed, Content.GUESSED), (background.sky, Content.SKY)):
+                marks[tuple(quads.T)] = content
+            near_m, png = _encoded_geometry(background.inverse, marks)
+            colour = _jpeg(background.rgb)
+        versions = [self._version] * 2
+        if old is not None and colour == old.colour:
+            versions[0] = old.colour_version
+        if old is not None and (near_m, png) == (old.near_m, old.geometry_png):
+            versions[1] = old.geometry_version
+        prior = keyframe.prior
+        return Layer(kind, number, prior.map_from_camera, gain, prior.relative_sigma, colour, near_m, png, *versions)
+
+
+def _marks(keyframe: Keyframe) -> NDArray[np.uint8]:
+    prior = keyframe.prior
+    content = np.zeros(prior.content.shape, np.uint8)
+    for here, there in _OF_PRIOR.items():
+        content[prior.content == here] = there
+    content[(content == Content.FILLED) & (prior.known == 1)] = Content.MEASURED
+    assert keyframe.warp is not None
+    return content | EDGE * np.minimum(keyframe.warp.depth_edge[1:-1], 1)
+
+
+def _encoded_geometry(inverse_depth: Floats, marks: NDArray[np.uint8]) -> tuple[float, bytes]:
+    """Depth in metres that the highest code stands for, and the PNG."""
+    most = float(inverse_depth.max())
+    code = np.maximum(np.rint(inverse_depth * np.float32(_CODES / most)), 1).astype(np.uint16)
+    image = np.dstack([marks, (code & 255).astype(np.uint8), (code >> 8).astype(np.uint8)])  # OpenCV writes BGR
+    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    return 1 / most, cv2.imencode(".png", image, fast)[1].tobytes()
+
+
+def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
+    return cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+
+
+@dataclass(frozen=True)
+class DecodedLayer:
+    """Arrays of a layer.
+
+    Attributes:
+        rgb: (H, 2 H, 3) uint8.
+        inverse_depth: 1/m along the ray, (h, 2 h) float32.
+        content: ``Content``, (h, 2 h) uint8: of each pixel, or of the quad right of and below it (``BEHIND``).
+        edge: whether the quad right of and below a pixel crosses a depth edge, (h, 2 h).
+    """
+
+    rgb: NDArray[np.uint8]
+    inverse_depth: Floats
+    content: NDArray[np.uint8]
+    edge: NDArray[np.bool_]
+
+
+def decode_layer(layer: Layer) -> DecodedLayer:
+    """The arrays of a whole layer.
+
+    Raises:
+        LayersError: an image cannot be decoded, or is no panorama.
+    """
+    name = f"layer {layer.kind.name} of keyframe {layer.keyframe_id}"
+    colour = decode_image(layer.colour, cv2.IMREAD_COLOR) if layer.colour else None
+    geometry = decode_image(layer.geometry_png, cv2.IMREAD_UNCHANGED) if layer.geometry_png else None
+    for what, image in (("colour", colour), ("geometry", geometry)):
+        if image is None:
+            raise LayersError(f"{name}: its {what} cannot be decoded as an image")
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.shape[1] != 2 * image.shape[0]:
+            raise LayersError(f"{name}: its {what} must be 8-bit RGB, twice as wide as high (got {image.shape})")
+    if not (math.isfinite(layer.near_m) and layer.near_m > 0):
+        raise LayersError(f"{name}: near_m must be > 0 (got {layer.near_m})")
+    assert colour is not None and geometry is not None
+    marks = geometry[..., 0]
+    code = 256 * geometry[..., 2].astype(np.float32) + geometry[..., 1]
+    if not code.all():
+        raise LayersError(f"{name}: its geometry has pixels without depth (code 0)")
+    rgb = cv2.cvtColor(colour, cv2.COLOR_BGR2RGB)
+    inverse_depth = code * np.float32(1 / (_CODES * layer.near_m))
+    return DecodedLayer(rgb, inverse_depth, marks & CONTENT, marks & EDGE > 0)
+
+
+def decode(layers: Layers, panorama_width: int, geometry: GeometryConfig | None = None) -> KeyframeSet:
+    """The keyframes of whole layers, to be rendered as the space's own (``VirtualSpace.show``). Needs numba.
+
+    Args:
+        layers: a whole version.
+        panorama_width: wider panoramas are area-averaged to this.
+        geometry: of the space that they come from.
+
+    Raises:
+        LayersError: a layer cannot be decoded, or there is none that the camera saw.
+    """
+    geometry = geometry or GeometryConfig()
+    seen = [layer for layer in layers.layers if layer.kind is Kind.SEEN]
+    behind = {layer.keyframe_id: layer for layer in layers.layers if layer.kind is Kind.BEHIND}
+    if not seen:
+        raise LayersError("the layers hold no keyframe")
+    keyframes = []
+    for place, layer in enumerate(seen):
+        prior = _prior(layer, panorama_width, geometry)
+        guess = behind.get(layer.keyframe_id)
+        background = None if guess is None else _background(guess)
+        keyframes.append(Keyframe(place, prior, PanoramaWarp.of_prior(prior), background))
+    return KeyframeSet(tuple(keyframes), np.stack([np.asarray(layer.gain, np.float32) for layer in seen]))
+
+
+def _prior(layer: Layer, panorama_width: int, geometry: GeometryConfig) -> PanoramaPrior:
+    decoded = decode_layer(layer)
+    content = np.full(decoded.content.shape, ROBOT, np.uint8)
+    for here, there in _OF_PRIOR.items():
+        content[decoded.content == there] = here
+    content[decoded.content == Content.MEASURED] = ROOM
+    known = np.isin(decoded.content, (Content.MEASURED, Content.SKY, Content.MOVED)).astype(np.uint8)
+    return PanoramaPrior(
+        rgb=np.ascontiguousarray(shrunk(decoded.rgb, panorama_width)),
+        inverse_depth=decoded.inverse_depth,
+        known=known,
+        depth_edge=edge_quads(decoded.inverse_depth, geometry.torn_ratio),
+        map_from_camera=np.array(layer.map_from_camera, np.float64),
+        relative_sigma=layer.relative_sigma,
+        band=float(np.clip(geometry.band_sigmas * layer.relative_sigma, geometry.band_min, geometry.band_max)),
+        sigma=np.full(content.shape, min(layer.relative_sigma, MOST_SIGMA), np.float32),
+        usable=(content == ROOM).astype(np.uint8),
+        content=content,
+    )
+
+
+def _background(layer: Layer) -> Background:
+    decoded = decode_layer(layer)
+    guessed, sky = (np.argwhere(decoded.content == kind).astype(np.int32) for kind in (Content.GUESSED, Content.SKY))
+    rgb = decoded.rgb
+    if rgb.shape[:2] != decoded.inverse_depth.shape:
+        raise LayersError(f"layer BEHIND of keyframe {layer.keyframe_id}: colour and geometry differ in size")
+    return Background(decoded.inverse_depth, rgb, guessed, sky, np.array(layer.map_from_camera, np.float64))

@@ -1,0 +1,190 @@
+"""Layers: what is rendered from their messages is what the space renders, and only what has changed is sent again."""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from instant_ic.bus import LATCHED, Node
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.experiments import box_room
+from instant_ic.geometry.image_quality import psnr_db
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.msg import VspaceLayers, deserialize, serialize
+from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.layers import Content, Kind, LayerEncoder, LayersError, decode, decode_layer
+from instant_ic.vspace_messages import layers_message, layers_of
+from nodes.nerf import NerfConfig, NerfNode
+from tests.vspace.test_nerf_node import keyframe_message
+
+WARP = VirtualSpaceConfig(source="warp", device="cpu", keyframes=3)
+ROBOT = np.zeros((64, 128), bool)
+ROBOT[58:, 30:50] = True
+
+
+def jpeg(rgb):
+    return cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
+
+
+def seen_by_the_camera(x, height=256, sky=False):
+    """Arguments of ``prepare`` and the camera's image: the room with noise of 1 % on its depth."""
+    pose = pose_matrix(x, -0.3, 0.1, 0.02, 0.01, 0.3 * x)
+    room = box_room.panorama(pose, height)
+    image = jpeg(room.rgb)
+    rgb = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].copy()
+    depth = room.depth_m * np.random.default_rng(3).normal(1, 0.01, room.depth_m.shape)
+    if sky:
+        depth[: height // 5] = 0
+        depth[height // 2 : height // 2 + 5, 40:60] = 0  # and a small hole
+    return (rgb, depth.astype(np.float32), pose, 0.03), image
+
+
+def space_and_layers(places, **options):
+    """A space of keyframes, in order of arrival, and its layers after the way over the bus."""
+    space, images = VirtualSpace(WARP, robot=ROBOT), []
+    for x in places:
+        keyframe, image = seen_by_the_camera(x, **options)
+        space.set_keyframe(*keyframe)
+        images.insert(0, image)
+    layers = LayerEncoder().encode(space._shown, range(len(images), 0, -1), images)
+    message = deserialize(serialize(layers_message(layers, 5)), "VspaceLayers")
+    return space, layers_of(message), images
+
+
+def shown(layers):
+    space = VirtualSpace(WARP)
+    space.show(decode(layers, WARP.panorama_width, GeometryConfig()))
+    return space
+
+
+@pytest.mark.parametrize("places", [(0.0,), (-1.2, 0.4, 0.0)], ids=["one keyframe", "three"])
+@pytest.mark.parametrize("sky", [False, True], ids=["room", "sky"])
+def test_the_layers_show_what_the_space_shows(places, sky):
+    space, layers, images = space_and_layers(places, sky=sky)
+    assert [layer.kind for layer in layers.layers] == [Kind.SEEN, Kind.BEHIND] * len(places)
+    assert [layer.colour for layer in layers.layers[::2]] == images  # the camera's own, unchanged
+    other = shown(layers)
+    for pose in (pose_matrix(0.1, -0.2), pose_matrix(0.9, 0.2, 0.1, yaw=0.4), pose_matrix(-0.5, -1.0, yaw=2)):
+        truth = box_room.perspective(pose, 320, 180, math.pi / 2).rgb
+        views = [one.render(pose, 320, 180, math.pi / 2) for one in (space, other)]
+        quality = [psnr_db(view.rgb, truth) for view in views]
+        assert quality[1] == pytest.approx(quality[0], abs=0.3)
+        assert psnr_db(views[1].rgb, views[0].rgb) > 35
+        assert np.mean(views[1].confidence == views[0].confidence) > 0.995
+
+
+def test_depth_content_and_edges_survive():
+    space, layers, _ = space_and_layers((0.0,), sky=True)
+    prior = space.keyframe
+    seen, behind = (decode_layer(layer) for layer in layers.layers)
+    np.testing.assert_allclose(seen.inverse_depth, prior.inverse_depth, atol=prior.inverse_depth.max() / 65535)
+    assert (seen.content[0] == Content.SKY).all()
+    assert (seen.content[-8:, 130:190] == Content.NOTHING).all()  # the robot
+    assert (seen.content[130, 45:55] == Content.FILLED).all()
+    assert (seen.content[100] == Content.MEASURED).all()
+    warp = space._shown.keyframes[0].warp
+    assert np.array_equal(seen.edge, warp.depth_edge[1:-1] > 0)
+    background = space._shown.keyframes[0].background
+    assert np.array_equal(np.argwhere(behind.content == Content.GUESSED), background.guessed)
+    assert len(background.guessed) > 100
+
+
+def test_a_code_by_hand():
+    """Depths of 2 m and 4 m: 4 m has half the inverse depth of the nearest, code 32768 = 128 · 256."""
+    rgb = box_room.panorama(np.eye(4), 32).rgb
+    depth = np.full((32, 64), 2.0, np.float32)
+    depth[:, 20:30] = 4.0
+    space = VirtualSpace(WARP)
+    space.set_keyframe(rgb, depth, np.eye(4), 0.02)
+    layer = LayerEncoder().encode(space._shown, [7], [None]).layers[0]
+    assert (layer.keyframe_id, layer.near_m) == (7, 2.0)
+    blue, green, red = cv2.imdecode(np.frombuffer(layer.geometry_png, np.uint8), cv2.IMREAD_UNCHANGED)[16, 25]
+    assert (red, green, blue) == (128, 0, Content.MEASURED)
+
+
+def test_only_what_has_changed_is_sent_again():
+    space = VirtualSpace(WARP)
+    encoder, images = LayerEncoder(), []
+    versions = []
+    for x in (0.0, 0.5):
+        keyframe, image = seen_by_the_camera(x, height=64)
+        space.set_keyframe(*keyframe)
+        images.insert(0, image)
+        versions.append(encoder.encode(space._shown, range(len(images), 0, -1), images))
+    first, second = versions
+    assert (first.version, second.version) == (1, 2)
+    part = second.since(1)
+    assert [bool(layer.colour) for layer in part.layers] == [True, True, False, False]  # the older one's are known
+    assert part.completed(first) == second
+    assert not any(layer.colour or layer.geometry_png for layer in second.since(2).layers)
+    # The second layer alone: another guess behind the same keyframe.
+    newest = space._shown.keyframes[0]
+    guess = dataclasses.replace(newest.background, rgb=newest.background.rgb // 2)
+    changed = dataclasses.replace(newest, background=guess)
+    shown = dataclasses.replace(space._shown, keyframes=(changed, *space._shown.keyframes[1:]))
+    third = encoder.encode(shown, [2, 1], images)
+    part = third.since(2)
+    assert [bool(layer.colour) for layer in part.layers] == [False, True, False, False]
+    assert not any(layer.geometry_png for layer in part.layers)
+    assert part.completed(second) == third
+    with pytest.raises(LayersError, match="BEHIND of keyframe 2 refers to a version that is not here"):
+        third.since(3).completed(second)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"colour": b"no image"}, "colour cannot be decoded"),
+        ({"geometry_png": b""}, "geometry cannot be decoded"),
+        ({"geometry_png": cv2.imencode(".png", np.ones((8, 16), np.uint8))[1].tobytes()}, "geometry must be 8-bit RGB"),
+        ({"geometry_png": cv2.imencode(".png", np.ones((8, 8, 3), np.uint8))[1].tobytes()}, "twice as wide as high"),
+        ({"geometry_png": cv2.imencode(".png", np.zeros((8, 16, 3), np.uint8))[1].tobytes()}, "without depth"),
+        ({"near_m": math.nan}, "near_m must be > 0"),
+        ({"near_m": 0.0}, "near_m must be > 0"),
+    ],
+)
+def test_damaged_layers_are_refused(changes, words):
+    _, layers, _ = space_and_layers((0.0,), height=32)
+    damaged = dataclasses.replace(layers, layers=(dataclasses.replace(layers.layers[0], **changes),))
+    with pytest.raises(LayersError, match=f"SEEN of keyframe 1: .*{words}"):
+        decode(damaged, 2048)
+
+
+def test_layers_without_a_keyframe_and_of_an_unknown_kind_are_refused():
+    _, layers, _ = space_and_layers((0.0,), height=32)
+    with pytest.raises(LayersError, match="hold no keyframe"):
+        decode(dataclasses.replace(layers, layers=layers.layers[1:]), 2048)
+    message = layers_message(layers, 0)
+    message.layers[0].kind = 9
+    with pytest.raises(LayersError, match="unknown kind 9"):
+        layers_of(message)
+
+
+class Listener(Node[NerfConfig]):
+    name = "listener"
+
+    def setup(self):
+        self.subscribe("/vspace/layers", VspaceLayers, lambda message: None, qos=LATCHED)
+
+
+@pytest.mark.parametrize("source", ["warp", "field"])
+def test_the_node_publishes_them_once_a_keyframe_while_somebody_listens(source):
+    config = NerfConfig(space=VirtualSpaceConfig(source=source, device="cpu"))
+    with LockstepBus(start_ns=10_000_000_000) as bus:
+        bus.add(NerfNode, config)
+        bus.publish("/keyframe", keyframe_message(4), latched=True)
+        bus.advance(0.6)
+        assert bus.messages("/vspace/layers") == []
+        bus.add(Listener, config)
+        bus.advance(0.6)
+        bus.publish("/keyframe", keyframe_message(5), latched=True)
+        found = bus.messages("/vspace/layers")  # the second at once
+        assert [[layer.keyframe_id for layer in message.layers] for message in found] == [[4, 4], [5, 5]]
+        assert [message.version for message in found] == [1, 2]
+        assert found[0].layers[0].colour.data.tobytes() == keyframe_message(4).panorama.data.tobytes()
+        bus.advance(1.0)
+        assert len(bus.messages("/vspace/layers")) == 2
+        assert bus.last("/vspace/status").keyframe_id == 5
