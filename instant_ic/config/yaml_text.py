@@ -46,4 +46,4 @@ def checked(read: Callable[[], T]) -> T:
     except _STRAY as error:
         raise yaml.YAMLError(str(error)) from error
     except RecursionError:
-        raise yaml.YAMLError("lists or mappings are nested too deeply") from None
+        raise yaml.YAMLError("lists or mappings are nested too deeply, or an anchor contains itself") from None

@@ -18,7 +18,9 @@ def pixel_directions(height=H, width=W):
 
 def room(height=H, width=W):
     """Inverse depth of a room of six planes, from its inside: the nearest plane in each direction."""
-    planes = np.array([(1 / 4, 0, 0), (-1 / 3, 0, 0), (0, 1 / 2, 0), (0, -1 / 2.5, 0), (0, 0, 1 / 1.5), (0, 0, -1 / 1.2)])
+    planes = np.array(
+        [(1 / 4, 0, 0), (-1 / 3, 0, 0), (0, 1 / 2, 0), (0, -1 / 2.5, 0), (0, 0, 1 / 1.5), (0, 0, -1 / 1.2)]
+    )
     return (pixel_directions(height, width) @ planes.T).max(axis=-1).astype(np.float32)
 
 
