@@ -1,12 +1,13 @@
 """Effect of keyframes on rendered views, in simulated worlds with true depth; prints JSON.
 
-    python benchmarks/keyframes.py [--mesh house.glb] [--only views,field,unseen,refresh,time]
+    python benchmarks/keyframes.py [--mesh house.glb] [--only views,field,unseen,refresh,layers,time]
 
 - views: PSNR (dB) and SSIM 2 m from the nearest of one keyframe, three in a row, and three around the place.
 - field: the same for the field alone after --seconds, one field on all keyframes.
 - unseen: views with unseen areas left black, filled from their surroundings, and as shown.
 - refresh: a drive with a keyframe every 0.75 m; how far a view falls behind what the earlier keyframes would have shown
   there, and how much unseen areas flicker.
+- layers: PSNR (dB) of views rendered by the space and from its published layers; their size, and CPU time to encode.
 - time: CPU time of each step from a keyframe to its first view, and of a view.
 """
 
@@ -19,12 +20,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 
 from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.config import PictureConfig
+from instant_ic.vspace.layers import LayerEncoder, decode
 
 SIZE, FOV, PANORAMA = (320, 180), math.pi / 2, 1024
 VIEWS = (pose_matrix(2.0), pose_matrix(2.0, 0.3, yaw=0.5), pose_matrix(2.0, yaw=-1.2))
@@ -149,6 +152,39 @@ def refresh(world: World, _: argparse.Namespace) -> dict[str, Any]:
     return result
 
 
+def layers(world: World, _: argparse.Namespace) -> dict[str, Any]:
+    """One keyframe and three; depth with 1 % of noise, which is the hardest to compress, and the camera's image."""
+    result: dict[str, Any] = {}
+    rng = np.random.default_rng(0)
+    for name in ("one", "three behind"):
+        space, encoder, images = warp(3), LayerEncoder(), []
+        for x in PLACES[name]:
+            rgb, depth_m, pose, _ = world.keyframe(pose_matrix(x))
+            images.insert(0, cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+            rgb = cv2.cvtColor(cv2.imdecode(np.frombuffer(images[0], np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+            space.set_keyframe(rgb, depth_m * rng.normal(1, 0.01, depth_m.shape), pose, 0.02)
+            start = time.process_time()
+            assert space._shown is not None
+            made = encoder.encode(space._shown, range(len(images), 0, -1), images)
+            encoded = time.process_time() - start
+        other = warp(3)
+        start = time.process_time()
+        other.show(decode(made, space.config.panorama_width))
+        spent = time.process_time() - start
+        rows = [[psnr_db(world.view(one, pose).rgb, world.truth(pose)) for one in (space, other)] for pose in ASIDE]
+        parts = [len(one.colour) + len(one.geometry_png) for one in made.layers]
+        newest = made.since(made.version - 1).layers
+        result[name] = {
+            "space_layers_db": np.round(np.mean(rows, axis=0), 2).tolist(),
+            "largest_difference_db": round(float(np.abs(np.diff(rows, axis=1)).max()), 3),
+            "encode_newest_ms": round(encoded * 1e3),
+            "decode_all_ms": round(spent * 1e3),
+            "kb": [round(size / 1024) for size in parts],
+            "kb_of_change": round(sum(len(one.colour) + len(one.geometry_png) for one in newest) / 1024),
+        }
+    return result
+
+
 def times(world: World, _: argparse.Namespace) -> dict[str, Any]:
     """CPU time of the last of four keyframes (2048 × 1024), kernels compiled."""
     result: dict[str, Any] = {}
@@ -176,7 +212,7 @@ def times(world: World, _: argparse.Namespace) -> dict[str, Any]:
     return result
 
 
-PARTS = {"views": views, "field": field, "unseen": unseen, "refresh": refresh, "time": times}
+PARTS = {"views": views, "field": field, "unseen": unseen, "refresh": refresh, "layers": layers, "time": times}
 
 
 def main() -> None:
