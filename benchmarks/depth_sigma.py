@@ -1,9 +1,10 @@
-"""Fits the uncertainty of LiDAR and fused depth, and checks that |error| / sigma is below 1 in 68 % of the pixels.
+"""Fits the uncertainty of depth from LiDAR, and checks that |error| / sigma is below 1 in 68 % of the pixels.
 
     python benchmarks/depth_sigma.py --mesh ../shared/data/worlds/small_house.glb
 
-The worlds are used neither for training nor in the evaluations. The two printed tables are ``_SIGMA`` in
-instant_ic/depth/lidar_depth.py and instant_ic/depth/fusion.py; run the script again after changing the model.
+The worlds are used neither for training nor in the evaluations. The printed table is ``_SIGMA`` in
+instant_ic/depth/lidar_depth.py, the last line ``_NETWORK_SIGMA`` in instant_ic/depth/sources.py; run the script again
+after changing the model.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize
 
-from instant_ic.depth.fusion import fuse, fused_sigma
 from instant_ic.depth.lidar_depth import Origin, structure_sigma
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.sources import DepthSource
@@ -61,19 +61,17 @@ def samples(model: DepthModel, count: int, mesh: Path | None) -> Iterator[tuple[
             fit = source.scaler.fit(model.estimate(frame.rgb), points)
             if not fit.ok:
                 continue
-            network, built = source.parts(fit, points, UP, height)
-            fused, off = fuse(network, built)
+            network, _ = source.network(fit, points, UP, height)
             alone = source.structure.estimate(points, UP, height, frame.depth_m.shape)
             truth = frame.depth_m
-            valid = np.flatnonzero((truth > 0) & (truth < MOST_M) & (fused > 0))
+            valid = np.flatnonzero((truth > 0) & (truth < MOST_M) & (network.depth_m > 0))
             chosen = rng.choice(valid, 6000)
             columns = {
-                "origin": built.origin, "gap": built.gap_rad, "off": off, "wrong": network.wrong, "fused": fused,
-                "alone_origin": alone.origin, "alone_gap": alone.gap_rad, "alone": alone.depth_m,
+                "origin": alone.origin, "gap": alone.gap_rad, "alone": alone.depth_m, "network": network.depth_m,
             }  # fmt: skip
             picked = {name: column.ravel()[chosen] for name, column in columns.items()}
             t = truth.ravel()[chosen]
-            yield kind, picked | {name: np.abs(picked[name] - t) / t for name in ("fused", "alone")}
+            yield kind, picked | {name: np.abs(picked[name] - t) / t for name in ("alone", "network")}
 
 
 def fit_sigma(features: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -107,43 +105,30 @@ def main() -> None:
     taken: dict[str, list[dict[str, np.ndarray]]] = {}
     for kind, one in samples(model, args.count, args.mesh):
         taken.setdefault(kind, []).append(one)
-    weight = np.concatenate([np.full(len(one["fused"]), 1 / len(ones)) for ones in taken.values() for one in ones])
+    weight = np.concatenate([np.full(len(one["alone"]), 1 / len(ones)) for ones in taken.values() for one in ones])
     every = {name: np.concatenate([one[name] for ones in taken.values() for one in ones]) for name in _names(taken)}
-    one = np.ones(len(weight))
-    tables = {
-        "lidar_depth": ("alone", every["alone_origin"], np.stack([one, every["alone_gap"]], axis=1)),
-        "fusion": (
-            "fused",
-            every["origin"],
-            np.stack([one, np.abs(every["off"]), every["gap"], every["wrong"]], axis=1),
-        ),
-    }
-    for module, (name, origin, features) in tables.items():
-        print(f"instant_ic/depth/{module}.py")
-        for each in Origin:
-            of = origin == each
-            if each == Origin.UNKNOWN and name == "alone":
-                row = np.array([np.inf, 0.0])
-            elif of.sum() < 200:
-                print(f"  # {each.name}: only {of.sum()} pixels, left as it is")
-                continue
-            else:
-                row = fit_sigma(features[of], every[name][of], weight[of])
-            print(f"  ({', '.join(f'{value:.4f}' for value in row)}),  # {each.name}")
-    print("share of errors under sigma with the tables as they are in the code:")
+    features = np.stack([np.ones(len(weight)), every["gap"]], axis=1)
+    for each in Origin:
+        of = every["origin"] == each
+        if each == Origin.UNKNOWN:
+            row = np.array([np.inf, 0.0])
+        elif of.sum() < 200:
+            print(f"  # {each.name}: only {of.sum()} pixels, left as it is")
+            continue
+        else:
+            row = fit_sigma(features[of], every["alone"][of], weight[of])
+        print(f"  ({', '.join(f'{value:.4f}' for value in row)}),  # {each.name}")
+    print("share of errors under sigma with the table as it is in the code:")
     start = 0
     for kind, ones in taken.items():
-        part = slice(start, start := start + sum(len(each["fused"]) for each in ones))
-        fused = fused_sigma(every["origin"][part], every["gap"][part], every["off"][part], every["wrong"][part])
-        alone = structure_sigma(every["alone_origin"][part], every["alone_gap"][part])
-        known = every["alone_origin"][part] > 0
-        floor = every["origin"][part] == Origin.FLOOR
-        print(
-            f"  {kind:9} fused {(every['fused'][part] < fused).mean():.3f}, "
-            f"without the floor {(every['fused'][part] < fused)[~floor].mean():.3f}, "
-            f"lidar {(every['alone'][part] < alone)[known].mean():.3f}, "
-            f"without the floor {(every['alone'][part] < alone)[known & ~floor].mean():.3f}"
-        )
+        part = slice(start, start := start + sum(len(each["alone"]) for each in ones))
+        origin = every["origin"][part]
+        below = every["alone"][part] < structure_sigma(origin, every["gap"][part])
+        known, floor = origin > 0, origin == Origin.FLOOR
+        print(f"  {kind:9} lidar {below[known].mean():.3f}, without the floor {below[known & ~floor].mean():.3f}")
+    unknown = every["origin"] == Origin.UNKNOWN
+    if unknown.any():
+        print(f"network where the structure is unknown: {np.quantile(every['network'][unknown], SHARE):.3f}")
 
 
 def _names(taken: dict[str, list[dict[str, np.ndarray]]]) -> list[str]:

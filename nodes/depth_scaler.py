@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
-from instant_ic.config.ranges import Positive, Range, check_ranges
-from instant_ic.depth.fusion import FusionConfig
 from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, Revolution, RevolutionTrigger
-from instant_ic.depth.keyframes import KeyframeSelectionConfig, KeyframeSelector, encode_sigma
-from instant_ic.depth.lidar_depth import LidarDepthConfig
-from instant_ic.depth.metric_depth import Frames, MetricDepth, MetricDepthConfig
-from instant_ic.depth.scaler import ScalerConfig
-from instant_ic.depth.sources import DepthResult, DepthSource, SourceConfig
+from instant_ic.depth.keyframes import KeyframeSelector, encode_sigma
+from instant_ic.depth.metric_depth import MetricDepth
+from instant_ic.depth.node_config import DepthScalerConfig
+from instant_ic.depth.sources import DepthResult, DepthSource
 from instant_ic.geometry.transforms import TransformError
+from instant_ic.mapping.mapper import CloudError, LocalMapper
 from instant_ic.msg import (
     CompressedImage,
     DepthModelInfo,
     Header,
     Image,
     Keyframe,
+    MessageError,
     PointCloud2,
     cloud_array,
+    cloud_of_points,
     cloud_xyz,
     header,
     image_array,
@@ -36,58 +36,12 @@ from instant_ic.msg import (
 )
 
 _SILENT_S = 10.0  # without an answer to any request
-
-
-@dataclass(frozen=True)
-class DepthScalerConfig:
-    """Parameters.
-
-    Attributes:
-        source: source of the depth: ``fused``, ``lidar`` (needs no network) or ``network``.
-        scaler: estimation of the network's scale.
-        lidar: depth from points alone.
-        fusion: combination of both.
-        keyframes: selection of keyframes.
-        max_rate_hz: highest rate of source ``lidar``, by the images' stamps; that of the others is depth_estimator's.
-        rows: height of the depth image of source ``lidar``; the others have the network's.
-        body_elevation_deg: below this elevation the image shows the robot itself, not the room; -90: nowhere.
-        max_cloud_age_s: largest difference in seconds between the middle of a revolution and the image.
-        map_frame, odom_frame: frames of the keyframe's pose and of the motion compensation.
-        base_frame: frame on the ground; reference of the camera's height.
-    """
-
-    source: str = "fused"
-    scaler: ScalerConfig = field(default_factory=ScalerConfig)
-    lidar: LidarDepthConfig = field(default_factory=LidarDepthConfig)
-    fusion: FusionConfig = field(default_factory=FusionConfig)
-    keyframes: KeyframeSelectionConfig = field(default_factory=KeyframeSelectionConfig)
-    max_rate_hz: Positive = 2.0
-    rows: Annotated[int, Range(32, 1024)] = 256
-    body_elevation_deg: Annotated[float, Range(-90, 0)] = -70.0
-    max_cloud_age_s: Positive = 0.3
-    map_frame: str = "map"
-    odom_frame: str = "odom"
-    base_frame: str = "base_link"
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        self.depth_source  # noqa: B018 - raises ValueError on an unknown source
-
-    @property
-    def depth_source(self) -> SourceConfig:
-        """The library's part of the parameters."""
-        return SourceConfig(self.source, self.scaler, self.lidar, self.fusion)
-
-    @property
-    def metric(self) -> MetricDepthConfig:
-        """The library's part about images, revolutions and poses."""
-        frames = Frames(self.map_frame, self.odom_frame, self.base_frame)
-        return MetricDepthConfig(frames, self.rows, self.body_elevation_deg, self.max_cloud_age_s)
+_LOCAL_MAP_S = 2.0
 
 
 class DepthScalerNode(Node[DepthScalerConfig]):
     """``/camera/image/compressed``, ``/tf`` → ``/depth/request``; with ``/depth/raw`` and ``/lidar/points`` →
-    ``/depth/scaled``, ``/keyframe``.
+    ``/depth/scaled``, ``/keyframe``, and the local 3D model as ``/map/local`` where someone subscribes.
     """
 
     name = "depth_scaler"
@@ -105,7 +59,9 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
         self.warn_of_method()
-        self.metric = MetricDepth(self.source, self.tf, self.inputs, self.config.metric)
+        self.metric = MetricDepth(self.source, self.tf, self.inputs, self.config.metric, self.new_mapper())
+        self.local_map = self.publisher("/map/local", PointCloud2, qos=SENSOR)
+        self.timer(_LOCAL_MAP_S, self.on_local_map)
         self.subscribe("/depth/model", DepthModelInfo, self.on_model, qos=LATCHED)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_image, qos=SENSOR)
         self.subscribe("/lidar/points", PointCloud2, self.on_cloud, qos=SENSOR)
@@ -115,10 +71,17 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         super().reconfigure(config)
         self.source.config, self.selector.config = config.depth_source, config.keyframes
         self.metric.config = config.metric
+        if self.metric.mapper.config != config.mapping or self.metric.mapper.frames != (
+            config.map_frame, config.odom_frame,
+        ):  # fmt: skip
+            self.metric.mapper = self.new_mapper()
         self.trigger.clear()
         if self.model is not None:
             self.on_model(self.model)
         self.warn_of_method()
+
+    def new_mapper(self) -> LocalMapper:
+        return LocalMapper(self.tf, self.config.mapping, self.config.map_frame, self.config.odom_frame)
 
     def warn_of_method(self) -> None:
         if self.config.scaler.method == "as_estimated" and self.config.source != "lidar":
@@ -163,12 +126,32 @@ class DepthScalerNode(Node[DepthScalerConfig]):
                 self.diagnose("scale", WARN, f"no /depth/raw for {silent_s:.0f} s: {text}")
 
     def on_cloud(self, message: Any) -> None:
-        time_s, xyz = cloud_array(message)["time"], functools.partial(cloud_xyz, message)
+        try:
+            time_s, xyz = cloud_array(message)["time"], functools.partial(cloud_xyz, message)
+        except (MessageError, ValueError) as error:  # a cloud of another driver
+            return self.diagnose("points", WARN, f"/lidar/points cannot be used: {error}")
+        self.diagnose("points", OK, f"{len(time_s)} points")
         revolution = Revolution(message.header.frame_id, stamp_ns(message), time_s, xyz)
+        self.add_to_model(revolution)
         self.inputs.revolutions.append(revolution)
         image = self.trigger.revolution(revolution.middle_ns)
         if image is not None:
             self.handle(None, image.frame, image.stamp_ns)
+
+    def add_to_model(self, revolution: Revolution) -> None:
+        if self.config.source == "network":
+            return
+        mapper = self.metric.mapper
+        try:
+            mapper.revolution(revolution.frame, revolution.stamp_ns, revolution.time_s, revolution.xyz)
+        except (CloudError, TransformError, MessageError, ValueError) as error:
+            return self.diagnose("local model", WARN, f"no points added: {error}")
+        self.diagnose("local model", OK, "growing", revolutions=mapper.model.revolutions)
+
+    def on_local_map(self) -> None:
+        if self.local_map.subscriber_count and self.metric.mapper.model.revolutions:
+            cloud = cloud_of_points(self.metric.mapper.cloud(), self.config.map_frame, self.image_ns)
+            self.local_map.publish(cloud)
 
     def on_depth(self, message: Any) -> None:
         if self.config.source != "lidar":

@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "instant_ic"
-ALGORITHMS = ("camera", "lidar", "base", "slam", "depth", "vspace", "control")
+ALGORITHMS = ("camera", "lidar", "base", "slam", "mapping", "depth", "vspace", "control")
 """Usable from a notebook: no bus, no files of the stack."""
 NOT_RUNTIME = ("training", "experiments")
 TOOLS = ("cli", "training", "experiments")

@@ -20,7 +20,7 @@ from typing import Any
 from instant_ic import paths
 from instant_ic.launch.process import dies_with_us
 
-PARTS = ("control", "vspace", "slam", "sim", "lidar")
+PARTS = ("control", "vspace", "slam", "sim", "mapping", "lidar")
 """The packages with kernels, the longest compilation first. Each is compiled in a process of its own."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -161,6 +161,10 @@ def _compile(part: str) -> None:
         simulation.panorama(64, 32)
         simulation.step(0.2)
         simulation.scanner.make(simulation.scanner.due(simulation.time_s))
+    elif part == "mapping":
+        from instant_ic.mapping.local_model import warm_up as warm_up_model
+
+        warm_up_model()
     else:
         from instant_ic.lidar.flatscan import warm_up as warm_up_lidar
 

@@ -1,4 +1,4 @@
-"""Fusion of the network's depth with the LiDAR's, with an uncertainty for every pixel."""
+"""The network's depth, corrected by LiDAR points, and the ceiling that it shows."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.config.ranges import Positive, check_ranges
-from instant_ic.depth.lidar_depth import LEAST_SIGMA, LidarDepth, Origin
 
 Floats = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class FusionConfig:
-    """Parameters of the fusion of network and LiDAR structure.
+    """Parameters of the correction of the network by points.
 
     Attributes:
         across_deg, along_deg: how far around a point, in azimuth and elevation, the network is corrected by it; a
@@ -65,13 +64,11 @@ class Corrected:
         depth_m: (H, W) metres, 0 = unknown.
         wrong: (H, W) share of the points around each pixel that are still plainly off.
         sigma: relative standard deviation at the points that are not.
-        before_m: (H, W) what was corrected, metres.
     """
 
     depth_m: NDArray[np.float32]
     wrong: NDArray[np.float32]
     sigma: float
-    before_m: NDArray[np.float32]
 
 
 def correct(network_m: Floats, measured_m: Floats, config: FusionConfig) -> Corrected:
@@ -111,48 +108,7 @@ def correct(network_m: Floats, measured_m: Floats, config: FusionConfig) -> Corr
     share = float((left > 0.25).mean()) if len(left) else 1.0
     wrong = grown((blurred(bad) + np.float32(0.01) * share) / (near + np.float32(0.01)))
     depth = np.where(network_m > 0, network_m * np.exp(field), 0).astype(np.float32)
-    return Corrected(depth, wrong, max(spread, 0.02), np.asarray(network_m, np.float32))
-
-
-#: What is known beforehand of structure of each ``Origin``: its relative standard deviation where it is right, and the
-#: share of its pixels where what is there is plainly nearer, and plainly farther.
-_TRUST = np.array(
-    [
-        (9.0, 0.5, 0.5),  # UNKNOWN
-        (0.012, 0.001, 0.001),  # BEAM
-        (0.012, 0.001, 0.001),  # BETWEEN
-        (0.05, 0.02, 0.3),  # EDGE
-        (0.02, 0.001, 0.03),  # UP
-        (0.02, 0.001, 0.03),  # DOWN
-        (0.005, 0.001, 0.001),  # FLOOR
-        (0.01, 0.01, 0.001),  # CEILING
-        (0.02, 0.01, 0.001),  # ASSUMED
-    ],
-    np.float32,
-)
-
-#: A thing that is nearer than this is met by the highest ring below a table's height (0.92 m, LiDAR at 0.6 m). It is
-#: likelier a box that ends there than a wall where the network sees something this many times as far over it, and where
-#: it takes no more of the circle than this share.
-_LOW_WITHIN_M, _OVER_IT, _BOX_SHARE = 1.2, 1.5, 0.2
-
-#: Relative standard deviation of fused depth for each ``Origin`` of the structure: at a point, its growth with the log
-#: ratio of network and structure, with the angle (1/rad) to the next point, and with ``Corrected.wrong``.
-#: Fitted so that 68 % of the errors are smaller: benchmarks/depth_sigma.py.
-_SIGMA = np.array(
-    [
-        (0.5767, 0.0, 0.0001, 0.0001),  # UNKNOWN
-        (0.0122, 0.0173, 0.0, 0.0097),  # BEAM
-        (0.0009, 0.0001, 0.6475, 0.0001),  # BETWEEN
-        (0.1370, 0.0188, 2.4074, 0.6396),  # EDGE
-        (0.0066, 0.4521, 0.0165, 0.0101),  # UP
-        (0.0089, 0.4220, 0.1347, 0.1642),  # DOWN
-        (0.0008, 0.0001, 0.0001, 0.0001),  # FLOOR
-        (0.0040, 0.0895, 0.0006, 0.0359),  # CEILING
-        (0.0296, 0.0733, 0.0167, 0.2437),  # ASSUMED
-    ],
-    np.float32,
-)
+    return Corrected(depth, wrong, max(spread, 0.02))
 
 
 def likely_ceiling(seen_m: float, network: Corrected, usual_m: float) -> float:
@@ -164,54 +120,3 @@ def likely_ceiling(seen_m: float, network: Corrected, usual_m: float) -> float:
     variance = 0.02**2 + network.sigma**2 + (0.3 * float(network.wrong.mean())) ** 2
     share = variance / (variance + 0.22**2)
     return float(np.exp((1 - share) * np.log(seen_m) + share * np.log(usual_m)))
-
-
-def fused_sigma(origin: NDArray[np.uint8], gap_rad: Floats, off: Floats, wrong: Floats) -> NDArray[np.float32]:
-    """Relative standard deviation (H, W) of fused depth; all of (H, W), see ``_SIGMA``."""
-    base, by_off, by_gap, by_wrong = (np.ascontiguousarray(column)[origin] for column in _SIGMA.T)
-    sigma = np.sqrt(base**2 + (by_off * off) ** 2 + (by_gap * gap_rad) ** 2 + (by_wrong * wrong) ** 2)
-    return np.asarray(np.maximum(sigma, LEAST_SIGMA), np.float32)
-
-
-def narrow(columns: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
-    """Of ``columns`` (W,) round the circle those whose run is no longer than the share ``most`` of it."""
-    if columns.all() or not columns.any():
-        return np.zeros_like(columns)
-    first = int(np.argmin(columns))  # no run goes through it
-    edges = np.diff(np.roll(columns, -first).astype(np.int8), prepend=0, append=0)
-    kept = np.zeros_like(columns)
-    for start, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        kept[start:end] = end - start <= most * len(columns)
-    return np.roll(kept, first)
-
-
-def fuse(network: Corrected, structure: LidarDepth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Fuses corrected network depth with LiDAR structure, pixel by pixel.
-
-    Where both agree the mean counts by precision; where they do not, one of the two is taken: the structure, unless
-    it is likelier wrong in this way than the network is wrong at all.
-
-    Returns:
-        Depth (H, W) in metres, 0 where both are unknown, and the log ratio (H, W) of network and structure, 0 where
-        one is unknown.
-    """
-    sigma_s, nearer, farther = (np.ascontiguousarray(column)[structure.origin] for column in _TRUST.T)
-    sigma_n = np.float32(network.sigma)
-    known_n, known_s = network.depth_m > 0, structure.depth_m > 0
-    both = known_n & known_s
-    n = np.log(np.where(known_n, network.depth_m, np.float32(1)))
-    s = np.log(np.where(known_s, structure.depth_m, np.float32(1)))
-    up = both & (structure.origin == Origin.UP)
-    near = up & (structure.depth_m < _LOW_WITHIN_M)
-    over = near & narrow(near.any(axis=0), _BOX_SHARE) & (network.before_m > _OVER_IT * structure.depth_m)
-    over = up & np.maximum.accumulate(over[::-1])[::-1]  # and all above it
-    n = np.where(over, np.log(np.where(over, network.before_m, np.float32(1))), n)
-    off = np.where(both, n - s, np.float32(0))
-    conflict = both & (off * off > 9 * (sigma_s**2 + sigma_n**2))
-    likely = np.where(off > 0, farther, nearer) * (1 - network.wrong)
-    takes_network = over | (conflict & (likely > network.wrong * (1 - nearer - farther)))
-    w_n = (known_n & (~conflict | takes_network)) / sigma_n**2
-    w_s = (known_s & ~takes_network) / sigma_s**2
-    total = np.maximum(w_n + w_s, np.float32(1e-9))
-    depth = np.where(known_n | known_s, np.exp((w_n * n + w_s * s) / total), 0)
-    return depth.astype(np.float32), off

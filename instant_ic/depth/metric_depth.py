@@ -12,6 +12,7 @@ from instant_ic.depth.inputs import RecentInputs
 from instant_ic.depth.sources import DepthResult, DepthSource, without_body
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.mapping.mapper import LocalMapper, LocalView
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,15 @@ class MetricDepth:
         transforms: poses over time.
         inputs: recent revolutions.
         config: parameters.
+        mapper: feeds the local 3D model.
     """
 
     def __init__(
-        self, source: DepthSource, transforms: TransformBuffer, inputs: RecentInputs, config: MetricDepthConfig
-    ) -> None:
+        self, source: DepthSource, transforms: TransformBuffer, inputs: RecentInputs, config: MetricDepthConfig,
+        mapper: LocalMapper,
+    ) -> None:  # fmt: skip
         self.source, self.transforms, self.inputs, self.config = source, transforms, inputs, config
+        self.mapper = mapper
 
     def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int) -> DepthResult:
         """Depth of an image; if something is missing the result is not ok, and its message says what.
@@ -70,11 +74,14 @@ class MetricDepth:
                 # Not masked: a camera at another place has another height.
                 return self.source.estimate(raw, np.empty((0, 3)), up, height_m, size=size)
             points = self.points_in_camera(camera, stamp_ns)
+            local = None
+            if self.source.config.source != "network":
+                local = LocalView(self.mapper.model, self.mapper.model_from_camera(camera, stamp_ns))
         except TransformError as error:
             return self.source.refuse(raw, str(error), size)
         if points is None:
             return self.source.refuse(raw, f"no LiDAR revolution within {config.max_age_s} s", size)
-        result = self.source.estimate(raw, points, up, height_m, size=size)
+        result = self.source.estimate(raw, points, up, height_m, size=size, local=local)
         return without_body(result, up, height_m, config.body_elevation_deg)
 
     def camera_stance(self, camera: str, stamp_ns: int) -> tuple[NDArray[np.float64], float]:

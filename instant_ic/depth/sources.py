@@ -8,15 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.config.ranges import check_ranges
-from instant_ic.depth.fusion import Corrected, FusionConfig, ceiling_height, correct, fuse, fused_sigma, likely_ceiling
+from instant_ic.depth.fusion import Corrected, FusionConfig, ceiling_height, correct, likely_ceiling
 from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, rays
 from instant_ic.depth.scaler import DepthScaler, ScaleFit, ScalerConfig
 from instant_ic.depth.visibility import nearest_points
+from instant_ic.mapping.mapper import LocalView
 
 Floats = NDArray[np.floating]
 SOURCES = ("network", "lidar", "fused")
 # Of the floor under the robot: a camera's height is known to centimetres.
 _FLOOR_SIGMA = 0.02
+# Of the network where nothing was measured (benchmarks/depth_sigma.py).
+_NETWORK_SIGMA = np.float32(0.58)
 
 
 @dataclass(frozen=True)
@@ -80,8 +83,26 @@ class DepthResult:
         }
 
 
+@dataclass(frozen=True)
+class _Built:
+    """Depth without a network, the structure of this revolution, and the ceiling that the local model shows."""
+
+    depth_m: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    structure: LidarDepth
+    ceiling_m: float | None
+
+    @property
+    def message(self) -> str:
+        return self.structure.message
+
+    @property
+    def points(self) -> int:
+        return self.structure.points
+
+
 class DepthSource:
-    """Computes depth from an image's network estimate and simultaneous LiDAR points."""
+    """Computes depth from an image's network estimate, simultaneous LiDAR points and the local model."""
 
     def __init__(self, config: SourceConfig | None = None) -> None:
         self.config = config or SourceConfig()
@@ -104,8 +125,12 @@ class DepthSource:
         up: Floats,
         camera_height_m: float | None,
         size: tuple[int, int] = (256, 512),
+        local: LocalView | None = None,
     ) -> DepthResult:
         """Depth of one image.
+
+        ``fused`` and ``lidar`` take the local model first, then the structure of this revolution. In ``fused`` the
+        network fills what both leave unknown; it overrides nothing.
 
         Args:
             raw: (H, W) the network's depth in its own unit, 0 = unknown; None is allowed for ``lidar`` alone.
@@ -113,19 +138,21 @@ class DepthSource:
             up: (3,) gravity's up in the camera's frame.
             camera_height_m: of the camera over the floor; None where it is not known.
             size: height and width of the result where there is no ``raw``; else it has ``raw``'s.
+            local: the local model, seen from the camera.
 
         Raises:
             ValueError: arrays of other shapes, or no ``raw`` where the source needs it.
         """
         config = self.config
         if config.source == "lidar":
-            return self._lidar(points, up, camera_height_m, raw.shape if raw is not None else size)
+            return self._lidar(points, up, camera_height_m, raw.shape if raw is not None else size, local)
         if raw is None:
             raise ValueError(f"source {config.source} needs the network's depth")
         fit = self.scaler.fit(raw, points)
         if config.source == "network" or config.scaler.method == "as_estimated":
             return _of_fit(fit)
-        network, built = self.parts(fit, points, up, camera_height_m)
+        network, top = self.network(fit, points, up, camera_height_m)
+        built = self._built(points, up, camera_height_m, fit.depth_m.shape, local, top)
         result = _of_fit(fit)
         if not fit.ok or built.message:
             # The LiDAR alone is the better estimate, but one of the two is wrong: not fit.
@@ -138,9 +165,10 @@ class DepthSource:
                 message=built.message if fit.ok else fit.message,
                 source="fused",
             )
-        depth, off = fuse(network, built)
-        sigma = np.where(depth > 0, fused_sigma(built.origin, built.gap_rad, off, network.wrong), np.float32(np.inf))
-        message = f"{fit.message}; floor {_metres(built.camera_height_m)}, ceiling {_metres(built.ceiling_height_m)}"
+        known = built.depth_m > 0
+        depth = np.where(known, built.depth_m, network.depth_m)
+        sigma = np.where(known, built.sigma, np.where(network.depth_m > 0, _NETWORK_SIGMA, np.float32(np.inf)))
+        message = f"{fit.message}; {_surfaces(built)}"
         return replace(
             result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source="fused"
         )
@@ -154,24 +182,41 @@ class DepthSource:
             np.zeros(size, np.float32), unknown, False, 1.0, 0.0, 0.0, float("inf"), 0, message, "lidar"
         )  # fmt: skip
 
-    def parts(
+    def network(
         self, fit: ScaleFit, points: Floats, up: Floats, camera_height_m: float | None
-    ) -> tuple[Corrected, LidarDepth]:
-        """Inputs of the fusion: the network, scaled and corrected by the points, and the LiDAR's structure."""
+    ) -> tuple[Corrected, float | None]:
+        """The network, scaled and corrected by the points, and the height over the camera of the ceiling it shows."""
         size = fit.depth_m.shape
         network = correct(fit.depth_m, self.structure.ranges(points, size), self.config.fusion)
-        rise = rays(*size) @ np.asarray(up, np.float32)
-        top = ceiling_height(network.depth_m, rise)
+        top = ceiling_height(network.depth_m, rays(*size) @ np.asarray(up, np.float32))
         if top is not None and camera_height_m is not None:
             usual = max(self.config.lidar.ceiling_height_m - camera_height_m, 0.3)
             top = likely_ceiling(top, network, usual)
-        return network, self.structure.estimate(points, up, camera_height_m, size, top)
+        return network, top
 
-    def _lidar(self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int]) -> DepthResult:
-        built = self.structure.estimate(points, up, camera_height_m, size)
-        known = f"floor {_metres(built.camera_height_m)}, ceiling {_metres(built.ceiling_height_m)}"
+    def _built(
+        self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int],
+        local: LocalView | None, top: float | None,
+    ) -> _Built:  # fmt: skip
+        """Depth without a network: the local model first, then this revolution's structure; ``top``: a ceiling."""
+        seen = None if local is None else local.ceiling_m
+        structure = self.structure.estimate(points, up, camera_height_m, size, top if seen is None else seen)
+        depth, sigma = structure.depth_m, structure.sigma
+        if local is not None and not structure.message:
+            ceiling = structure.ceiling_height_m if structure.ceiling_height_m is not None else top
+            if ceiling is None and camera_height_m is not None:
+                ceiling = self.config.lidar.ceiling_height_m - camera_height_m
+            modelled = local.render(size, ceiling)
+            known = modelled.depth_m > 0
+            depth, sigma = np.where(known, modelled.depth_m, depth), np.where(known, modelled.sigma, sigma)
+        return _Built(depth, sigma, structure, seen)
+
+    def _lidar(
+        self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int], local: LocalView | None
+    ) -> DepthResult:
+        built = self._built(points, up, camera_height_m, size, local, None)
         quality = agreement(built.depth_m, points, self.config.scaler)
-        message = f"LiDAR alone: {quality:.0%} of {built.points} points on its surfaces; {known}"
+        message = f"LiDAR alone: {quality:.0%} of {built.points} points on its surfaces; {_surfaces(built)}"
         return DepthResult(
             depth_m=built.depth_m,
             sigma=built.sigma,
@@ -214,6 +259,11 @@ def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:
     if len(rows) == 0:
         return 0.0
     return float((np.abs(depth_m[rows, columns] - range_m) <= config.agreement * range_m).mean())
+
+
+def _surfaces(built: _Built) -> str:
+    ceiling = built.structure.ceiling_height_m if built.ceiling_m is None else built.ceiling_m
+    return f"floor {_metres(built.structure.camera_height_m)}, ceiling {_metres(ceiling)}"
 
 
 def _metres(height: float | None) -> str:

@@ -153,6 +153,13 @@ def cloud_message(points: NDArray[Any], frame_id: str, stamp: int) -> Any:
     )
 
 
+def cloud_of_points(xyz: NDArray[np.floating], frame_id: str, stamp: int) -> Any:
+    """sensor_msgs/PointCloud2 of points (N, 3) in metres."""
+    points = np.zeros(len(xyz), [("x", np.float32), ("y", np.float32), ("z", np.float32)])
+    points["x"], points["y"], points["z"] = np.asarray(xyz, np.float32).T
+    return cloud_message(points, frame_id, stamp)
+
+
 @functools.lru_cache(maxsize=16)
 def _cloud_dtype(fields: tuple[tuple[str, int, int], ...], step: int) -> np.dtype[Any]:
     return np.dtype(

@@ -1,0 +1,437 @@
+"""Compiled loops of the local model: a window of columns of voxels that moves with the robot.
+
+``key`` (N, N, 2) int32 names the cell that each column holds, so the window needs no shifting: a column is reused when
+a point or a beam reaches another cell with the same place modulo N. ``odds`` (N, N, L) int8 is the log odds of each
+voxel, 0 where nothing was measured. ``sums`` (N, N, 6) float32 holds count, x, y, xx, xy and yy of a column's points,
+relative to its cell's centre. ``last`` (N, N) float32 is the age of the newest point, in the units of ``now``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+HIT, MOST, LEAST = 4, 24, -12
+OCCUPIED, FREE = 3, -2
+UNSEEN, OPEN, PLATE = -2, -1, -10  # values of the index of columns
+_BESIDE_M = 0.02  # a beam that passes a column's mean at this distance says nothing about its surface
+_SHORT_OF_M = 0.12  # beams free space up to this distance before their end
+_MOST_POINTS = 256.0  # a column's sums are halved from here on, so that they follow changes
+
+# How a voxel of a column is known to be solid.
+EMPTY, MEASURED, BETWEEN, UP, DOWN, BEHIND = 0, 1, 2, 3, 4, 5
+# What a ray ends on: one of the above on an upright surface, or:
+NOTHING, TOP, FLOOR, CEILING, ASSUMED = 0, 6, 7, 8, 9
+
+
+@njit(cache=True)
+def _take(key, odds, sums, last, ix, iy, now, keep):  # type: ignore[no-untyped-def]
+    """Place of a cell's column; what another cell left there, or what is too old, is cleared."""
+    n = key.shape[0]
+    a, b = ix % n, iy % n
+    if key[a, b, 0] != ix or key[a, b, 1] != iy or now - last[a, b] > keep:
+        key[a, b, 0], key[a, b, 1] = ix, iy
+        odds[a, b, :] = 0
+        sums[a, b, :] = 0
+        last[a, b] = now
+    return a, b
+
+
+@njit(cache=True)
+def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
+    """Free the voxels that beams passed, then add their ends. All in metres and in the model's frame.
+
+    Args:
+        points: (M, 3); origin: (3,) of the beams.
+        low: height of the lowest voxels.
+        body: heights (from, to) whose points make a column's mean.
+        first, stride: which beams free space.
+        reach: farther points free space up to there.
+    """
+    levels = odds.shape[2]
+    for i in range(first, len(points), stride):
+        dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if not length > 0.3:
+            continue
+        dx, dy, dz = dx / length, dy / length, dz / length
+        end = min(length - _SHORT_OF_M, reach)
+        flat = math.sqrt(dx * dx + dy * dy)
+        ix, iy = math.floor(origin[0] / cell), math.floor(origin[1] / cell)
+        step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+        next_x = ((ix + (dx > 0)) * cell - origin[0]) / dx if dx != 0 else np.inf
+        next_y = ((iy + (dy > 0)) * cell - origin[1]) / dy if dy != 0 else np.inf
+        per_x = cell / abs(dx) if dx != 0 else np.inf
+        per_y = cell / abs(dy) if dy != 0 else np.inf
+        t = 0.0
+        while t < end:
+            leave = min(next_x, next_y, end)
+            a, b = _take(key, odds, sums, last, ix, iy, now, keep)
+            passes = True
+            count = sums[a, b, 0]
+            if count > 0:
+                mx = (ix + 0.5) * cell + sums[a, b, 1] / count - origin[0]
+                my = (iy + 0.5) * cell + sums[a, b, 2] / count - origin[1]
+                passes = abs(mx * dy - my * dx) < _BESIDE_M * flat
+            if passes:
+                z0 = math.floor((origin[2] + t * dz - low) / cell)
+                z1 = math.floor((origin[2] + leave * dz - low) / cell)
+                for level in range(max(min(z0, z1), 0), min(max(z0, z1), levels - 1) + 1):
+                    if odds[a, b, level] > LEAST:
+                        odds[a, b, level] -= 1
+            t = leave
+            if next_x < next_y:
+                ix += step_x
+                next_x += per_x
+            else:
+                iy += step_y
+                next_y += per_y
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        dx, dy = x - origin[0], y - origin[1]
+        if not dx * dx + dy * dy < reach * reach:
+            continue
+        ix, iy = math.floor(x / cell), math.floor(y / cell)
+        a, b = _take(key, odds, sums, last, ix, iy, now, keep)
+        last[a, b] = now
+        level = math.floor((z - low) / cell)
+        if 0 <= level < levels:
+            odds[a, b, level] = min(odds[a, b, level] + HIT, MOST)
+        if body[0] < z < body[1]:
+            if sums[a, b, 0] >= _MOST_POINTS:
+                sums[a, b, :] *= np.float32(0.5)
+            u, v = x - (ix + 0.5) * cell, y - (iy + 0.5) * cell
+            sums[a, b, 0] += 1
+            sums[a, b, 1] += u
+            sums[a, b, 2] += v
+            sums[a, b, 3] += u * u
+            sums[a, b, 4] += u * v
+            sums[a, b, 5] += v * v
+
+
+@njit(cache=True)
+def ceiling_levels(key, odds, last, now, keep, centre, within, first, under):  # type: ignore[no-untyped-def]
+    """Histogram (L,) of the level of the uppermost solid voxel of columns around ``centre`` (2,) cells.
+
+    Only columns with no other solid voxel in the ``under`` levels below it count: a wall has some.
+    """
+    n, levels = key.shape[0], odds.shape[2]
+    found = np.zeros(levels, np.int64)
+    for a in range(n):
+        for b in range(n):
+            if now - last[a, b] > keep:
+                continue
+            if abs(key[a, b, 0] - centre[0]) > within or abs(key[a, b, 1] - centre[1]) > within:
+                continue
+            for level in range(levels - 1, first, -1):
+                if odds[a, b, level] >= OCCUPIED:
+                    alone = True  # a wall has points below
+                    for below in range(max(level - under, 0), level - 1):
+                        alone = alone and odds[a, b, below] <= 0
+                    found[level] += alone
+                    break
+    return found
+
+
+@njit(cache=True)
+def solid_columns(key, odds, sums, last, now, keep, cell, ground, top, index):  # type: ignore[no-untyped-def]
+    """Solid voxels of every column with points, and its surface.
+
+    Args:
+        ground, top: lowest and one past the highest level between floor and ceiling.
+        index: (N, N) int32, written: row of each column in the results, -1 without a solid voxel.
+
+    Returns:
+        ``codes`` (M, L) uint8, and ``faces`` (M, 6) float32: a point x, y of the surface, its normal (0, 0: none), and
+        how far it reaches from the point to either side.
+    """
+    n, levels = key.shape[0], odds.shape[2]
+    count = 0
+    for a in range(n):
+        for b in range(n):
+            index[a, b] = UNSEEN
+            if now - last[a, b] > keep:
+                continue
+            index[a, b] = OPEN
+            if sums[a, b, 0] > 0:
+                for level in range(ground, top):
+                    if odds[a, b, level] >= OCCUPIED:
+                        index[a, b] = count
+                        count += 1
+                        break
+    codes = np.zeros((count, levels), np.uint8)
+    faces = np.zeros((count, 6), np.float32)
+    tops = np.zeros((count, 2), np.int32)  # one past the highest measured level, first free level above
+    for a in range(n):
+        for b in range(n):
+            at = index[a, b]
+            if at < 0:
+                continue
+            below = -1
+            for level in range(ground, top):
+                if odds[a, b, level] < OCCUPIED:
+                    continue
+                codes[at, level] = MEASURED
+                _fill_between(codes[at], odds[a, b], below, level, ground)
+                below = level
+            tops[at, 0] = tops[at, 1] = below + 1
+            while tops[at, 1] < levels and odds[a, b, tops[at, 1]] > FREE:
+                tops[at, 1] += 1
+            _set_face(key, sums, index, a, b, cell, faces[at])
+    for a in range(n):
+        for b in range(n):
+            at = index[a, b]
+            if at < 0:
+                continue
+            # Whether a surface goes on above its measured part is decided with its neighbours.
+            x0, y0 = key[a, b, 0], key[a, b, 1]
+            open_above, ends = 0, 0
+            for i in range(-2, 3):
+                for j in range(-2, 3):
+                    p, q = (x0 + i) % n, (y0 + j) % n
+                    if index[p, q] >= 0 and key[p, q, 0] == x0 + i and key[p, q, 1] == y0 + j:
+                        if tops[index[p, q], 1] >= top:
+                            open_above += 1
+                        else:
+                            ends += 1
+            end = tops[at, 1]
+            if end < top and open_above > 2 * ends:
+                end = levels
+            elif end >= top and ends > 2 * open_above:
+                end = tops[at, 0]
+            codes[at, tops[at, 0] : end] = UP
+    _bridge(key, index, faces, cell)
+    return codes, faces
+
+
+@njit(cache=True)
+def _moments(key, sums, a, b, cell, around, total):  # type: ignore[no-untyped-def]
+    """Write mean x, y, variances xx, xy, yy and count of the points in ``around`` cells around a column."""
+    n = key.shape[0]
+    x0, y0 = key[a, b, 0], key[a, b, 1]
+    total[:] = 0
+    for i in range(-around, around + 1):
+        for j in range(-around, around + 1):
+            p, q = (x0 + i) % n, (y0 + j) % n
+            c = sums[p, q, 0]
+            if c == 0 or key[p, q, 0] != x0 + i or key[p, q, 1] != y0 + j:
+                continue
+            u, v = i * cell, j * cell
+            total[0] += sums[p, q, 1] + c * u
+            total[1] += sums[p, q, 2] + c * v
+            total[2] += sums[p, q, 3] + 2 * u * sums[p, q, 1] + c * u * u
+            total[3] += sums[p, q, 4] + u * sums[p, q, 2] + v * sums[p, q, 1] + c * u * v
+            total[4] += sums[p, q, 5] + 2 * v * sums[p, q, 2] + c * v * v
+            total[5] += c
+    total[:5] /= total[5]
+    total[2] -= total[0] * total[0]
+    total[3] -= total[0] * total[1]
+    total[4] -= total[1] * total[1]
+
+
+@njit(cache=True)
+def _set_face(key, sums, index, a, b, cell, face):  # type: ignore[no-untyped-def]
+    """Write the surface of a column: a plane through the points around it where they lie on one, else its mean."""
+    n = key.shape[0]
+    x0, y0 = key[a, b, 0], key[a, b, 1]
+    own, total = np.zeros(6), np.zeros(6)
+    _moments(key, sums, a, b, cell, 0, own)
+    for around in (2, 1):
+        _moments(key, sums, a, b, cell, around, total)
+        half = math.sqrt(0.25 * (total[2] - total[4]) ** 2 + total[3] * total[3])
+        small, large = 0.5 * (total[2] + total[4]) - half, 0.5 * (total[2] + total[4]) + half
+        if total[5] < 5 or small > 0.025**2 or large < 4 * small:
+            continue
+        angle = 0.5 * math.atan2(2 * total[3], total[2] - total[4])
+        ux, uy = math.cos(angle), math.sin(angle)
+        off_plane = abs((own[0] - total[0]) * uy - (own[1] - total[1]) * ux)
+        if off_plane > 0.03 and own[5] > 0.04 * total[5]:  # a few points are noise of the plane
+            continue
+        off = (own[0] - total[0]) * ux + (own[1] - total[1]) * uy
+        face[0] = (x0 + 0.5) * cell + total[0] + off * ux
+        face[1] = (y0 + 0.5) * cell + total[1] + off * uy
+        face[2], face[3] = -uy, ux
+        # Of points spread evenly the farthest lie at 1.73 standard deviations. A surface that the next columns
+        # continue is not cut.
+        ends = 1.73 * math.sqrt(max(own[2] * ux * ux + 2 * own[3] * ux * uy + own[4] * uy * uy, 0.0)) + 0.006
+        for side in range(2):
+            face[4 + side] = ends
+            for k in range(1, 4):
+                x, y = x0 + round((1 - 2 * side) * k * ux), y0 + round((1 - 2 * side) * k * uy)
+                p, q = x % n, y % n
+                if index[p, q] >= 0 and key[p, q, 0] == x and key[p, q, 1] == y:
+                    face[4 + side] = (0.2 + k) * cell
+                    break
+        return
+    face[0], face[1] = (x0 + 0.5) * cell + own[0], (y0 + 0.5) * cell + own[1]
+    face[4:6] = min(0.75 * cell, 1.73 * math.sqrt(max(own[2] + own[4], 0.0)) + 0.006)
+
+
+@njit(cache=True)
+def _bridge(key, index, faces, cell):  # type: ignore[no-untyped-def]
+    """Columns without points between two of one plane show it too: beams lie apart far from the robot."""
+    n = key.shape[0]
+    bridged = []
+    for a in range(n):
+        for b in range(n):
+            at = index[a, b]
+            if at < 0 or (faces[at, 2] == 0 and faces[at, 3] == 0):
+                continue
+            ux, uy = faces[at, 3], -faces[at, 2]
+            for side in range(2):
+                gap = round(faces[at, 4 + side] / cell - 0.2)
+                for k in range(1, gap):
+                    x = key[a, b, 0] + round((1 - 2 * side) * k * ux)
+                    y = key[a, b, 1] + round((1 - 2 * side) * k * uy)
+                    if index[x % n, y % n] < 0:
+                        bridged.append((x, y, at))
+    for x, y, at in bridged:
+        key[x % n, y % n, 0], key[x % n, y % n, 1] = x, y
+        index[x % n, y % n] = at
+
+
+@njit(cache=True)
+def _fill_between(code, odds, below, above, ground):  # type: ignore[no-untyped-def]
+    """Solid between two measured voxels, or from the floor (``below`` -1) up, as far as nothing there is free."""
+    for level in range(above - 1, max(below, ground - 1), -1):
+        if odds[level] <= FREE:
+            break
+        code[level] = DOWN if below < 0 else BETWEEN
+    if below < 0:
+        return
+    for level in range(below + 1, above):
+        if odds[level] <= FREE or code[level] != EMPTY:
+            break
+        code[level] = BETWEEN
+
+
+@njit(cache=True)
+def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, highest):  # type: ignore[no-untyped-def]
+    """Continue the tops of low things behind their measured faces, where nothing was measured.
+
+    ``index`` becomes ``PLATE`` minus the level of the top. ``behind``: how far, in metres; ``highest``: level.
+    """
+    n, levels = key.shape[0], odds.shape[2]
+    for a in range(n):
+        for b in range(n):
+            at = index[a, b]
+            if at < 0:
+                continue
+            top = 0
+            for level in range(ground, levels):
+                if codes[at, level] != EMPTY:
+                    top = level + 1
+                elif top > 0:
+                    break
+            if codes[at, ground] == EMPTY or not ground + 1 < top <= highest:
+                continue
+            x, y = faces[at, 0], faces[at, 1]
+            dx, dy = x - origin[0], y - origin[1]
+            length = math.sqrt(dx * dx + dy * dy)
+            for k in range(1, int(behind / cell * 2) + 1):
+                ix = math.floor((x + dx / length * 0.5 * k * cell) / cell)
+                iy = math.floor((y + dy / length * 0.5 * k * cell) / cell)
+                p, q = ix % n, iy % n
+                if index[p, q] >= 0:
+                    continue
+                if key[p, q, 0] == ix and key[p, q, 1] == iy and odds[p, q, (ground + top) // 2] < 0:
+                    break
+                key[p, q, 0], key[p, q, 1] = ix, iy
+                index[p, q] = min(index[p, q], PLATE - top)
+
+
+@njit(cache=True)
+def cast_rays(  # type: ignore[no-untyped-def]
+    key, index, codes, faces, origin, rays, cell, low, ceiling, assumed, reach, unseen, depth, kind
+):
+    """First surface on every ray.
+
+    Args:
+        origin: (3,) of the rays; rays: (M, 3) unit directions in the model's frame.
+        ceiling: height of the level ceiling (inf: none); assumed: whether it is.
+        reach: longest horizontal distance; unseen: metres of a ray through columns that nobody has seen, at most.
+        depth: (M,) float32 and kind (M,) uint8, written; 0 where a ray ends nowhere.
+    """
+    n, levels = key.shape[0], codes.shape[1]
+    for i in range(len(rays)):
+        dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
+        depth[i], kind[i] = 0.0, NOTHING
+        limit, limit_kind = np.inf, NOTHING
+        if dz < -1e-6:
+            limit, limit_kind = -origin[2] / dz, FLOOR
+        elif dz > 1e-6 and ceiling < np.inf:
+            limit, limit_kind = (ceiling - origin[2]) / dz, (ASSUMED if assumed else CEILING)
+        flat = math.sqrt(dx * dx + dy * dy)
+        end = min(limit, reach / max(flat, 1e-6))
+        ix, iy = math.floor(origin[0] / cell), math.floor(origin[1] / cell)
+        step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+        next_x = ((ix + (dx > 0)) * cell - origin[0]) / dx if dx != 0 else np.inf
+        next_y = ((iy + (dy > 0)) * cell - origin[1]) / dy if dy != 0 else np.inf
+        per_x = cell / abs(dx) if dx != 0 else np.inf
+        per_y = cell / abs(dy) if dy != 0 else np.inf
+        t, missing = 0.0, 0.0
+        pending, pending_kind = np.inf, NOTHING
+        while t < end:
+            leave = min(next_x, next_y, end)
+            a, b = ix % n, iy % n
+            at = index[a, b]
+            if at == UNSEEN:
+                missing += (leave - t) * flat
+                if missing > unseen:
+                    break
+            elif at == OPEN:
+                missing = 0.0
+            else:
+                missing = 0.0
+                if key[a, b, 0] != ix or key[a, b, 1] != iy:
+                    break
+                if at <= PLATE:
+                    height = low + (PLATE - at) * cell
+                    if origin[2] + t * dz <= height:
+                        pending, pending_kind = t, BEHIND
+                    elif origin[2] + leave * dz <= height:
+                        pending, pending_kind = (height - origin[2]) / dz, TOP
+                else:
+                    z0 = math.floor((origin[2] + t * dz - low) / cell)
+                    z1 = math.floor((origin[2] + leave * dz - low) / cell)
+                    if 0 <= z0 < levels and codes[at, z0] != EMPTY:
+                        nx, ny = faces[at, 2], faces[at, 3]
+                        px, py = faces[at, 0] - origin[0], faces[at, 1] - origin[1]
+                        across = dx * nx + dy * ny
+                        if abs(across) > 0.02 * flat:
+                            hit = (px * nx + py * ny) / across
+                        elif nx == 0 and ny == 0:
+                            hit = min(max((px * dx + py * dy) / (flat * flat), t), leave)
+                        else:
+                            hit = np.inf
+                        if hit < t:
+                            hit = max(hit, t - 2 * cell / flat)
+                        if nx == 0 and ny == 0:
+                            nx, ny = dx / flat, dy / flat
+                        aside = (dx * hit - px) * ny - (dy * hit - py) * nx
+                        if aside > faces[at, 4] or -aside > faces[at, 5]:
+                            hit = np.inf
+                        if hit < pending and hit - t < 0.6 / flat:
+                            pending, pending_kind = hit, codes[at, z0]
+                    elif z1 != z0:
+                        step = 1 if z1 > z0 else -1
+                        for level in range(z0 + step, z1 + step, step):
+                            if 0 <= level < levels and codes[at, level] != EMPTY:
+                                height = low + (level + (1 if step < 0 else 0)) * cell
+                                pending, pending_kind = (height - origin[2]) / dz, TOP
+                                break
+            if pending <= leave:
+                break
+            t = leave
+            if next_x < next_y:
+                ix += step_x
+                next_x += per_x
+            else:
+                iy += step_y
+                next_y += per_y
+        if pending <= limit and pending < np.inf:
+            depth[i], kind[i] = pending, pending_kind
+        elif t >= limit - 1e-9:
+            depth[i], kind[i] = limit, limit_kind

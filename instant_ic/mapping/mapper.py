@@ -1,0 +1,196 @@
+"""Feeds the local model from LiDAR revolutions and transforms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.depth.deskew import points_at
+from instant_ic.geometry.poses import Matrix, inverse
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.mapping.local_model import LocalDepth, LocalModel, LocalModelConfig
+
+_JUMP_M, _JUMP_RAD = 0.2, math.radians(2.0)
+_BACK_NS = 1_000_000_000
+_MOST_POINTS = 200_000
+_ENOUGH_POINTS = 16_000
+_STILL_M, _STILL_RAD = 0.01, math.radians(1.0)
+
+
+class CloudError(ValueError):
+    """A revolution that cannot be added; the text says why."""
+
+
+@dataclass(frozen=True)
+class MapperConfig:
+    """Parameters of the local 3D model.
+
+    Attributes:
+        model: what is kept, and how finely.
+        every_m: metres of motion to the next revolution that is added.
+        every_s: the same in seconds, while the robot stands: for what moves around it.
+    """
+
+    model: LocalModelConfig = field(default_factory=LocalModelConfig)
+    every_m: Positive = 0.1
+    every_s: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+class LocalMapper:
+    """Adds revolutions to a ``LocalModel``, each one when the next arrives: by then the odometry around it is known.
+
+    The model follows the corrections of the pose while they are small: surfaces then fit together better than by
+    odometry alone. A jump (a loop closure, a relocalization) moves the model with the robot instead.
+
+    Args:
+        transforms: poses over time.
+        config: parameters.
+        map_frame, odom_frame: without a path between them, odometry alone is used.
+    """
+
+    def __init__(
+        self, transforms: TransformBuffer, config: MapperConfig | None = None, map_frame: str = "map",
+        odom_frame: str = "odom",
+    ) -> None:  # fmt: skip
+        self.transforms, self.map_frame, self.odom_frame = transforms, map_frame, odom_frame
+        self.config = config or MapperConfig()
+        self.model = LocalModel(self.config.model)
+        self.clear()
+
+    @property
+    def frames(self) -> tuple[str, str]:
+        """The map frame and the odom frame."""
+        return self.map_frame, self.odom_frame
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self.model.clear()
+        self._held: tuple[str, int, NDArray[np.floating], Callable[[], NDArray[np.floating]]] | None = None
+        self._taken_ns: int | None = None
+        self._taken_at: Matrix | None = None
+        self._map_from_odom: Matrix | None = None
+        self._model_from_map = np.eye(4)
+
+    def revolution(
+        self, frame: str, stamp_ns: int, time_s: NDArray[np.floating], xyz: Callable[[], NDArray[np.floating]]
+    ) -> bool:
+        """Hold a revolution; add the one held before if it is due. Returns whether one was added.
+
+        Args:
+            frame: of the points.
+            stamp_ns: of the cloud.
+            time_s: (N,) seconds after the stamp.
+            xyz: returns the points (N, 3); called only for revolutions that are added.
+
+        Raises:
+            CloudError: the revolution is empty or its stamp went back; the model is cleared for the latter.
+            TransformError: the pose of the LiDAR is not known.
+        """
+        held, self._held = self._held, None
+        newest = self._taken_ns if held is None else held[1]
+        if newest is not None and stamp_ns < newest - _BACK_NS:
+            self.clear()
+            self._held = (frame, stamp_ns, time_s, xyz)
+            raise CloudError(f"time went back by {(newest - stamp_ns) / 1e9:.1f} s: the local model starts again")
+        if not 0 < len(time_s) <= _MOST_POINTS:
+            raise CloudError(f"a revolution of {len(time_s)} points is left out (1 to {_MOST_POINTS} are possible)")
+        self._held = (frame, stamp_ns, time_s, xyz)
+        return held is not None and self._add(*held)
+
+    def _add(
+        self, frame: str, stamp_ns: int, time_s: NDArray[np.floating], xyz: Callable[[], NDArray[np.floating]]
+    ) -> bool:
+        """Add a revolution if the robot has moved or enough time has passed."""
+        middle_ns = stamp_ns + round(0.5e9 * float(time_s[0] + time_s[-1]))
+        odom_from_lidar = self.transforms.lookup(self.odom_frame, frame, middle_ns)
+        moved_m, turned_rad = math.inf, math.inf
+        if self._taken_at is not None and self._taken_ns is not None:
+            moved_m = float(np.linalg.norm(odom_from_lidar[:3, 3] - self._taken_at[:3, 3]))
+            turned_rad = _angle(self._taken_at, odom_from_lidar)
+            waited_s = (stamp_ns - self._taken_ns) / 1e9
+            if moved_m < self.config.every_m and 0 <= waited_s < self.config.every_s:
+                return False
+        model_from_odom = self._model_from_odom(odom_from_lidar[:3, 3])
+        points = xyz()
+        if len(points) != len(time_s):
+            raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is left out")
+        step = max(1, len(points) // _ENOUGH_POINTS)
+        # Other points each time: of beams that fire in the same order, every second would be of the same rings.
+        first = self.model.revolutions % step
+        lidar = points_at(
+            points[first::step], time_s[first::step], stamp_ns,
+            lambda at_ns: model_from_odom @ self.transforms.lookup(self.odom_frame, frame, at_ns),
+        )  # fmt: skip
+        if len(lidar) == 0:
+            raise CloudError("a revolution without a finite point is left out")
+        advance_m = 0.0
+        if self._taken_ns is not None and (moved_m > _STILL_M or turned_rad > _STILL_RAD):
+            model, since_s = self.config.model, max(stamp_ns - self._taken_ns, 0) / 1e9
+            advance_m = max(moved_m, min(since_s, self.config.every_s) * model.keep_m / model.keep_s)
+        self.model.add(lidar, (model_from_odom @ odom_from_lidar)[:3, 3], advance_m)
+        self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar
+        return True
+
+    def _model_from_odom(self, odom_place: NDArray[np.float64]) -> Matrix:
+        """Pose of odometry in the model, with the newest correction."""
+        try:
+            map_from_odom = self.transforms.lookup(self.map_frame, self.odom_frame)
+        except TransformError:
+            map_from_odom = np.eye(4) if self._map_from_odom is None else self._map_from_odom
+        before = map_from_odom if self._map_from_odom is None else self._map_from_odom
+        place = np.append(odom_place, 1.0)
+        if float(np.linalg.norm(((map_from_odom - before) @ place)[:3])) > _JUMP_M or (
+            _angle(before, map_from_odom) > _JUMP_RAD
+        ):
+            self._model_from_map = self._model_from_map @ before @ inverse(map_from_odom)
+        self._map_from_odom = map_from_odom
+        return self._model_from_map @ map_from_odom
+
+    def model_from_camera(self, camera: str, stamp_ns: int) -> Matrix:
+        """Pose of a camera in the model.
+
+        Raises:
+            TransformError: the pose is not known.
+        """
+        odom_from_camera = self.transforms.lookup(self.odom_frame, camera, stamp_ns)
+        return self._model_from_odom(odom_from_camera[:3, 3]) @ odom_from_camera
+
+    def cloud(self) -> NDArray[np.float32]:
+        """(N, 3) points of the model in the map frame; (0, 3) before the first revolution."""
+        if self.model.revolutions == 0:
+            return np.empty((0, 3), np.float32)
+        map_from_model = inverse(self._model_from_map)
+        points = self.model.points()
+        return (points @ map_from_model[:3, :3].T + map_from_model[:3, 3]).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class LocalView:
+    """The model as seen from a camera."""
+
+    model: LocalModel
+    model_from_camera: Matrix
+
+    @property
+    def ceiling_m(self) -> float | None:
+        """Height of the ceiling over the camera; None where none was seen."""
+        found = self.model.ceiling_m(self.model_from_camera[:3, 3])
+        return None if found is None else found - float(self.model_from_camera[2, 3])
+
+    def render(self, size: tuple[int, int], ceiling_m: float | None) -> LocalDepth:
+        """Depth image; ``ceiling_m`` over the camera is assumed where no ceiling was seen."""
+        over_floor = None if ceiling_m is None else ceiling_m + float(self.model_from_camera[2, 3])
+        return self.model.render(self.model_from_camera, size, over_floor)
+
+
+def _angle(first: Matrix, second: Matrix) -> float:
+    """Angle between two poses."""
+    return math.acos(min(1.0, max(-1.0, float(np.trace(first[:3, :3].T @ second[:3, :3]) - 1) / 2)))
