@@ -72,7 +72,7 @@ class CalibrationRecording:
 
 
 @dataclass(frozen=True)
-class _Cloud:
+class Cloud:
     points: NDArray[Any]
     stamp_ns: int
     frame_id: str
@@ -125,6 +125,18 @@ def read_recording(path: Path, selection: Selection | None = None) -> Calibratio
         places=places,
         moves=moves,
     )
+
+
+def read_clouds(bag: BagReader, points_topic: str = "") -> tuple[TransformBuffer, Iterator[Cloud]]:
+    """All transforms of a bag, and its LiDAR revolutions, from points or packets.
+
+    Raises:
+        BagError: the bag is damaged.
+        CalibrationError: the bag has no LiDAR data, or not on the topic given.
+    """
+    types = {topic.topic: topic.type_name for topic in bag.topics}
+    topic = _choose(bag.path, types, (CLOUD, PACKETS), points_topic, ("/lidar/points", "/lidar/packets"))
+    return _transforms(bag, types), _clouds(bag, topic, types[topic], lambda ns: True)
 
 
 def _choose(path: Path, types: dict[str, str], kinds: tuple[str, ...], wanted: str, usual: tuple[str, ...]) -> str:
@@ -227,13 +239,13 @@ def _evenly(values: list[int], most: int) -> list[int]:
     return [values[round(k)] for k in np.linspace(0, len(values) - 1, most)] if most else []
 
 
-def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) -> Iterator[_Cloud]:
+def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) -> Iterator[Cloud]:
     """Revolutions from points or packets whose messages are close in time to an image."""
     if kind == CLOUD:
         for message in bag.messages([topic]):
             if near(message.stamp_ns):
                 cloud = deserialize(message.payload, message.type_name)
-                yield _Cloud(cloud_array(cloud), stamp_ns(cloud), cloud.header.frame_id)
+                yield Cloud(cloud_array(cloud), stamp_ns(cloud), cloud.header.frame_id)
         return
     from instant_ic.lidar.stream import PacketStream
 
@@ -243,16 +255,16 @@ def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) 
         for packet in scan.packets:
             revolution = stream.feed(bytes(packet.data), stamp_ns(packet))
             if revolution is not None and revolution.complete and near(revolution.end_ns):
-                yield _Cloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
+                yield Cloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
 
 
 def _nearest_clouds(
     path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int], selection: Selection
-) -> dict[int, _Cloud]:
+) -> dict[int, Cloud]:
     """Revolution nearest in time to each stamp, where one is near enough."""
     # The bag stamps messages on arrival, up to a second late on a busy machine.
     at = np.array(stamps)
-    found: dict[int, _Cloud] = {}
+    found: dict[int, Cloud] = {}
     count = 0
     for cloud in _clouds(bag, topic, kind, lambda ns: bool((np.abs(at - ns) < 1_500_000_000).any())):
         missing = [name for name in _FIELDS if name not in (cloud.points.dtype.names or ())]
@@ -287,7 +299,7 @@ def _decoded(path: Path, picture: Any) -> NDArray[np.uint8]:
 
 def _frame(
     rgb: NDArray[np.uint8],
-    cloud: _Cloud,
+    cloud: Cloud,
     stamp: int,
     place: int,
     transforms: TransformBuffer | None,

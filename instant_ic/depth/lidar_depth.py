@@ -7,6 +7,7 @@ ceiling. Each pixel carries its origin and its uncertainty.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
@@ -53,6 +54,7 @@ class LidarDepthConfig:
         floor_tolerance_m: a point this near the floor's plane belongs to the floor.
         same_surface: two points above each other are of one surface when their horizontal ranges differ by less than
             this share.
+        top_ring_deg: elevation of the LiDAR's uppermost ring.
     """
 
     min_range_m: NotNegative = 0.4
@@ -64,6 +66,7 @@ class LidarDepthConfig:
     ceiling_height_m: Positive = 2.7
     floor_tolerance_m: Positive = 0.08
     same_surface: Annotated[float, Range(above=0, below=1)] = 0.15
+    top_ring_deg: Annotated[float, Range(0, 60)] = 15.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -395,7 +398,9 @@ class _Building:
         upright = np.where(self.flat, 0, self.hit)
         row = (upright > 0).argmax(axis=0)
         across = upright[row, np.arange(self.size[1])]
-        donor = self._bridged(_reaches_top(across, across * self.tan[row, 0]))
+        donor = self._bridged(
+            _reaches_top(across, across * self.tan[row, 0], math.tan(math.radians(self.config.top_ring_deg)))
+        )
         return np.where(donor >= 0, across[donor], 0).astype(np.float32)
 
     def _plates(
@@ -457,22 +462,23 @@ def _highest(z: Floats) -> float:
     return max(0.1, float(np.quantile(z, 0.995))) if len(z) else 0.1
 
 
-def _reaches_top(across: Floats, z: Floats) -> NDArray[np.bool_]:
+def _reaches_top(across: Floats, z: Floats, slope: float) -> NDArray[np.bool_]:
     """Columns (W,) whose uppermost upright point lies where the LiDAR's uppermost ring runs.
+
+    In range and height the ring is a line of known slope. Its height at range 0, the LiDAR's, is that of the highest
+    points: a line fitted to them as well is wrong where far walls are seen by lower rings only.
 
     Args:
         across: horizontal range of that point, 0 where there is none.
         z: its height.
+        slope: of the ring.
     """
     there = across > 0
-    line = np.zeros(2)
-    # The ring is a line in range and height; what ends below it is left out by and by.
-    for slack in (np.inf, 0.3, 0.15):
-        use = there & (z > line[0] + line[1] * across - slack)
-        if use.sum() < 10 or np.ptp(across[use]) < 0.2:
-            return there
-        line = np.polynomial.polynomial.polyfit(across[use], z[use], 1)
-    return np.asarray(there & (z > line[0] + line[1] * across - 0.1 - 0.03 * across))
+    if not there.any():
+        return there
+    over = z - slope * across
+    highest = over[there & (over > np.quantile(over[there], 0.9) - 0.1)]
+    return np.asarray(there & (over > np.median(highest) - 0.1 - 0.03 * across))
 
 
 def _middle(values: Floats, reach: int = 3) -> Floats:

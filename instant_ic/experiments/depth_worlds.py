@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.world import World
 
-KINDS = ("random", "corridor", "mesh")
+KINDS = ("random", "corridor", "long", "mesh")
 FIRST_SEED = 900_000
 """Worlds from this seed on are for evaluation; training uses smaller seeds."""
 CAMERA_HEIGHT_M = 1.2
@@ -60,8 +60,8 @@ def scenes(kind: str, count: int = 20, mesh: str | Path | None = None, height: i
     """The held-out panoramas of a kind; always the same ones.
 
     Args:
-        kind: ``random`` (one world per panorama, seeds from ``FIRST_SEED``), ``corridor`` (positions in the corridor of
-            the experiments and its rooms) or ``mesh`` (its known positions first, then random free ones).
+        kind: ``random`` (one world per panorama, seeds from ``FIRST_SEED``), ``long`` (the same with corridors and halls
+            of 20 to 40 m), ``corridor`` (positions in the corridor of the experiments and its rooms) or ``mesh`` (its known positions first, then random free ones).
         count: panoramas.
         mesh: the file, for ``mesh``.
         height: rows of a panorama; twice as many columns.
@@ -80,18 +80,18 @@ def scenes(kind: str, count: int = 20, mesh: str | Path | None = None, height: i
 
 def _scenes(kind: str, count: int, mesh: Path | None, height: int) -> Iterator[Scene]:
     from instant_ic.sim.render import EquirectRenderer
-    from instant_ic.sim.worlds import corridor_world, load_world, random_world
+    from instant_ic.sim.worlds import corridor_world, load_world, long_world, random_world
 
-    if kind == "random":
+    if kind in ("random", "long"):
         seed, made = FIRST_SEED, 0
         while made < count and seed < FIRST_SEED + 10 * count:
-            world = random_world(seed)
+            world = random_world(seed) if kind == "random" else long_world(seed)
             try:
                 places = world.sample_free_poses(np.random.default_rng([5, seed]), 1)
             except ValueError:  # some floor plans have no free position
                 places = np.empty((0, 3))
             for x, y, yaw in places:
-                yield _scene(f"random:{seed}", EquirectRenderer(world), x, y, yaw, height)
+                yield _scene(f"{kind}:{seed}", EquirectRenderer(world), x, y, yaw, height)
                 made += 1
             seed += 1
         return

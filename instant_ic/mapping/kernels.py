@@ -13,7 +13,8 @@ import math
 import numpy as np
 from numba import njit
 
-HIT, MOST, LEAST = 4, 24, -12
+HIT, MOST, LEAST = 4, 12, -12
+THROUGH = 2  # odds that a beam takes from the voxels of a column whose mean it passes; elsewhere 1
 OCCUPIED, FREE = 3, -2
 UNSEEN, OPEN, PLATE = -2, -1, -10  # values of the index of columns
 _BESIDE_M = 0.02  # a beam that passes a column's mean at this distance says nothing about its surface
@@ -69,18 +70,18 @@ def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, 
         while t < end:
             leave = min(next_x, next_y, end)
             a, b = _take(key, odds, sums, last, ix, iy, now, keep)
-            passes = True
+            passes, takes = True, 1
             count = sums[a, b, 0]
             if count > 0:
                 mx = (ix + 0.5) * cell + sums[a, b, 1] / count - origin[0]
                 my = (iy + 0.5) * cell + sums[a, b, 2] / count - origin[1]
-                passes = abs(mx * dy - my * dx) < _BESIDE_M * flat
+                passes, takes = abs(mx * dy - my * dx) < _BESIDE_M * flat, THROUGH
             if passes:
                 z0 = math.floor((origin[2] + t * dz - low) / cell)
                 z1 = math.floor((origin[2] + leave * dz - low) / cell)
                 for level in range(max(min(z0, z1), 0), min(max(z0, z1), levels - 1) + 1):
                     if odds[a, b, level] > LEAST:
-                        odds[a, b, level] -= 1
+                        odds[a, b, level] -= takes
             t = leave
             if next_x < next_y:
                 ix += step_x

@@ -104,13 +104,14 @@ class LocalModel:
         self._odds[:], self._sums[:], self._last[:] = 0, 0, -np.inf
         self._path_m, self.revolutions = 0.0, 0
 
-    def add(self, points: Floats, origin: Floats, advance_m: float = 0.0) -> None:
+    def add(self, points: Floats, origin: Floats, advance_m: float = 0.0, stride: int = 0) -> None:
         """Add a revolution.
 
         Args:
             points: (N, 3) in the model's frame, metres; points that are not finite are left out.
             origin: (3,) of the beams.
             advance_m: how far the robot has come since the last one; ages what is known.
+            stride: every so many beams free space; 0: as configured.
 
         Raises:
             ValueError: other shapes, an origin that is not finite, or a negative advance.
@@ -125,9 +126,10 @@ class LocalModel:
             raise ValueError(f"advance_m must be >= 0 (got {advance_m})")
         points = points[np.isfinite(points).all(axis=1)]
         self._path_m += advance_m
+        stride = stride or config.stride
         kernels.add_revolution(
             self._key, self._odds, self._sums, self._last, points, origin, config.cell_m, _LOW_M, _BODY_M,
-            np.float32(self._path_m), np.float32(config.keep_m), self.revolutions % config.stride, config.stride,
+            np.float32(self._path_m), np.float32(config.keep_m), self.revolutions % stride, stride,
             config.reach_m,
         )  # fmt: skip
         self.revolutions += 1

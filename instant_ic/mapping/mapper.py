@@ -135,7 +135,9 @@ class LocalMapper:
         if self._taken_ns is not None and (moved_m > _STILL_M or turned_rad > _STILL_RAD):
             model, since_s = self.config.model, max(stamp_ns - self._taken_ns, 0) / 1e9
             advance_m = max(moved_m, min(since_s, self.config.every_s) * model.keep_m / model.keep_s)
-        self.model.add(lidar, (model_from_odom @ odom_from_lidar)[:3, 3], advance_m)
+        # At rest revolutions are few, and what has gone shall not stay for long.
+        stride = 1 if moved_m < self.config.every_m else 0
+        self.model.add(lidar, (model_from_odom @ odom_from_lidar)[:3, 3], advance_m, stride)
         self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar
         return True
 

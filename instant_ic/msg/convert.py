@@ -195,7 +195,11 @@ def cloud_array(message: Any) -> NDArray[Any]:
 
 def cloud_xyz(message: Any) -> NDArray[np.float32]:
     """Coordinates (N, 3) of a PointCloud2, in metres."""
-    points = cloud_array(message)
+    return cloud_points(cloud_array(message))
+
+
+def cloud_points(points: NDArray[Any]) -> NDArray[np.float32]:
+    """Coordinates (N, 3) of a structured array (N,) with the fields x, y and z."""
     return np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float32, copy=False)
 
 

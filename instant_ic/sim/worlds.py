@@ -11,7 +11,7 @@ from instant_ic.sim.building import SIDES, Building, Finish, Zone
 from instant_ic.sim.mesh_files import load_world
 from instant_ic.sim.world import Material, World
 
-__all__ = ["World", "corridor_world", "load_world", "make_world", "random_world"]
+__all__ = ["World", "corridor_world", "load_world", "long_world", "make_world", "random_world"]
 
 _WALL_M = 0.16
 
@@ -371,23 +371,53 @@ def random_world(seed: int, light_cell_m: float = 0.25, rays: int = 20) -> World
     return world
 
 
+def long_world(seed: int, light_cell_m: float = 0.4, rays: int = 12) -> World:
+    """Generate a corridor (even seeds) or a hall (odd ones) of 20 to 40 m, with open doors to side rooms.
+
+    Args: as ``random_world``.
+    """
+    rng = np.random.default_rng([29, seed])
+    building = Building()
+    finish, wall = random_finish(rng), float(rng.uniform(0.1, 0.25))
+    length = float(rng.uniform(20, 40))
+    width = float(rng.uniform(8, 15) if seed % 2 else rng.uniform(1.8, 3.2))
+    height = float(rng.uniform(3.0, 5.0) if seed % 2 else rng.uniform(2.4, 3.2))
+    start = float(rng.uniform(-0.7, -0.1) * length)
+    first = building.add(Zone(start, -width / 2, start + length, width / 2, height, finish))
+    zones = [first]
+    for side in ("north", "south"):
+        for share in range(3):
+            if rng.random() < 0.7:
+                low, high = (0.4 + (length - 0.8) * part / 3 for part in (share, share + 1))
+                zones.append(side_room(rng, building, first, side, wall, (low, high)))
+    for zone in zones:
+        building.lamps(zone, float(rng.uniform(2.4, 4.0)), float(rng.uniform(2.5, 6.0)), bool(rng.random() < 0.5))
+        decorate(rng, building, zone)
+        _furnish(rng, building, zone, (0.0, 0.0) if zone is first else None)
+    return building.world(f"long:{seed}", (0.0, 0.0, 0.0), light_cell_m, rays)
+
+
 def make_world(name_or_path: str) -> World:
-    """Make a world: ``corridor``, ``corridor:SEED``, ``corridor-free`` (no obstacle), ``random:SEED``, or a mesh file.
+    """Make a world from its name, or from a mesh file.
+
+    Names: ``corridor``, ``corridor:SEED``, ``corridor-free`` (no obstacle), ``random:SEED``, ``long:SEED``.
 
     Raises:
         ValueError: neither a known name nor an existing file.
     """
     name, _, argument = name_or_path.partition(":")
-    if name in ("corridor", "corridor-free", "random"):
+    if name in ("corridor", "corridor-free", "random", "long"):
         try:
             seed = int(argument or 0)
         except ValueError as error:
             raise ValueError(f"world {name_or_path!r}: the seed must be an integer") from error
         if name == "random":
             return random_world(seed)
+        if name == "long":
+            return long_world(seed)
         return corridor_world(seed, obstacle=name == "corridor")
     if Path(name_or_path).is_file():
         return load_world(name_or_path)
     raise ValueError(
-        f"world {name_or_path!r} is neither corridor, corridor:SEED, corridor-free, random:SEED nor a mesh file"
+        f"world {name_or_path!r} is neither corridor, corridor:SEED, corridor-free, random:SEED, long:SEED nor a mesh file"
     )
