@@ -61,7 +61,8 @@ def scenes(kind: str, count: int = 20, mesh: str | Path | None = None, height: i
 
     Args:
         kind: ``random`` (one world per panorama, seeds from ``FIRST_SEED``), ``long`` (the same with corridors and halls
-            of 20 to 40 m), ``corridor`` (positions in the corridor of the experiments and its rooms) or ``mesh`` (its known positions first, then random free ones).
+            of 20 to 40 m), ``corridor`` (positions in the corridor of the experiments and its rooms) or ``mesh`` (its
+            known positions first, then random free ones).
         count: panoramas.
         mesh: the file, for ``mesh``.
         height: rows of a panorama; twice as many columns.

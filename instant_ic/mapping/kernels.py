@@ -1,9 +1,10 @@
 """Compiled loops of the local model: a window of columns of voxels that moves with the robot.
 
 ``key`` (N, N, 2) int32 names the cell that each column holds, so the window needs no shifting: a column is reused when
-a point or a beam reaches another cell with the same place modulo N. ``odds`` (N, N, L) int8 is the log odds of each
-voxel, 0 where nothing was measured. ``sums`` (N, N, 6) float32 holds count, x, y, xx, xy and yy of a column's points,
-relative to its cell's centre. ``last`` (N, N) float32 is the age of the newest point, in the units of ``now``.
+a point or a beam reaches another cell with the same place modulo N, a power of two. ``odds`` (N, N, L) int8 is the log
+odds of each voxel, 0 where nothing was measured. ``sums`` (N, N, 6) float32 holds count, x, y, xx, xy and yy of a
+column's points, relative to its cell's centre. ``last`` (N, N) float32 is the age of the newest point, in the units of
+``now``.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ THROUGH = 2  # odds that a beam takes from the voxels of a column whose mean it 
 OCCUPIED, FREE = 3, -2
 UNSEEN, OPEN, PLATE = -2, -1, -10  # values of the index of columns
 _BESIDE_M = 0.02  # a beam that passes a column's mean at this distance says nothing about its surface
+_CROWDED_M = 1.2  # nearer, beams pass so close to each other that a quarter of them is enough
 _SHORT_OF_M = 0.12  # beams free space up to this distance before their end
 _MOST_POINTS = 256.0  # a column's sums are halved from here on, so that they follow changes
 
@@ -31,7 +33,7 @@ NOTHING, TOP, FLOOR, CEILING, ASSUMED = 0, 6, 7, 8, 9
 def _take(key, odds, sums, last, ix, iy, now, keep):  # type: ignore[no-untyped-def]
     """Place of a cell's column; what another cell left there, or what is too old, is cleared."""
     n = key.shape[0]
-    a, b = ix % n, iy % n
+    a, b = ix & (n - 1), iy & (n - 1)
     if key[a, b, 0] != ix or key[a, b, 1] != iy or now - last[a, b] > keep:
         key[a, b, 0], key[a, b, 1] = ix, iy
         odds[a, b, :] = 0
@@ -60,13 +62,13 @@ def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, 
         dx, dy, dz = dx / length, dy / length, dz / length
         end = min(length - _SHORT_OF_M, reach)
         flat = math.sqrt(dx * dx + dy * dy)
-        ix, iy = math.floor(origin[0] / cell), math.floor(origin[1] / cell)
+        t = 0.0 if (i >> 6) & 3 == 0 else _CROWDED_M
+        ix, iy = math.floor((origin[0] + t * dx) / cell), math.floor((origin[1] + t * dy) / cell)
         step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
         next_x = ((ix + (dx > 0)) * cell - origin[0]) / dx if dx != 0 else np.inf
         next_y = ((iy + (dy > 0)) * cell - origin[1]) / dy if dy != 0 else np.inf
         per_x = cell / abs(dx) if dx != 0 else np.inf
         per_y = cell / abs(dy) if dy != 0 else np.inf
-        t = 0.0
         while t < end:
             leave = min(next_x, next_y, end)
             a, b = _take(key, odds, sums, last, ix, iy, now, keep)
@@ -191,7 +193,7 @@ def solid_columns(key, odds, sums, last, now, keep, cell, ground, top, index):  
             open_above, ends = 0, 0
             for i in range(-2, 3):
                 for j in range(-2, 3):
-                    p, q = (x0 + i) % n, (y0 + j) % n
+                    p, q = (x0 + i) & (n - 1), (y0 + j) & (n - 1)
                     if index[p, q] >= 0 and key[p, q, 0] == x0 + i and key[p, q, 1] == y0 + j:
                         if tops[index[p, q], 1] >= top:
                             open_above += 1
@@ -215,7 +217,7 @@ def _moments(key, sums, a, b, cell, around, total):  # type: ignore[no-untyped-d
     total[:] = 0
     for i in range(-around, around + 1):
         for j in range(-around, around + 1):
-            p, q = (x0 + i) % n, (y0 + j) % n
+            p, q = (x0 + i) & (n - 1), (y0 + j) & (n - 1)
             c = sums[p, q, 0]
             if c == 0 or key[p, q, 0] != x0 + i or key[p, q, 1] != y0 + j:
                 continue
@@ -261,7 +263,7 @@ def _set_face(key, sums, index, a, b, cell, face):  # type: ignore[no-untyped-de
             face[4 + side] = ends
             for k in range(1, 4):
                 x, y = x0 + round((1 - 2 * side) * k * ux), y0 + round((1 - 2 * side) * k * uy)
-                p, q = x % n, y % n
+                p, q = x & (n - 1), y & (n - 1)
                 if index[p, q] >= 0 and key[p, q, 0] == x and key[p, q, 1] == y:
                     face[4 + side] = (0.2 + k) * cell
                     break
@@ -286,11 +288,11 @@ def _bridge(key, index, faces, cell):  # type: ignore[no-untyped-def]
                 for k in range(1, gap):
                     x = key[a, b, 0] + round((1 - 2 * side) * k * ux)
                     y = key[a, b, 1] + round((1 - 2 * side) * k * uy)
-                    if index[x % n, y % n] < 0:
+                    if index[x & (n - 1), y & (n - 1)] < 0:
                         bridged.append((x, y, at))
     for x, y, at in bridged:
-        key[x % n, y % n, 0], key[x % n, y % n, 1] = x, y
-        index[x % n, y % n] = at
+        key[x & (n - 1), y & (n - 1), 0], key[x & (n - 1), y & (n - 1), 1] = x, y
+        index[x & (n - 1), y & (n - 1)] = at
 
 
 @njit(cache=True)
@@ -334,7 +336,7 @@ def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, hig
             for k in range(1, int(behind / cell * 2) + 1):
                 ix = math.floor((x + dx / length * 0.5 * k * cell) / cell)
                 iy = math.floor((y + dy / length * 0.5 * k * cell) / cell)
-                p, q = ix % n, iy % n
+                p, q = ix & (n - 1), iy & (n - 1)
                 if index[p, q] >= 0:
                     continue
                 if key[p, q, 0] == ix and key[p, q, 1] == iy and odds[p, q, (ground + top) // 2] < 0:
@@ -376,7 +378,7 @@ def cast_rays(  # type: ignore[no-untyped-def]
         pending, pending_kind = np.inf, NOTHING
         while t < end:
             leave = min(next_x, next_y, end)
-            a, b = ix % n, iy % n
+            a, b = ix & (n - 1), iy & (n - 1)
             at = index[a, b]
             if at == UNSEEN:
                 missing += (leave - t) * flat

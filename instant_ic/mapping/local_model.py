@@ -145,10 +145,13 @@ class LocalModel:
             np.float32(config.keep_m), centre, within, first,
             round(_CEILING_CLEAR_M / config.cell_m),
         )  # fmt: skip
-        best = int(np.convolve(found, np.ones(3), "same").argmax())
-        near = np.arange(max(best - 1, 0), min(best + 2, len(found)))
-        if found[near].sum() < _LEAST_CEILING_COLUMNS:
+        # Nothing is seen through a ceiling: the highest level that is as wide as some other counts.
+        wide = np.convolve(found, np.ones(3), "same")
+        enough = np.flatnonzero(wide >= max(_LEAST_CEILING_COLUMNS, 0.3 * wide.max()))
+        if len(enough) == 0:
             return None
+        best = max(range(max(int(enough[-1]) - 2, 0), int(enough[-1]) + 1), key=lambda level: wide[level])
+        near = np.arange(max(best - 1, 0), min(best + 2, len(found)))
         return float(_LOW_M + (np.average(near, weights=found[near]) + 0.5) * config.cell_m)
 
     def render(self, model_from_camera: Matrix, size: tuple[int, int], ceiling_m: float | None = None) -> LocalDepth:

@@ -37,7 +37,7 @@ class MapperConfig:
     """
 
     model: LocalModelConfig = field(default_factory=LocalModelConfig)
-    every_m: Positive = 0.1
+    every_m: Positive = 0.15
     every_s: Positive = 1.0
 
     def __post_init__(self) -> None:

@@ -53,7 +53,7 @@ class SimulationConfig:
     """Parameters of the simulation.
 
     Attributes:
-        world: corridor, corridor:SEED, corridor-free, random:SEED, or a mesh file (see ``make_world``).
+        world: corridor, corridor:SEED, corridor-free, random:SEED, long:SEED, or a mesh file (see ``make_world``).
         start: start pose x, y (metres), yaw (radians) of the robot; empty selects the world's start.
         seed: seed of all noise.
         robot, camera, lidar, base: parameters of the parts.

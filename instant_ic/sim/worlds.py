@@ -419,5 +419,6 @@ def make_world(name_or_path: str) -> World:
     if Path(name_or_path).is_file():
         return load_world(name_or_path)
     raise ValueError(
-        f"world {name_or_path!r} is neither corridor, corridor:SEED, corridor-free, random:SEED, long:SEED nor a mesh file"
+        f"world {name_or_path!r} is neither corridor, corridor:SEED, corridor-free, random:SEED, long:SEED nor a mesh "
+        "file"
     )

@@ -1,5 +1,6 @@
 """The depth nodes in lockstep: a robot in a box-shaped room."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from instant_ic.bus import NodeError
+from instant_ic.bus import Node, NodeError
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.depth.keyframes import KeyframeSelectionConfig, KeyframeSelector, decode_sigma, encode_sigma
 from instant_ic.depth.lidar_depth import LidarDepthConfig
@@ -17,8 +18,10 @@ from instant_ic.geometry.projections import equirect_directions
 from instant_ic.msg import (
     POINT_DTYPE,
     DepthModelInfo,
+    PointCloud2,
     TFMessage,
     cloud_message,
+    cloud_xyz,
     compressed_image_message,
     header,
     image_array,
@@ -157,6 +160,42 @@ def far_off(depth: np.ndarray, stamp: int) -> np.ndarray:
     """|relative error| of depth of the room, (H, W)."""
     truth = room_depth(base_at(stamp) @ BASE_FROM_CAMERA, len(depth))
     return np.abs(depth / truth - 1)
+
+
+@dataclass(frozen=True)
+class NoConfig:
+    """No parameters."""
+
+
+class Viewer(Node[NoConfig]):
+    """Subscribes to the local model."""
+
+    name = "viewer"
+
+    def setup(self) -> None:
+        self.subscribe("/map/local", PointCloud2, lambda message: None)
+
+
+def test_the_local_model_grows_is_published_on_demand_and_starts_again() -> None:
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthScalerNode)
+        drive(bus, 3.0)
+        assert not bus.messages("/map/local")  # nobody subscribes
+        grown = node.metric.mapper.model.revolutions
+        assert 5 <= grown <= 9  # 1.2 m, one in 0.15 m
+        assert level(node, "local model") == (0, "growing")
+        bus.add(Viewer)
+        drive(bus, 4.2, START + 3 * S)
+        clouds = bus.messages("/map/local")
+        cloud = cloud_xyz(clouds[-1])
+        assert len(clouds) in (1, 2, 3) and clouds[-1].header.frame_id == "map" and len(cloud) > 500
+        off = np.minimum(np.abs(cloud - LOW), np.abs(cloud - HIGH)).min(axis=1)
+        assert np.quantile(off, 0.95) < 0.06  # all on the walls, the floor or the ceiling
+        node.on_cloud(cloud_message(np.zeros(5, [("x", "f4"), ("y", "f4"), ("z", "f4")]), "velodyne", START + 8 * S))
+        assert level(node, "points") == (1, "/lidar/points cannot be used: no field of name time")
+        node.on_cloud(cloud_message(np.zeros(5, POINT_DTYPE), "velodyne", START))
+        assert level(node, "local model")[0] == 1 and "time went back" in level(node, "local model")[1]
+        assert node.metric.mapper.model.revolutions == 0
 
 
 def test_scaler_scales_and_makes_keyframes() -> None:

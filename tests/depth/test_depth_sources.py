@@ -13,6 +13,7 @@ from instant_ic.depth.lidar_depth import (
     LidarDepthConfig,
     LidarStructure,
     Origin,
+    _reaches_top,
     level_from_camera,
     lonely,
     plane_height,
@@ -207,6 +208,15 @@ def test_any_network_is_fused_to_finite_depth(raw: np.ndarray, seed: int) -> Non
     assert found.message and (found.sigma > 0).all()
     if found.ok:
         assert ((found.depth_m > 0) == np.isfinite(found.sigma)).all()
+
+
+def test_far_walls_do_not_hide_which_columns_the_top_ring_reaches() -> None:
+    """Near walls at 2 to 6 m are met by the ring (0.6 m under the camera, 15 degrees), far ones by lower rings only."""
+    slope = np.tan(np.radians(15))
+    across = np.concatenate([np.linspace(2, 6, 60), np.linspace(15, 30, 100), [0.0, 3.0]])
+    z = np.concatenate([slope * across[:60] - 0.6, 0.5 + 0.02 * across[60:160], [0.0, -0.4]])  # the last: a low thing
+    assert _reaches_top(across, z, slope).tolist() == [True] * 60 + [False] * 102
+    assert not _reaches_top(np.zeros(4), np.zeros(4), slope).any()
 
 
 def test_level_from_camera_by_hand() -> None:

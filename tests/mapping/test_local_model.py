@@ -206,7 +206,7 @@ def test_bad_revolutions_are_refused_with_the_reason() -> None:
     with pytest.raises(CloudError, match="99 points with 100 times"):
         mapper.revolution("velodyne", 45 * S // 10, times, lambda: np.zeros((100, 3)))
     assert mapper.model.revolutions == 1
-    with pytest.raises(CloudError, match="time went back by 3.5 s"):
+    with pytest.raises(CloudError, match="time went back"):
         mapper.revolution("velodyne", S, times, lambda: np.zeros((100, 3)))
     assert mapper.model.revolutions == 0 and len(mapper.cloud()) == 0
 

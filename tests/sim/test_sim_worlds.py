@@ -9,7 +9,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.contact import occupied_mask
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.world import World
-from instant_ic.sim.worlds import corridor_world, make_world, random_world
+from instant_ic.sim.worlds import corridor_world, long_world, make_world, random_world
 
 
 def ranges(world: World, origin: tuple[float, float, float], *directions: tuple[float, float, float]) -> np.ndarray:
@@ -79,6 +79,19 @@ def test_random_interiors_follow_their_seed() -> None:
     assert np.array_equal(one.vertices, same.vertices) and np.array_equal(one.light, same.light)
     assert one.vertices.shape != other.vertices.shape or not np.array_equal(one.vertices, other.vertices)
     assert make_world("random:7").name == "random:7"
+
+
+@pytest.mark.parametrize(("seed", "width_m"), [(2, (1.8, 3.2)), (3, (8.0, 15.0))])
+def test_long_worlds_have_a_far_end_and_open_doors(seed: int, width_m: tuple[float, float]) -> None:
+    world = long_world(seed, light_cell_m=1.0, rays=2)
+    x0, y0, x1, y1, _ = world.zones[0]
+    assert 20 <= x1 - x0 <= 40 and width_m[0] <= y1 - y0 <= width_m[1]
+    assert len(world.zones) > 2  # side rooms with their doorways
+    angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
+    x, y, _ = world.sample_free_poses(np.random.default_rng(0), 1)[0]
+    reach = ranges(world, (x, y, 2.0), *map(tuple, np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])))
+    assert np.isfinite(reach).all() and reach.max() > 2
+    assert make_world(f"long:{seed}").name == f"long:{seed}"
 
 
 def test_no_place_is_told(box_room: World) -> None:
