@@ -11,7 +11,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,9 @@ from instant_ic.experiments.teleop_worlds import Course, floor_plan
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 
+if TYPE_CHECKING:
+    from instant_ic.sim.world import World
+
 FloatArray: TypeAlias = NDArray[np.float64]
 
 AT_GOAL_M = 0.35
@@ -46,7 +49,15 @@ READY_S = 10.0
 class _Episode:
     """One running episode."""
 
-    def __init__(self, settings: TeleopSettings, course: Course, index: int, method: str, filmed: bool = False) -> None:
+    def __init__(
+        self,
+        settings: TeleopSettings,
+        course: Course,
+        index: int,
+        method: str,
+        filmed: bool = False,
+        make_stack: Callable[[World, StackConfig], SimulatedStack] = SimulatedStack,
+    ) -> None:
         seed, words = 1000 * settings.seed + index, settings.overrides
         config = StackConfig(method, settings.depth, seed, whole_views=filmed, overrides=words)
         self.settings, self.course = settings, course
@@ -56,7 +67,7 @@ class _Episode:
         self.operator: Operator = make_operator(course.goals, lambda: floor_plan(course.world), log)
         per_obstacle = 20.0 * len(course.obstacles)
         self.limit_s = READY_S + (log[-1, 0] + 20.0 if log is not None else 20.0 + 4.0 * course.way_m + per_obstacle)
-        self.stack = SimulatedStack(course.world, config)
+        self.stack = make_stack(course.world, config)
         self.began_s: float | None = None
         self.ended_s: float | None = None
         self.contacts = 0
@@ -160,12 +171,15 @@ def run_episode(
     index: int,
     on_step: Callable[[SimulatedStack], None] | None = None,
     methods: tuple[str, ...] = (),
+    make_stack: Callable[[World, StackConfig], SimulatedStack] = SimulatedStack,
 ) -> list[Drive]:
     """Drive one course by each method in turn; the same settings and index give the same result, except for times."""
-    course = settings.course(index)
+    course, filmed = settings.course(index), on_step is not None
     with _quiet():
-        filmed = on_step is not None
-        return [_Episode(settings, course, index, name, filmed).run(on_step) for name in methods or settings.methods]
+        return [
+            _Episode(settings, course, index, name, filmed, make_stack).run(on_step)
+            for name in methods or settings.methods
+        ]
 
 
 @contextlib.contextmanager

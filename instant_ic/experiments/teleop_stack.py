@@ -44,7 +44,7 @@ from instant_ic.msg import (
     stamp_ns,
     to_time,
 )
-from instant_ic.vspace.jobs import Job, Outcome, SpaceWorker
+from instant_ic.vspace.jobs import EncodedView, Job, Outcome, SpaceWorker
 
 if TYPE_CHECKING:
     from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
@@ -187,6 +187,7 @@ class _Page(SilentPage):
     def __init__(self, stack: SimulatedStack) -> None:
         self._stack = stack
         self.virtual = False
+        self.state: dict[str, Any] = {}  # newest message
 
     def now_ms(self) -> float:
         return self._stack.bus.clock.now_ns() / 1e6
@@ -194,6 +195,7 @@ class _Page(SilentPage):
     def publish(self, kind: str, message: dict[str, Any]) -> None:
         if kind != "state":
             return
+        self.state = message
         virtual = message["shown"] == "virtual"
         if virtual != self.virtual:
             self.virtual = virtual
@@ -254,7 +256,7 @@ class SimulatedStack:
         self._keyframe_at: FloatArray | None = None
         self._drawn: dict[int, FloatArray] = {}  # images on their way to a keyframe: stamp, r-bot's true pose
         # newest view: its request, and a function that renders it at full size
-        self._whole: tuple[int, Callable[[], bytes]] | None = None
+        self._whole: tuple[int, Callable[[], EncodedView]] | None = None
         self._newest: dict[bool, Shown] = {}
         self.bus = LockstepBus(START_NS, keep=False, on_record=self._on_record)
         self._add_nodes()
@@ -340,7 +342,7 @@ class SimulatedStack:
                     return super().do(job)
                 as_now = copy.copy(self)
                 as_now.space = copy.copy(self.space)  # rendering changes the space's state; the keyframes stay the same
-                stack._whole = int(order.id), lambda: _jpeg(SpaceWorker.do(as_now, job))
+                stack._whole = int(order.id), lambda: _encoded(SpaceWorker.do(as_now, job))
                 width, height = (max(16, int(side) // _SMALLER) for side in (order.width, order.height))
                 return super().do(replace(job, view=replace(order, width=width, height=height)))
 
@@ -357,8 +359,8 @@ class SimulatedStack:
             map_from_camera = matrix_from_quaternion(np.array(header["q"]))
             map_from_camera[:3, 3] = header["p"]
             pose = self._in_world(pose2_from_matrix(map_from_camera))
-            draw = self._whole[1] if self._whole is not None and self._whole[0] == header["request_id"] else None
-            now, fov = self.time_s, float(header["fov"])
+            now, fov, whole = self.time_s, float(header["fov"]), self._whole_view(header)
+            draw = None if whole is None else lambda: whole().jpeg
             shown = Shown(now, now, True, pose, pose[:2], float(pose[2]), payload, fov, draw)
         else:
             exposure_s, taken_from = self._exposed.popleft()
@@ -369,6 +371,10 @@ class SimulatedStack:
         self._newest[virtual] = shown
         if virtual == self.page.virtual:
             self._show(shown)
+
+    def _whole_view(self, header: dict[str, Any]) -> Callable[[], EncodedView] | None:
+        """Function that renders the view of a frame's header at full size; None if another view is the newest."""
+        return self._whole[1] if self._whole is not None and self._whole[0] == header["request_id"] else None
 
     def on_show(self) -> None:
         """Switch the page to the other kind of image: its newest one, if it is fresh."""
@@ -493,9 +499,9 @@ class SimulatedStack:
         log.reason.append(str(state.reason))
 
 
-def _jpeg(outcome: Outcome) -> bytes:
+def _encoded(outcome: Outcome) -> EncodedView:
     assert outcome.encoded is not None
-    return outcome.encoded.jpeg
+    return outcome.encoded
 
 
 def _settled(shown: Shown, whole: bool) -> Shown:

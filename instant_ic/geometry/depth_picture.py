@@ -96,23 +96,38 @@ def reproject(
         moved_m: (3,) in the image's camera frame (x forward, y left, z up).
         fov_rad: horizontal field of view.
     """
-    import cv2
-
-    def sample(image: NDArray[np.generic], at: NDArray[np.float32]) -> NDArray[np.generic]:
-        # 0 is the centre of the image, 1 its right and its upper edge.
-        rows, columns = image.shape[:2]
-        u, v = (1 + at[..., 0]) * (columns / 2) - 0.5, (1 - at[..., 1]) * (rows / 2) - 0.5
-        return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-
     rows, columns = picture.shape[:2]
     half = math.tan(fov_rad / 2) * np.array([1, rows / columns])
     x, y = (2 * np.arange(columns) + 1) / columns - 1, 1 - (2 * np.arange(rows) + 1) / rows
     here = np.stack(np.meshgrid(x, y), axis=2).astype(np.float32)
+    return _sample(picture, positions_before(here, inverse, moved_m, half)).astype(np.uint8)
+
+
+def positions_before(
+    here: NDArray[np.float32], inverse: NDArray[np.float32], moved_m: NDArray[np.floating], half: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Positions in an image of what a moved camera sees at given positions, as ``reproject`` and the shader find them.
+
+    Args:
+        here: (H, W, 2) positions; 0 is the image's centre, 1 its right and its upper edge.
+        inverse: (h, w) of ``decode_depth``.
+        moved_m: (3,) in the image's camera frame (x forward, y left, z up).
+        half: (2,) tangents of half the horizontal and vertical field of view.
+    """
     forward, left, up = (float(value) for value in moved_m)
     per_inverse = (np.array([-left, up]) / half - forward * here).astype(np.float32)  # of a point at 1 m
     size = math.hypot(forward, left, up)
     most = min(float(inverse.max()), MOST_PARALLAX / size if size > 0 else math.inf)
-    found = np.full((rows, columns), most, np.float32)
+    found = np.full(here.shape[:2], most, np.float32)
     for _ in range(STEPS):
-        found = np.minimum(sample(inverse, here + per_inverse * found[..., None]), np.float32(most))
-    return sample(picture, here + per_inverse * found[..., None]).astype(np.uint8)
+        found = np.minimum(_sample(inverse, here + per_inverse * found[..., None]), np.float32(most))
+    return np.asarray(here + per_inverse * found[..., None], np.float32)
+
+
+def _sample(image: NDArray[np.generic], at: NDArray[np.float32]) -> NDArray[np.generic]:
+    """Bilinear samples of an image at positions (H, W, 2) as in ``positions_before``."""
+    import cv2
+
+    rows, columns = image.shape[:2]
+    u, v = (1 + at[..., 0]) * (columns / 2) - 0.5, (1 - at[..., 1]) * (rows / 2) - 0.5
+    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

@@ -1,0 +1,220 @@
+"""``ic evaluate illusion``: how far is what the operator sees inside and behind an obstacle from the truth?
+
+The drive is that of ``ic evaluate teleop`` with illusory control. ``illusion_stack`` compares the frames of the page.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.experiments.illusion_stack import (
+    FRAME_HZ,
+    LIVE,
+    SOURCES,
+    VIEW_AGE_S,
+    FilmedStack,
+    IllusionFrame,
+    Screen,
+    StackConfig,
+)
+from instant_ic.experiments.processes import process_pool
+from instant_ic.experiments.teleop import prepare, run_episode
+from instant_ic.experiments.teleop_settings import TeleopSettings
+
+STEP_M = 0.5
+"""Width of a row of ``by_distance``."""
+WITHIN_DB = 2.0
+"""Error allowed in the expected PSNR."""
+Still = dict[str, NDArray[np.uint8]]
+"""Images of one frame: ``truth`` and each source."""
+
+
+@dataclass
+class Film:
+    """The frames of one episode.
+
+    Attributes:
+        index: number of the episode.
+        completed: whether the drive reached its goal.
+        frames: in the order of time.
+        stills: of the frame nearest to each multiple of ``STEP_M``, by that distance, metres.
+    """
+
+    index: int
+    completed: bool = False
+    frames: list[IllusionFrame] = field(default_factory=list)
+    stills: dict[float, Still] = field(default_factory=dict)
+
+
+def film_episode(settings: TeleopSettings, index: int) -> Film:
+    """Drive one course and compare the frames; the same settings and index give the same result.
+
+    Raises:
+        ValueError: no such world, or no possible drive in it.
+        RuntimeError: the stack did not become ready.
+    """
+    film, course = Film(index), settings.course(index)
+    nearest: dict[float, float] = {}
+
+    def take(frame: IllusionFrame, images: Still, truth: NDArray[np.uint8]) -> None:
+        film.frames.append(frame)
+        if frame.distance_m is None:
+            return
+        row = _row(frame.distance_m)
+        away = abs(frame.distance_m - row)
+        if away < nearest.get(row, math.inf):
+            nearest[row] = away
+            film.stills[row] = {"truth": truth, **images}
+
+    def make_stack(world: Any, config: StackConfig) -> FilmedStack:
+        return FilmedStack(world, config, course, index, take)
+
+    (drive,) = run_episode(settings, index, methods=("ic",), make_stack=make_stack)
+    film.completed = drive.completed
+    return film
+
+
+def evaluate(
+    settings: TeleopSettings, jobs: int = 1, on_film: Callable[[Film], None] | None = None, timeout_s: float = 7200.0
+) -> list[Film]:
+    """Film all episodes, ``jobs`` in parallel; with more than one job, each in its own process.
+
+    Raises:
+        ValueError: nothing to do, no such world.
+        TimeoutError: the episodes took longer than ``timeout_s``.
+        RuntimeError: a process died, or a stack did not become ready.
+    """
+    from concurrent.futures import as_completed
+    from concurrent.futures.process import BrokenProcessPool
+
+    if jobs < 1:
+        raise ValueError(f"jobs must be at least 1 (got {jobs})")
+    films: list[Film] = []
+    began, late = time.monotonic(), f"the episodes took longer than {timeout_s:.0f} s"
+
+    def take(film: Film) -> None:
+        films.append(film)
+        if on_film is not None:
+            on_film(film)
+
+    if jobs == 1 or settings.episodes == 1:
+        prepare()
+        for index in range(settings.episodes):
+            if time.monotonic() - began > timeout_s:
+                raise TimeoutError(late)
+            take(film_episode(settings, index))
+        return films
+    with process_pool(min(jobs, settings.episodes), prepare) as pool:
+        try:
+            futures = [pool.submit(film_episode, settings, index) for index in range(settings.episodes)]
+            for future in as_completed(futures, timeout=timeout_s):
+                take(future.result())
+        except BrokenProcessPool as error:
+            raise RuntimeError("a process that filmed an episode died (out of memory?); try --jobs 1") from error
+        except TimeoutError as error:
+            raise TimeoutError(late) from error
+    return sorted(films, key=lambda film: film.index)
+
+
+def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
+    """Figures of all frames, the same with the oracles, readiness, and each frame; ready for JSON.
+
+    Raises:
+        ValueError: the virtual space was never shown.
+    """
+    frames = [frame for film in films for frame in film.frames]
+    if not frames:
+        raise ValueError(f"world {settings.world!r}: the virtual space was not shown in {len(films)} episode(s)")
+    screen = Screen()
+    result = {
+        "world": settings.world,
+        "episodes": len(films),
+        "seed": settings.seed,
+        "overrides": list(settings.overrides),
+        "screen": [screen.width, screen.height, round(math.degrees(screen.fov_rad), 1)],
+        "frames_per_simulated_s": FRAME_HZ,
+        "view_age_s": VIEW_AGE_S,
+        "completed": sum(film.completed for film in films),
+        **figures(frames, LIVE),
+        "by_distance": by_distance(frames, LIVE),
+        "frames_without_obstacle": sum(frame.distance_m is None for frame in frames),
+    }
+    for source in SOURCES[1:]:
+        result[source] = {**figures(frames, source), "by_distance": by_distance(frames, source)}
+    result["readiness"] = readiness(frames)
+    result["each"] = [asdict(frame) for frame in frames]
+    rounded: dict[str, Any] = _rounded(result)
+    return rounded
+
+
+def figures(frames: Sequence[IllusionFrame], source: str) -> dict[str, Any]:
+    """Mean figures of frames for a source; NaN where there is nothing to average."""
+    scores = [frame.scores[source] for frame in frames]
+    psnr = np.array([one.psnr_db for one in scores])
+    floor = sum(one.floor for one in scores)
+    return {
+        "frames": len(frames),
+        "psnr_mean_db": float(psnr.mean()),
+        "psnr_p05_db": float(np.percentile(psnr, 5)),
+        "ssim_mean": float(np.mean([one.ssim for one in scores])),
+        "unseen_share_mean": float(np.mean([frame.unseen_share[source] for frame in frames])),
+        "floor_fog_share": sum(one.fog for one in scores) / floor if floor else math.nan,
+    }
+
+
+def by_distance(frames: Sequence[IllusionFrame], source: str) -> list[dict[str, Any]]:
+    """``figures`` by distance behind the near face, in rows of ``STEP_M`` around their distance."""
+    rows: dict[float, list[IllusionFrame]] = {}
+    for frame in frames:
+        if frame.distance_m is not None:
+            rows.setdefault(_row(frame.distance_m), []).append(frame)
+    return [{"distance_m": row, **figures(rows[row], source)} for row in sorted(rows)]
+
+
+def readiness(frames: Sequence[IllusionFrame]) -> dict[str, Any]:
+    """Error of the expected PSNR over the live frames, dB."""
+    error = np.array([frame.expected_psnr_db - frame.scores[LIVE].psnr_db for frame in frames])
+    return {
+        "mean_error_db": float(error.mean()),
+        "rms_error_db": float(np.sqrt(np.mean(error**2))),
+        "p95_abs_error_db": float(np.percentile(np.abs(error), 95)),
+        "share_within_2_db": float(np.mean(np.abs(error) <= WITHIN_DB)),
+    }
+
+
+def save(path: Path, figures_: dict[str, Any]) -> None:
+    """Write the report atomically: an interrupted program leaves no half of a file."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_text(json.dumps(figures_, indent=2) + "\n")
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _row(distance_m: float) -> float:
+    return STEP_M * round(distance_m / STEP_M) + 0.0  # no −0
+
+
+def _rounded(value: Any) -> Any:
+    """Round numbers to four places; NaN and infinity become None, which JSON has."""
+    if isinstance(value, dict):
+        return {key: _rounded(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(one) for one in value]
+    if isinstance(value, float):
+        return round(value, 4) if math.isfinite(value) else None
+    return value
+
+
+__all__ = ["Film", "TeleopSettings", "evaluate", "film_episode", "report"]

@@ -1,0 +1,90 @@
+"""Image strip and plots of ``experiments.illusion``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.experiments.illusion import Film
+from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, TRUE_FILL, TRUE_VIEW
+from instant_ic.experiments.pictures import new_figure, save_figure
+
+_TILE = (400, 225)
+_LABEL_PX, _HEAD_PX = 64, 24
+_COLUMNS = {LIVE: "shown", "truth": "true", TRUE_DEPTH: "with true depth", TRUE_FILL: "with true depth and fill"}
+_NAMES = {**_COLUMNS, TRUE_VIEW: "true view (the page alone)"}
+_COLOURS = {LIVE: "tab:red", TRUE_DEPTH: "tab:blue", TRUE_FILL: "tab:green", TRUE_VIEW: "0.4"}
+
+
+def save_strip(path: Path, films: Sequence[Film]) -> None:
+    """Save rows of frames by distance behind the obstacle's near face, of the episode that has most of them.
+
+    Raises:
+        ValueError: no frame has a distance: no obstacle was passed.
+    """
+    film = max(films, key=lambda film: len(film.stills))
+    if not film.stills:
+        raise ValueError(f"{path}: there is no strip because no obstacle was passed")
+    head = np.full((_HEAD_PX, _LABEL_PX + len(_COLUMNS) * _TILE[0], 3), 255, np.uint8)
+    for number, title in enumerate(_COLUMNS.values()):
+        _write(head, title, (_LABEL_PX + number * _TILE[0] + 8, 17))
+    rows = [head]
+    for distance in sorted(film.stills):
+        label = np.full((_TILE[1], _LABEL_PX, 3), 255, np.uint8)
+        _write(label, f"{distance:+.1f} m", (4, _TILE[1] // 2))
+        still = film.stills[distance]
+        tiles = [cv2.resize(still[name], _TILE, interpolation=cv2.INTER_AREA) for name in _COLUMNS]
+        rows.append(np.hstack([label, *tiles]))
+    if not cv2.imwrite(str(path), np.vstack(rows)[..., ::-1]):
+        raise ValueError(f"{path}: the strip cannot be written")
+
+
+def save_plot(path: Path, report: dict[str, Any]) -> None:
+    """Save PSNR against distance for all sources, and the expected PSNR against the live one."""
+    figure, axes = new_figure(1, 2, (12.0, 4.6))
+    left, right = axes[0]
+    each = report["each"]
+    for source in SOURCES:
+        label, colour = _NAMES[source], _COLOURS[source]
+        known = [frame for frame in each if frame["distance_m"] is not None]
+        left.plot(
+            [frame["distance_m"] for frame in known],
+            [frame["scores"][source]["psnr_db"] for frame in known],
+            ".",
+            color=colour,
+            alpha=0.25,
+            markersize=4,
+        )
+        rows = (report if source == LIVE else report[source])["by_distance"]
+        left.plot([r["distance_m"] for r in rows], [r["psnr_mean_db"] for r in rows], color=colour, label=label)
+    left.axvline(0.0, color="0.6", linewidth=0.8)
+    left.set_xlabel("metres behind the obstacle's near face")
+    left.set_ylabel("PSNR, dB")
+    left.grid(alpha=0.3)
+    left.legend(fontsize=8)
+    live = np.array([frame["scores"][LIVE]["psnr_db"] for frame in each])
+    expected = np.array([np.nan if f["expected_psnr_db"] is None else f["expected_psnr_db"] for f in each])
+    ends = _ends(live, expected)
+    right.fill_between(ends, ends - 2, ends + 2, color="0.9", label="within 2 dB")
+    right.plot(live, expected, ".", color="tab:red", alpha=0.5)
+    right.set_xlabel("live PSNR, dB")
+    right.set_ylabel("expected PSNR, dB")
+    right.grid(alpha=0.3)
+    right.legend(fontsize=8)
+    name = Path(str(report["world"])).name
+    figure.suptitle(f"{name}, {report['episodes']} episode(s), {report['frames']} frames", fontsize=10)
+    save_figure(figure, path)
+
+
+def _ends(*values: NDArray[np.float64]) -> NDArray[np.float64]:
+    together = np.concatenate(values)
+    return np.array([np.nanmin(together) - 1, np.nanmax(together) + 1])
+
+
+def _write(image: NDArray[np.uint8], text: str, at: tuple[int, int]) -> None:
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
