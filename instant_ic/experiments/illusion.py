@@ -54,6 +54,17 @@ class Film:
     completed: bool = False
     frames: list[IllusionFrame] = field(default_factory=list)
     stills: dict[float, Still] = field(default_factory=dict)
+    _off_m: dict[float, float] = field(default_factory=dict)  # how far each still is from its distance
+
+    def take(self, frame: IllusionFrame, images: Still, truth: NDArray[np.uint8]) -> None:
+        """Add a frame, its images by source, and the true image."""
+        self.frames.append(frame)
+        if frame.distance_m is None:
+            return
+        row = _row(frame.distance_m)
+        off = abs(frame.distance_m - row)
+        if off < self._off_m.get(row, math.inf):
+            self._off_m[row], self.stills[row] = off, {"truth": truth, **images}
 
 
 def film_episode(settings: TeleopSettings, index: int) -> Film:
@@ -64,20 +75,9 @@ def film_episode(settings: TeleopSettings, index: int) -> Film:
         RuntimeError: the stack did not become ready.
     """
     film, course = Film(index), settings.course(index)
-    nearest: dict[float, float] = {}
-
-    def take(frame: IllusionFrame, images: Still, truth: NDArray[np.uint8]) -> None:
-        film.frames.append(frame)
-        if frame.distance_m is None:
-            return
-        row = _row(frame.distance_m)
-        away = abs(frame.distance_m - row)
-        if away < nearest.get(row, math.inf):
-            nearest[row] = away
-            film.stills[row] = {"truth": truth, **images}
 
     def make_stack(world: Any, config: StackConfig) -> FilmedStack:
-        return FilmedStack(world, config, course, index, take)
+        return FilmedStack(world, config, course, index, film.take)
 
     (drive,) = run_episode(settings, index, methods=("ic",), make_stack=make_stack)
     film.completed = drive.completed

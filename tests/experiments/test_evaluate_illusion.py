@@ -1,0 +1,250 @@
+"""``ic evaluate illusion``: the page's image by hand, the truth against a world built without its box, a short film."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from instant_ic.cli.main import main
+from instant_ic.experiments import illusion, teleop, teleop_worlds
+from instant_ic.experiments.illusion_page import PageView, Screen, compose, place_on_screen, smooth_samples, softened
+from instant_ic.experiments.illusion_plot import save_plot, save_strip
+from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, TRUE_VIEW, FilmedStack, IllusionFrame
+from instant_ic.experiments.illusion_truth import Passage, Score, corners, fog_pixels, score, surfaces, without
+from instant_ic.experiments.teleop_stack import StackConfig
+from instant_ic.experiments.teleop_worlds import Obstacle
+from instant_ic.geometry.image_quality import psnr_db
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.sim.render import EquirectRenderer
+from instant_ic.sim.worlds import corridor_world
+
+BOX = Obstacle(4.25, 0.0, 0.5, 0.5, 0.0, 0.8)
+RIGHT_ANGLE = math.pi / 2
+
+
+@pytest.fixture(scope="module")
+def corridor() -> teleop_worlds.Course:
+    """The simulator's corridor; the face of its box is 4 m ahead of the origin."""
+    return teleop_worlds.make_course("corridor", 0, 0)
+
+
+def grid(width: int, height: int) -> np.ndarray:
+    x, y = (2 * np.arange(width) + 1) / width - 1, 1 - (2 * np.arange(height) + 1) / height
+    return np.stack(np.meshgrid(x, y), axis=2).astype(np.float32)
+
+
+# -- the page
+
+
+def test_the_magnification_filter_is_a_cubic_b_spline() -> None:
+    """Of one white pixel 4/6 · 4/6 is left, each neighbour gets 4/6 · 1/6 and each corner 1/36."""
+    image = np.zeros((7, 7, 3), np.float32)
+    image[3, 3] = 1.0
+    out = smooth_samples(image, grid(7, 7))[..., 0]
+    assert out[3, 3] == pytest.approx(16 / 36, abs=2e-3)
+    assert out[3, 4] == pytest.approx(4 / 36, abs=2e-3) and out[2, 3] == pytest.approx(4 / 36, abs=2e-3)
+    assert out[4, 4] == pytest.approx(1 / 36, abs=2e-3) and out[3, 6] == pytest.approx(0.0, abs=2e-3)
+
+
+def test_unseen_places_are_paler() -> None:
+    """Red where nothing was seen: halfway to its grey, 0.30; where all was seen: as it is."""
+    red = np.zeros((48, 64, 3), np.float32)
+    red[..., 0] = 1.0
+    mask = np.zeros((6, 8), np.float32)
+    mask[:, 5:] = 1.0
+    out = softened(red, mask)
+    assert out[20, 5] == pytest.approx([0.65, 0.15, 0.15], abs=1e-3)
+    assert out[20, 60] == pytest.approx([1.0, 0.0, 0.0], abs=1e-3)
+
+
+def ramp_view(inverse_depth: float) -> PageView:
+    """A view of 90° whose red is its horizontal position, 0 left to 1 right."""
+    rgb = np.zeros((64, 64, 3), np.float32)
+    rgb[..., 0] = 0.5 + 0.5 * grid(64, 64)[..., 0]
+    return PageView(rgb, np.full((24, 24), inverse_depth, np.float32), np.eye(4), RIGHT_ANGLE)
+
+
+@pytest.mark.parametrize(
+    ("moved", "yaw", "at", "source"),
+    [
+        ((0.0, 0.0, 0.0), 0.0, 0.5, 0.5),
+        # A wall 2 m ahead, 1 m nearer: twice as large.
+        ((1.0, 0.0, 0.0), 0.0, 0.5, 0.25),
+        # 0.4 m to the left: what is seen at tan 0.3 was at 0.3 − 0.4/2.
+        ((0.0, 0.4, 0.0), 0.0, 0.3, 0.1),
+        # Turned to the left by atan 0.5: the new centre was at −0.5.
+        ((0.0, 0.0, 0.0), math.atan(0.5), 0.0, -0.5),
+    ],
+)
+def test_the_view_moves_with_the_camera(
+    moved: tuple[float, float, float], yaw: float, at: float, source: float
+) -> None:
+    screen = Screen(100, 100, RIGHT_ANGLE)
+    placed, inside = place_on_screen(ramp_view(0.5), screen, pose_matrix(yaw=yaw)[:3, :3], np.array(moved))
+    column = 50 + 50 * at - 0.5
+    row = placed[50, :, 0]
+    assert np.interp(column, np.arange(100), row) == pytest.approx(0.5 + 0.5 * source, abs=0.006)
+    assert inside[50, 50] == 1.0
+
+
+def test_beyond_the_view_the_camera_continues_grey() -> None:
+    """A view of 90° on a screen of 120°: its middle is the view; the corner is 35 % of the camera's grey on night."""
+    screen = Screen(100, 60, math.radians(120))
+    placed, inside = place_on_screen(ramp_view(0.5), screen, np.eye(3), np.zeros(3))
+    camera = np.full((60, 100, 3), (255, 0, 0), np.uint8)
+    image = compose(placed, inside, camera, 1.0)
+    assert inside[30, 50] == 1 and inside[0, 0] == 0
+    night = np.array([0.035, 0.043, 0.055])
+    assert np.abs(image[0, 0] - 255 * (night + 0.35 * (0.3 - night))).max() < 1
+    assert np.abs(image[30, 50] - np.array([128.0, 0.0, 0.0])).max() < 4
+    assert np.array_equal(compose(placed, inside, camera, 0.0), camera)
+
+
+# -- the truth
+
+
+def test_distance_behind_the_near_face_by_hand() -> None:
+    """From x = 3 the box's face is 1 m ahead, that of the next box 3 m; a third one stands 2 m aside."""
+    boxes = [Obstacle(6.25, 0.2, 0.5, 0.5, 0.0, 0.8), BOX, Obstacle(4.0, 2.0, 0.5, 0.5, 0.0, 0.8)]
+    passage = Passage.of(np.array([3.0, 0.0, 0.0]), boxes)
+    assert [near for near, _ in passage.obstacles] == pytest.approx([1.0, 3.0])
+    assert passage.obstacle_at(np.array([3.2, 0.0])) == (pytest.approx(-0.8), BOX)
+    assert passage.obstacle_at(np.array([5.5, 0.3])) == (pytest.approx(1.5), BOX)
+    assert passage.obstacle_at(np.array([6.5, 0.0])) == (pytest.approx(0.5), boxes[0])
+    assert Passage.of(np.array([3.0, 0.0, math.pi]), boxes).obstacle_at(np.zeros(2)) is None
+    turned = corners(Obstacle(0.0, 0.0, 2.0, 1.0, math.pi / 2, 1.0))
+    assert turned[0] == pytest.approx([-0.5, 1.0])
+
+
+def test_the_world_without_its_box_is_the_one_built_without_it(corridor: teleop_worlds.Course) -> None:
+    """Depth and colours from inside and behind the box, and the depth from before it."""
+    (box,) = corridor.obstacles
+    assert (box.x, box.y, box.length) == pytest.approx((4.25, 0.0, 0.5), abs=0.06)
+    removed = EquirectRenderer(without(corridor.world, box))
+    free, full = EquirectRenderer(corridor_world(obstacle=False)), EquirectRenderer(corridor.world)
+    for x in (3.4, 4.2, 5.5):
+        pose = pose_matrix(x, 0.0, 1.2)
+        ours, theirs = (one.render_perspective(pose, 160, 90, RIGHT_ANGLE) for one in (removed, free))
+        assert np.abs(ours.depth_m - theirs.depth_m).max() < 0.01
+        assert psnr_db(ours.rgb, theirs.rgb) > 30
+    pose = pose_matrix(3.0, 0.0, 1.2)
+    assert np.abs(removed.render(pose, 128, 64).depth_m - full.render(pose, 128, 64).depth_m).max() > 0.3
+
+
+def test_floor_shown_as_wall_counts_as_fog() -> None:
+    """Floor 100, wall 200: the floor's left half is shown at 190, its right half at 110."""
+    true = np.full((60, 80, 3), 200, np.uint8)
+    true[30:] = 100
+    floor = np.zeros((60, 80), bool)
+    floor[30:] = True
+    shown = true.copy()
+    shown[30:, :40], shown[30:, 40:] = 190, 110
+    fog = fog_pixels(shown, true, floor, ~floor)
+    # The mean of nine columns changes sides at the border itself.
+    assert fog[:, :39].sum() == 30 * 39 and fog[:, 41:].sum() == 0
+    assert not fog_pixels(true, true, floor, ~floor).any()
+    assert not fog_pixels(shown, true, floor, np.zeros_like(floor)).any()
+
+
+def test_surfaces_by_height(corridor: teleop_worlds.Course) -> None:
+    """1.2 m over the floor at 90°, 90 rows: the floor is met below the horizon, 4 m of corridor walls beside."""
+    pose = pose_matrix(0.0, 0.0, 1.2)
+    truth = EquirectRenderer(corridor.world).render_perspective(pose, 160, 90, RIGHT_ANGLE)
+    floor, wall = surfaces(truth, pose, RIGHT_ANGLE)
+    assert floor[89, 80] and not floor[:45].any() and not wall[89, 80]
+    assert wall[45, 2] and wall[45, 157] and not wall[0, 80]
+    assert score(truth.rgb, truth, pose, RIGHT_ANGLE).fog == 0
+
+
+# -- figures
+
+
+def frame(distance_m: float | None, db: float, expected: float = 25.0) -> IllusionFrame:
+    scores = dict.fromkeys(SOURCES, Score(db, 0.5, 10, 100))
+    return IllusionFrame(0, 1.0, distance_m, False, scores, db, None, dict.fromkeys(SOURCES, 0.1), expected)
+
+
+def test_figures_by_hand() -> None:
+    frames = [frame(0.1, 20.0), frame(0.2, 24.0), frame(0.4, 28.0), frame(None, 24.0)]
+    whole = illusion.figures(frames, LIVE)
+    assert whole["psnr_mean_db"] == 24.0 and whole["frames"] == 4 and whole["floor_fog_share"] == 0.1
+    assert whole["psnr_p05_db"] == pytest.approx(20.6)  # 0.15 of the way from the first to the second of four
+    rows = illusion.by_distance(frames, TRUE_DEPTH)
+    assert [(row["distance_m"], row["frames"], row["psnr_mean_db"]) for row in rows] == [(0.0, 2, 22.0), (0.5, 1, 28.0)]
+    ready = illusion.readiness(frames)  # errors 5, 1, −3, 1
+    assert ready["mean_error_db"] == 1.0 and ready["rms_error_db"] == 3.0 and ready["share_within_2_db"] == 0.5
+    told = illusion.report([illusion.Film(0, True, [frame(None, 24.0)])], illusion.TeleopSettings(methods=("ic",)))
+    assert told["by_distance"] == [] and told["frames_without_obstacle"] == 1
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    with pytest.raises(ValueError, match="virtual space was not shown"):
+        illusion.report([illusion.Film(0)], illusion.TeleopSettings())
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--episodes", "0"], "episodes must be at least 1"),
+        (["--world", "nowhere"], "neither corridor"),
+        (["--jobs", "0"], "jobs must be at least 1"),
+        (["--strip", "strip.jpg"], "must end in .png"),
+        (["--plot", "/no/such/folder/plot.png"], "does not exist"),
+        (["--timeout", "0"], "--timeout must be > 0"),
+        (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),
+    ],
+)
+def test_wrong_arguments_are_reported(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "illusion", "--episodes", "1", *words]) == 1
+    assert told in " ".join(capsys.readouterr().err.split())
+
+
+# -- a short film
+
+
+def film(corridor: teleop_worlds.Course) -> illusion.Film:
+    """From 1.6 m before the box's face into it, with depth from the LiDAR alone."""
+    world = copy.copy(corridor.world)
+    world.spawn = (2.4, 0.0, 0.0)
+    course = teleop_worlds.Course(world, corridor.goals, corridor.obstacles)
+    settings = illusion.TeleopSettings(1, 0, "corridor", ("ic",), "lidar", pictures=False)
+    result = illusion.Film(0)
+
+    def make_stack(world: teleop_worlds.World, config: StackConfig) -> FilmedStack:
+        return FilmedStack(world, config, course, 0, result.take)
+
+    episode = teleop._Episode(settings, course, 0, "ic", make_stack=make_stack)
+    episode.limit_s = 8.0
+    episode.run()
+    return result
+
+
+def test_a_short_film(corridor: teleop_worlds.Course, tmp_path: Path) -> None:
+    first, second = film(corridor), film(corridor)
+    settings = illusion.TeleopSettings(1, 0, "corridor", ("ic",), "lidar")
+    told = illusion.report([first], settings)
+    assert told == illusion.report([second], settings)  # the same seed, the same figures
+    assert told["frames"] >= 8 and told["frames_without_obstacle"] == 0
+    rows = [row["distance_m"] for row in told["by_distance"]]
+    assert rows[0] < 0 <= rows[-1]
+    # The page alone loses least; with true depth nothing is lost to depth.
+    assert told[TRUE_VIEW]["psnr_mean_db"] > told["with_true_depth_and_fill"]["psnr_mean_db"] > 20
+    assert told["with_true_depth_and_fill"]["psnr_mean_db"] > told["psnr_mean_db"] > 12
+    assert told[TRUE_VIEW]["floor_fog_share"] < 0.01 and 0 < told["unseen_share_mean"] < 0.5
+    for each in told["each"]:
+        assert each["with_obstacle"] == (each["distance_m"] < 0)
+        both = each["psnr_with_db"], each["psnr_without_db"]
+        assert each["scores"][LIVE]["psnr_db"] == both[0 if each["with_obstacle"] else 1]
+    illusion.save(tmp_path / "film.json", told)
+    assert json.loads((tmp_path / "film.json").read_text()) == told
+    save_strip(tmp_path / "strip.png", [first])
+    strip = cv2.imread(str(tmp_path / "strip.png"))
+    assert strip.shape == (24 + 225 * len(rows), 64 + 4 * 400, 3) and strip.std() > 20
+    save_plot(tmp_path / "plot.png", told)
+    assert cv2.imread(str(tmp_path / "plot.png")).std() > 10
+    with pytest.raises(ValueError, match="no obstacle was passed"):
+        save_strip(tmp_path / "strip.png", [illusion.Film(0)])
