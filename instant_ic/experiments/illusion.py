@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.illusion_stack import (
-    FRAME_HZ,
+    FRAME_S,
     LIVE,
     SOURCES,
     VIEW_AGE_S,
@@ -142,7 +142,7 @@ def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
         "seed": settings.seed,
         "overrides": list(settings.overrides),
         "screen": [screen.width, screen.height, round(math.degrees(screen.fov_rad), 1)],
-        "frames_per_simulated_s": FRAME_HZ,
+        "seconds_between_frames": FRAME_S,
         "view_age_s": VIEW_AGE_S,
         "completed": sum(film.completed for film in films),
         **figures(frames, LIVE),
@@ -182,8 +182,10 @@ def by_distance(frames: Sequence[IllusionFrame], source: str) -> list[dict[str, 
 
 
 def readiness(frames: Sequence[IllusionFrame]) -> dict[str, Any]:
-    """Error of the expected PSNR over the live frames, dB."""
-    error = np.array([frame.expected_psnr_db - frame.scores[LIVE].psnr_db for frame in frames])
+    """Error of the expected PSNR over the live frames that show the view alone, dB; empty without such frames."""
+    error = np.array([frame.expected_psnr_db - frame.scores[LIVE].psnr_db for frame in frames if frame.blend == 1])
+    if not error.size:
+        return {}
     return {
         "mean_error_db": float(error.mean()),
         "rms_error_db": float(np.sqrt(np.mean(error**2))),

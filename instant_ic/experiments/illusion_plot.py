@@ -67,8 +67,9 @@ def save_plot(path: Path, report: dict[str, Any]) -> None:
     left.set_ylabel("PSNR, dB")
     left.grid(alpha=0.3)
     left.legend(fontsize=8)
-    live = np.array([frame["scores"][LIVE]["psnr_db"] for frame in each])
-    expected = np.array([np.nan if f["expected_psnr_db"] is None else f["expected_psnr_db"] for f in each])
+    alone = [frame for frame in each if frame["blend"] == 1] or each
+    live = np.array([frame["scores"][LIVE]["psnr_db"] for frame in alone])
+    expected = np.array([np.nan if f["expected_psnr_db"] is None else f["expected_psnr_db"] for f in alone])
     ends = _ends(live, expected)
     right.fill_between(ends, ends - 2, ends + 2, color="0.9", label="within 2 dB")
     right.plot(live, expected, ".", color="tab:red", alpha=0.5)

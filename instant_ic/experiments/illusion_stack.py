@@ -35,8 +35,8 @@ LIVE, TRUE_DEPTH, TRUE_FILL = "live", "with_true_depth", "with_true_depth_and_fi
 TRUE_VIEW = "with_true_view"
 """The simulator's image and depth instead of the rendered view: what the page itself loses."""
 SOURCES = (LIVE, TRUE_DEPTH, TRUE_FILL, TRUE_VIEW)
-FRAME_HZ = 4.0
-"""Frames compared per simulated second; the page shows up to 60."""
+FRAME_S = 0.3
+"""Simulated seconds between two compared frames: every third view. The page shows up to 60 frames a second."""
 VIEW_AGE_S = 0.15
 """Age of the shown view's pose: rendering and transport take about 0.1 s, and views come ten times a second."""
 ELSEWHERE_M = 1.0
@@ -51,6 +51,7 @@ class IllusionFrame:
 
     Attributes:
         episode, time_s: which frame, in simulated seconds.
+        blend: 1 where the view is shown alone, less while it dissolves into the camera's image or out of it.
         distance_m: position behind the near face of the obstacle that is passed, negative before it; None without any.
         with_obstacle: whether the truth is the world with the obstacle.
         scores: of each source against that truth.
@@ -62,6 +63,7 @@ class IllusionFrame:
 
     episode: int
     time_s: float
+    blend: float
     distance_m: float | None
     with_obstacle: bool
     scores: dict[str, Score]
@@ -83,7 +85,7 @@ class _Taken:
 
 
 class FilmedStack(SimulatedStack):
-    """Compares what the page shows of the virtual space with the truth, ``FRAME_HZ`` times a simulated second.
+    """Compares what the page shows of the virtual space with the truth, every ``FRAME_S``.
 
     Args:
         world, config: as ``SimulatedStack``.
@@ -148,7 +150,7 @@ class FilmedStack(SimulatedStack):
         whole = self._whole_view(header)
         if whole is None or self._truth_space is None:
             return
-        self._next_frame_s = self.time_s + 1 / FRAME_HZ
+        self._next_frame_s = self.time_s + FRAME_S - 1e-9
         self._taken = self._render(whole(), self._truth_space)
 
     def _render(self, live: EncodedView, truth_space: VirtualSpace) -> _Taken:
@@ -220,6 +222,7 @@ class FilmedStack(SimulatedStack):
         frame = IllusionFrame(
             self._episode,
             self.time_s,
+            self._blend,
             distance_m,
             with_obstacle,
             {name: score(image, truth, world_from_shown, screen.fov_rad) for name, image in images.items()},

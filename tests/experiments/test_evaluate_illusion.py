@@ -167,7 +167,7 @@ def test_surfaces_by_height(corridor: teleop_worlds.Course) -> None:
 
 def frame(distance_m: float | None, db: float, expected: float = 25.0) -> IllusionFrame:
     scores = dict.fromkeys(SOURCES, Score(db, 0.5, 10, 100))
-    return IllusionFrame(0, 1.0, distance_m, False, scores, db, None, dict.fromkeys(SOURCES, 0.1), expected)
+    return IllusionFrame(0, 1.0, 1.0, distance_m, False, scores, db, None, dict.fromkeys(SOURCES, 0.1), expected)
 
 
 def test_figures_by_hand() -> None:
