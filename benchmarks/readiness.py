@@ -1,101 +1,108 @@
-"""Compares the expected PSNR of the virtual space with the measured one in simulated worlds; prints JSON.
+"""Compares the expected PSNR of the virtual space with the one on the operator's page; prints JSON.
 
-    python benchmarks/readiness.py [--mesh house.glb] [--fit]
+    python benchmarks/readiness.py [--world W[,W]] [--seed S] [--episodes N] [--fit]
 
-Keyframes have the true depth with a smooth error of known size. ``--fit`` fits the gains of ``vspace/readiness.py`` to
-the random worlds; the corridor and the mesh are for testing only.
+The frames are those of ``ic evaluate illusion``. ``--fit`` prints the base and the gains of ``vspace/readiness.py``
+that fit them best: fit on some worlds and seeds, test on others.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
-from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
-from scipy.optimize import nnls
+from numpy.typing import NDArray
 
-from instant_ic.experiments.depth_worlds import Scene, scenes
-from instant_ic.geometry.image_quality import psnr_of_mse
-from instant_ic.geometry.poses import pose_matrix
-from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig, readiness
+from instant_ic.experiments.illusion import TeleopSettings
+from instant_ic.experiments.illusion_stack import LIVE, FilmedStack, IllusionFrame
+from instant_ic.experiments.teleop import prepare, run_episode
+from instant_ic.vspace import readiness
 from instant_ic.vspace.view import perspective_rays
 
-SIZE, FOV = (160, 90), math.pi / 2
-DISTANCES_M = (0.0, 0.4, 0.8, 1.4, 2.0)
-SIGMAS = (0.01, 0.04, 0.1)
+if TYPE_CHECKING:
+    from instant_ic.experiments.teleop_stack import StackConfig
+    from instant_ic.sim.world import World
+
+COLUMNS = 64
+"""Columns of the rays that are judged, as in ``VirtualSpace``."""
 
 
-def places(mesh: str | None, count: int) -> Iterator[tuple[str, Scene]]:
-    """Held-out panoramas with their kind: of the corridor, of the mesh, of random worlds."""
-    kinds: list[tuple[str, int, str | None]] = [("corridor", 2, None), ("random", count, None)]
-    for kind, number, file in [*kinds, ("mesh", 2, mesh)] if mesh else kinds:
-        yield from ((kind, scene) for scene in scenes(kind, number, file, height=512))
+class _JudgedStack(FilmedStack):
+    """Keeps the terms of each live view."""
+
+    terms: tuple[float, float] = (0.0, 0.0)
+
+    def _render(self, live: Any, truth_space: Any) -> Any:
+        priors, order = self.nodes["nerf"].work.space.keyframes, live.order
+        rays = perspective_rays(order.pose(), order.width, order.height, order.fov_rad)
+        step = max(1, order.width // COLUMNS)
+        rows, columns = np.arange(step // 2, order.height, step), np.arange(step // 2, order.width, step)
+        chosen = (rows[:, None] * order.width + columns).reshape(-1)
+        depth, confidence = (image.reshape(-1)[chosen] for image in (live.view.depth_m, live.view.confidence))
+        texture = readiness.Texture.of(priors[0].rgb)
+        self.terms = readiness.error_terms(priors, texture, rays.some(chosen), depth, confidence)
+        return super()._render(live, truth_space)
 
 
-def wrong_depth(depth_m: Any, sigma: float, seed: int) -> Any:
-    """Depth with a smooth relative error of standard deviation ``sigma``."""
-    noise = np.random.default_rng(seed).normal(size=(8, 16)).astype(np.float32)
-    smooth = cv2.resize(noise, depth_m.shape[::-1], interpolation=cv2.INTER_CUBIC)
-    return depth_m * (1 + sigma * smooth / smooth.std())
+def samples(world: str, seed: int, episodes: int) -> list[dict[str, Any]]:
+    """Terms, expected and measured PSNR of the frames of a world that show the view alone."""
+    settings, rows = TeleopSettings(episodes, seed, world, ("ic",), pictures=False), []
+    stacks: list[_JudgedStack] = []
 
+    def note(frame: IllusionFrame, *_: Any) -> None:
+        if frame.blend == 1:
+            shown, expected = frame.scores[LIVE].psnr_db, frame.expected_psnr_db
+            rows.append({"terms": stacks[-1].terms, "psnr_db": shown, "expected_db": expected})
 
-def samples(kind: str, scene: Scene) -> list[dict[str, Any]]:
-    """Terms and measured PSNR of views ahead and to the side."""
-    rows = []
-    pose = scene.map_from_camera
-    reach = float(scene.depth_m[250:262, 500:524].min()) - 0.5
-    for sigma in SIGMAS:
-        space = VirtualSpace(VirtualSpaceConfig(source="warp"))
-        space.set_keyframe(scene.rgb, wrong_depth(scene.depth_m, sigma, 1), pose, sigma)
-        for index, distance in enumerate(d for d in DISTANCES_M if d < reach):
-            view = pose @ pose_matrix(distance, yaw=(0.0, 0.9, -0.9)[index % 3])
-            picture = space.render(view, *SIZE, FOV)
-            real = scene.renderer.render_perspective(view, *SIZE, FOV, supersample=2).rgb
-            rays = perspective_rays(view, *SIZE, FOV)
-            terms = readiness.error_terms(
-                [space.keyframe], readiness.Texture.of(scene.rgb), rays,
-                picture.depth_m.reshape(-1), picture.confidence.reshape(-1),
-            )  # fmt: skip
-            mse = float(np.mean((picture.rgb.astype(float) - real) ** 2)) / 255**2
-            rows.append({
-                "world": kind, "sigma": sigma, "distance_m": distance, "terms": terms,
-                "psnr_db": psnr_of_mse(mse), "expected_db": space.expected_psnr_db(view),
-            })  # fmt: skip
+    for index in range(episodes):
+        course = settings.course(index)
+
+        def make_stack(world: World, config: StackConfig, course: Any = course, index: int = index) -> FilmedStack:
+            stacks.append(_JudgedStack(world, config, course, index, note))
+            return stacks[-1]
+
+        run_episode(settings, index, methods=("ic",), make_stack=make_stack)
     return rows
 
 
 def fit(rows: list[dict[str, Any]]) -> list[float]:
     """Base and non-negative gains with the least relative error of the squared error; unbiased in dB."""
+    from scipy.optimize import nnls
+
     mse = np.array([10 ** (-row["psnr_db"] / 10) for row in rows])
-    matrix = np.array([[1e-3, *row["terms"]] for row in rows]) / mse[:, None]
-    gains = nnls(matrix, np.ones(len(rows)))[0]
-    gains /= np.exp(np.mean(np.log(matrix @ gains)))
+    matrix = np.array([[1e-3, *row["terms"]] for row in rows])
+    weight: NDArray[np.float64] = mse
+    for _ in range(20):  # relative to measured and fitted error alike: large and small errors in dB count the same
+        gains = nnls(matrix / weight[:, None], mse / weight)[0]
+        weight = np.sqrt(mse * np.maximum(matrix @ gains, 1e-6))
+    gains /= np.exp(np.mean(np.log(matrix @ gains / mse)))
     return [float(gains[0] * 1e-3), *map(float, gains[1:])]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mesh", help="mesh world to test on as well")
-    parser.add_argument("--count", type=int, default=5, help="random worlds (default 5)")
-    parser.add_argument("--fit", action="store_true", help="fit base and gains on the random worlds")
+    parser.add_argument("--world", default="corridors", help="worlds, by comma (default corridors)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the courses (default 0)")
+    parser.add_argument("--episodes", type=int, default=4, help="courses in each world (default 4)")
+    parser.add_argument("--fit", action="store_true", help="fit base and gains to these frames")
     arguments = parser.parse_args()
-    rows = [row for place in places(arguments.mesh, arguments.count) for row in samples(*place)]
+    prepare()
+    frames = {world: samples(world, arguments.seed, arguments.episodes) for world in arguments.world.split(",")}
     result: dict[str, Any] = {}
-    for kind in dict.fromkeys(row["world"] for row in rows):
-        measured, expected = (np.array([r[k] for r in rows if r["world"] == kind]) for k in ("psnr_db", "expected_db"))
+    for world, rows in frames.items():
+        measured, expected = (np.array([row[key] for row in rows]) for key in ("psnr_db", "expected_db"))
         error = expected - measured
-        result[kind] = {
-            "views": len(measured),
+        result[world] = {
+            "frames": len(rows),
             "correlation": round(float(np.corrcoef(measured, expected)[0, 1]), 3),
             "mean_error_db": round(float(error.mean()), 2),
             "rms_error_db": round(float(np.sqrt(np.mean(error**2))), 2),
+            "share_within_2_db": round(float(np.mean(np.abs(error) <= 2)), 3),
         }
     if arguments.fit:
-        result["base_and_gains"] = fit([row for row in rows if row["world"] == "random"])
+        result["base_and_gains"] = fit([row for rows in frames.values() for row in rows])
     print(json.dumps(result, indent=2))
 
 

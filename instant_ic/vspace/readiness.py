@@ -1,8 +1,10 @@
 """Expected PSNR of a view, without its ground truth.
 
-Two things make an image differ from the truth: the depth's error moves surfaces aside, and some have not been seen at
-all. What a shift of some radians costs is read off the panorama itself: the mean squared difference between it and
-itself turned by that angle. (The detail that a near surface lacks was tried as a third: the fit gave it no weight.)
+Three things make the image on the operator's page differ from the truth: the page itself (size of the view, JPEG,
+magnification), the depth's error, which moves surfaces aside, and places that have not been seen at all. The cost of a
+shift is read off the panorama: the mean squared difference between it and itself turned by that angle. The gains are
+fitted to live frames (``benchmarks/readiness.py``). Tried without gain: detail that near surfaces lack, the panorama's
+finest detail, the share of filled depth.
 """
 
 from __future__ import annotations
@@ -15,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
+from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import PanoramaPrior, area_average
 
-_ROWS = 128
-_TURNS = np.array([1, 2, 3, 5, 8, 13, 21, 34])
-BASE_MSE = 8.8e-5
-"""Error of a view at the keyframe's own pose, from sampling alone."""
-SHIFT_GAIN, UNSEEN_GAIN = 0.76, 1.98
-"""These three are fitted on simulated rooms: ``benchmarks/readiness.py --fit``."""
+_ROWS = 512
+_TURNS = np.array([1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])
+BASE_MSE = 1.1e-3
+"""Error of a view at the keyframe's own pose, as the page shows it."""
+SHIFT_GAIN, UNSEEN_GAIN = 0.81, 0.75
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ def error_terms(
     """Squared errors (0..1 units) of a view from shifts and from unseen parts, before weighting.
 
     Args:
-        priors: keyframes that the view is rendered from; a surface counts for the one that sees it most alike.
+        priors: keyframes that the view is rendered from, with each pixel's sigma; a surface counts for the one by whose
+            depth it is shifted least.
         texture: of the newest.
         rays, depth, confidence: the view, (P,) each, as rendered.
     """
@@ -70,12 +73,21 @@ def error_terms(
         cosine = -np.einsum("ij,ij->i", back, rays.directions[seen]) / away
         ratio = away / np.maximum(depth[seen], 1e-3)
         sine = np.sqrt(np.clip(1 - cosine * cosine, 0, 1))
-        shift = np.minimum(shift, float(np.median(prior.relative_sigma)) * ratio * sine)
+        shift = np.minimum(shift, _sigma_at(prior, points) * ratio * sine)
     return (1 - unseen) * float(texture.cost(shift).mean()), unseen * texture.variance
 
 
+def _sigma_at(prior: PanoramaPrior, points: Floats) -> Floats:
+    """Relative sigma of a keyframe's depth in the direction of points (N, 3) of the map, (N,)."""
+    pose = prior.map_from_camera.astype(np.float32)
+    height, width = prior.sigma.shape
+    u, v = equirect_pixels(np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3]), width, height)
+    row = np.clip(np.rint(v), 0, height - 1).astype(np.intp)
+    return np.asarray(prior.sigma[row, np.rint(u).astype(np.intp) % width], np.float32)
+
+
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:
-    """PSNR from ``error_terms``; parts rendered by the field have at least its training error."""
+    """PSNR on the page from ``error_terms``; parts rendered by the field have at least its training error."""
     shift, unseen = terms
     training = 0.0 if panorama_share == 1 else (1 - panorama_share) * 10 ** (-training_psnr_db / 10)
     mse = BASE_MSE + SHIFT_GAIN * shift + UNSEEN_GAIN * unseen + training
