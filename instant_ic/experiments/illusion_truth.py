@@ -27,8 +27,6 @@ OBJECT_M, WALL_M = (0.03, 1.6), (1.9, 2.2)
 """Heights in which an object has surfaces, and in which only walls have."""
 _CELL_M = 0.05
 _AWAY_M = 1000.0
-_HANGS_M = 0.9
-"""Vertical surfaces on a wall that begin above this height hang there: posters, notice boards."""
 _FLOOR_M = 0.03
 _WALL_FROM_M, _WALL_TO_M = 0.3, 2.0
 _BLUR = 9
@@ -87,26 +85,27 @@ def without(world: World, obstacle: Obstacle) -> World:
     """The world without the object that stands at an obstacle's place; its shadow remains.
 
     The object is what is connected to that place in the floor plan of ``OBJECT_M`` without the walls. Surfaces that
-    lie in its cells completely and above the floor are moved far below the floor; what hangs on a wall stays.
+    lie in its cells completely and above the floor are moved far below the floor. What lies on a wall stays: posters
+    and skirting boards.
     """
     things, walls = (world.occupied(low, high, _CELL_M) for low, high in (OBJECT_M, WALL_M))
-    _, labels = cv2.connectedComponents((things.cells & ~walls.cells).astype(np.uint8), connectivity=8)
+    beside_walls = cv2.dilate(walls.cells.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    _, labels = cv2.connectedComponents((things.cells & ~beside_walls).astype(np.uint8), connectivity=8)
     outline = np.fliplr(things.index(corners(obstacle))).astype(np.int32)
     place = cv2.dilate(cv2.fillConvexPoly(np.zeros(labels.shape, np.uint8), outline, 1), np.ones((3, 3), np.uint8))
     found = np.setdiff1d(np.unique(labels[place > 0]), [0])
 
-    def within(cells: NDArray[np.bool_], around: int) -> NDArray[np.bool_]:
-        """Surfaces all of whose corners lie in cells or at most ``around`` cells beside them, (S,)."""
-        size = 2 * around + 1
-        grown = cv2.dilate(cells.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-        corner = replace(things, cells=grown).at(world.vertices[:, :2])
+    cells = cv2.dilate(np.isin(labels, found).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+
+    def within(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Surfaces all of whose corners lie in a mask's cells, (S,)."""
+        corner = replace(things, cells=mask).at(world.vertices[:, :2])
         return np.asarray(corner.reshape(len(world.normal), -1).all(axis=1))
 
     vertices = world.vertices.reshape(len(world.normal), -1, 3).copy()
-    low, high = vertices[..., 2].min(axis=1), vertices[..., 2].max(axis=1)
-    hangs = (low > _HANGS_M) & (np.abs(world.normal[:, 2]) < 0.5) & within(walls.cells, 1)
+    high = vertices[..., 2].max(axis=1)
     # A box's sides begin on the floor; the floor itself does not rise.
-    gone = within(np.isin(labels, found), 2) & (high > 0.01) & (high < WALL_M[0]) & ~hangs
+    gone = within(cells) & (high > 0.01) & (high < WALL_M[0]) & ~within(beside_walls)
     vertices[gone, :, 2] -= _AWAY_M
     return replace(world, vertices=vertices.reshape(-1, 3))
 

@@ -21,7 +21,9 @@ from instant_ic.experiments.teleop_stack import StackConfig
 from instant_ic.experiments.teleop_worlds import Obstacle
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.render import EquirectRenderer
+from instant_ic.sim.world import Material
 from instant_ic.sim.worlds import corridor_world
 
 BOX = Obstacle(4.25, 0.0, 0.5, 0.5, 0.0, 0.8)
@@ -135,6 +137,20 @@ def test_the_world_without_its_box_is_the_one_built_without_it(corridor: teleop_
         assert psnr_db(ours.rgb, theirs.rgb) > 30
     pose = pose_matrix(3.0, 0.0, 1.2)
     assert np.abs(removed.render(pose, 128, 64).depth_m - full.render(pose, 128, 64).depth_m).max() > 0.3
+
+
+def test_a_poster_over_the_removed_box_stays() -> None:
+    """A box of 0.6 m at the wall, a poster over it, a skirting board behind it: the box's front, sides and top go."""
+    building = Building()
+    room = building.add(Zone(-1.0, -1.2, 5.0, 1.2, 2.6))
+    building.picture(room, "north", 3.0, 1.4, (0.5, 0.7), Material("poster:1"))
+    building.builder.box((2.0, 0.85), (0.6, 0.6, 0.7))
+    world = building.world("room", (0.0, 0.0, 0.0), light_cell_m=1.0, rays=1)
+    gone = without(world, Obstacle(2.0, 0.85, 0.6, 0.6, 0.0, 0.7))
+    moved = (gone.vertices != world.vertices).any(axis=1).reshape(len(world.normal), -1).all(axis=1)
+    was = world.vertices.reshape(len(world.normal), -1, 3)[moved]
+    assert moved.sum() == 4 and was[..., 2].max() == pytest.approx(0.7) and was[..., 0].min() == pytest.approx(1.7)
+    assert gone.vertices[:, 2].min() < -900
 
 
 def test_floor_shown_as_wall_counts_as_fog() -> None:
