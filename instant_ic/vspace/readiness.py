@@ -21,7 +21,7 @@ from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import PanoramaPrior, area_average
 
-_ROWS = 512
+_ROWS, _ROW_STEP = 512, 4
 _TURNS = np.array([1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144])
 BASE_MSE = 1.23e-3
 """Error of a view at the keyframe's own pose, as the page shows it."""
@@ -39,8 +39,10 @@ class Texture:
     @classmethod
     def of(cls, rgb: NDArray[np.uint8]) -> Texture:
         """Of a panorama (H, 2 H, 3), over the middle third of its rows, where a turn moves pixels by its own angle."""
-        height = min(_ROWS, rgb.shape[0])
-        small = area_average(rgb, height, 2 * height)[height // 3 : height - height // 3].astype(np.float32) / 255
+        height, whole = min(_ROWS, rgb.shape[0]), rgb.shape[0]
+        band = rgb[whole // 3 : whole - whole // 3]
+        small = area_average(band, max(1, round(len(band) * height / whole)), 2 * height)[::_ROW_STEP]
+        small = small.astype(np.float32) / 255
         mse = [np.mean((small - np.roll(small, int(turn), 1)) ** 2) for turn in _TURNS]
         angles = np.concatenate([[0.0], _TURNS * (math.pi / height)])
         return cls(angles.astype(np.float32), np.array([0.0, *mse], np.float32), float(small.var(axis=(0, 1)).mean()))
