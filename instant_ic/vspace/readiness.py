@@ -41,8 +41,8 @@ class Texture:
         """Of a panorama (H, 2 H, 3), over the middle third of its rows, where a turn moves pixels by its own angle."""
         height, whole = min(_ROWS, rgb.shape[0]), rgb.shape[0]
         band = rgb[whole // 3 : whole - whole // 3]
-        small = area_average(band, max(1, round(len(band) * height / whole)), 2 * height)[::_ROW_STEP]
-        small = small.astype(np.float32) / 255
+        averaged = area_average(band, max(1, round(len(band) * height / whole)), 2 * height)
+        small = averaged[::_ROW_STEP].astype(np.float32) / 255
         mse = [np.mean((small - np.roll(small, int(turn), 1)) ** 2) for turn in _TURNS]
         angles = np.concatenate([[0.0], _TURNS * (math.pi / height)])
         return cls(angles.astype(np.float32), np.array([0.0, *mse], np.float32), float(small.var(axis=(0, 1)).mean()))
