@@ -92,8 +92,12 @@ def draw_quads(  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
-def paint(rgb, camera_from_map, gain, origin, directions, wanted, depth, colour):  # type: ignore[no-untyped-def]
-    """Colours (P, 3) of a panorama (h, w, 3), bilinear, at places ``depth`` (P,) along rays where ``wanted`` (P,)."""
+def paint(  # type: ignore[no-untyped-def]
+    rgb, shares, camera_from_map, gain, origin, directions, wanted, depth, colour, share
+):
+    """Colours (P, 3) of a panorama (h, w, 3), bilinear, at places ``depth`` (P,) along rays where ``wanted`` (P,);
+    likewise ``share`` (P,) in 0..1 of ``shares`` (h, w) uint8.
+    """
     height, width = rgb.shape[:2]
     one = np.float32(1)
     for n in range(depth.shape[0]):
@@ -101,32 +105,11 @@ def paint(rgb, camera_from_map, gain, origin, directions, wanted, depth, colour)
             continue
         x, y, z = along(camera_from_map, origin, directions[n], depth[n])
         v0, v1, fv, left, right, fu = panorama_pixels(x, y, z, height, width)
+        wa, wb, wc, wd = (one - fu) * (one - fv), fu * (one - fv), (one - fu) * fv, fu * fv
         for c in range(3):
-            top = np.float32(rgb[v0, left, c]) * (one - fu) + np.float32(rgb[v0, right, c]) * fu
-            bottom = np.float32(rgb[v1, left, c]) * (one - fu) + np.float32(rgb[v1, right, c]) * fu
-            colour[n, c] = (top * (one - fv) + bottom * fv) * np.float32(1 / 255) * gain[c]
-
-
-@njit(**_OPTIONS)
-def mix_guess(guess, guessed, reach, share, image):  # type: ignore[no-untyped-def]
-    """Mix guessed colours (H, W, 3) into an image where ``guessed`` (H, W), more with distance from the seen parts.
-
-    ``share`` is reached ``reach`` pixels (city blocks) inside.
-    """
-    height, width = guessed.shape
-    inside = np.zeros((height, width), np.int32)
-    for y in range(height):
-        for x in range(width):
-            if guessed[y, x]:
-                up = inside[y - 1, x] if y > 0 else reach
-                left = inside[y, x - 1] if x > 0 else reach
-                inside[y, x] = min(up, left) + 1
-    for y in range(height - 1, -1, -1):
-        for x in range(width - 1, -1, -1):
-            if guessed[y, x]:
-                down = inside[y + 1, x] if y + 1 < height else reach
-                right = inside[y, x + 1] if x + 1 < width else reach
-                inside[y, x] = min(inside[y, x], min(down, right) + 1)
-                weight = np.float32(share * min(1.0, inside[y, x] / reach))
-                for c in range(3):
-                    image[y, x, c] += weight * (guess[y, x, c] - image[y, x, c])
+            value = wa * np.float32(rgb[v0, left, c]) + wb * np.float32(rgb[v0, right, c])
+            value += wc * np.float32(rgb[v1, left, c]) + wd * np.float32(rgb[v1, right, c])
+            colour[n, c] = value * np.float32(1 / 255) * gain[c]
+        value = wa * np.float32(shares[v0, left]) + wb * np.float32(shares[v0, right])
+        value += wc * np.float32(shares[v1, left]) + wd * np.float32(shares[v1, right])
+        share[n] = value * np.float32(1 / 255)

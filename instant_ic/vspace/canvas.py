@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.vspace.background import mixed_in
 from instant_ic.vspace.compose import Layer, compose
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.store import KeyframeSet
@@ -22,12 +21,12 @@ Painted = tuple[NDArray[np.uint8], Floats, Floats]
 
 @dataclass(frozen=True)
 class Picture:
-    """A rendered view (P, …); ``guessed``: unseen parts of the background."""
+    """A rendered view (P, …); ``guessed``: share of the background's guess in the image, 0 in what has been seen."""
 
     colour: Floats
     depth: Floats
     confidence: Floats
-    guessed: NDArray[np.bool_]
+    guessed: Floats
 
 
 def draw(
@@ -54,12 +53,12 @@ def draw(
     else:
         picture = field
     colour, depth, confidence = picture
-    guessed = np.zeros(len(depth), bool)
+    guessed = np.zeros(len(depth), np.float32)
     for keyframe, gain in () if shown is None else zip(shown.keyframes, shown.gains, strict=True):
-        wanted = (confidence == 0) & ~guessed
+        wanted = (confidence == 0) & (guessed == 0)
         if keyframe.background is None or not wanted.any():
             break
-        guessed |= keyframe.background.draw(rays, gain, wanted, picture)
+        guessed += keyframe.background.draw(rays, gain, wanted, picture)
     return Picture(colour, depth, confidence, guessed)
 
 
@@ -82,7 +81,8 @@ def continued(picture: Picture, shape: tuple[int, int], wraps: bool) -> Floats:
     drawn = picture.colour.reshape(*shape, 3)
     depth, confidence = picture.depth.reshape(shape), picture.confidence.reshape(shape)
     image = continue_unseen(drawn, depth, confidence, wraps)
-    return mixed_in(image, drawn, picture.guessed.reshape(shape)) if picture.guessed.any() else image
+    share = np.where(confidence > 0, 0, picture.guessed.reshape(shape))[..., None]
+    return image + share * (drawn - image)
 
 
 def painted(picture: Picture, image: Floats) -> Painted:

@@ -4,11 +4,14 @@ import math
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace import KeyframeError, VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace.background import Background, level_planes, mixed_in
+from instant_ic.vspace.background import Background, level_planes
 from instant_ic.vspace.background_kernels import in_front
+from instant_ic.vspace.canvas import CpuCanvas, Picture
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
 from instant_ic.vspace.view import perspective_rays
@@ -84,7 +87,7 @@ def test_floor_and_ceiling_are_found_and_go_on_behind_a_thing():
     seen = inverse.copy()
     seen[thing] = np.maximum(np.repeat(flat / 2, W, 1)[thing], inverse[thing])
     background = Background.of(prepare(rgb, 1 / seen, np.eye(4), 0.02, GeometryConfig(), 2048))
-    assert background.inverse[thing] == pytest.approx(inverse[thing], rel=0.03)
+    assert background.inverse[thing] == pytest.approx(inverse[thing], rel=0.07)  # a plane, not a cylinder
     assert background.rgb[40, 60:68, 1].min() > 140  # floor, green
     assert background.rgb[28, 60:68, 2].min() > 140  # wall, blue
 
@@ -111,23 +114,84 @@ def test_the_guess_lies_fixed_in_the_map():
         done = background.draw(rays, np.ones(3, np.float32), np.ones(96 * 64, bool), picture)
         ends = rays.origin + picture[1][:, None] * rays.directions
         azimuth = np.arctan2(ends[:, 1], ends[:, 0])
-        inside = done & (np.abs(azimuth) < 0.2) & (np.abs(ends[:, 2]) < 0.5)
+        inside = (done > 0) & (np.abs(azimuth) < 0.2) & (np.abs(ends[:, 2]) < 0.5)
         assert inside.sum() > 50
         assert np.linalg.norm(ends[inside], axis=1) == pytest.approx(np.full(inside.sum(), 4.0), rel=0.01)
         drawn.append(picture[0][inside].mean(axis=0))
     assert drawn[0] == pytest.approx(drawn[1], abs=0.01)
 
 
+def hall(door=False):
+    """A keyframe 1.2 m over the floor of a hall, walls 4 m ahead and 6 m aside; rows of 1.4°.
+
+    With a box of 1 m height and width 2 m ahead, or a partition there with a doorway 1.2 m wide. Returns directions,
+    depth and kinds: 0 wall, 1 floor, 2 ceiling (2.7 m), 3 what stands in front.
+    """
+    height, width = 128, 256
+    directions = equirect_directions(width, height).astype(np.float64)
+    x, y, z = np.moveaxis(directions, -1, 0)
+    with np.errstate(divide="ignore"):
+        ranges = np.stack([np.where(x > 0, 4 / x, 3 / -x), np.abs(6 / y), np.where(z < 0, 1.2 / -z, 1.5 / z)])
+        near = np.where(x > 0, 2 / x, np.inf)
+    depth, side = ranges.min(axis=0), ranges.argmin(axis=0)
+    kind = np.where(side < 2, 0, np.where(z < 0, 1, 2))
+    across, up = np.where(np.isfinite(near), near, 0) * y, np.where(np.isfinite(near), near, 0) * z
+    stands = np.abs(across) > 0.6 if door else (np.abs(across) < 0.5) & (up < -0.2)
+    front = (near < depth) & stands
+    return directions, np.where(front, near, depth).astype(np.float32), np.where(front, 3, kind), depth, kind
+
+
+COLOURS = np.array([(40, 90, 160), (20, 150, 20), (220, 220, 200), (200, 30, 30)], np.uint8)
+
+
+def test_floor_and_wall_go_on_behind_a_box():
+    """Behind the box lies what stands there without it: floor up to 4 m, then the wall, to 2 % and in their colours."""
+    _, depth, shown, truth, kind = hall()
+    background = Background.of(prepare(COLOURS[shown], depth, np.eye(4), 0.02, GeometryConfig(), 2048))
+    inside = binary_erosion(shown == 3, iterations=2)
+    assert inside.sum() > 200
+    assert background.inverse[inside] * truth[inside] == pytest.approx(np.ones(inside.sum()), abs=0.02)
+    for number in (0, 1):
+        away = binary_erosion(kind == number, iterations=2) & inside  # a pixel on the line has a share of both
+        assert away.any()
+        assert np.abs(background.rgb[away].astype(int) - COLOURS[number]).max() <= 2
+        assert (background.sure[away] == 255).all()
+    quads = np.zeros(depth.shape, bool)
+    quads[tuple(background.guessed.T)] = True
+    assert quads[inside].mean() > 0.95
+
+
+def test_a_doorway_stays_open():
+    """Beside a doorway the far room's floor and wall go on: nothing of the partition's colour, wall 4 m ahead."""
+    directions, depth, shown, _, _ = hall(door=True)
+    background = Background.of(prepare(COLOURS[shown], depth, np.eye(4), 0.02, GeometryConfig(), 2048))
+    x, y, z = np.moveaxis(directions, -1, 0)
+    beside = binary_erosion(shown == 3, iterations=2) & (x > 0) & (np.abs(y / x) < 0.5) & (np.abs(z + 0.1) < 0.3)
+    assert beside.sum() > 100
+    assert background.rgb[beside][:, 0].max() < 60  # nothing red
+    wall = beside & (z > -0.15)
+    assert 1 / background.inverse[wall] == pytest.approx(4 / x[wall], rel=0.1)
+    floor = beside & (z < -0.3)
+    assert floor.any()
+    assert 1 / background.inverse[floor] == pytest.approx(1.2 / -z[floor], rel=0.02)
+    assert np.abs(background.rgb[floor].astype(int) - COLOURS[1]).max() <= 2
+    # A wall that leads on out of sight is a guess: part of it is continued from around in the image.
+    assert background.sure[wall].max() < 0.7 * 255 <= background.sure[floor].min()
+    space = VirtualSpace(VirtualSpaceConfig(device="cpu", source="warp"))
+    space.set_keyframe(COLOURS[shown], depth, np.eye(4), 0.02)
+    view = space.render(pose_matrix(x=1.8, pitch=0.4), 160, 90, math.pi / 2)  # in the doorway
+    low = view.rgb[60:].reshape(-1, 3).astype(int)
+    assert (np.abs(low - COLOURS[1]).max(axis=1) < 40).mean() > 0.99  # floor, from side to side
+
+
 def test_guesses_are_mixed_in_by_hand():
-    image, guess = np.zeros((5, 7, 3), np.float32), np.ones((5, 7, 3), np.float32)
-    guessed = np.zeros((5, 7), bool)
-    guessed[1:4, 1:6] = True
-    mixed = mixed_in(image, guess, guessed)  # a reach of one pixel
-    assert mixed[..., 0] == pytest.approx(np.where(guessed, 0.6, 0.0))
-    wide = mixed_in(np.zeros((1, 200, 3), np.float32), np.ones((1, 200, 3), np.float32), np.arange(200)[None] >= 100)
-    # 0.04 · 200 = 8 pixels: an eighth of 0.6 more at each.
-    assert wide[0, 98:106, 0] == pytest.approx([0, 0, 0.075, 0.15, 0.225, 0.3, 0.375, 0.45])
-    assert not image.any()
+    colour, depth = np.zeros((12, 3), np.float32), np.ones(12, np.float32)
+    colour[[0, 5, 6, 11]], colour[1:5], colour[7:11] = 0.2, 1.0, 1.0
+    seen = np.tile(np.array([1, 0, 0, 0, 0, 1], np.float32), 2)
+    share = np.tile(np.array([0, 1, 0.5, 0.25, 0, 0], np.float32), 2)
+    image = CpuCanvas().continued(Picture(colour, depth, seen, share), (2, 6), False)
+    # From around it is 0.2 everywhere: 0.2 + share · 0.8.
+    assert image[0, :, 0] == pytest.approx([0.2, 1.0, 0.6, 0.4, 0.2, 0.2])
 
 
 def test_the_robot_is_not_shown_and_not_learnt():

@@ -1,0 +1,256 @@
+"""CPU kernels that continue walls, floor and ceiling of a panorama behind what hides them (numba)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from instant_ic.vspace.nerf.kernels import _OPTIONS
+
+
+@njit(**_OPTIONS)
+def farthest_walls(upright, wall, share, far):  # type: ignore[no-untyped-def]
+    """Distance of the farthest walls around a keyframe, by direction.
+
+    Args:
+        upright: inverse of the horizontal distance, (h, w); wall: (h, w) where that is of anything upright.
+        share: quantile of a column that counts, from the far end.
+        far: out, (w,) inverse distance, 0 where no wall is seen.
+    """
+    height, width = upright.shape
+    column = np.empty(height, np.float32)
+    for u in range(width):
+        count = 0
+        for v in range(height):
+            if wall[v, u]:
+                column[count] = upright[v, u]
+                count += 1
+        far[u] = np.sort(column[:count])[int(share * count)] if count >= 3 else np.float32(0)
+
+
+@njit(**_OPTIONS)
+def walls_behind(  # type: ignore[no-untyped-def]
+    upright, wall, hole, far, look, span, same, behind, slope_prior, farthest, found
+):
+    """Walls behind near surfaces, upright.
+
+    What is seen above a near surface goes on behind it. Where nothing behind it is seen above it, the planes of the
+    walls at its left and right go on; two of them meet in a corner.
+
+    Args:
+        upright, wall: of ``farthest_walls``; hole: (h, w) near surfaces.
+        far: of ``farthest_walls``; look: rows above a near surface, span: columns beside it, that a wall is fitted to.
+        same: neighbours whose distances differ by less than this factor are one surface.
+        behind: a wall is farther than what hides it by this factor.
+        slope_prior: pseudo-observations for a wall at right angles to the ray; farthest: in metres.
+        found: out, (h, w) inverse horizontal distance of the wall, 0 where there is none.
+    """
+    height, width = upright.shape
+    found[:] = 0
+    for u in range(width):
+        top = 0
+        while top < height:
+            if not hole[top, u]:
+                top += 1
+                continue
+            end = top + 1
+            while end < height and hole[end, u] and _alike(upright[end, u], upright[end - 1, u], same):
+                end += 1
+            hidden = upright[(top + end) // 2, u]
+            value, count = np.float32(0), 0
+            for v in range(top - 3, max(top - 3 - look, -1), -1):
+                if wall[v, u] and upright[v, u] * behind < hidden:
+                    value += upright[v, u]
+                    count += 1
+            if count >= 3:
+                value = min(value / count, far[u]) if far[u] > 0 else value / count
+            else:
+                value = np.float32(0)
+                for side in (-1, 1):
+                    value = max(value, _plane_beside(
+                        upright, far, u, (top + end) // 2, hidden, side, span, same, behind, slope_prior, farthest
+                    ))  # fmt: skip
+            found[top:end, u] = value
+            top = end
+
+
+@njit(**_OPTIONS)
+def _alike(a, b, factor):  # type: ignore[no-untyped-def]
+    return max(a, b) < factor * min(a, b)
+
+
+@njit(**_OPTIONS)
+def _plane_beside(upright, far, u, row, hidden, side, span, same, behind, slope_prior, farthest):  # type: ignore[no-untyped-def]
+    """Inverse distance at column ``u`` of the plane beside what hides it there; 0 where there is none behind it."""
+    width = far.shape[0]
+    step = np.float32(2 * math.pi / width)
+    front = hidden
+    for gap in range(1, width // 4):
+        anchor = (u + side * gap) % width
+        if far[anchor] > 0 and far[anchor] * behind < front and far[anchor] * behind < hidden:
+            break
+        if _alike(upright[row, anchor], front, same):
+            front = upright[row, anchor]
+        elif far[anchor] > 0:
+            front = far[anchor]
+    else:
+        return np.float32(0)
+    anchor = (anchor + 2 * side) % width  # the first columns are of both sides
+    gap += 2
+    # q(a) = x cos a + y sin a by the angle a from the anchor, away from the gap, is a plane.
+    sum_cc, sum_cs, sum_ss, sum_cq, sum_sq = 0.0, 0.0, 0.0, 0.0, 0.0
+    last = far[anchor]
+    for k in range(span):
+        q = far[(anchor + side * k) % width]
+        if q <= 0 or not _alike(q, last, same):
+            break
+        last = q
+        c, s = math.cos(k * step), math.sin(k * step)
+        sum_cc, sum_cs, sum_ss = sum_cc + c * c, sum_cs + c * s, sum_ss + s * s
+        sum_cq, sum_sq = sum_cq + c * q, sum_sq + s * q
+    if sum_cc == 0:
+        return np.float32(0)
+    sum_ss += slope_prior * math.sin(span * step) ** 2
+    determinant = sum_cc * sum_ss - sum_cs * sum_cs
+    x = (sum_cq * sum_ss - sum_sq * sum_cs) / determinant
+    y = (sum_sq * sum_cc - sum_cq * sum_cs) / determinant
+    value = x * math.cos(gap * step) - y * math.sin(gap * step)
+    value = min(max(value, 1 / farthest, 0.3 * far[anchor]), 3 * far[anchor])
+    return np.float32(value) if value * behind < hidden else np.float32(0)
+
+
+@njit(**_OPTIONS)
+def wall_colours(rgb, source, upright, far, same, colours):  # type: ignore[no-untyped-def]
+    """Common colour of the farthest wall in each column, out (w, 3) float32; −1 where it is not seen.
+
+    Args:
+        rgb: (h, w, 3); source: (h, w) pixels of walls; upright, far, same: as in ``walls_behind``.
+    """
+    height, width = source.shape
+    some = np.empty((height, 3), np.float32)
+    for u in range(width):
+        count = 0
+        for v in range(height):
+            if source[v, u] and _alike(upright[v, u], far[u], same):
+                for c in range(3):
+                    some[count, c] = rgb[v, u, c]
+                count += 1
+        for c in range(3):
+            colours[u, c] = np.median(some[:count, c]) if count else np.float32(-1)
+
+
+@njit(**_OPTIONS)
+def continue_walls(  # type: ignore[no-untyped-def]
+    rgb, source, hole, coverage, slope, upright, far, found, column_colour, same, fade, reach, most, sure_share,
+    sure_fade, colour, sure,
+):  # fmt: skip
+    """Continue the colours of walls into holes: of what is seen of the wall above, else of both sides, close by as they
+    are there at the same height, farther on in the wall's common colour.
+
+    Args:
+        rgb: (h, w, 3); source: (h, w) pixels of walls.
+        hole: (h, w); coverage: (h, w) share of the wall in each pixel; colours are computed where that is over 0.
+        slope: tangent of each pixel's elevation, (h, w); upright, far, found, same: as in ``walls_behind``.
+        column_colour: of ``wall_colours``; fade: pixels; reach: columns that are searched at most.
+        most: pixels that a common colour is the median of.
+        sure_share, sure_fade: beside what is seen a colour is this sure, less by e after this many columns.
+        colour: out, (h, w, 3) float32, −1 where nothing was found; sure: out, (h, w), 1 below what is seen of the wall.
+    """
+    height, width = hole.shape
+    rows = np.float32(height / math.pi)
+    some = np.empty((most, 3), np.float32)
+    total, common = np.zeros(3, np.float32), np.zeros(3, np.float32)
+    for v in range(height):
+        for u in range(width):
+            if not hole[v, u] or coverage[v, u] <= 0:
+                continue
+            total[:] = 0
+            weights, nearest = np.float32(0), reach
+            count, first = 0, 0
+            for n in range(v - 1, -1, -1):
+                if source[n, u] and _alike(upright[n, u], found[v, u], same):
+                    first = first if count else v - n
+                    for c in range(3):
+                        some[count, c] = rgb[n, u, c]
+                    count += 1
+                    if count >= min(most, 2 + first):
+                        break
+            if count:
+                weights, nearest = np.float32(1), 0
+                for c in range(3):
+                    total[c] = np.median(some[:count, c])
+            for side in (-1, 1):
+                if nearest == 0:
+                    break  # it was seen above
+                count, first, q, anchor = 0, 0, found[v, u], 0
+                for gap in range(1, reach):
+                    m = (u + side * gap) % width
+                    if column_colour[m, 0] < 0 or not _alike(far[m], q, same):
+                        if count > 0:
+                            break
+                        continue
+                    q = far[m]
+                    if count == 0:
+                        first, anchor = gap, m
+                    for c in range(3):
+                        some[count, c] = column_colour[m, c]
+                    count += 1
+                    if count >= most:
+                        break
+                if count == 0:
+                    continue
+                for c in range(3):
+                    common[c] = np.median(some[:count, c])
+                q = far[anchor]
+                n = int((np.float32(math.pi / 2) - math.atan(slope[v, u] * q / found[v, u])) * rows)
+                here, weight = np.float32(0), np.float32(0.05) / np.float32(first * first)
+                if 0 <= n < height and source[n, anchor] and _alike(upright[n, anchor], q, same):
+                    here = math.exp(-np.float32(first) / fade)
+                    weight *= 20
+                weights += weight
+                nearest = min(nearest, first)
+                for c in range(3):
+                    total[c] += weight * (common[c] + here * (np.float32(rgb[n, anchor, c]) - common[c]))
+            sure[v, u] = np.float32(1) if nearest == 0 else sure_share * math.exp(-np.float32(nearest) / sure_fade)
+            for c in range(3):
+                colour[v, u, c] = total[c] / weights if weights > 0 else np.float32(-1)
+
+
+@njit(**_OPTIONS)
+def continue_level(rgb, source, hole, coverage, reach, most, colour):  # type: ignore[no-untyped-def]
+    """Continue the floor or the ceiling into holes from both sides along rows: a row lies at one distance.
+
+    Args:
+        rgb, source, hole, coverage, reach, colour: as in ``continue_walls``.
+        most: pixels of a side that a colour is the median of, fewer close by.
+    """
+    height, width = hole.shape
+    some = np.empty((most, 3), np.float32)
+    total = np.zeros(3, np.float32)
+    for v in range(height):
+        for u in range(width):
+            if not hole[v, u] or coverage[v, u] <= 0:
+                continue
+            total[:] = 0
+            weights = np.float32(0)
+            for side in (-1, 1):
+                count, weight = 0, np.float32(0)
+                for gap in range(1, reach):
+                    m = (u + side * gap) % width
+                    if not source[v, m]:
+                        continue
+                    if count == 0:
+                        weight = np.float32(1) / np.float32(gap * gap)
+                    for c in range(3):
+                        some[count, c] = rgb[v, m, c]
+                    count += 1
+                    if count >= min(most, 1 + gap):
+                        break
+                if count:
+                    weights += weight
+                    for c in range(3):
+                        total[c] += weight * np.median(some[:count, c])
+            for c in range(3):
+                colour[v, u, c] = total[c] / weights if weights > 0 else np.float32(-1)
