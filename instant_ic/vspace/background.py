@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import equirect_directions
+from instant_ic.geometry.projections import equirect_directions, equirect_pixels
 from instant_ic.vspace.continuation import continued_colours, continued_walls, grown
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import ROOM, SKY, PanoramaPrior, area_average, edge_quads, fill_holes
@@ -28,6 +29,7 @@ _BEHIND = 1.05  # a guess lies farther than what hides it by this factor
 _STEEP, _ALIKE, _LEVEL_SHARE = 0.6, 0.04, 0.6  # beyond this sine of the elevation so many heights agree so far
 _NOTHING = 9  # kind of what is no surface of the place
 _WALL_RISE = 0.7  # sine of the elevation up to which an upright surface says how far walls are
+_SEEN = 0.08  # depths within this share of a guess's are of its surface
 _SKY_M = 1e4
 _ROWS = 256  # of the images that the background is made in: it is smooth
 _directions = functools.lru_cache(maxsize=2)(equirect_directions)  # a keyframe is as large as the one before
@@ -98,6 +100,34 @@ class Background:
             _places(_any_corner(sky) & ~guessed & whole), prior.map_from_camera,
         )  # fmt: skip
 
+    def seen_by(self, others: Sequence[tuple[PanoramaPrior, Floats]]) -> Background:
+        """The background with the pixels of other keyframes that have seen places of it.
+
+        Of those that have, the nearest to the place counts, whatever their order.
+
+        Args:
+            others: keyframes, and the factors (3,) that bring their colours to this one's.
+        """
+        if not others or not len(self.guessed):
+            return self
+        height, width = self.inverse.shape
+        mask = np.zeros((height, width), bool)
+        for down in (0, 1):
+            for right in (0, 1):
+                mask[np.minimum(self.guessed[:, 0] + down, height - 1), (self.guessed[:, 1] + right) % width] = True
+        pose = self.map_from_camera.astype(np.float32)
+        ways = _directions(width, height)[mask] / self.inverse[mask][:, None]
+        points = np.einsum("ij,kj->ik", ways, pose[:3, :3]) + pose[:3, 3]
+        rgb, sure = self.rgb.copy(), self.sure.copy()
+        colours, sures, nearest = rgb[mask], sure[mask], np.full(len(points), np.inf, np.float32)
+        for prior, gain in others:
+            distance, theirs = _as_seen(prior, points)
+            better = distance < nearest
+            colours[better] = np.rint(np.clip(theirs[better] * gain, 0, 255))
+            nearest[better], sures[better] = distance[better], 255
+        rgb[mask], sure[mask] = colours, sures
+        return replace(self, rgb=rgb, sure=sure)
+
     def draw(
         self, rays: Rays, gain: Floats, wanted: NDArray[np.bool_], picture: tuple[Floats, Floats, Floats]
     ) -> Floats:
@@ -128,6 +158,22 @@ class Background:
         paint(self.rgb, self.sure, camera_from_map, gain, rays.origin, rays.directions, drawn, depth, colour, share)
         confidence[drawn & (marks.reshape(-1) == 2)] = 1
         return share
+
+
+def _as_seen(prior: PanoramaPrior, points: Floats) -> tuple[Floats, Floats]:
+    """Distances (N,) of points (N, 3) of the map from a keyframe, inf where it has not seen them, and colours (N, 3)."""
+    pose = prior.map_from_camera.astype(np.float32)
+    local = np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3])
+    distance = np.sqrt(np.einsum("ij,ij->i", local, local))
+    height, width = prior.inverse_depth.shape
+    u, v = equirect_pixels(local, width, height)
+    row, column = np.clip(np.floor(v), 0, height - 1).astype(np.intp), np.floor(u).astype(np.intp) % width
+    seen = np.abs(prior.inverse_depth[row, column] * distance - 1) < _SEEN
+    seen &= (prior.known[row, column] == 1) & (prior.depth_edge[row, column] == 0) & (prior.content[row, column] == ROOM)
+    high, wide = prior.rgb.shape[:2]
+    u, v = equirect_pixels(local, wide, high)
+    row = np.clip(np.rint(v), 0, high - 1).astype(np.intp)
+    return np.where(seen, distance, np.float32(np.inf)), prior.rgb[row, np.rint(u).astype(np.intp) % wide].astype(np.float32)
 
 
 def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list[Floats]:

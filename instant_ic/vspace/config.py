@@ -194,6 +194,8 @@ class VirtualSpaceConfig:
             torch-cpu (slow).
         panorama_width: px; wider panoramas are area-averaged to this.
         keyframes: newest keyframes that are kept and shown together, 1..8; the time per view grows with it.
+        older: older keyframes, from up to 3 m away, whose pixels show what is hidden from the newest; costs nothing per
+            view.
         picture: the keyframe's panorama, warped by its depth, then the field.
     """
 
@@ -205,6 +207,7 @@ class VirtualSpaceConfig:
     device: str = "auto"
     panorama_width: Annotated[int, Range(64, 8192)] = 2048
     keyframes: Annotated[int, Range(1, 8)] = 1
+    older: Annotated[int, Range(0, 4)] = 2
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)

@@ -29,7 +29,7 @@ from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import KeyframeError, PanoramaPrior, prepare
 from instant_ic.vspace.readiness import Texture, error_terms, expected_psnr_db
 from instant_ic.vspace.saved import Progress, SavedSpace, read, write
-from instant_ic.vspace.store import Keyframe, KeyframeSet, KeyframeStore, ready
+from instant_ic.vspace.store import RECENT, Keyframe, KeyframeSet, KeyframeStore, ready, recent, spread
 from instant_ic.vspace.view import Drawn, View, checked_pose, perspective_rays
 
 T = TypeVar("T")
@@ -132,7 +132,7 @@ class VirtualSpace(Drawn):
             source = "warp" if self._can_warp and not self._device.on_gpu else "field"
             self.config = dataclasses.replace(self.config, source=source)
         # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
-        self._store = KeyframeStore(self.config.keyframes + 2)
+        self._store = KeyframeStore(self.config.keyframes + 2 + (RECENT - 1 if self.config.older else 0))
         self._shown: KeyframeSet | None = None
         self._before: KeyframeSet | None = None  # what images showed before, until these have taken over
         self._pictures = 0  # rendered since then
@@ -204,8 +204,9 @@ class VirtualSpace(Drawn):
     ) -> KeyframeSet:
         """Prepare a new keyframe, with the earlier ones that are kept; changes nothing that is shown.
 
-        Of the keyframes before it ``config.keyframes`` − 1 are kept (0, the paper's way), in the new one's exposure and
-        without what has moved; none where its images have another size. May run in a thread of its own beside all
+        Of the keyframes before it ``config.keyframes`` − 1 are shown too (0, the paper's way), in the new one's exposure
+        and without what has moved, and ``config.older`` give their pixels of what is hidden from it; none where its
+        images have another size. May run in a thread of its own beside all
         other calls; one keyframe at a time, and each must be shown before the next.
 
         Args: as ``prior.prepare``.
@@ -218,10 +219,18 @@ class VirtualSpace(Drawn):
             rgb, depth_m, map_from_camera, relative_sigma, config.geometry, config.panorama_width, self._robot
         )
         newest = self._store.put(prior, self._can_warp)
-        older = () if self._shown is None else self._shown.keyframes[: config.keyframes - 1]
-        same = (newest.prior.rgb.shape, newest.prior.inverse_depth.shape)
-        older = tuple(one for one in older if (one.prior.rgb.shape, one.prior.inverse_depth.shape) == same)
-        return self._together((newest, *older))
+        before = () if self._shown is None else (*self._shown.keyframes, *self._shown.kept)
+        size = (newest.prior.rgb.shape, newest.prior.inverse_depth.shape)
+        before = tuple(one for one in before if (one.prior.rgb.shape, one.prior.inverse_depth.shape) == size)
+        shown = self._together((newest, *before[: config.keyframes - 1]))
+        first = shown.keyframes[0]
+        kept = tuple(one for one in before if all(one.place != other.place for other in shown.keyframes))
+        if first.background is None or not config.older:
+            return shown
+        kept = recent((first, *kept))[1:]
+        others = [(one.prior, exposure_gains([first.prior, one.prior])[1]) for one in spread((first, *kept), config.older)]
+        first = dataclasses.replace(first, background=first.background.seen_by(others))
+        return KeyframeSet((first, *shown.keyframes[1:]), shown.gains, kept)
 
     def _together(self, keyframes: tuple[Keyframe, ...]) -> KeyframeSet:
         """Keyframes in one exposure, without moved objects."""
@@ -248,7 +257,7 @@ class VirtualSpace(Drawn):
         """Free keyframes that are neither shown nor trained on."""
         if self._pictures >= self.config.picture.refresh_pictures - 1:
             self._before = None
-        shown = [one.keyframes for one in (self._shown, self._before) if one is not None]
+        shown = [(*one.keyframes, *one.kept) for one in (self._shown, self._before) if one is not None]
         self._store.keep(itertools.chain(*shown, self._held))
 
     def scene_of(self, prepared: KeyframeSet) -> Prepared:

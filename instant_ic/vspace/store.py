@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -14,6 +14,10 @@ from instant_ic.vspace.background import Background
 from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import PanoramaPrior
 from instant_ic.vspace.warp import PanoramaWarp, Pyramid
+
+
+REACH_M, APART_M, RECENT = 3.0, 0.25, 7
+"""Older keyframes are used from up to so far, are so far apart, and so many are kept: at one each 0.6 m, 3 m of them."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +32,47 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class KeyframeSet:
-    """Keyframes that views show together, newest first; ``gains`` (K, 3) bring their colours to the newest's."""
+    """Keyframes that views show together, newest first; ``gains`` (K, 3) bring their colours to the newest's.
+
+    ``kept``: older ones, newest first, for their pixels of what is hidden from the newest.
+    """
 
     keyframes: tuple[Keyframe, ...]
     gains: Floats
+    kept: tuple[Keyframe, ...] = ()
 
     @property
     def priors(self) -> tuple[PanoramaPrior, ...]:
         """Of the keyframes, newest first."""
         return tuple(keyframe.prior for keyframe in self.keyframes)
+
+
+def spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
+    """Those of older keyframes (newest first, after the one that they are for) that show most of what it does not see.
+
+    The farthest within ``REACH_M`` first, then those farthest from all chosen before; none within ``APART_M`` of another.
+    """
+    places = np.array([keyframe.prior.map_from_camera[:3, 3] for keyframe in keyframes])
+    gaps = np.linalg.norm(places - places[0], axis=1)
+    within = gaps <= REACH_M
+    chosen: list[Keyframe] = []
+    while len(chosen) < count:
+        best = int(np.where(within, gaps, 0).argmax())
+        if gaps[best] < APART_M or not within[best]:
+            break
+        chosen.append(keyframes[best])
+        gaps = np.minimum(gaps, np.linalg.norm(places - places[best], axis=1))
+    return chosen
+
+
+def recent(keyframes: Iterable[Keyframe]) -> tuple[Keyframe, ...]:
+    """The newest ``RECENT`` keyframes of those that lie apart, newest first: of a standing robot the newest."""
+    kept: list[Keyframe] = []
+    for keyframe in keyframes:
+        place = keyframe.prior.map_from_camera[:3, 3]
+        if all(np.linalg.norm(other.prior.map_from_camera[:3, 3] - place) >= APART_M for other in kept):
+            kept.append(keyframe)
+    return tuple(kept[:RECENT])
 
 
 class KeyframeStore:
