@@ -169,11 +169,15 @@ def _as_seen(prior: PanoramaPrior, points: Floats) -> tuple[Floats, Floats]:
     u, v = equirect_pixels(local, width, height)
     row, column = np.clip(np.floor(v), 0, height - 1).astype(np.intp), np.floor(u).astype(np.intp) % width
     seen = np.abs(prior.inverse_depth[row, column] * distance - 1) < _SEEN
-    seen &= (prior.known[row, column] == 1) & (prior.depth_edge[row, column] == 0) & (prior.content[row, column] == ROOM)
+    seen &= (
+        (prior.known[row, column] == 1) & (prior.depth_edge[row, column] == 0) & (prior.content[row, column] == ROOM)
+    )
     high, wide = prior.rgb.shape[:2]
     u, v = equirect_pixels(local, wide, high)
     row = np.clip(np.rint(v), 0, high - 1).astype(np.intp)
-    return np.where(seen, distance, np.float32(np.inf)), prior.rgb[row, np.rint(u).astype(np.intp) % wide].astype(np.float32)
+    return np.where(seen, distance, np.float32(np.inf)), prior.rgb[row, np.rint(u).astype(np.intp) % wide].astype(
+        np.float32
+    )
 
 
 def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list[Floats]:

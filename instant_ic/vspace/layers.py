@@ -46,7 +46,7 @@ class Content(enum.IntEnum):
     GUESSED = 5
 
 
-CONTENT, EDGE = np.uint8(15), np.uint8(128)
+CONTENT, SHARE, EDGE = np.uint8(15), np.uint8(112), np.uint8(128)
 """Bits of the geometry's blue channel."""
 _OF_PRIOR = {ROBOT: Content.NOTHING, SKY: Content.SKY, MOVED: Content.MOVED, ROOM: Content.FILLED}
 
@@ -150,6 +150,7 @@ class LayerEncoder:
             marks = np.zeros(background.inverse.shape, np.uint8)
             for quads, content in ((background.guessed, Content.GUESSED), (background.sky, Content.SKY)):
                 marks[tuple(quads.T)] = content
+            marks |= np.rint(background.sure * (7 / 255)).astype(np.uint8) << 4
             near_m, png = _encoded_geometry(background.inverse, marks)
             colour = _jpeg(background.rgb)
         versions = [self._version] * 2
@@ -193,12 +194,14 @@ class DecodedLayer:
         inverse_depth: 1/m along the ray, (h, 2 h) float32.
         content: ``Content``, (h, 2 h) uint8: of each pixel, or of the quad right of and below it (``BEHIND``).
         edge: whether the quad right of and below a pixel crosses a depth edge, (h, 2 h).
+        share: of a guess in the image (``BEHIND``), the rest is continued from around in the image, (h, 2 h) 0..1.
     """
 
     rgb: NDArray[np.uint8]
     inverse_depth: Floats
     content: NDArray[np.uint8]
     edge: NDArray[np.bool_]
+    share: Floats
 
 
 def decode_layer(layer: Layer) -> DecodedLayer:
@@ -224,7 +227,7 @@ def decode_layer(layer: Layer) -> DecodedLayer:
         raise LayersError(f"{name}: its geometry has pixels without depth (code 0)")
     rgb = cv2.cvtColor(colour, cv2.COLOR_BGR2RGB)
     inverse_depth = code * np.float32(1 / (_CODES * layer.near_m))
-    return DecodedLayer(rgb, inverse_depth, marks & CONTENT, marks & EDGE > 0)
+    return DecodedLayer(rgb, inverse_depth, marks & CONTENT, marks & EDGE > 0, (marks & SHARE) * np.float32(1 / SHARE))
 
 
 def decode(layers: Layers, panorama_width: int, geometry: GeometryConfig | None = None) -> KeyframeSet:
@@ -279,4 +282,5 @@ def _background(layer: Layer) -> Background:
     rgb = decoded.rgb
     if rgb.shape[:2] != decoded.inverse_depth.shape:
         raise LayersError(f"layer BEHIND of keyframe {layer.keyframe_id}: colour and geometry differ in size")
-    return Background(decoded.inverse_depth, rgb, guessed, sky, np.array(layer.map_from_camera, np.float64))
+    sure = np.rint(255 * decoded.share).astype(np.uint8)
+    return Background(decoded.inverse_depth, rgb, sure, guessed, sky, np.array(layer.map_from_camera, np.float64))

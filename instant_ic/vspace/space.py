@@ -228,7 +228,9 @@ class VirtualSpace(Drawn):
         if first.background is None or not config.older:
             return shown
         kept = recent((first, *kept))[1:]
-        others = [(one.prior, exposure_gains([first.prior, one.prior])[1]) for one in spread((first, *kept), config.older)]
+        others = [
+            (one.prior, exposure_gains([first.prior, one.prior])[1]) for one in spread((first, *kept), config.older)
+        ]
         first = dataclasses.replace(first, background=first.background.seen_by(others))
         return KeyframeSet((first, *shown.keyframes[1:]), shown.gains, kept)
 
