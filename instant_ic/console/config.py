@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from instant_ic.config.ranges import Positive, Range, check_ranges
-from instant_ic.config.robot import CAMERA_MOUNT, Mount, Rectangle
+from instant_ic.config.robot import CAMERA_MOUNT, MotionLimits, Mount, Rectangle
 from instant_ic.console.server import ServerConfig
 from instant_ic.console.view import LeadConfig, ViewConfig
 
@@ -36,6 +36,7 @@ class ConsoleConfig:
     ease_ms: Annotated[float, Range(0, 5000)] = 400.0
     colour_release_s: Annotated[float, Range(0, 60)] = 6.0
     footprint: Rectangle = field(default_factory=Rectangle)
+    limits: MotionLimits = field(default_factory=MotionLimits)
     camera_mount: Mount = CAMERA_MOUNT
     recorder: str = "operator_recorder"
 
@@ -49,6 +50,7 @@ class ConsoleConfig:
             "ease_ms": self.ease_ms,
             "colour_release_s": self.colour_release_s,
             "lead_max_m": self.lead.max_m,
+            "max_accel": [self.limits.max_linear_accel_m_s2, self.limits.max_angular_accel_rad_s2],
             "footprint": [self.footprint.length_m, self.footprint.width_m],
             "camera": [0.0, 0.0, self.camera_mount.xyz[2]],
         }

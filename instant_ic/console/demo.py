@@ -30,6 +30,7 @@ from instant_ic.geometry.projections import equirect_directions, perspective_dir
 
 CAMERA_HEIGHT_M = 1.2
 STEP_S = 0.05
+KEYFRAME_M = 1.5  # distance between two keyframes
 Pose = NDArray[np.float64]
 
 
@@ -39,6 +40,7 @@ class DemoConfig:
 
     panorama_width: int = 640
     panorama_hz: float = 5.0
+    layers: bool = False  # pages that can render the virtual space by themselves
     view: ViewConfig = field(default_factory=ViewConfig)
 
 
@@ -96,6 +98,8 @@ class Demo:
         self.depth: bytes | None = None  # sent instead of the views' own depth
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
         self.keyframe: Pose | None = None  # trained pose of the virtual space; what it did not see is noise
+        self._layers_at: Pose | None = None  # keyframe of the layers that were sent
+        self._version = 0
         self.mode = "real"
         self.reason = ""
         self.robot: Pose = np.zeros(3)
@@ -187,8 +191,20 @@ class Demo:
             if now >= due and self.images:
                 due = now + 1.0 / self.config.panorama_hz
                 self._send_panorama()
-            if self.images and self._views.due(now, virtual=self.mode == "virtual"):
+            if self.config.layers and self.mode == "real":
+                far = self._layers_at is None or math.hypot(*(self.robot - self._layers_at)[:2]) > KEYFRAME_M
+                if far:
+                    self.send_layers(self.robot)
+            if self.images and self.server.needs_views() and self._views.due(now, virtual=self.mode == "virtual"):
                 self._send_view(self._views.asked(now))
+
+    def send_layers(self, keyframe: Pose) -> None:
+        """Send the layers round a keyframe at this pose (m, rad)."""
+        from instant_ic.console.demo_layers import demo_layers  # takes seconds to import
+
+        self._layers_at = keyframe.copy()
+        self._version += 1
+        self.server.send_layers(demo_layers(self._version, _camera(keyframe)))
 
     def place(self, x: float, y: float, yaw: float) -> None:
         """Place both robots at this pose (m, rad)."""
@@ -394,7 +410,7 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO)
-    demo = Demo(ServerConfig(port=arguments.port))
+    demo = Demo(ServerConfig(port=arguments.port), DemoConfig(layers=True))
     demo.start()
     logging.getLogger("instant_ic.console.demo").info("open %s (Ctrl-C stops)", demo.server.url)
     try:

@@ -11,6 +11,7 @@ from instant_ic.console.scene import Scene
 from instant_ic.console.view import Lead, LeadConfig
 from instant_ic.geometry.poses import Matrix
 from instant_ic.msg import ControlState, Pose, ShownPictures, header, pose_message, to_time
+from instant_ic.pace import current
 
 MODES: dict[int, str] = {
     ControlState.REAL: "real",
@@ -40,6 +41,8 @@ class Display:
         self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
         self._rendered: tuple[Matrix, bool] | None = None  # its camera pose, and whether it carries depth
         self._displayed = pose_message(np.eye(4))  # pose from which the page shows it
+        self._drawn_ms: float | None = None  # newest state that the driver's page has rendered by itself
+        self._drawn_ns = self._drawn_id = 0  # its time, steady clock; counts such states
         self._lost_ns: int | None = None  # when the driver was last lost, steady clock
 
     @property
@@ -78,6 +81,19 @@ class Display:
         self._rendered = camera, has_depth
         self._displayed = self._view_pose()
 
+    def take_drawn(self, drawn_ms: float | None, server_ms: float, now_ns: int) -> None:
+        """Note what the driver's page renders by itself.
+
+        Args:
+            drawn_ms: time of the newest state that it has shown; None: it shows rendered views.
+            server_ms: present time of the same clock.
+            now_ns: steady clock.
+        """
+        if drawn_ms is not None and drawn_ms != self._drawn_ms:
+            self._drawn_ns = now_ns - round(max(server_ms - drawn_ms, 0.0) * 1e6 * current().factor)
+            self._drawn_id = self._drawn_id % (2**32 - 1) + 1  # uint32; 0 means no view
+        self._drawn_ms = drawn_ms
+
     def lose_driver(self, now_ns: int) -> None:
         """Note the loss of the driver. His return shows in his commands."""
         self._lost_ns = now_ns
@@ -90,17 +106,25 @@ class Display:
         """Return the available images, their age and the loss of the driver. Any thread may call it."""
         lost_ns = self._lost_ns
         view_id, came_ns, delay_s = self._view
+        pose = self._displayed
+        if self._drawn_ms is not None:  # the page renders the v-bot's present pose, as of this state
+            view_id, came_ns, delay_s, pose = self._drawn_id, self._drawn_ns, 0.0, self._vbot_camera(pose)
         return ShownPictures(
             header=header("map", stamp_ns),
             picture_stamp=to_time(self.image_stamp_ns),
             picture_age_s=self.image_age_s(now_ns),
             view_id=view_id,
-            view_pose=self._displayed,
+            view_pose=pose,
             view_age_s=math.inf if view_id == 0 else (now_ns - came_ns) / 1e9,
             view_delay_s=delay_s,
             # Steady clock: if the system clock is set back, new commands must not look older than the loss.
             operator_lost=to_time(0 if lost_ns is None else stamp_ns - (now_ns - lost_ns)),
         )
+
+    def _vbot_camera(self, unknown: Pose) -> Pose:
+        """Pose of the v-bot's camera."""
+        vbot = self._scene.vbot_pose()
+        return unknown if vbot is None else pose_message(vbot @ self._scene.camera_mount())
 
     def _view_pose(self) -> Pose:
         """Pose from which the page shows the newest view, moved towards the v-bot's present pose."""

@@ -12,7 +12,8 @@ from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import GridLayers
-from instant_ic.console.protocol import FrameKind
+from instant_ic.console.layers import PageLayers
+from instant_ic.console.protocol import FrameKind, ProtocolError
 from instant_ic.console.scene import Newest, Scene
 from instant_ic.console.server import PLAIN_HTTP, ConsoleServer
 from instant_ic.console.view_requests import ViewRequests
@@ -97,6 +98,7 @@ class PageFeed:
     ) -> None:
         self.watched = True
         self.server = server
+        server.on_drawn = self.report_shown
         self.scene = Scene(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
         self.display = Display(config.lead, self.scene)
         self.requests = ViewRequests(config.view, self.scene, self.display)
@@ -131,6 +133,15 @@ class PageFeed:
         header = page.view_header(self._captured_ms(stamp_ns(message)), message, self.scene.camera_mount())
         self.server.send_frame(FrameKind.VIEW, header, bytes(message.image.data), client=client)
         self._request_view()
+
+    def take_layers(self, layers: PageLayers) -> None:
+        """Send a version of the virtual space that pages render by themselves."""
+        try:
+            self.server.send_layers(layers)
+        except ProtocolError as error:
+            self._diagnose("layers", ERROR, f"virtual space dropped: {error}")
+            return
+        self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))
 
     def take_control(self, message: ControlState) -> None:
         """Send a change of mode at once, because both robots keep moving."""
@@ -201,10 +212,11 @@ class PageFeed:
     def report_shown(self, always: bool = False) -> None:
         """Report the available images and the loss of the driver. Any thread may call it."""
         if self.watched or always:
+            self.display.take_drawn(self.server.drawn_ms(), self.server.now_ms(), self._clock.steady_ns())
             self._outputs.report_shown(self.display.report(self._clock.now_ns(), self._clock.steady_ns()))
 
     def _request_view(self) -> None:
-        if not self.watched:
+        if not (self.watched and self.server.needs_views()):
             return
         status = self._inputs.vspace.message
         renders = status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)

@@ -8,7 +8,7 @@ Binary frame, little endian::
     offset 4   uint32  sequence number, counted for each kind and client
     offset 8   uint32  length of the header, bytes
     offset 12          header: JSON, UTF-8
-    then               payload: JPEG or PNG
+    then               payload: JPEG or PNG; for LAYERS the parts of all layers, by the ranges in the header
 
 docs/console.md lists the fields of every message and header.
 """
@@ -37,6 +37,7 @@ class FrameKind(IntEnum):
     VIEW = 2  # perspective JPEG of the virtual space
     MAP = 3  # 8-bit grey PNG: 0..100 occupied %, 255 unknown; row 0 is the highest y
     COSTMAP = 4  # the same layout; 0..100 cost
+    LAYERS = 5  # the virtual space as layers of triangles
 
 
 @dataclass(frozen=True)

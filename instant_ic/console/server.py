@@ -36,9 +36,10 @@ from instant_ic.console.connections import (
     network_of,
 )
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.console.layers import PageLayers
 from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, short_text, whole
-from instant_ic.console.session import PendingFrame, Session
+from instant_ic.console.session import PendingFrame, PendingLayers, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
 from instant_ic.pace import current
 from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
@@ -58,6 +59,7 @@ RESERVED_FOR_DRIVERS = 2  # share of max_clients that pages that may only watch 
 MAX_BOOKMARK = 60  # characters
 SILENT_CLIENT_S = 15.0
 OWN_S = 1.5
+SUPERSEDED_S = 5.0  # time for a page to load new layers; what it still renders from older ones does not count as a view
 START_TIMEOUT_S = 10.0
 SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; form-action 'self'; "
@@ -153,6 +155,8 @@ class ConsoleServer:
         self.page = page or {}
         self.on_watched: Callable[[bool], None] = lambda watched: None
         """Called on the server's thread when the first page comes (True) and when the last one has gone (False)."""
+        self.on_drawn: Callable[[], None] = lambda: None
+        """Called on the server's thread when :meth:`drawn_ms` has changed."""
         self.gate = DriveGate(self.config.drive)
         try:
             self.access = Access(self.config.access, self.config.host)
@@ -165,7 +169,8 @@ class ConsoleServer:
         self._requests = AddressBuckets(REQUESTS_PER_S, BURST_REQUESTS)
         self._sockets = AddressBuckets(SOCKETS_PER_S, BURST_SOCKETS)
         self._texts: dict[str, str] = {}
-        self._frames: dict[FrameKind, PendingFrame] = {}
+        self._frames: dict[FrameKind, PendingFrame | PendingLayers] = {}
+        self._versions: dict[int, float] = {}  # of layers -> when the next one superseded it; inf: not yet
         self._looks: dict[int, Look] = {}
         self._own: dict[tuple[int, FrameKind], float] = {}  # (client, kind) -> time of its last own frame
         self._foreground = frozenset({FrameKind.PANORAMA})
@@ -250,11 +255,40 @@ class ConsoleServer:
         """
         self._call(self._send_frame, kind, PendingFrame(header, payload), client)
 
+    def send_layers(self, layers: PageLayers) -> None:
+        """Send a version of the virtual space to every client; it replaces a pending one.
+
+        Raises:
+            ProtocolError: a layer that no page could render.
+        """
+        layers.check()
+        _ = layers.digests  # on this thread: hashing takes milliseconds
+        self._call(self._send_layers, layers)
+
+    def drawn_ms(self) -> float | None:
+        """Return the time (:meth:`now_ms`) of the newest state that a page has shown, rendering the v-space by itself.
+
+        The page is the driver's, or without a driver the oldest. None: it needs rendered views.
+        """
+        sessions = self._sessions.copy()
+        driver = sessions.get(self.gate.driver or 0) or next(iter(sessions.values()), None)
+        return None if driver is None or driver.drawn is None else driver.drawn[1]
+
+    def needs_views(self) -> bool:
+        """Whether a page does not render the virtual space by itself."""
+        return any(session.drawn is None for session in self._sessions.copy().values())
+
     def watching(self) -> dict[int, Look]:
         """Looks of the clients that do not drive, by client; empty while nobody drives."""
         driver = self.gate.driver
         return (
-            {} if driver is None else {number: look for number, look in self._looks.copy().items() if number != driver}
+            {}
+            if driver is None
+            else {
+                number: look
+                for number, look in self._looks.copy().items()
+                if number != driver and (page := self._sessions.get(number)) is not None and page.drawn is None
+            }
         )
 
     def show(self, *kinds: FrameKind) -> None:
@@ -422,7 +456,7 @@ class ConsoleServer:
 
     async def _export_panorama(self, request: web.Request) -> web.StreamResponse:
         frame = self._frames.get(FrameKind.PANORAMA)
-        if frame is None:
+        if not isinstance(frame, PendingFrame):
             raise web.HTTPNotFound(text="there is no camera image yet\n")
         return _download(frame.payload, "panorama", "jpg", "image/jpeg")
 
@@ -613,6 +647,7 @@ class ConsoleServer:
             "snapshot": self._on_snapshot,
             "bookmark": self._on_bookmark,
             "ack": self._on_ack,
+            "drawn": self._on_drawn,
         }.get(kind)
         if handler is None:
             raise ProtocolError(f"unknown message type {kind!r:.40}")
@@ -720,8 +755,21 @@ class ConsoleServer:
             kind = FrameKind(whole(message, "kind"))
         except ValueError as error:
             raise ProtocolError(f"ack.kind: {error}") from None
-        if session.acknowledge(kind, whole(message, "seq")):
+        if session.acknowledge(kind, whole(message, "seq"), flag(message, "loaded", True)):
             session.bucket.give_back()  # acknowledgements are limited by the server's own frames
+
+    def _on_drawn(self, session: Session, message: dict[str, Any], now: float) -> None:
+        version, state_ms = whole(message, "version"), number(message, "state_ms", 0.0, self.now_ms())
+        before = self.drawn_ms()
+        if version == 0:
+            session.drawn = None
+        else:
+            current_version = time.monotonic() - self._versions.get(version, float("-inf")) < SUPERSEDED_S
+            # Of outdated layers no new state counts as shown: the view ages until it is stale.
+            shown_ms = state_ms if current_version else 0.0 if session.drawn is None else session.drawn[1]
+            session.drawn = version, shown_ms
+        if self.drawn_ms() != before:
+            self.on_drawn()
 
     async def _drive_forever(self) -> None:
         pace = current()
@@ -780,6 +828,18 @@ class ConsoleServer:
         for session in self._sessions.values():
             if now - self._own.get((session.number, kind), -OWN_S) >= OWN_S:
                 session.put_frame(kind, frame)
+
+    def _send_layers(self, layers: PageLayers) -> None:
+        now = time.monotonic()
+        self._versions = {
+            version: min(since, now)
+            for version, since in self._versions.items()
+            if version != layers.version and now - since < 2 * SUPERSEDED_S
+        }
+        self._versions[layers.version] = float("inf")
+        pending = self._frames[FrameKind.LAYERS] = PendingLayers(layers)
+        for session in self._sessions.values():
+            session.put_frame(FrameKind.LAYERS, pending)
 
     def _show(self, kinds: frozenset[FrameKind]) -> None:
         self._foreground = kinds

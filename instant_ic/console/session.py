@@ -12,12 +12,13 @@ from typing import Any
 from aiohttp import web
 
 from instant_ic.console.connections import Connection
+from instant_ic.console.layers import PageLayers
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
 from instant_ic.web_access import TokenBucket
 
 MAX_REPLIES = 256  # pending, about one second of a page's traffic; a client with more does not read
 # Smallest first: an image must not delay the state, nor a map an image.
-FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.MAP, FrameKind.COSTMAP)
+FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.LAYERS, FrameKind.MAP, FrameKind.COSTMAP)
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,21 @@ class PendingFrame:
 
     header: dict[str, Any]
     payload: bytes
+
+    def content(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
+        """Return header and payload."""
+        return self.header, self.payload
+
+
+@dataclass(frozen=True)
+class PendingLayers:
+    """Layers of the virtual space."""
+
+    layers: PageLayers
+
+    def content(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
+        """Return header and payload without the layers that the page holds."""
+        return self.layers.frame(held)
 
 
 class Session:
@@ -58,9 +74,14 @@ class Session:
         self.chokes = False
         """Whether too many replies are pending, which means that the client does not read."""
         self.away = False
+        self.drawn: tuple[int, float] | None = None
+        """Version of the layers that the page renders by itself, and time of the newest state that it has shown
+        (server's clock, ms); None: it needs rendered views."""
+        self._held: frozenset[str] = frozenset()  # digests of the layers that the page holds
+        self._offered: frozenset[str] = frozenset()  # of the layers sent last
         self._replies: deque[str] = deque()
         self._texts: dict[str, str] = {}
-        self._frames: dict[FrameKind, PendingFrame] = {}
+        self._frames: dict[FrameKind, PendingFrame | PendingLayers] = {}
         self._sent_frames: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
         self._unacknowledged: dict[FrameKind, int] = {}
         self._last_sent: dict[FrameKind, float] = {}
@@ -81,7 +102,7 @@ class Session:
         self._texts[key] = text
         self._wake.set()
 
-    def put_frame(self, kind: FrameKind, frame: PendingFrame) -> None:
+    def put_frame(self, kind: FrameKind, frame: PendingFrame | PendingLayers) -> None:
         """Queue a frame, replacing a pending one of the same kind."""
         self._frames[kind] = frame
         self._wake.set()
@@ -92,10 +113,15 @@ class Session:
         self._background_period_s = background_period_s
         self._wake.set()
 
-    def acknowledge(self, kind: FrameKind, sequence: int) -> bool:
-        """Note that the client has shown frame ``sequence``; False if it was not sent or already acknowledged."""
+    def acknowledge(self, kind: FrameKind, sequence: int, loaded: bool = True) -> bool:
+        """Note that the client has shown frame ``sequence``; False if it was not sent or already acknowledged.
+
+        ``loaded``: the client holds the layers of the frame from now on; if not, the next ones are sent in full.
+        """
         if self._unacknowledged.get(kind) != sequence:
             return False
+        if kind is FrameKind.LAYERS:
+            self._held = self._offered if loaded else frozenset()
         del self._unacknowledged[kind]
         self._wake.set()
         return True
@@ -123,7 +149,9 @@ class Session:
             self._sent_frames[kind] += 1
             self._unacknowledged[kind] = self._sent_frames[kind]
             self._last_sent[kind] = now
-            return encode_frame(Frame(kind, self._sent_frames[kind], pending.header, pending.payload))
+            if isinstance(pending, PendingLayers):
+                self._offered = pending.layers.digests
+            return encode_frame(Frame(kind, self._sent_frames[kind], *pending.content(self._held)))
         return None
 
     def _held_back(self, kind: FrameKind, now: float) -> bool:

@@ -48,6 +48,7 @@ class FakeServer:
         self.clock = clock
         self.texts, self.frames, self.shown = {}, [], None
         self.clients, self.watchers = [], {}
+        self.drawn, self.layers = None, []
 
     def now_ms(self):
         return self.clock.now_ns() / 1e6 + 5000.0
@@ -58,6 +59,16 @@ class FakeServer:
     def send_frame(self, kind, header, payload, client=None):
         self.frames.append((kind, header, payload))
         self.clients.append(client)
+
+    def send_layers(self, layers):
+        layers.check()
+        self.layers.append(layers)
+
+    def drawn_ms(self):
+        return self.drawn
+
+    def needs_views(self):
+        return self.drawn is None
 
     def watching(self):
         return self.watchers

@@ -11,7 +11,7 @@ import { Images } from "./images.js";
 import { Lease, OTHER_DRIVES } from "./lease.js";
 import { Link, onDetail } from "./link.js";
 import { Look } from "./look.js";
-import { MAP, PANORAMA, VIEW } from "./messages.js";
+import { LAYERS, MAP, PANORAMA, VIEW } from "./messages.js";
 import { Recording } from "./record.js";
 import { saveFile } from "./save.js";
 import { Screen } from "./screen.js";
@@ -63,6 +63,7 @@ onDetail(link, "message", (/** @type {Message} */ message) => {
       lease.mayDrive = recording.mayRecord = settings.mayDrive;
       mark("mayDrive", String(settings.mayDrive));
       images.configure(settings);
+      images.expectLayers();
       drive.limits = settings.limits;
       break;
     }
@@ -92,6 +93,7 @@ onDetail(link, "message", (/** @type {Message} */ message) => {
 });
 onDetail(link, "frame", (/** @type {Frame} */ received) => {
   if (received.kind === PANORAMA || received.kind === VIEW) images.take(received).then(wake);
+  else if (received.kind === LAYERS) images.takeLayers(received).then(wake);
   else takeGrid(received);
 });
 
@@ -207,7 +209,11 @@ pads.addEventListener("stop", stopNow);
 pads.addEventListener("centre", () => look.centre());
 onDetail(pads, "scale", (/** @type {number} */ change) => setScale(+scale.value + change));
 onDetail(pads, "notice", hud.toast);
-drive.addEventListener("change", showCommand);
+drive.addEventListener("change", () => {
+  images.prediction.command(drive.command, link.serverNow());
+  showCommand();
+  wake();
+});
 onDetail(drive, "stop", (/** @type {string} */ why) => hud.toast(`Stopped: ${why}`));
 
 const keyCaps = [...document.querySelectorAll("#keys kbd")].filter((cap) => cap instanceof HTMLElement);

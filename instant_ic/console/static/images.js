@@ -6,7 +6,8 @@
 /** @import { Link } from "./link.js" */
 /** @import { Look } from "./look.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
-/** @import { PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
+/** @import { Camera, Layer } from "./layers.js" */
+/** @import { LayerData, LayersFrame, LayersHeader, PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
 /** @import { Settings } from "./settings.js" */
 /** @import { Depth, GlViewer } from "./viewer.js" */
 import { coloured, fitColour, plain, Releasing } from "./colour.js";
@@ -14,6 +15,7 @@ import { offscreen } from "./dom.js";
 import { fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, transpose } from "./math.js";
 import { PANORAMA, VIEW } from "./messages.js";
 import { Motion, SMOOTHING_MS } from "./motion.js";
+import { Prediction } from "./prediction.js";
 
 /** @typedef {GlViewer | FlatViewer} Viewer */
 /** @typedef {1 | 2} Kind PANORAMA or VIEW. */
@@ -26,6 +28,7 @@ import { Motion, SMOOTHING_MS } from "./motion.js";
  * @property {Mat3} viewFromLook
  * @property {[number, number]} viewTanHalf of the rendered view
  * @property {Vec3 | null} moved motion of the camera since the view was rendered: forward, left, up in its frame, m
+ * @property {Camera | null} camera of the layers, which then take the place of the rendered view; null: there are none
  * @property {number} blend 0 panorama, 1 view
  * @property {Colour} panoramaColour
  * @property {Colour} viewColour
@@ -36,6 +39,7 @@ const STALE_MS = 2000;
 const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
 const RELEASE_STEP_MS = 100; // the matched colour fades in steps too small to be seen
 const LEAST_M = 0.0005; // smallest motion of a view that is rendered
+const LAYERS_MS = 5000; // longest wait for the layers of a new link
 const ELSEWHERE_M = 1; // a view rendered farther away shows another place
 
 export class Images {
@@ -52,6 +56,14 @@ export class Images {
     this.decodeErrors = 0;
     this.changed = true;
     this.motion = new Motion();
+    this.prediction = new Prediction();
+    /** @type {LayersHeader | null} The layers that this page renders by itself; null: it shows rendered views. */
+    this.layers = null;
+    /** @type {Map<string, Layer>} Those that are loaded, by id. */
+    this._held = new Map();
+    this._loads = 0; // counts loads, so that a late one of a lost link is dropped
+    this.shownMs = 0; // time of the newest state that is shown, server's clock
+    this.moves = false; // the v-bot moves, as far as this page knows
     this.leadMaxM = 0; // largest distance by which a view is moved from its rendered position; 0: never moved
     /** @type {[number, number] | null} Position in the map frame from which the view is shown. */
     this.place = null;
@@ -76,6 +88,7 @@ export class Images {
     this.dissolveMs = settings.dissolveMs;
     this.motion.easeMs = settings.easeMs;
     this.leadMaxM = settings.leadMaxM;
+    this.prediction.maxAccel = settings.maxAccel;
     this.colourReleaseMs = settings.colourReleaseMs;
   }
 
@@ -99,6 +112,58 @@ export class Images {
     } finally {
       this.link.acknowledge(frame);
     }
+  }
+
+  /**
+   * Decodes and loads layers, then acknowledges them. A viewer that renders none does not: it gets no more of them.
+   * @param {LayersFrame} frame
+   */
+  async takeLayers(frame) {
+    const { viewer } = this;
+    if (!("loadLayers" in viewer)) return;
+    const load = this._loads;
+    let loaded = false;
+    try {
+      const layers = await Promise.all(frame.layers.map((data) => this._decodedLayer(data)));
+      if (load === this._loads && !viewer.lost) {
+        viewer.loadLayers(layers);
+        this._held = new Map(frame.layers.map(({ id }, i) => [id, layers[i]]));
+        this.layers = frame.header;
+        this.changed = loaded = true;
+      }
+    } catch (error) {
+      this.decodeErrors++;
+      console.warn(`layers of version ${frame.header.version}: ${error}; the ones before stay`);
+    }
+    if (load === this._loads) this.link.acknowledge(frame, loaded);
+  }
+
+  /** A link is new: a server with layers sends them again. Without them, the page returns to rendered views. */
+  expectLayers() {
+    const load = ++this._loads, { layers } = this;
+    setTimeout(() => {
+      if (load !== this._loads || layers !== this.layers) return;
+      this._held.clear();
+      this.layers = null;
+      this.changed = true;
+    }, LAYERS_MS);
+  }
+
+  /** @param {LayerData} data @returns {Promise<Layer>} */
+  async _decodedLayer({ id, size, gain, mesh }) {
+    if (!mesh) {
+      const held = this._held.get(id);
+      if (!held) throw new Error(`layer ${id} is not here`);
+      return held;
+    }
+    const { image, confidence, ...numbers } = mesh;
+    const [colours, seen] = await Promise.all([decoded(image), confidence && decoded(confidence)]);
+    return { ...numbers, size, gain, image: colours, confidence: seen };
+  }
+
+  /** Whether the layers take the place of rendered views. */
+  get rendersLayers() {
+    return this.layers !== null && !this.viewer.lost;
   }
 
   /** @param {PanoramaFrame} frame */
@@ -130,6 +195,7 @@ export class Images {
 
   /** Header of the shown image. */
   get shown() {
+    if (this.blend > 0.5 && this.rendersLayers) return { captured_ms: this.shownMs };
     return this.blend > 0.5 ? this.view : this.panorama;
   }
 
@@ -168,11 +234,12 @@ export class Images {
       viewFromLook: this.view ? relative(this.view.q) : identity,
       viewTanHalf: [viewTan, viewTan / (this.view?.aspect ?? 1)],
       moved: this.view ? this._moved(this.view, state, elapsedMs) : null,
+      camera: this.layers && this.rendersLayers ? this._camera(this.layers, mapFromLook, tanHalf) : null,
       blend: this.blend * this.blend * (3 - 2 * this.blend),
       panoramaColour: plain,
       viewColour: plain,
     };
-    if (starts && this.panorama && this.view) this._match(scene, now);
+    if (starts && this.panorama && (this.view || scene.camera)) this._match(scene, now);
     this._release(now);
     scene.panoramaColour = this._colours[PANORAMA].at(now);
     scene.viewColour = this._colours[VIEW].at(now);
@@ -198,6 +265,27 @@ export class Images {
     if (share * far < LEAST_M) return null;
     this.place = [p[0] + share * way[0], p[1] + share * way[1]];
     return rotate(transpose(fromQuaternion(q)), [share * way[0], share * way[1], 0]);
+  }
+
+  /**
+   * The v-bot's camera, in the keyframe's frame; null: its pose is unknown. While the real robot is shown, it stays where
+   * the v-bot was last.
+   * @param {LayersHeader} layers @param {Mat3} mapFromLook @param {[number, number]} tanHalf @returns {Camera | null}
+   */
+  _camera({ p, q, mount }, mapFromLook, tanHalf) {
+    const own = this.motion.own;
+    if (own && (this._virtual || !this._now)) {
+      const [x, y] = rotate(rotationZ(own[2]), mount);
+      this._now = [own[0] + x, own[1] + y];
+    }
+    if (!this._now) return null;
+    this.place = this._now;
+    const panoramaFromMap = transpose(fromQuaternion(q));
+    return {
+      panoramaFromLook: multiply(panoramaFromMap, mapFromLook),
+      position: rotate(panoramaFromMap, [this._now[0] - p[0], this._now[1] - p[1], mount[2] - p[2]]),
+      tanHalf,
+    };
   }
 
   /**
@@ -232,6 +320,7 @@ export class Images {
 
   /** Whether the newest image of a kind may be shown: made since the switch, or the wait is over. @param {Kind} kind */
   _fits(kind) {
+    if (kind === VIEW && this.rendersLayers) return true;
     const header = kind === VIEW ? this.view : this.panorama;
     if (!header) return kind === PANORAMA;
     return header.captured_ms >= this._since[kind] || (this.link.serverNow() ?? 0) - this._changedAt > WAIT_MS[kind];
@@ -258,8 +347,17 @@ export class Images {
   /** Updates the pose of the shown robot between the state messages. @param {State | null} state @param {number} elapsedMs */
   _follow(state, elapsedMs) {
     const robot = shows(state), pose = robot === "virtual" ? (state?.vbot ?? state?.robot) : state?.robot;
-    const age = state ? (this.link.serverNow() ?? state.at_ms) - state.at_ms : 0;
-    this.motion.follow(robot, pose, state?.twist ?? [0, 0], age, elapsedMs);
+    const now = this.link.serverNow() ?? state?.at_ms ?? 0, age = state ? now - state.at_ms : 0;
+    const twist = state?.twist ?? [0, 0];
+    if (state && pose && state.mode === "virtual" && robot === "virtual" && this.rendersLayers) {
+      const delay = (state.lead * (this.link.roundTripMs ?? 0)) / 2;
+      const present = this.prediction.from(pose, twist, state.at_ms, now, delay);
+      this.motion.follow(robot, present.pose, present.twist, 0, elapsedMs);
+      this.moves = present.twist[0] !== 0 || present.twist[1] !== 0;
+    } else {
+      this.motion.follow(robot, pose, twist, age, elapsedMs);
+      this.moves = false;
+    }
   }
 }
 

@@ -1,6 +1,7 @@
 // @ts-check
 // The virtual space in WebGL 2: layers of triangles round a keyframe, rendered from any place (Python: vspace/layers.py).
 
+/** @import { Colour } from "./colour.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
 import { link } from "./program.js";
 
@@ -24,6 +25,7 @@ import { link } from "./program.js";
 /** @typedef {{vertices: WebGLVertexArrayObject, count: number, image: WebGLTexture, confidence: WebGLTexture, layer: Layer, buffers: WebGLBuffer[]}} Loaded */
 
 const NEAR_M = 0.02;
+const IMAGE = 6, CONFIDENCE = 7; // texture units
 const BEYOND_LEVEL = 4; // mipmap level of what no layer covers
 
 // Homogeneous coordinates are divided by the vertex's distance: what is endlessly far needs no large numbers.
@@ -46,7 +48,7 @@ const FRAGMENT = `
 in vec3 direction;
 out vec4 colour;
 uniform sampler2D image, confidence;
-uniform vec3 gain;
+uniform vec3 gain, offset;
 uniform bool soft; // what nobody has seen is blurred and paler
 const vec3 GREY = vec3(0.30, 0.59, 0.11);
 const float PI = ${Math.PI};
@@ -61,12 +63,13 @@ void main() {
   } else colour = vec4(textureLod(image, uv, 0.0).rgb, 1.0);
   if (soft) {
     float seen = textureLod(confidence, uv, 0.0).r;
+    colour.a = seen;
     if (seen < 1.0) {
       vec3 guess = textureLod(image, uv, 2.0).rgb;
       colour.rgb = mix(mix(guess, vec3(dot(guess, GREY)), 0.5), colour.rgb, seen);
     }
   }
-  colour.rgb *= gain;
+  colour.rgb = colour.rgb * gain + offset;
 }`;
 
 // Where no layer has a surface: the colours of the direction, blurred.
@@ -77,11 +80,11 @@ out vec4 colour;
 uniform sampler2D image;
 uniform mat3 panoramaFromLook;
 uniform vec2 tanHalf;
-uniform vec3 gain;
+uniform vec3 gain, offset;
 void main() {
   vec3 d = panoramaFromLook * normalize(vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y));
   vec2 uv = vec2(0.5 - atan(d.y, d.x) / ${2 * Math.PI}, acos(clamp(d.z, -1.0, 1.0)) / ${Math.PI});
-  colour = vec4(gain * textureLod(image, uv, ${BEYOND_LEVEL}.0).rgb, 1.0);
+  colour = vec4(gain * textureLod(image, uv, ${BEYOND_LEVEL}.0).rgb + offset, 0.0);
 }`;
 const FULL = `#version 300 es
 out vec2 screen;
@@ -102,6 +105,8 @@ export class LayerRenderer {
     /** @type {Loaded[]} The nearest first. */
     this._layers = [];
     this._empty = this._texture(null);
+    /** @type {Map<WebGLProgram, Map<string, WebGLUniformLocation | null>>} */
+    this._places = new Map();
   }
 
   /** Replaces the layers, from the first one that differs. @param {Layer[]} layers */
@@ -121,18 +126,21 @@ export class LayerRenderer {
     return this._layers.reduce((sum, { count }) => sum + count / 3, 0);
   }
 
-  /** @param {Camera} camera @param {number} width @param {number} height @param {boolean} soft see the shader */
-  render(camera, width, height, soft) {
-    const gl = this._gl, program = this._program;
-    /** @param {string} name */
-    const at = (name) => gl.getUniformLocation(program, name);
+  /**
+   * The alpha of what is rendered is 1 where the place was seen.
+   * @param {Camera} camera @param {number} width @param {number} height
+   * @param {Colour} tint gain and offset of the colours
+   */
+  render(camera, width, height, tint) {
+    const gl = this._gl, program = this._program, at = this._place(program);
     gl.viewport(0, 0, width, height);
     gl.useProgram(program);
     gl.uniformMatrix3fv(at("lookFromPanorama"), false, camera.panoramaFromLook); // transposed: row-major read by columns
     gl.uniform3fv(at("position"), camera.position);
     gl.uniform2fv(at("tanHalf"), camera.tanHalf);
-    gl.uniform1i(at("image"), 0);
-    gl.uniform1i(at("confidence"), 1);
+    gl.uniform3fv(at("offset"), tint.offset);
+    gl.uniform1i(at("image"), IMAGE);
+    gl.uniform1i(at("confidence"), CONFIDENCE);
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.STENCIL_TEST);
     gl.depthFunc(gl.LESS);
@@ -145,35 +153,49 @@ export class LayerRenderer {
       gl.stencilFunc(gl.EQUAL, 1 << k, (1 << k) - 1);
       gl.stencilOpSeparate(gl.FRONT, gl.KEEP, gl.KEEP, gl.REPLACE);
       gl.stencilOpSeparate(gl.BACK, gl.KEEP, gl.KEEP, gl.ZERO);
-      gl.activeTexture(gl.TEXTURE1);
+      gl.activeTexture(gl.TEXTURE0 + CONFIDENCE);
       gl.bindTexture(gl.TEXTURE_2D, confidence);
-      gl.activeTexture(gl.TEXTURE0);
+      gl.activeTexture(gl.TEXTURE0 + IMAGE);
       gl.bindTexture(gl.TEXTURE_2D, image);
       gl.uniform2fv(at("size"), layer.size);
-      gl.uniform3fv(at("gain"), layer.gain);
-      gl.uniform1i(at("soft"), Number(soft && layer.confidence !== null));
+      gl.uniform3fv(at("gain"), times(layer.gain, tint.gain));
+      gl.uniform1i(at("soft"), Number(layer.confidence !== null));
       gl.bindVertexArray(vertices);
       gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
     });
     gl.bindVertexArray(null);
     gl.disable(gl.DEPTH_TEST);
-    this._renderBeyond(camera);
+    this._renderBeyond(camera, tint);
     gl.disable(gl.STENCIL_TEST);
   }
 
-  /** @param {Camera} camera */
-  _renderBeyond(camera) {
-    const gl = this._gl, program = this._beyond, last = this._layers[this._layers.length - 1];
+  /** @param {Camera} camera @param {Colour} tint */
+  _renderBeyond(camera, tint) {
+    const gl = this._gl, program = this._beyond, at = this._place(program), last = this._layers[this._layers.length - 1];
     if (!last) return;
     gl.useProgram(program);
     gl.stencilFunc(gl.EQUAL, 0, 0xff);
     gl.stencilOp(gl.KEEP, gl.KEEP, gl.KEEP);
     gl.bindTexture(gl.TEXTURE_2D, last.image);
-    gl.uniform1i(gl.getUniformLocation(program, "image"), 0);
-    gl.uniformMatrix3fv(gl.getUniformLocation(program, "panoramaFromLook"), true, camera.panoramaFromLook);
-    gl.uniform2fv(gl.getUniformLocation(program, "tanHalf"), camera.tanHalf);
-    gl.uniform3fv(gl.getUniformLocation(program, "gain"), last.layer.gain);
+    gl.uniform1i(at("image"), IMAGE);
+    gl.uniformMatrix3fv(at("panoramaFromLook"), true, camera.panoramaFromLook);
+    gl.uniform2fv(at("tanHalf"), camera.tanHalf);
+    gl.uniform3fv(at("gain"), times(last.layer.gain, tint.gain));
+    gl.uniform3fv(at("offset"), tint.offset);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /** Places of a program's uniforms, looked up once. @param {WebGLProgram} program */
+  _place(program) {
+    let places = this._places.get(program);
+    if (!places) this._places.set(program, places = new Map());
+    const known = places;
+    /** @param {string} name @returns {WebGLUniformLocation | null} */
+    return (name) => {
+      let place = known.get(name);
+      if (place === undefined) known.set(name, place = this._gl.getUniformLocation(program, name));
+      return place;
+    };
   }
 
   /** @param {Layer} layer @returns {Loaded} */
@@ -208,7 +230,7 @@ export class LayerRenderer {
   /** @param {ImageBitmap | null} bitmap */
   _texture(bitmap) {
     const gl = this._gl, texture = gl.createTexture(), extension = this._anisotropy;
-    gl.activeTexture(gl.TEXTURE0);
+    gl.activeTexture(gl.TEXTURE0 + IMAGE);
     gl.bindTexture(gl.TEXTURE_2D, texture);
     if (bitmap) gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, bitmap);
     else gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, 1, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, new Uint8Array([255, 255, 255]));
@@ -221,3 +243,6 @@ export class LayerRenderer {
     return texture;
   }
 }
+
+/** @param {number[]} a @param {number[]} b */
+const times = (a, b) => a.map((value, i) => value * b[i]);

@@ -3,7 +3,7 @@
 
 /** @import { Frame, Pong } from "./messages.js" */
 import { ServerClock } from "./clock.js";
-import { decodeFrame, MessageError, parseMessage } from "./messages.js";
+import { decodeFrame, frameNumber, MessageError, parseMessage } from "./messages.js";
 
 const PING_MS = 50; // the server counts a driver as lost after beat_timeout_s (0.25 s)
 const SILENCE_MS = 1000; // the link counts as lost after this silence
@@ -64,9 +64,9 @@ export class Link extends EventTarget {
     return true;
   }
 
-  /** @param {Pick<Frame, "kind" | "sequence">} frame */
-  acknowledge(frame) {
-    this.send({ type: "ack", kind: frame.kind, seq: frame.sequence });
+  /** @param {Pick<Frame, "kind" | "sequence">} frame @param {boolean} loaded false: the page could not use it */
+  acknowledge(frame, loaded = true) {
+    this.send({ type: "ack", kind: frame.kind, seq: frame.sequence, ...(loaded ? {} : { loaded }) });
   }
 
   _connect() {
@@ -144,6 +144,8 @@ export class Link extends EventTarget {
     } catch (error) {
       if (!(error instanceof MessageError)) throw error;
       console.error(`message of the server dropped: ${error.message}`);
+      const frame = typeof data === "string" ? null : frameNumber(data);
+      if (frame) this.acknowledge(frame, false); // else the server would wait, and send no other one
     }
   }
 

@@ -63,6 +63,7 @@ const page = object({
   ease_ms: optional(number),
   colour_release_s: optional(number),
   lead_max_m: optional(number),
+  max_accel: optional(pair),
   footprint: optional(pair),
   camera: optional(triple),
 });
@@ -164,7 +165,8 @@ function parsed(json) {
 
 // ---- binary frames -------------------------------------------------------------------------------
 
-export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4;
+export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4, LAYERS = 5;
+const KINDS = /** @type {const} */ ([PANORAMA, VIEW, MAP, COSTMAP, LAYERS]);
 const PREFIX_BYTES = 12;
 const VERSION = 1;
 
@@ -173,14 +175,38 @@ const viewHeader = object({
   captured_ms: number, q: quaternion, p: triple, fov: number, mask: text, depth: text, depth_near_m: number, mount: triple,
 });
 const gridHeader = object({ resolution: number, width: number, height: number, x: number, y: number });
+const MOST_LAYERS = 8; // bits of the stencil buffer
+const parts = object({ inverse: pair, triangles: pair, corners: pair, image: pair, confidence: pair });
+const layersHeader = object({
+  version: number, keyframe: number, q: quaternion, p: triple, mount: triple,
+  layers: list(object({ id: text, size: pair, gain: triple, parts: optional(parts) })),
+});
 
+/**
+ * A layer: triangles round the keyframe, whose vertices are corners of the panorama's pixels.
+ * @typedef {object} LayerData
+ * @property {string} id equal for equal content
+ * @property {[number, number]} size height and width of the lattice of corners
+ * @property {[number, number, number]} gain factors of the colours
+ * @property {Mesh | null} mesh null: as in the layers before, by its id
+ */
+/**
+ * @typedef {object} Mesh
+ * @property {Uint16Array} corners column and row of each vertex
+ * @property {Float32Array} inverse inverse depth of each vertex, 1/m
+ * @property {Uint32Array} triangles indices of vertices
+ * @property {Blob} image JPEG or PNG, equirectangular
+ * @property {Blob | null} confidence PNG; null: all of it was seen
+ */
+/** @typedef {Omit<ReturnType<typeof layersHeader>, "layers">} LayersHeader */
+/** @typedef {{kind: 5, sequence: number, header: LayersHeader, layers: LayerData[]}} LayersFrame */
 /** @typedef {ReturnType<typeof panoramaHeader>} PanoramaHeader */
 /** @typedef {ReturnType<typeof viewHeader>} ViewHeader */
 /** @typedef {ReturnType<typeof gridHeader>} GridHeader */
 /** @typedef {{kind: 1, sequence: number, header: PanoramaHeader, payload: Blob}} PanoramaFrame */
 /** @typedef {{kind: 2, sequence: number, header: ViewHeader, payload: Blob}} ViewFrame */
 /** @typedef {{kind: 3 | 4, sequence: number, header: GridHeader, payload: Blob}} GridFrame */
-/** @typedef {PanoramaFrame | ViewFrame | GridFrame} Frame */
+/** @typedef {PanoramaFrame | ViewFrame | GridFrame | LayersFrame} Frame */
 
 /** Decodes a binary frame; throws MessageError. @param {ArrayBuffer} buffer @returns {Frame} */
 export function decodeFrame(buffer) {
@@ -190,12 +216,63 @@ export function decodeFrame(buffer) {
   const kind = view.getUint8(1), sequence = view.getUint32(4, true), headerEnd = PREFIX_BYTES + view.getUint32(8, true);
   if (headerEnd > size) return refuse("frame", `at least ${headerEnd} bytes long`, size);
   const header = parsed(new TextDecoder().decode(new Uint8Array(buffer, PREFIX_BYTES, headerEnd - PREFIX_BYTES)));
+  if (kind === LAYERS) return { kind, sequence, ...decodeLayers(header, buffer.slice(headerEnd)) };
   const payload = new Blob([new Uint8Array(buffer, headerEnd)]);
   switch (kind) {
     case PANORAMA: return { kind, sequence, header: panoramaHeader(header, "panorama"), payload };
     case VIEW: return { kind, sequence, header: viewHeader(header, "view"), payload };
     case MAP:
     case COSTMAP: return { kind, sequence, header: gridHeader(header, "grid"), payload };
-    default: return refuse("frame.kind", "1 to 4", kind);
+    default: return refuse("frame.kind", "1 to 5", kind);
   }
+}
+
+/**
+ * Kind and sequence of a frame, even of one that cannot be decoded; null: it has none.
+ * @param {ArrayBuffer} buffer @returns {Pick<Frame, "kind" | "sequence"> | null}
+ */
+export function frameNumber(buffer) {
+  if (buffer.byteLength < PREFIX_BYTES) return null;
+  const view = new DataView(buffer), kind = KINDS.find((known) => known === view.getUint8(1));
+  return kind === undefined ? null : { kind, sequence: view.getUint32(4, true) };
+}
+
+/** @param {unknown} value @param {ArrayBuffer} payload @returns {Pick<LayersFrame, "header" | "layers">} */
+function decodeLayers(value, payload) {
+  const { layers, ...header } = layersHeader(value, "layers");
+  if (layers.length < 1 || layers.length > MOST_LAYERS) return refuse("layers", `1 to ${MOST_LAYERS} layers`, layers.length);
+  return { header, layers: layers.map((layer, i) => ({
+    id: layer.id, size: layer.size, gain: layer.gain,
+    mesh: layer.parts && decodeMesh(layer.parts, layer.size, payload, `layers[${i}]`) })) };
+}
+
+/**
+ * @param {ReturnType<typeof parts>} ranges start and length in bytes @param {[number, number]} size
+ * @param {ArrayBuffer} payload @param {string} name @returns {Mesh}
+ */
+function decodeMesh(ranges, [height, width], payload, name) {
+  /** @param {keyof typeof ranges} part @param {number} unit bytes of one entry */
+  const bytes = (part, unit) => {
+    const [start, length] = ranges[part], end = start + length;
+    const whole = Number.isInteger(start) && Number.isInteger(length) && length % unit === 0;
+    if (whole && start >= 0 && length >= 0 && end <= payload.byteLength) return payload.slice(start, end);
+    return refuse(`${name}.${part}`, `entries of ${unit} bytes within ${payload.byteLength} bytes`, [start, length]);
+  };
+  const corners = new Uint16Array(bytes("corners", 4)), inverse = new Float32Array(bytes("inverse", 4));
+  const triangles = new Uint32Array(bytes("triangles", 12)), count = inverse.length;
+  if (corners.length !== 2 * count) return refuse(`${name}.corners`, `${count} pairs`, corners.length / 2);
+  if (![height, width].every((side) => Number.isInteger(side) && side >= 1 && side <= 0xffff))
+    return refuse(`${name}.size`, "two sizes from 1 to 65535", [height, width]);
+  for (let i = 0; i < count; i++) {
+    if (corners[2 * i] > width || corners[2 * i + 1] > height)
+      return refuse(`${name}.corners[${i}]`, `within ${width} x ${height}`, [corners[2 * i], corners[2 * i + 1]]);
+    if (!(inverse[i] >= 0 && inverse[i] < Infinity)) return refuse(`${name}.inverse[${i}]`, "finite and >= 0", inverse[i]);
+  }
+  const wrong = triangles.findIndex((index) => index >= count);
+  if (wrong >= 0) return refuse(`${name}.triangles[${wrong}]`, `below ${count}`, triangles[wrong]);
+  const confidence = bytes("confidence", 1);
+  return {
+    corners, inverse, triangles, image: new Blob([bytes("image", 1)]),
+    confidence: confidence.byteLength ? new Blob([confidence]) : null,
+  };
 }

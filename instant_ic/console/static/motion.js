@@ -39,7 +39,7 @@ export class Motion {
    */
   follow(robot, pose, twist, ageMs, elapsedMs) {
     if (!pose) return;
-    const target = moved(pose, twist, clamp(ageMs, 0, EXTRAPOLATION_MS) / 1000);
+    const target = advanced(pose, twist, clamp(ageMs, 0, EXTRAPOLATION_MS) / 1000);
     if (robot !== this._robot && this._robot && this.pose !== null) {
       const apart = difference(this.pose, target);
       this._residual = size(apart) < EASED_M && Math.abs(apart[2]) < EASED_RAD ? apart : [0, 0, 0];
@@ -48,7 +48,7 @@ export class Motion {
     }
     this._robot = robot;
     // Move on at the velocity and smooth only the remaining error, so that steady motion is shown without lag.
-    const went = this._followed && moved(this._followed, twist, ageMs < EXTRAPOLATION_MS ? elapsedMs / 1000 : 0);
+    const went = this._followed && advanced(this._followed, twist, ageMs < EXTRAPOLATION_MS ? elapsedMs / 1000 : 0);
     const left = went ? difference(target, went) : null;
     if (!went || !left || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this._followed = target;
     else this._followed = sum(went, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
@@ -66,7 +66,7 @@ const difference = (a, b) => [a[0] - b[0], a[1] - b[1], wrapAngle(a[2] - b[2])];
 const sum = (a, b, share) => [a[0] + share * b[0], a[1] + share * b[1], wrapAngle(a[2] + share * b[2])];
 
 /** @param {Vec3} pose @param {[number, number]} twist @param {number} seconds @returns {Vec3} */
-function moved([x, y, yaw], [v, w], seconds) {
+export function advanced([x, y, yaw], [v, w], seconds) {
   const middle = yaw + (w * seconds) / 2;
   return [x + v * seconds * Math.cos(middle), y + v * seconds * Math.sin(middle), wrapAngle(yaw + w * seconds)];
 }

@@ -25,6 +25,7 @@ const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
 const SLOW_PIXELS = 0.5, SLOW_VIEW_PIXELS = 0.36; // share of the window's pixels per axis; a rendered view has fewer
 const SLOW_MAP_MS = 200;
+const REPORT_MS = 500; // longest interval between two reports of the shown state while the camera is shown
 const IDLE_MS = 200; // longest interval between two frames while messages arrive
 const COLOURS = { real: "#45c4b0", entering: "#45c4b0", virtual: "#f0ac45", returning: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
 
@@ -53,7 +54,12 @@ export class Screen {
     /** Rotation and field of view of the last drawn image. @type {number[]} */
     this._direction = [];
     this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
-    link.addEventListener("open", () => { this._sentLook = ""; });
+    this._reported = "0"; // the server takes a page for one that needs rendered views
+    this._reportedAt = 0;
+    link.addEventListener("open", () => {
+      this._sentLook = "";
+      this._reported = "0";
+    });
     document.addEventListener("visibilitychange", () => { this._steppedAt = performance.now(); });
   }
 
@@ -62,6 +68,22 @@ export class Screen {
     const same = this.state && JSON.stringify({ ...this.state, at_ms: state.at_ms }) === JSON.stringify(state);
     this.state = state;
     if (!same || performance.now() - this._frameAt > IDLE_MS) this.wake();
+    else if (!this._wanted) this._reportShown();
+  }
+
+  /** Reports that the newest state is on the screen, if this page renders the virtual space by itself. */
+  _reportShown() {
+    const { state, images, link } = this;
+    if (!state) return;
+    images.shownMs = state.at_ms;
+    if (!link.connected) return;
+    const version = images.rendersLayers && images.layers ? images.layers.version : 0;
+    const soon = state.mode === "virtual" || state.mode === "entering" || state.mode === "returning";
+    const key = version === 0 ? "0" : `${version} ${soon}`, now = performance.now();
+    if (key === this._reported && (version === 0 || (!soon && now - this._reportedAt < REPORT_MS))) return;
+    this._reported = key;
+    this._reportedAt = now;
+    link.send({ type: "drawn", version, state_ms: state.at_ms });
   }
 
   /** Requests a frame. */
@@ -104,6 +126,7 @@ export class Screen {
     const tanHalf = this._tanHalf(), waits = this._sendLook(tanHalf, now);
     const scene = this.images.scene(this.state, this.look, tanHalf, elapsed);
     const moved = this._renderView(scene);
+    this._reportShown();
     this._rate.frame(now, moved);
     this._drawOverlay(scene, tanHalf);
     this._drawMap(tanHalf, now);
@@ -116,7 +139,7 @@ export class Screen {
     // For tests and debugging.
     mark("blend", scene.blend.toFixed(2));
     mark("map", this.minimap.hasMap ? "drawn" : "none");
-    return moved || waits || this.look.moves;
+    return moved || waits || this.look.moves || this.images.moves;
   }
 
   enlargeMap() {
@@ -161,7 +184,8 @@ export class Screen {
   _renderView(scene) {
     const { viewer, images, look } = this;
     const resized = fit(viewer.canvas, viewer.slow ? (scene.blend === 1 ? SLOW_VIEW_PIXELS : SLOW_PIXELS) : 1);
-    const key = rounded([scene.blend], 4) + (scene.blend > 0 ? rounded(scene.moved, 3) : "");
+    const viewpoint = scene.camera?.position ?? scene.moved;
+    const key = rounded([scene.blend], 4) + (scene.blend > 0 ? rounded(viewpoint, 3) : "");
     const direction = [...scene.mapFromLook, look.vfov];
     // A standing robot's pose is never still: SLAM turns it by parts of a milliradian with every scan.
     const halfPixel = this._tanHalf()[0] / viewer.canvas.width;

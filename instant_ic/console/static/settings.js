@@ -14,6 +14,8 @@ export const DEFAULTS = {
   easeMs: 400,
   colourReleaseMs: 6000,
   leadMaxM: 0,
+  /** @type {[number, number]} */
+  maxAccel: [0.8, 2], // m/s², rad/s²
 };
 
 /** @typedef {typeof DEFAULTS} Settings */
@@ -29,6 +31,7 @@ export function settingsOf(hello, reducedMotion) {
     dissolveMs: reducedMotion ? 0 : page.dissolve_ms ?? DEFAULTS.dissolveMs,
     easeMs: reducedMotion ? 0 : page.ease_ms ?? DEFAULTS.easeMs,
     colourReleaseMs: page.colour_release_s === null ? DEFAULTS.colourReleaseMs : 1000 * page.colour_release_s,
+    maxAccel: page.max_accel ?? DEFAULTS.maxAccel,
     leadMaxM: page.lead_max_m ?? DEFAULTS.leadMaxM,
   };
 }

@@ -2,11 +2,15 @@
 // The view in WebGL 2: panorama and rendered view in one projection and one pass.
 
 /** @import { Scene } from "./images.js" */
+/** @import { Layer } from "./layers.js" */
 import { plain } from "./colour.js";
-import { rotate } from "./math.js";
+import { LayerRenderer } from "./layers.js";
+import { identity, rotate } from "./math.js";
 import { Program } from "./program.js";
 
 const EDGE = 0.94; // the rendered view fades out from here to 1, its edge
+const WITHIN = 1.1; // layers are rendered wider than shown by this factor where they are mixed: their edge stays out of sight
+const RENDERED = 5; // texture unit of rendered layers
 const SOFT_LEVEL = 4; // mipmap level of the view for unseen places
 
 const COMMON = `
@@ -119,7 +123,8 @@ const MOST_REST_MS = 100; // longest pause between two frames that the CPU rende
 export class GlViewer {
   /** Throws when WebGL 2 is missing. @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
-    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
+    const gl = canvas.getContext("webgl2", {
+      alpha: false, antialias: false, depth: true, stencil: true, powerPreference: "high-performance" });
     if (!gl) throw new Error("WebGL 2 is missing");
     this.gl = gl;
     this.canvas = canvas;
@@ -148,6 +153,10 @@ export class GlViewer {
     this._viewUnit = 1; // 4: softened where the view was not seen
     this._perInverse = 0; // 1/m; 0: depth unknown
     this._viewSize = [1, 1];
+    /** @type {LayerRenderer | null} Made with the first layers. */
+    this._layers = null;
+    /** @type {{buffer: WebGLFramebuffer, texture: WebGLTexture, depth: WebGLRenderbuffer, size: string} | null} */
+    this._layerTarget = null;
     /** @type {WebGLSync | null} Signalled when the CPU has rendered the last frame. */
     this._fence = null;
     /** @type {WebGLFramebuffer | null} */
@@ -183,10 +192,26 @@ export class GlViewer {
     if (depth) this._upload(3, this._depth, depth.image);
   }
 
+  /** Replaces the layers that are rendered for a scene with their camera. @param {Layer[]} layers the nearest first */
+  loadLayers(layers) {
+    const first = this._layers === null;
+    this._layers ??= new LayerRenderer(this.gl, this.slow);
+    this._layers.load(layers);
+    if (!first) return;
+    // As for the other programs: not at the first switch.
+    const buffer = this._targetForLayers(2, 2);
+    this.gl.bindFramebuffer(this.gl.FRAMEBUFFER, buffer);
+    const camera = { panoramaFromLook: identity, position: /** @type {[number, number, number]} */ ([0, 0, 0]) };
+    this._layers.render({ ...camera, tanHalf: [1, 1] }, 2, 2, plain);
+    this.gl.bindFramebuffer(this.gl.FRAMEBUFFER, null);
+  }
+
   /** @param {Scene} scene */
   render(scene) {
-    const gl = this.gl;
-    this._render(scene, this.canvas.width, this.canvas.height, false);
+    const gl = this.gl, { width, height } = this.canvas;
+    if (scene.camera && this._layers && scene.blend === 1)
+      this._layers.render(scene.camera, width, height, scene.viewColour);
+    else this._render(scene, width, height, false, null);
     if (!this.slow) return;
     if (this._fence) gl.deleteSync(this._fence);
     this._fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -219,7 +244,7 @@ export class GlViewer {
     const raw = { ...scene, panoramaColour: plain, viewColour: plain };
     /** @param {number} blend */
     const read = (blend) => {
-      this._render({ ...raw, blend }, width, height, blend === 1);
+      this._render({ ...raw, blend }, width, height, blend === 1, this._samples);
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
       return cells(pixels);
     };
@@ -228,15 +253,19 @@ export class GlViewer {
     return { 1: panorama.colours, 2: view.colours, weights: view.alpha };
   }
 
-  /** @param {Scene} scene @param {number} width @param {number} height @param {boolean} sample see the shader */
-  _render(scene, width, height, sample) {
-    const gl = this.gl, shown = scene.blend > 0;
-    const moved = shown && this._perInverse > 0 ? scene.moved : null;
+  /**
+   * @param {Scene} scene @param {number} width @param {number} height @param {boolean} sample see the shader
+   * @param {WebGLFramebuffer | null} target which is bound
+   */
+  _render(scene, width, height, sample, target) {
+    const gl = this.gl, shown = scene.blend > 0, layers = shown && scene.camera !== null && this._layers !== null;
+    if (layers) scene = this._withLayers(scene, width, height, target);
+    const moved = shown && !layers && this._perInverse > 0 ? scene.moved : null;
     const mostInverse = moved ? Math.min(this._perInverse, MOST_PARALLAX / Math.hypot(...moved)) : 0;
     const real = !sample && (scene.blend < 1 || !covers(scene, mostInverse));
-    const at = this._use({ REAL: real, VIEW: shown, MOVED: moved !== null, PLAIN: this.slow, SAMPLE: sample });
+    const at = this._use({ REAL: real, VIEW: shown, MOVED: moved !== null, PLAIN: this.slow || layers, SAMPLE: sample });
     gl.viewport(0, 0, width, height);
-    gl.uniform1i(at("view"), this._viewUnit);
+    gl.uniform1i(at("view"), layers ? RENDERED : this._viewUnit);
     gl.uniform3fv(at("panoramaGain"), scene.panoramaColour.gain);
     gl.uniform3fv(at("panoramaOffset"), scene.panoramaColour.offset);
     gl.uniform3fv(at("viewGain"), scene.viewColour.gain);
@@ -256,6 +285,44 @@ export class GlViewer {
     }
     gl.uniform1f(at("blend"), scene.blend);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /**
+   * Renders the layers into a texture; returns the scene with it in place of the rendered view.
+   * @param {Scene} scene @param {number} width @param {number} height @param {WebGLFramebuffer | null} target bound afterwards
+   * @returns {Scene}
+   */
+  _withLayers(scene, width, height, target) {
+    const gl = this.gl, { camera } = scene;
+    if (!camera || !this._layers) return scene;
+    const [x, y] = camera.tanHalf, wide = /** @type {[number, number]} */ ([x * WITHIN, y * WITHIN]);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this._targetForLayers(width, height));
+    this._layers.render({ ...camera, tanHalf: wide }, width, height, plain);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target);
+    // Row 0 of what is rendered is the lowest, of a view that arrives the highest.
+    return { ...scene, viewFromLook: identity, viewTanHalf: [wide[0], -wide[1]], moved: null };
+  }
+
+  /** @param {number} width @param {number} height */
+  _targetForLayers(width, height) {
+    const gl = this.gl, size = `${width} ${height}`;
+    if (!this._layerTarget) {
+      const buffer = gl.createFramebuffer(), texture = this._texture(RENDERED, gl.CLAMP_TO_EDGE), depth = gl.createRenderbuffer();
+      gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+      gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.DEPTH_STENCIL_ATTACHMENT, gl.RENDERBUFFER, depth);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      this._layerTarget = { buffer, texture, depth, size: "" };
+    }
+    if (this._layerTarget.size !== size) {
+      this._layerTarget.size = size;
+      gl.activeTexture(gl.TEXTURE0 + RENDERED);
+      gl.bindTexture(gl.TEXTURE_2D, this._layerTarget.texture);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, width, height, 0, gl.RGBA, gl.UNSIGNED_BYTE, null);
+      gl.bindRenderbuffer(gl.RENDERBUFFER, this._layerTarget.depth);
+      gl.renderbufferStorage(gl.RENDERBUFFER, gl.DEPTH24_STENCIL8, width, height);
+    }
+    return this._layerTarget.buffer;
   }
 
   /** Blurs the view where the mask is dark. @param {OffscreenCanvas} mask */

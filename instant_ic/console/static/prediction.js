@@ -1,0 +1,67 @@
+// @ts-check
+// The v-bot between a state message and now: what the operator has commanded since, with the v-bot's own kinematics.
+
+/** @import { Vec3 } from "./math.js" */
+/** @typedef {[number, number]} Twist m/s, rad/s */
+import { clamp } from "./math.js";
+import { advanced } from "./motion.js";
+
+const MOST_MS = 250; // longest time that is predicted
+const MOST_DELAY_MS = 100; // longest delay of a command that is predicted
+const STEP_MS = 10;
+const SETTLED_MS = 700; // a robot that has had a command for so long goes at the speed that its state reports
+
+export class Prediction {
+  constructor() {
+    /** @type {[number, number]} Largest change of the speed, m/s² and rad/s². */
+    this.maxAccel = [0.8, 2];
+    /** @type {{at: number, twist: Twist}[]} Commands and the times from which on they were sent, oldest first. */
+    this._commands = [];
+  }
+
+  /** Takes a command of this page. @param {Twist} twist @param {number | null} now server's clock, ms */
+  command(twist, now) {
+    if (now === null) {
+      this._commands = [];
+      return;
+    }
+    const last = this._commands[this._commands.length - 1];
+    if (last && last.twist[0] === twist[0] && last.twist[1] === twist[1]) return;
+    this._commands.push({ at: now, twist: [...twist] });
+    if (this._commands.length > 100) this._commands.shift();
+  }
+
+  /**
+   * Pose and twist at `now`, from those `at` the time of a state; times of the server's clock, ms.
+   * @param {Vec3} pose @param {Twist} twist @param {number} at @param {number} now
+   * @param {number} delayMs time that a command takes to the robot: what was sent before the state by less is not in it
+   * @returns {{pose: Vec3, twist: Twist}}
+   */
+  from(pose, twist, at, now, delayMs) {
+    const delay = clamp(delayMs, 0, MOST_DELAY_MS), start = at - delay;
+    const end = Math.min(now, start + MOST_MS + delay);
+    const newest = this._commands[this._commands.length - 1];
+    const known = newest !== undefined && newest.at > start - SETTLED_MS;
+    let t = start, speed = twist;
+    while (t < end) {
+      const step = Math.min(STEP_MS, end - t), seconds = step / 1000;
+      const wanted = known ? this._at(t) : null;
+      const [v, w] = speed;
+      /** @type {Twist} */
+      const next = wanted ? [toward(v, wanted[0], this.maxAccel[0] * seconds), toward(w, wanted[1], this.maxAccel[1] * seconds)] : speed;
+      pose = advanced(pose, [(v + next[0]) / 2, (w + next[1]) / 2], seconds);
+      speed = next;
+      t += step;
+    }
+    return { pose, twist: end < now ? [0, 0] : speed }; // an old state carries on no longer
+  }
+
+  /** The command that held at a time; null before the first. @param {number} t @returns {Twist | null} */
+  _at(t) {
+    for (let i = this._commands.length - 1; i >= 0; i--) if (this._commands[i].at <= t) return this._commands[i].twist;
+    return null;
+  }
+}
+
+/** @param {number} value @param {number} target @param {number} step */
+const toward = (value, target, step) => value + clamp(target - value, -step, step);

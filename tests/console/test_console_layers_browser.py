@@ -1,0 +1,150 @@
+"""The virtual space rendered by the page itself, from layers, in Debian's Chromium."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from console_pages import BROWSER_TEST, WAIT_MS, expect_body, likeness_of, make_demo, picture_of, room_seen, wait_until
+
+from instant_ic.console import FrameKind
+
+pytestmark = BROWSER_TEST
+KEYFRAME = np.array([1.6, 0.2, 0.3])  # a box is 1.4 m ahead
+DRAWN = """
+    window.drawn = [];
+    addEventListener("rendered", ({detail: {place, pose, blend}}) => drawn.push({place, pose, blend}));
+"""
+SLOW_DISSOLVE = {"dissolve_ms": 60_000, "colour_release_s": 0, "ease_ms": 0}
+
+
+@pytest.fixture(scope="module")
+def room():
+    demo = make_demo(panorama_width=640)
+    demo.forced_mode = "virtual"
+    demo.send_layers(KEYFRAME)
+    yield demo
+    demo.stop()
+
+
+def open_layers(open_page, demo, query=""):
+    page = open_page(query, at=demo, bypass_csp=True)
+    page.evaluate(DRAWN)
+    page.add_style_tag(content="#view { filter: none !important }")  # old pictures turn grey
+    return page
+
+
+def wait_place(page, x, y, yaw):
+    """Until the page shows the view from there, which it reaches within its smoothing."""
+    arrived = """([x, y, yaw]) => {
+        const at = drawn.at(-1);
+        return at?.place && Math.hypot(at.place[0] - x, at.place[1] - y) < 0.002 && Math.abs(at.pose[2] - yaw) < 0.002;
+    }"""
+    page.wait_for_function(arrived, arg=[x, y, yaw], timeout=WAIT_MS)
+    page.wait_for_timeout(200)
+
+
+def psnr_db(picture, expected):
+    shown = cv2.resize(picture, expected.shape[1::-1], interpolation=cv2.INTER_AREA)
+    return 10 * math.log10(255**2 / np.mean((cv2.blur(shown, (3, 3)) - cv2.blur(expected, (3, 3))) ** 2))
+
+
+def test_the_view_is_the_room_seen_from_the_vbot_and_no_view_is_requested(open_page, room):
+    demo = room
+    demo.place(*KEYFRAME)
+    page = open_layers(open_page, demo)
+    expect_body(page, "blend", "1.00")
+    wait_until(lambda: not demo.server.needs_views(), page, "the page renders by itself")
+    found = []
+    for pose in (tuple(KEYFRAME), (1.9, 0.2, 0.1), (1.5, -0.2, 0.6), (1.4, 0.5, -0.5), (1.6, 0.2, 3.0)):
+        demo.place(*pose)
+        wait_place(page, *pose)
+        picture, expected = picture_of(page), room_seen(pose, 0.0, demo.look.pitch)
+        found.append((likeness_of(picture, expected), psnr_db(picture, expected)))
+    assert min(alike for alike, _ in found) > 0.97
+    assert found[0][1] > 30  # where the keyframe is
+    drawn = demo.server.drawn_ms()
+    assert drawn is not None
+    wait_until(lambda: demo.server.drawn_ms() > drawn, page, "reports of what is shown")
+
+
+def test_the_dissolve_mixes_two_views_of_the_same_place(open_page, room):
+    demo = room
+    demo.place(*KEYFRAME)
+    demo.forced_mode = "real"
+    demo.server.page |= SLOW_DISSOLVE
+    try:
+        page = open_layers(open_page, demo)
+        wait_until(lambda: not demo.server.needs_views(), page, "the layers")
+        expect_body(page, "image", "live")
+        demo.forced_mode = "virtual"
+        page.wait_for_function("drawn.at(-1)?.blend > 0.3", timeout=WAIT_MS)
+        picture, expected = picture_of(page), room_seen(tuple(KEYFRAME), 0.0, demo.look.pitch)
+        assert page.evaluate("drawn.at(-1).blend") < 0.9
+        assert likeness_of(picture, expected) > 0.97
+        edge = np.abs(cv2.resize(picture, expected.shape[1::-1], interpolation=cv2.INTER_AREA) - expected)
+        assert edge[:3].mean() < 3 * edge.mean()  # no frame round the image
+        assert edge[:, :3].mean() < 3 * edge.mean()
+    finally:
+        demo.forced_mode = "virtual"
+        demo.server.page |= {"dissolve_ms": 250, "colour_release_s": 6, "ease_ms": 400}
+
+
+def test_a_bad_frame_of_layers_is_refused_and_the_ones_before_stay(open_page, room):
+    demo = room
+    demo.place(*KEYFRAME)
+    page = open_layers(open_page, demo)
+    wait_until(lambda: not demo.server.needs_views(), page, "the layers")
+    expect_body(page, "blend", "1.00")
+    demo.server.send_frame(FrameKind.LAYERS, {"version": 1, "layers": "none"}, b"")
+    wait_until(lambda: page.faults, page, "the refusal")
+    assert "layers.keyframe must be" in page.faults[0]
+    page.faults.clear()
+    demo.place(1.9, 0.2, 0.1)
+    wait_place(page, 1.9, 0.2, 0.1)
+    demo.send_layers(np.array([1.7, 0.2, 0.0]))
+    version = demo._version
+    wait_until(lambda: any(s.drawn and s.drawn[0] == version for s in demo.server._sessions.values()), page, "the next")
+
+
+def test_a_page_without_webgl_gets_rendered_views(open_page, room):
+    demo = room
+    demo.place(*KEYFRAME)
+    page = open_layers(open_page, demo, "?viewer=canvas")
+    expect_body(page, "viewer", "canvas")
+    expect_body(page, "blend", "1.00")
+    assert demo.server.needs_views()
+    assert demo.server.drawn_ms() is None
+    page.wait_for_function("drawn.at(-1)?.place", timeout=WAIT_MS)
+    assert likeness_of(picture_of(page), room_seen(tuple(KEYFRAME), 0.0, demo.look.pitch)) > 0.9
+
+
+# A v-bot at rest; the last state is 20 ms old when the operator's key goes down, and no other one comes.
+KEY = """async () => {
+    const {Images} = await import("/static/images.js");
+    let now = 1000;
+    const images = new Images({name: "none", sample() {}}, {serverNow: () => now, roundTripMs: 10, connected: true,
+        acknowledge() {}});
+    images.layers = {version: 1, keyframe: 1, q: [0, 0, 0, 1], p: [1, 2, 1.2], mount: [0.1, 0, 1.2]};
+    images.prediction.maxAccel = [0.8, 2];
+    const pose = [1, 2, 0], twist = [0, 0];
+    const state = {at_ms: 1000, mode: "virtual", shown: "virtual", robot: pose, vbot: pose, twist, lead: 1};
+    const seen = () => images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
+    const places = [];
+    for (; now < 1600; now += 10) {
+        if (now === 1020) images.prediction.command([0.4, 0], now);
+        places.push(seen().camera.position[0]);
+    }
+    return places;
+}"""
+
+
+def test_a_key_moves_the_view_before_a_new_state_arrives(open_page, room):
+    page = open_layers(open_page, room)
+    places = page.evaluate(KEY)
+    assert places[:3] == pytest.approx([0.1] * 3)  # at rest, the mount ahead of the keyframe
+    # From 1020 ms on with 0.8 m/s²: after t seconds 0.4 t² m, shown with the page's smoothing of 50 ms.
+    assert places[4] > places[2]
+    assert places[17] == pytest.approx(0.1 + 0.4 * 0.15**2, abs=0.002)
+    # A state that is too old carries on no longer: no more than 250 ms after it.
+    assert places[-1] == pytest.approx(0.1 + 0.4 * 0.23**2, abs=0.002)
