@@ -826,6 +826,8 @@ class ConsoleServer:
             return
         self._frames[kind] = frame
         for session in self._sessions.values():
+            if kind is FrameKind.VIEW and session.drawn is not None:
+                continue
             if now - self._own.get((session.number, kind), -OWN_S) >= OWN_S:
                 session.put_frame(kind, frame)
 

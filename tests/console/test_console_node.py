@@ -11,6 +11,7 @@ from instant_ic import pace
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.console import FrameKind, Look, ViewConfig
 from instant_ic.console.config import ConsoleConfig
+from instant_ic.console.layers import PageLayer, PageLayers
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix
 from instant_ic.msg import (
     BatteryState,
@@ -377,6 +378,55 @@ def test_the_page_leads_with_the_vbot_and_the_arbiter_hears_what_is_displayed(se
     assert lead == pytest.approx(0.5, abs=0.15)
     assert ahead == pytest.approx(0.1 * lead, abs=1e-4)
     assert drive(ControlState.RETURNING, 0.6) == (0.0, pytest.approx(0.0))
+
+
+def test_a_page_that_renders_by_itself_needs_no_views_and_the_arbiter_hears_how_old_its_state_is(setup):
+    bus, _, server = setup
+    publish_tree(bus)
+    vbot = odometry_message(pose_matrix(x=1.1, y=2.0), 0.2, 0.0, "map", "vbot", 0)
+
+    def drive(seconds, age_ms):
+        asked = len(bus.messages("/view/request"))
+        for _ in range(round(seconds / 0.05)):
+            bus.publish("/ic/state", virtual_state(bus), latched=True)
+            bus.publish("/vbot/odom", vbot)
+            server.drawn = None if age_ms is None else server.now_ms() - age_ms
+            bus.publish("/vspace/view", view_message(bus, 1))  # for another page
+            bus.advance(0.05)
+        return len(bus.messages("/view/request")) - asked, bus.last("/view/shown")
+
+    requests, shown = drive(0.5, None)
+    assert (requests > 0, shown.view_id) == (True, 1)
+    requests, shown = drive(0.5, 30.0)
+    assert requests == 0
+    # 30 ms when the page said so; the reports come at each step of the v-bot and at 20 Hz.
+    assert 0.03 <= shown.view_age_s <= 0.085
+    assert shown.view_delay_s == 0.0
+    assert matrix_from_pose(shown.view_pose)[:3, 3] == pytest.approx([1.1, 2.0, 1.5])  # the v-bot's camera now
+    # The page shows nothing newer: it hangs, or its link is lost. No view, no driving.
+    frozen, number = server.drawn, shown.view_id
+    for _ in range(20):
+        server.drawn = frozen
+        bus.publish("/vbot/odom", vbot)
+        bus.publish("/vspace/view", view_message(bus, 2))
+        bus.advance(0.05)
+    assert bus.last("/view/shown").view_age_s > 1.0
+    assert bus.last("/view/shown").view_id == number
+    requests, shown = drive(0.5, None)  # without WebGL from now on
+    assert requests > 0
+    assert (shown.view_id, shown.view_age_s < 0.1) == (1, True)
+
+
+def test_layers_that_no_page_could_render_are_a_fault_of_the_console(setup):
+    _, node, server = setup
+    mesh = np.zeros((3, 2), np.uint16), np.ones(3, np.float32), np.array([[0, 1, 2]], np.uint32)
+    good = PageLayer(b"JPEG", b"", (1.0, 1.0, 1.0), (2, 4), *mesh)
+    version = PageLayers(1, 1, np.eye(4), (0.0, 0.0, 1.2), (good,))
+    node.feed.take_layers(version)
+    assert server.layers == [version]
+    node.feed.take_layers(dataclasses.replace(version, layers=(dataclasses.replace(good, image=b""),)))
+    assert len(server.layers) == 1
+    assert "layers[0].image is empty" in node.diagnoses()["layers"][1]
 
 
 @pytest.mark.parametrize(("vspace", "counts"), [(VspaceStatus.TRAINING, (3, 4)), (VspaceStatus.EMPTY, (0,))])

@@ -62,6 +62,7 @@ export class Images {
     /** @type {Map<string, Layer>} Those that are loaded, by id. */
     this._held = new Map();
     this._loads = 0; // counts loads, so that a late one of a lost link is dropped
+    this.framesPerSecond = 0; // of what this page renders
     this.shownMs = 0; // time of the newest state that is shown, server's clock
     this.moves = false; // the v-bot moves, as far as this page knows
     this.leadMaxM = 0; // largest distance by which a view is moved from its rendered position; 0: never moved
@@ -187,6 +188,7 @@ export class Images {
 
   /** Images of a kind per second, over the last 3 s. @param {Kind} kind */
   rate(kind) {
+    if (kind === VIEW && this.rendersLayers) return this.framesPerSecond;
     const now = performance.now();
     const recent = this._arrivals[kind].filter((t) => now - t < 3000);
     if (recent.length < 2) return 0;

@@ -52,9 +52,22 @@ uniform vec3 gain, offset;
 uniform bool soft; // what nobody has seen is blurred and paler
 const vec3 GREY = vec3(0.30, 0.59, 0.11);
 const float PI = ${Math.PI};
+
+// Azimuth and angle from the zenith. The CPU's own functions take a seventh of its time for an image; polynomials
+// (Abramowitz and Stegun, 4.4.45 and 4.4.49) are exact to 7e-5 rad, a fiftieth of a pixel.
+vec2 angles(vec3 d) {
+  if (SHARP) return vec2(atan(d.y, d.x), acos(clamp(d.z, -1.0, 1.0)));
+  vec2 a = abs(d.xy);
+  float q = min(a.x, a.y) / max(max(a.x, a.y), 1e-9), s = q * q, z = abs(d.z);
+  float azimuth = q * (0.9998660 + s * (-0.3302995 + s * (0.1801410 + s * (-0.0851330 + s * 0.0208351))));
+  azimuth = a.y > a.x ? 0.5 * PI - azimuth : azimuth;
+  azimuth = d.x < 0.0 ? PI - azimuth : azimuth;
+  float down = sqrt(max(1.0 - z, 0.0)) * (1.5707288 + z * (-0.2121144 + z * (0.0742610 - z * 0.0187293)));
+  return vec2(d.y < 0.0 ? -azimuth : azimuth, d.z < 0.0 ? PI - down : down);
+}
+
 void main() {
-  vec3 d = normalize(direction);
-  vec2 uv = vec2(0.5 - atan(d.y, d.x) / (2.0 * PI), acos(clamp(d.z, -1.0, 1.0)) / PI);
+  vec2 angle = angles(normalize(direction)), uv = vec2(0.5 - angle.x / (2.0 * PI), angle.y / PI);
   if (SHARP) {
     vec2 across = dFdx(uv), down = dFdy(uv);
     across.x -= round(across.x); // over the seam at the back
@@ -101,6 +114,7 @@ export class LayerRenderer {
     const sharp = `#version 300 es\nprecision highp float;\nconst bool SHARP = ${!slow};\nconst float SHARPNESS = 0.7;\n`;
     this._program = link(gl, VERTEX, sharp + FRAGMENT);
     this._beyond = link(gl, FULL, `#version 300 es\n${BEYOND}`);
+    this._minification = slow ? gl.LINEAR_MIPMAP_NEAREST : gl.LINEAR_MIPMAP_LINEAR; // the CPU would read two levels
     this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
     /** @type {Loaded[]} The nearest first. */
     this._layers = [];
@@ -237,7 +251,7 @@ export class LayerRenderer {
     gl.generateMipmap(gl.TEXTURE_2D);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.REPEAT);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, this._minification);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
     if (extension) gl.texParameterf(gl.TEXTURE_2D, extension.TEXTURE_MAX_ANISOTROPY_EXT, 8);
     return texture;

@@ -133,6 +133,7 @@ export class Screen {
     if (now - this._latencyAt > LATENCY_MS) {
       this._latencyAt = now;
       showLatency(this.link, this.images);
+      this.images.framesPerSecond = this._rate.perSecond;
       mark("fps", this._rate.perSecond.toFixed(1));
       mark("image", this.images.shown ? (this.images.stale ? "stale" : "live") : "none");
     }
@@ -183,7 +184,7 @@ export class Screen {
    */
   _renderView(scene) {
     const { viewer, images, look } = this;
-    const resized = fit(viewer.canvas, viewer.slow ? (scene.blend === 1 ? SLOW_VIEW_PIXELS : SLOW_PIXELS) : 1);
+    const resized = fit(viewer.canvas, viewer.slow ? (scene.blend === 1 && !scene.camera ? SLOW_VIEW_PIXELS : SLOW_PIXELS) : 1);
     const viewpoint = scene.camera?.position ?? scene.moved;
     const key = rounded([scene.blend], 4) + (scene.blend > 0 ? rounded(viewpoint, 3) : "");
     const direction = [...scene.mapFromLook, look.vfov];

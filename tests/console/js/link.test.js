@@ -127,3 +127,14 @@ test("a message that violates the protocol is dropped and reported with its fiel
   socket().deliver({ type: "session", driver: "you", clients: 1, estop: false });
   assert.equal(events.at(-1)[1].driver, "you");
 });
+
+test("a frame that is refused is acknowledged as not loaded, so that the next one comes", () => {
+  connect();
+  const said = mock.method(console, "error", () => {});
+  const frame = new Uint8Array(14);
+  frame.set([1, 5, 0, 0, 7, 0, 0, 0, 2, 0, 0, 0, 123, 125]); // "{}"
+  socket().deliver(frame.buffer);
+  assert.deepEqual(socket().sent.at(-1), { type: "ack", kind: 5, seq: 7, loaded: false });
+  assert.match(said.mock.calls[0].arguments[0], /layers\.version must be a finite number/);
+  assert.ok(!events.some(([name]) => name === "frame"));
+});

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-const { decodeFrame, MessageError, parseMessage } = await import("../../../instant_ic/console/static/messages.js");
+const { decodeFrame, frameNumber, MessageError, parseMessage } = await import("../../../instant_ic/console/static/messages.js");
 const { settingsOf } = await import("../../../instant_ic/console/static/settings.js");
 
 const STATE = {
@@ -64,6 +64,60 @@ test("frames that cannot be decoded are refused", () => {
     [frame(3, header), /grid\.resolution must be a finite number/],
     [frame(1, header, { length: 4 }), /not valid JSON/],
   ]) assert.throws(() => decodeFrame(buffer), text);
+});
+
+// One triangle on a lattice of 2 x 4 pixels, as in test_console_layers.py.
+const LAYER = { id: "a", size: [2, 4], gain: [1, 0.9, 1.1],
+  parts: { inverse: [0, 12], triangles: [12, 12], corners: [24, 12], image: [36, 4], confidence: [40, 3] } };
+const LAYERS = { version: 3, keyframe: 7, q: [0, 0, 0, 1], p: [1, 0, 1.2], mount: [0.1, 0, 1.2], layers: [LAYER] };
+
+function layersFrame(header = LAYERS, { inverse = [0.5, 0.25, 0], triangles = [0, 1, 2], corners = [0, 0, 4, 0, 2, 2] } = {}) {
+  const parts = [new Float32Array(inverse), new Uint32Array(triangles), new Uint16Array(corners)].map((a) => new Uint8Array(a.buffer));
+  const payload = [...parts.flatMap((part) => [...part]), ...new TextEncoder().encode("JPEGPNG")];
+  const json = new TextEncoder().encode(JSON.stringify(header)), bytes = new Uint8Array(12 + json.length + payload.length);
+  bytes.set([1, 5, 0, 0, 9, 0, 0, 0]);
+  new DataView(bytes.buffer).setUint32(8, json.length, true);
+  bytes.set(json, 12);
+  bytes.set(payload, 12 + json.length);
+  return bytes.buffer;
+}
+
+test("layers: numbers and images by their ranges; a layer without parts is one that the page holds", async () => {
+  const held = { ...LAYER, id: "b", parts: null };
+  const { sequence, header, layers } = decodeFrame(layersFrame({ ...LAYERS, layers: [LAYER, held] }));
+  assert.deepEqual([sequence, header.version, header.p, "layers" in header], [9, 3, [1, 0, 1.2], false]);
+  const [{ size, gain, mesh }, second] = layers;
+  assert.deepEqual([size, gain, [...mesh.inverse], [...mesh.triangles]], [[2, 4], [1, 0.9, 1.1], [0.5, 0.25, 0], [0, 1, 2]]);
+  assert.deepEqual([...mesh.corners], [0, 0, 4, 0, 2, 2]);
+  assert.deepEqual([await mesh.image.text(), await mesh.confidence.text()], ["JPEG", "PNG"]);
+  assert.deepEqual(second, { id: "b", size: [2, 4], gain: [1, 0.9, 1.1], mesh: null });
+});
+
+test("layers that cannot be rendered are refused by the name of what is wrong", () => {
+  /** Layers with other ranges. */
+  const ranges = (parts) => ({ ...LAYERS, layers: [{ ...LAYER, parts: { ...LAYER.parts, ...parts } }] });
+  const sized = (size) => ({ ...LAYERS, layers: [{ ...LAYER, size }] });
+  for (const [buffer, text] of [
+    [layersFrame({ ...LAYERS, layers: [] }), /layers must be 1 to 8 layers \(got 0\)/],
+    [layersFrame({ ...LAYERS, layers: Array(9).fill(LAYER) }), /layers must be 1 to 8 layers \(got 9\)/],
+    [layersFrame({ ...LAYERS, p: [1, 2] }), /layers\.p must be 3 numbers/],
+    [layersFrame(ranges({ image: [36, 99] })), /layers\[0\]\.image must be entries of 1 bytes within 43 bytes/],
+    [layersFrame(ranges({ inverse: [0, 11] })), /layers\[0\]\.inverse must be entries of 4 bytes/],
+    [layersFrame(ranges({ inverse: [-4, 12] })), /layers\[0\]\.inverse must be/],
+    [layersFrame(ranges({ inverse: [0, 1e300] })), /layers\[0\]\.inverse must be/],
+    [layersFrame(ranges({ inverse: [0.5, 12] })), /layers\[0\]\.inverse must be/],
+    [layersFrame(ranges({ inverse: [0, 8] })), /layers\[0\]\.corners must be 2 pairs/],
+    [layersFrame(sized([1, 4])), /layers\[0\]\.corners\[2\] must be within 4 x 1/],
+    [layersFrame(sized([0, 4])), /layers\[0\]\.size must be two sizes/],
+    [layersFrame(LAYERS, { inverse: [0.5, NaN, 0] }), /layers\[0\]\.inverse\[1\] must be finite and >= 0/],
+    [layersFrame(LAYERS, { inverse: [0.5, -1, 0] }), /layers\[0\]\.inverse\[1\] must be finite and >= 0/],
+    [layersFrame(LAYERS, { triangles: [0, 1, 3] }), /layers\[0\]\.triangles\[2\] must be below 3 \(got 3\)/],
+  ]) {
+    assert.throws(() => decodeFrame(buffer), (error) => error instanceof MessageError && text.test(error.message), `${text}`);
+    assert.deepEqual(frameNumber(buffer), { kind: 5, sequence: 9 });
+  }
+  assert.equal(frameNumber(frame(9, {})), null);
+  assert.equal(frameNumber(new ArrayBuffer(5)), null);
 });
 
 test("settings: the server's values, else the defaults; no motion for those who asked for none", () => {
