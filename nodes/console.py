@@ -30,6 +30,7 @@ from instant_ic.msg import (
     String,
     TwistStamped,
     ViewRequest,
+    VspaceLayers,
     VspaceStatus,
     twist_stamped,
 )
@@ -68,6 +69,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.feed = feed = PageFeed(config, self.server, self.tf, inputs, self, self.clock, self.diagnose)
         self.subscribe("/camera/image/compressed", CompressedImage, feed.take_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", RenderedView, feed.take_view, qos=SENSOR)
+        mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms a keyframe, which commands must not wait for
+        self.subscribe("/vspace/layers", VspaceLayers, mesher.submit, qos=LATCHED)
         self.subscribe("/map", OccupancyGrid, partial(feed.grids.take, FrameKind.MAP), qos=LATCHED)
         self.subscribe("/costmap", OccupancyGrid, partial(feed.grids.take, FrameKind.COSTMAP), qos=SENSOR)
         self.subscribe("/diagnostics", DiagnosticArray, feed.take_diagnostics, qos=RELIABLE)

@@ -6,33 +6,15 @@ import base64
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from instant_ic.vspace.layer_mesh import LayerMesh
+from instant_ic.console.layers import PageLayer
 
 _STATIC = Path(__file__).parent / "static"
 _IMPORT = re.compile(r'from "\./(\w+)\.js"')
 
 
-@dataclass(frozen=True)
-class SceneLayer:
-    """A layer as the page renders it.
-
-    Attributes:
-        image: JPEG or PNG, equirectangular.
-        confidence: grey PNG, white where it was seen; empty: everywhere.
-        gain: factors of the colours.
-        mesh: its surface.
-    """
-
-    image: bytes
-    confidence: bytes
-    gain: tuple[float, float, float]
-    mesh: LayerMesh
-
-
-def scene_html(title: str, layers: Sequence[SceneLayer]) -> str:
+def scene_html(title: str, layers: Sequence[PageLayer]) -> str:
     """The file's text: the page's own renderer and the layers, the nearest first.
 
     Raises:
@@ -48,17 +30,9 @@ def scene_html(title: str, layers: Sequence[SceneLayer]) -> str:
     return text.replace("IMPORT_MAP", modules, 1).replace("SCENE_JSON", data, 1)
 
 
-def _fields(layer: SceneLayer) -> dict[str, object]:
-    mesh = layer.mesh
-    return {
-        "image": _base64(layer.image),
-        "confidence": _base64(layer.confidence),
-        "gain": layer.gain,
-        "size": mesh.size,
-        "corners": _base64(mesh.corners.astype("<u2").tobytes()),
-        "inverse": _base64(mesh.inverse_depth.astype("<f4").tobytes()),
-        "triangles": _base64(mesh.triangles.astype("<u4").tobytes()),
-    }
+def _fields(layer: PageLayer) -> dict[str, object]:
+    parts = {name: _base64(part) for name, part in layer.parts.items()}
+    return {"gain": layer.gain, "size": layer.size, **parts}
 
 
 def _modules(name: str) -> dict[str, str]:

@@ -12,7 +12,7 @@ from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import GridLayers
-from instant_ic.console.layers import PageLayers
+from instant_ic.console.layers import PageLayers, page_layers
 from instant_ic.console.protocol import FrameKind, ProtocolError
 from instant_ic.console.scene import Newest, Scene
 from instant_ic.console.server import PLAIN_HTTP, ConsoleServer
@@ -27,11 +27,13 @@ from instant_ic.msg import (
     RenderedView,
     ShownPictures,
     ViewRequest,
+    VspaceLayers,
     VspaceStatus,
     matrix_from_pose,
     stamp_ns,
 )
 from instant_ic.pace import current
+from instant_ic.vspace_messages import layers_of
 
 IMAGE_TIMEOUT_S = 2.0
 
@@ -99,6 +101,7 @@ class PageFeed:
         self.watched = True
         self.server = server
         server.on_drawn = self.report_shown
+        self._mount = config.camera_mount.xyz
         self.scene = Scene(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
         self.display = Display(config.lead, self.scene)
         self.requests = ViewRequests(config.view, self.scene, self.display)
@@ -134,8 +137,18 @@ class PageFeed:
         self.server.send_frame(FrameKind.VIEW, header, bytes(message.image.data), client=client)
         self._request_view()
 
-    def take_layers(self, layers: PageLayers) -> None:
-        """Send a version of the virtual space that pages render by themselves."""
+    def layers_of(self, message: VspaceLayers) -> PageLayers | str:
+        """What pages render of a version of the virtual space, or what is wrong with it. For a worker thread."""
+        try:
+            return page_layers(layers_of(message), self._mount)
+        except ValueError as error:
+            return str(error)
+
+    def take_layers(self, layers: PageLayers | str) -> None:
+        """Send a version of the virtual space that pages render by themselves; a text says what is wrong with it."""
+        if isinstance(layers, str):
+            self._diagnose("layers", ERROR, f"virtual space dropped: {layers}")
+            return
         try:
             self.server.send_layers(layers)
         except ProtocolError as error:

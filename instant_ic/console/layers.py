@@ -7,12 +7,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.console.protocol import ProtocolError
 from instant_ic.geometry.poses import Matrix, quaternion_from_matrix
+from instant_ic.vspace.layer_mesh import layer_mesh
+from instant_ic.vspace.layers import Content, Kind, Layer, Layers, LayersError, decode_layer
+from instant_ic.vspace.prior import edge_quads
 
+BEHIND_EDGE = 0.12
+"""Share by which depths differ at an edge of what lies behind."""
 MOST_LAYERS = 8
 """The page marks each layer by a bit of its stencil buffer."""
 
@@ -137,3 +143,38 @@ class PageLayers:
             "layers": layers,
         }
         return header, bytes(payload)
+
+
+def page_layers(layers: Layers, mount: tuple[float, float, float]) -> PageLayers:
+    """What a page renders of a version of the virtual space: the layers of the newest keyframe. Needs numba.
+
+    Args:
+        layers: a whole version.
+        mount: position of the camera on the robot, m.
+
+    Raises:
+        LayersError: a layer cannot be decoded, or there is none that the camera saw.
+    """
+    if not layers.layers or layers.layers[0].kind is not Kind.SEEN:
+        raise LayersError("the layers do not begin with what a camera saw")
+    newest = layers.layers[0]
+    own = tuple(_page_layer(layer) for layer in layers.layers if layer.keyframe_id == newest.keyframe_id)
+    return PageLayers(layers.version, newest.keyframe_id, newest.map_from_camera, mount, own)
+
+
+def _page_layer(layer: Layer) -> PageLayer:
+    decoded = decode_layer(layer)
+    if layer.kind is Kind.SEEN:
+        shown, edge = decoded.content >= Content.FILLED, decoded.edge
+        confidence = b""
+    else:
+        quads = decoded.content > Content.NOTHING
+        shown = quads | np.roll(quads, 1, 1)  # a quad has four pixels
+        shown[1:] |= shown[:-1]
+        edge = edge_quads(decoded.inverse_depth, BEHIND_EDGE) > 0
+        confidence = cv2.imencode(".png", np.rint(255 * decoded.share).astype(np.uint8))[1].tobytes()
+    mesh = layer_mesh(decoded.inverse_depth, edge, shown)
+    red, green, blue = (float(value) for value in layer.gain)
+    return PageLayer(
+        layer.colour, confidence, (red, green, blue), mesh.size, mesh.corners, mesh.inverse_depth, mesh.triangles
+    )  # fmt: skip

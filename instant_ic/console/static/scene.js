@@ -3,6 +3,7 @@
 
 /** @import { Layer } from "./layers.js" */
 /** @import { Vec3 } from "./math.js" */
+import { plain } from "./colour.js";
 import { elementOf, byId } from "./dom.js";
 import { LayerRenderer } from "./layers.js";
 import { Look } from "./look.js";
@@ -63,7 +64,7 @@ async function run() {
     canvas.width = width;
     canvas.height = height;
     const tan = Math.tan(look.vfov / 2), panoramaFromLook = lookRotation(look.yaw, look.pitch);
-    renderer.render({ panoramaFromLook, position: place, tanHalf: [tan * width / Math.max(height, 1), tan] }, width, height, false);
+    renderer.render({ panoramaFromLook, position: place, tanHalf: [tan * width / Math.max(height, 1), tan] }, width, height, plain);
   };
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
