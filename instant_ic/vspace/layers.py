@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.limits import decode_image
-from instant_ic.vspace.background import Background
+from instant_ic.vspace.background import GUESS_SHARE, Background
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import MOST_SIGMA, MOVED, ROBOT, ROOM, SKY, PanoramaPrior, edge_quads, shrunk
@@ -41,14 +41,13 @@ class Content(enum.IntEnum):
     NOTHING = 0
     SKY = 1
     MOVED = 2
-    FILLED = 3
-    MEASURED = 4
-    GUESSED = 5
+    SURFACE = 3
 
 
-CONTENT, SHARE, EDGE = np.uint8(15), np.uint8(112), np.uint8(128)
+_CONTENT, _CONFIDENCE, _EDGE = np.uint8(7), np.uint8(120), np.uint8(128)
 """Bits of the geometry's blue channel."""
-_OF_PRIOR = {ROBOT: Content.NOTHING, SKY: Content.SKY, MOVED: Content.MOVED, ROOM: Content.FILLED}
+_SURE, _FILLED = 15, 8
+_OF_PRIOR = {ROBOT: Content.NOTHING, SKY: Content.SKY, MOVED: Content.MOVED, ROOM: Content.SURFACE}
 
 
 class LayersError(ValueError):
@@ -147,10 +146,9 @@ class LayerEncoder:
             colour = image or _jpeg(keyframe.prior.rgb)
         else:
             assert background is not None
-            marks = np.zeros(background.inverse.shape, np.uint8)
-            for quads, content in ((background.guessed, Content.GUESSED), (background.sky, Content.SKY)):
-                marks[tuple(quads.T)] = content
-            marks |= np.rint(background.sure * (7 / 255)).astype(np.uint8) << 4
+            marks = np.full(background.inverse.shape, round(GUESS_SHARE * _SURE) << 3, np.uint8)
+            for quads, content in ((background.guessed, Content.SURFACE), (background.sky, Content.SKY)):
+                marks[tuple(quads.T)] |= np.uint8(content)
             near_m, png = _encoded_geometry(background.inverse, marks)
             colour = _jpeg(background.rgb)
         versions = [self._version] * 2
@@ -167,9 +165,9 @@ def _marks(keyframe: Keyframe) -> NDArray[np.uint8]:
     content = np.zeros(prior.content.shape, np.uint8)
     for here, there in _OF_PRIOR.items():
         content[prior.content == here] = there
-    content[(content == Content.FILLED) & (prior.known == 1)] = Content.MEASURED
+    confidence = np.where(prior.known == 1, _SURE, _FILLED).astype(np.uint8)
     assert keyframe.warp is not None
-    return content | EDGE * np.minimum(keyframe.warp.depth_edge[1:-1], 1)
+    return content | confidence << 3 | _EDGE * np.minimum(keyframe.warp.depth_edge[1:-1], 1)
 
 
 def _encoded_geometry(inverse_depth: Floats, marks: NDArray[np.uint8]) -> tuple[float, bytes]:
@@ -193,6 +191,7 @@ class DecodedLayer:
         rgb: (H, 2 H, 3) uint8.
         inverse_depth: 1/m along the ray, (h, 2 h) float32.
         content: ``Content``, (h, 2 h) uint8: of each pixel, or of the quad right of and below it (``BEHIND``).
+        confidence: 0..1, (h, 2 h) float32: below 1 the depth is filled from around; of a guess its share of an image.
         edge: whether the quad right of and below a pixel crosses a depth edge, (h, 2 h).
         share: of a guess in the image (``BEHIND``), the rest is continued from around in the image, (h, 2 h) 0..1.
     """
@@ -200,6 +199,7 @@ class DecodedLayer:
     rgb: NDArray[np.uint8]
     inverse_depth: Floats
     content: NDArray[np.uint8]
+    confidence: Floats
     edge: NDArray[np.bool_]
     share: Floats
 
@@ -227,7 +227,8 @@ def decode_layer(layer: Layer) -> DecodedLayer:
         raise LayersError(f"{name}: its geometry has pixels without depth (code 0)")
     rgb = cv2.cvtColor(colour, cv2.COLOR_BGR2RGB)
     inverse_depth = code * np.float32(1 / (_CODES * layer.near_m))
-    return DecodedLayer(rgb, inverse_depth, marks & CONTENT, marks & EDGE > 0, (marks & SHARE) * np.float32(1 / SHARE))
+    confidence = ((marks & _CONFIDENCE) >> 3).astype(np.float32) / np.float32(_SURE)
+    return DecodedLayer(rgb, inverse_depth, marks & _CONTENT, confidence, marks & _EDGE > 0)
 
 
 def decode(layers: Layers, panorama_width: int, geometry: GeometryConfig | None = None) -> KeyframeSet:
@@ -260,12 +261,10 @@ def _prior(layer: Layer, panorama_width: int, geometry: GeometryConfig) -> Panor
     content = np.full(decoded.content.shape, ROBOT, np.uint8)
     for here, there in _OF_PRIOR.items():
         content[decoded.content == there] = here
-    content[decoded.content == Content.MEASURED] = ROOM
-    known = np.isin(decoded.content, (Content.MEASURED, Content.SKY, Content.MOVED)).astype(np.uint8)
     return PanoramaPrior(
         rgb=np.ascontiguousarray(shrunk(decoded.rgb, panorama_width)),
         inverse_depth=decoded.inverse_depth,
-        known=known,
+        known=(decoded.confidence == 1).astype(np.uint8),
         depth_edge=edge_quads(decoded.inverse_depth, geometry.torn_ratio),
         map_from_camera=np.array(layer.map_from_camera, np.float64),
         relative_sigma=layer.relative_sigma,
@@ -278,7 +277,7 @@ def _prior(layer: Layer, panorama_width: int, geometry: GeometryConfig) -> Panor
 
 def _background(layer: Layer) -> Background:
     decoded = decode_layer(layer)
-    guessed, sky = (np.argwhere(decoded.content == kind).astype(np.int32) for kind in (Content.GUESSED, Content.SKY))
+    guessed, sky = (np.argwhere(decoded.content == kind).astype(np.int32) for kind in (Content.SURFACE, Content.SKY))
     rgb = decoded.rgb
     if rgb.shape[:2] != decoded.inverse_depth.shape:
         raise LayersError(f"layer BEHIND of keyframe {layer.keyframe_id}: colour and geometry differ in size")

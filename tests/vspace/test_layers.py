@@ -83,12 +83,13 @@ def test_depth_content_and_edges_survive():
     np.testing.assert_allclose(seen.inverse_depth, prior.inverse_depth, atol=prior.inverse_depth.max() / 65535)
     assert (seen.content[0] == Content.SKY).all()
     assert (seen.content[-8:, 130:190] == Content.NOTHING).all()  # the robot
-    assert (seen.content[130, 45:55] == Content.FILLED).all()
-    assert (seen.content[100] == Content.MEASURED).all()
+    assert (seen.content[130, 45:55] == Content.SURFACE).all()
+    assert (seen.confidence[130, 45:55] == np.float32(8 / 15)).all()  # filled
+    assert ((seen.confidence == 1) == (prior.known == 1)).all()
     warp = space._shown.keyframes[0].warp
     assert np.array_equal(seen.edge, warp.depth_edge[1:-1] > 0)
     background = space._shown.keyframes[0].background
-    assert np.array_equal(np.argwhere(behind.content == Content.GUESSED), background.guessed)
+    assert np.array_equal(np.argwhere(behind.content == Content.SURFACE), background.guessed)
     assert len(background.guessed) > 100
 
 
@@ -102,7 +103,7 @@ def test_a_code_by_hand():
     layer = LayerEncoder().encode(space._shown, [7], [None]).layers[0]
     assert (layer.keyframe_id, layer.near_m) == (7, 2.0)
     blue, green, red = cv2.imdecode(np.frombuffer(layer.geometry_png, np.uint8), cv2.IMREAD_UNCHANGED)[16, 25]
-    assert (red, green, blue) == (128, 0, Content.MEASURED)
+    assert (red, green, blue) == (128, 0, Content.SURFACE + 15 * 8)
 
 
 def test_only_what_has_changed_is_sent_again():
