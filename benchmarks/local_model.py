@@ -28,6 +28,7 @@ from instant_ic.experiments.depth_worlds import CAMERA_HEIGHT_M, LIDAR_HEIGHT_M
 from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.transforms import TransformBuffer
+from instant_ic.mapping.local_model import warm_up
 from instant_ic.mapping.mapper import LocalMapper, LocalView
 from instant_ic.paths import shipped_file
 from instant_ic.sim.render import EquirectRenderer, Frame
@@ -192,6 +193,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     model = DepthModel.load(shipped_file("models", DEFAULT_MODEL), threads=1)
+    warm_up()
     worlds = {scene.name: evaluate(scene, model, args.strips) for scene in scenes(args)}
     mean: dict[str, Any] = {"cpu_share": round(float(np.mean([one["cpu_share"] for one in worlds.values()])), 4)}
     for name in ("structure alone", "structure and network", "local model", "true depth"):

@@ -60,9 +60,9 @@ def scenes(kind: str, count: int = 20, mesh: str | Path | None = None, height: i
     """The held-out panoramas of a kind; always the same ones.
 
     Args:
-        kind: ``random`` (one world per panorama, seeds from ``FIRST_SEED``), ``long`` (the same with corridors and halls
-            of 20 to 40 m), ``corridor`` (positions in the corridor of the experiments and its rooms) or ``mesh`` (its
-            known positions first, then random free ones).
+        kind: ``random`` (one world per panorama, seeds from ``FIRST_SEED``), ``long`` (the same with corridors
+            and halls of 20 to 40 m), ``corridor`` (positions in the corridor of the experiments and its rooms) or
+            ``mesh`` (its known positions first, then random free ones).
         count: panoramas.
         mesh: the file, for ``mesh``.
         height: rows of a panorama; twice as many columns.

@@ -122,7 +122,7 @@ class LocalMapper:
         points = xyz()
         if len(points) != len(time_s):
             raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is left out")
-        step = max(1, len(points) // _ENOUGH_POINTS)
+        step = -(-len(points) // _ENOUGH_POINTS)
         # Other points each time: of beams that fire in the same order, every second would be of the same rings.
         first = self.model.revolutions % step
         lidar = points_at(

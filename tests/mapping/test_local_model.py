@@ -140,7 +140,7 @@ def test_wrong_use_is_refused() -> None:
         model.add(np.zeros((4, 2)), np.zeros(3))
     with pytest.raises(ValueError, match="position must be finite"):
         model.add(np.zeros((4, 3)), np.array([np.nan, 0, 0]))
-    with pytest.raises(ValueError, match="reach_m must be at most 12.3 with voxels of 0.05 m"):
+    with pytest.raises(ValueError, match=r"reach_m must be at most 12\.3 with voxels of 0\.05 m"):
         LocalModelConfig(reach_m=15.0)
 
 
