@@ -108,10 +108,10 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
     figures = illusion.report(films, settings)
     if args.json:
         illusion.save(args.json, figures)
-    if args.strip:
-        illusion_plot.save_strip(args.strip, films)
     if args.plot:
         illusion_plot.save_plot(args.plot, figures)
     figures.pop("each")
     sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+    if args.strip:  # last: without an obstacle there is none
+        illusion_plot.save_strip(args.strip, films)
     return 0
