@@ -165,14 +165,14 @@ def page_layers(layers: Layers, mount: tuple[float, float, float]) -> PageLayers
 def _page_layer(layer: Layer) -> PageLayer:
     decoded = decode_layer(layer)
     if layer.kind is Kind.SEEN:
-        shown, edge = decoded.content >= Content.FILLED, decoded.edge
+        shown, edge = decoded.content == Content.SURFACE, decoded.edge
         confidence = b""
     else:
         quads = decoded.content > Content.NOTHING
         shown = quads | np.roll(quads, 1, 1)  # a quad has four pixels
         shown[1:] |= shown[:-1]
         edge = edge_quads(decoded.inverse_depth, BEHIND_EDGE) > 0
-        confidence = cv2.imencode(".png", np.rint(255 * decoded.share).astype(np.uint8))[1].tobytes()
+        confidence = cv2.imencode(".png", np.rint(255 * decoded.confidence).astype(np.uint8))[1].tobytes()
     mesh = layer_mesh(decoded.inverse_depth, edge, shown)
     red, green, blue = (float(value) for value in layer.gain)
     return PageLayer(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.limits import decode_image
-from instant_ic.vspace.background import GUESS_SHARE, Background
+from instant_ic.vspace.background import Background
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import MOST_SIGMA, MOVED, ROBOT, ROOM, SKY, PanoramaPrior, edge_quads, shrunk
@@ -146,7 +146,7 @@ class LayerEncoder:
             colour = image or _jpeg(keyframe.prior.rgb)
         else:
             assert background is not None
-            marks = np.full(background.inverse.shape, round(GUESS_SHARE * _SURE) << 3, np.uint8)
+            marks = np.rint(background.sure * np.float32(_SURE / 255)).astype(np.uint8) << 3
             for quads, content in ((background.guessed, Content.SURFACE), (background.sky, Content.SKY)):
                 marks[tuple(quads.T)] |= np.uint8(content)
             near_m, png = _encoded_geometry(background.inverse, marks)
@@ -193,7 +193,6 @@ class DecodedLayer:
         content: ``Content``, (h, 2 h) uint8: of each pixel, or of the quad right of and below it (``BEHIND``).
         confidence: 0..1, (h, 2 h) float32: below 1 the depth is filled from around; of a guess its share of an image.
         edge: whether the quad right of and below a pixel crosses a depth edge, (h, 2 h).
-        share: of a guess in the image (``BEHIND``), the rest is continued from around in the image, (h, 2 h) 0..1.
     """
 
     rgb: NDArray[np.uint8]
@@ -201,7 +200,6 @@ class DecodedLayer:
     content: NDArray[np.uint8]
     confidence: Floats
     edge: NDArray[np.bool_]
-    share: Floats
 
 
 def decode_layer(layer: Layer) -> DecodedLayer:
@@ -281,5 +279,5 @@ def _background(layer: Layer) -> Background:
     rgb = decoded.rgb
     if rgb.shape[:2] != decoded.inverse_depth.shape:
         raise LayersError(f"layer BEHIND of keyframe {layer.keyframe_id}: colour and geometry differ in size")
-    sure = np.rint(255 * decoded.share).astype(np.uint8)
+    sure = np.rint(255 * decoded.confidence).astype(np.uint8)
     return Background(decoded.inverse_depth, rgb, sure, guessed, sky, np.array(layer.map_from_camera, np.float64))
