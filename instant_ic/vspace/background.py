@@ -161,7 +161,7 @@ class Background:
 
 
 def _as_seen(prior: PanoramaPrior, points: Floats) -> tuple[Floats, Floats]:
-    """Distances (N,) of points (N, 3) of the map from a keyframe, inf where it has not seen them, and colours (N, 3)."""
+    """Distances (N,) of points (N, 3) of the map from a keyframe, inf where it has not seen them; colours (N, 3)."""
     pose = prior.map_from_camera.astype(np.float32)
     local = np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3])
     distance = np.sqrt(np.einsum("ij,ij->i", local, local))

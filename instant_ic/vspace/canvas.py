@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from instant_ic.vspace.compose import Layer, compose
 from instant_ic.vspace.nerf.field import Floats, Rays
-from instant_ic.vspace.store import KeyframeSet
+from instant_ic.vspace.store import Keyframe, KeyframeSet
 from instant_ic.vspace.view import continue_unseen
 from instant_ic.vspace.warp import dissolve
 
@@ -54,7 +54,7 @@ def draw(
         picture = field
     colour, depth, confidence = picture
     guessed = np.zeros(len(depth), np.float32)
-    for keyframe, gain in () if shown is None else zip(shown.keyframes, shown.gains, strict=True):
+    for keyframe, gain in () if shown is None else _nearest_first(shown, rays):
         wanted = (confidence == 0) & (guessed == 0)
         if keyframe.background is None or not wanted.any():
             break
@@ -65,7 +65,7 @@ def draw(
 def _warped(rays: Rays, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawing:
     """Compose the keyframes' panoramas, warped by their depth."""
     drawn = []
-    for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
+    for keyframe, gain in _nearest_first(shown, rays):
         assert keyframe.warp is not None
         if id(keyframe.warp) not in layers:
             layers[id(keyframe.warp)] = keyframe.warp.draw(rays)
@@ -89,3 +89,13 @@ def painted(picture: Picture, image: Floats) -> Painted:
     """The image of ``continued``, or a blend of several, in 8 bit; depth and confidence of ``picture``."""
     rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
     return rgb, picture.depth, picture.confidence
+
+
+def _nearest_first(shown: KeyframeSet, rays: Rays) -> list[tuple[Keyframe, Floats]]:
+    """Keyframes and their gains by their distance from a view: the order in which they were taken does not matter."""
+
+    def distance(pair: tuple[Keyframe, Floats]) -> tuple[float, ...]:
+        place = pair[0].prior.map_from_camera[:3, 3]
+        return float(np.linalg.norm(place - rays.origin)), *place.tolist()
+
+    return sorted(zip(shown.keyframes, shown.gains, strict=True), key=distance)

@@ -37,7 +37,7 @@ _VOTE_ROWS = 256  # of the pixels that are asked whether they have moved
 _STEP_ROWS = 128  # of the pixels that an exposure is fitted on
 _MIN_SAMPLES = 200
 _MAX_GAIN = 2.5
-_LEAST_GAIN = 0.03  # logarithm of a gain that is told from none
+_LEAST_GAIN = 0.03  # logarithm of a gain that differs from none
 _MAX_SPREAD = 0.35  # of the logarithms of the ratios: more is no common factor
 
 
@@ -163,8 +163,8 @@ def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats | None:
     """Factors (3,) that bring an older keyframe's colours to the newest's, from places that both have seen.
 
     The middle of the shortest interval that holds half of the ratios, a colour (the shorth): what has changed between
-    the two, such as a lamp or a shadow, does not move it as long as it is less than half. Where that interval comes near
-    1 in all colours the evidence is weak, and the factors are 1.
+    the two, such as a lamp or a shadow, does not move it as long as it is less than half. Where no factor differs from
+    1 by more than the interval is wide, the evidence is weak, and all are 1.
 
     Returns:
         None where too few places are seen by both, or where their ratios have no common factor.

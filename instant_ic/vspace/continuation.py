@@ -17,7 +17,7 @@ from instant_ic.vspace.prior import fill_holes
 SAME = 1.15
 """Distances of neighbours that differ by less than this factor are of one surface."""
 WALL_BEHIND = 1.3
-"""A wall is farther than what hides it by this factor: nearer, the two cannot be told apart."""
+"""A wall is farther than what hides it by this factor: if it is nearer, depth errors hide the gap."""
 FLOOR_SURE, CEILING_SURE = 1.0, 0.6
 """Share of the continued colour in the image; the rest is continued from the image's own surroundings."""
 BESIDE_SURE, LEAST_SURE = 0.6, 0.2
@@ -74,7 +74,7 @@ def continued_colours(
     height, width = hole.shape
     reach = _pixels(_SEARCH_RAD, height)
     total, covered, sure = np.zeros(rgb.shape, np.float32), np.zeros(hole.shape, np.float32), np.zeros_like(upright)
-    flat = np.maximum(upright[..., None], np.float32(1e-3))
+    weight = np.maximum(upright, np.float32(1e-3)) ** np.float32(-4)  # what is far goes on behind what is near
     for number, plane in enumerate(planes):
         # Within a pixel of the line where two planes meet both have a share.
         ahead = plane - np.delete(planes, number, 0).max(axis=0)
@@ -102,7 +102,7 @@ def continued_colours(
         if lost.any():
             source = source if source.any() else ~hole
             known = np.where(source[..., None], rgb, 0).astype(np.float32)
-            colour[lost] = fill_holes(known, source, weight=(1 / flat[..., 0]) ** 4)[lost]
+            colour[lost] = fill_holes(known, source, weight)[lost]
         total += coverage[..., None] * colour
         covered += coverage
         sure += coverage * own

@@ -205,7 +205,7 @@ def continue_walls(  # type: ignore[no-untyped-def]
                     common[c] = np.median(some[:count, c])
                 q = far[anchor]
                 n = int((np.float32(math.pi / 2) - math.atan(slope[v, u] * q / found[v, u])) * rows)
-                here, weight = np.float32(0), np.float32(0.05) / np.float32(first * first)
+                here, weight = 0.0, np.float32(0.05) / np.float32(first * first)
                 if 0 <= n < height and source[n, anchor] and _alike(upright[n, anchor], q, same):
                     here = math.exp(-np.float32(first) / fade)
                     weight *= 20

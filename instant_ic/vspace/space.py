@@ -204,9 +204,9 @@ class VirtualSpace(Drawn):
     ) -> KeyframeSet:
         """Prepare a new keyframe, with the earlier ones that are kept; changes nothing that is shown.
 
-        Of the keyframes before it ``config.keyframes`` − 1 are shown too (0, the paper's way), in the new one's exposure
-        and without what has moved, and ``config.older`` give their pixels of what is hidden from it; none where its
-        images have another size. May run in a thread of its own beside all
+        Of the keyframes before it ``config.keyframes`` − 1 are shown too (0, the paper's way), in the new one's
+        exposure and without what has moved, and ``config.older`` give their pixels of what is hidden from it; none
+        where its images have another size. May run in a thread of its own beside all
         other calls; one keyframe at a time, and each must be shown before the next.
 
         Args: as ``prior.prepare``.

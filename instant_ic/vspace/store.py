@@ -15,9 +15,9 @@ from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import PanoramaPrior
 from instant_ic.vspace.warp import PanoramaWarp, Pyramid
 
-
 REACH_M, APART_M, RECENT = 3.0, 0.25, 7
-"""Older keyframes are used from up to so far, are so far apart, and so many are kept: at one each 0.6 m, 3 m of them."""
+"""Older keyframes are used from up to this distance, are this far apart, and this many are kept: at one each 0.6 m
+those of 3.6 m."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,8 @@ class KeyframeSet:
 def spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
     """Those of older keyframes (newest first, after the one that they are for) that show most of what it does not see.
 
-    The farthest within ``REACH_M`` first, then those farthest from all chosen before; none within ``APART_M`` of another.
+    The farthest within ``REACH_M`` first, then those farthest from all chosen before; none within ``APART_M`` of
+    another.
     """
     places = np.array([keyframe.prior.map_from_camera[:3, 3] for keyframe in keyframes])
     gaps = np.linalg.norm(places - places[0], axis=1)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import types
 
 import numpy as np
 import pytest
@@ -15,11 +16,13 @@ from instant_ic.vspace.compose import Layer, compose, exposure_gain, exposure_ga
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.field import Rays
 from instant_ic.vspace.prior import MOVED, prepare
+from instant_ic.vspace.store import Keyframe, recent, spread
 from instant_ic.vspace.view import perspective_rays
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",
     keyframes=3,
+    older=0,
     field=FieldConfig(log2_table=10, levels=4),
     train=TrainConfig(ray_columns=32, ray_rows=16, iterations=8),
     readiness=ReadinessConfig(psnr_db=5),
@@ -112,6 +115,67 @@ def test_exposure_is_fitted_where_both_have_seen():
     uneven = learn(VirtualSpace(CONFIG), SECOND, FIRST, gains=(0.6, 1.0)).render(VIEW, 96, 64, 1.5)
     even = learn(VirtualSpace(CONFIG), SECOND, FIRST).render(VIEW, 96, 64, 1.5)
     assert psnr_db(uneven.rgb, even.rgb) > 28
+
+
+def test_a_gain_without_strong_evidence_is_1():
+    """Ratios spread evenly by ±20 %: half of them lie within 0.2. Around 0.95 that interval holds 1, around 0.7 not."""
+    newest = prior_of(FIRST)
+    rng = np.random.default_rng(0)
+    for factor, expected in ((0.95, 1.0), (0.7, 1 / 0.7)):
+        spread_out = rng.uniform(0.8, 1.2, newest.rgb.shape[:2])[..., None] * factor
+        rgb = np.clip(newest.rgb * spread_out, 0, 255).astype(np.uint8)
+        fitted = exposure_gain(newest, dataclasses.replace(newest, rgb=rgb))
+        assert fitted == pytest.approx([expected] * 3, rel=0.1 if factor < 0.9 else 0)
+    assert exposure_gain(newest, prior_of(FIRST, gain=0.9)) == pytest.approx([1 / 0.9] * 3, rel=0.02)  # one factor
+    assert exposure_gain(newest, prior_of(FIRST, gain=0.98)).tolist() == [1, 1, 1]  # rounding makes as much
+
+
+def test_the_order_of_keyframes_does_not_matter():
+    space = VirtualSpaceConfig(device="cpu", source="warp", keyframes=3, older=0)
+    views = []
+    for poses in ((FIRST, SECOND, pose_matrix()), (pose_matrix(), FIRST, SECOND), (SECOND, pose_matrix(), FIRST)):
+        made = VirtualSpace(space)
+        for pose in poses:
+            picture = box_room.panorama(pose, 96)
+            made.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
+        view = made.render(VIEW, 96, 64, 1.5)
+        views.append(view)
+    for view in views[1:]:
+        assert np.array_equal(view.rgb, views[0].rgb)
+        assert np.array_equal(view.confidence, views[0].confidence)
+
+
+def test_which_older_keyframes_are_chosen_and_kept():
+    def at(x):
+        return Keyframe(0, types.SimpleNamespace(map_from_camera=pose_matrix(x=x)), None, None)
+
+    def places(keyframes):
+        return [float(keyframe.prior.map_from_camera[0, 3]) for keyframe in keyframes]
+
+    driven = [at(x) for x in (0.0, -0.6, -1.2, -1.8, -2.4, -3.0, -3.6)]
+    # The farthest within 3 m, then the one in the middle of the others (1.2 m from one and 1.8 m from the other).
+    assert places(spread(driven, 2)) == [-3.0, -1.2]
+    assert places(spread(driven[:2], 2)) == [-0.6]
+    assert places(spread([at(0), at(-0.1)], 2)) == []
+    # Standing: taken again at one place, the newest of them stays.
+    assert places(recent([at(0), at(0.01), at(-0.01), at(-1), at(-1.1)])) == [0, -1]
+    assert len(recent([at(float(x)) for x in range(20)])) == 7
+
+
+def test_older_keyframes_show_what_is_hidden_from_the_newest():
+    """What lies behind the box, seen from the other side of it; bit for bit the same in either order."""
+    truth = box_room.perspective(VIEW, 96, 64, 1.5).rgb
+    other = pose_matrix(x=2.2, y=-0.5)
+    views = []
+    for older, poses in ((0, (SECOND, other)), (2, (SECOND, other)), (2, (other, SECOND))):
+        space = VirtualSpace(VirtualSpaceConfig(device="cpu", source="warp", older=older))
+        for pose in (*poses, pose_matrix(x=0.2, y=0.4)):
+            picture = box_room.panorama(pose, 96)
+            space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
+        views.append(space.render(VIEW, 96, 64, 1.5))
+    assert psnr_db(views[1].rgb, truth) > psnr_db(views[0].rgb, truth) + 0.3
+    assert np.array_equal(views[0].confidence, views[1].confidence)  # the newest has not seen it
+    assert np.array_equal(views[1].rgb, views[2].rgb)
 
 
 def test_a_lamp_in_a_part_of_the_room_is_no_exposure():
