@@ -158,6 +158,9 @@ def _compared(scene: Scene, setup: Setup) -> dict[str, Any]:
     rng = np.random.default_rng(5)
     shape = (setup.train.ray_columns * setup.train.ray_rows, 3)
     result["gradient_error"] = _gradient_error(ours, peer, rng.random(shape, np.float32), setup)
+    for device in (ours, peer):  # both optimisers start again
+        device.load(ours.parameters())
+        device.set_scene(scene)
     errors = []
     for _ in range(setup.steps):
         uniform = rng.random(shape, np.float32)
@@ -372,7 +375,7 @@ def main() -> int:
         start = time.perf_counter()
         try:
             found: dict[str, Any] = STEPS[step](setup)
-        except RuntimeError as error:  # one step's failure must not hide the others' figures
+        except (RuntimeError, ImportError) as error:  # one step's failure must not hide the others' figures
             found, failed = {"error": f"{type(error).__name__}: {error}"}, True
         about = {"step": step, "machine": machine, "python": platform.python_version(), "torch": torch.__version__}
         result = about | {"targets": TARGETS[step], "took_s": round(time.perf_counter() - start, 1), "result": found}
