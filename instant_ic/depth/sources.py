@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from instant_ic.config.ranges import check_ranges
 from instant_ic.depth.fusion import Corrected, FusionConfig, ceiling_height, correct, likely_ceiling
-from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, rays
+from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, Origin, rays
 from instant_ic.depth.scaler import DepthScaler, ScaleFit, ScalerConfig
 from instant_ic.depth.visibility import nearest_points
 from instant_ic.mapping.mapper import LocalView
@@ -18,6 +18,8 @@ Floats = NDArray[np.floating]
 SOURCES = ("network", "lidar", "fused")
 # Of the floor under the robot: a camera's height is known to centimetres.
 _FLOOR_SIGMA = 0.02
+# A point nearer than the local model by this share is of something that has come since.
+_MOVED = 0.15
 # Of the network where nothing was measured (benchmarks/depth_sigma.py).
 _NETWORK_SIGMA = np.float32(0.58)
 
@@ -85,10 +87,11 @@ class DepthResult:
 
 @dataclass(frozen=True)
 class _Built:
-    """Depth without a network, the structure of this revolution, and the ceiling that the local model shows."""
+    """Depth without a network, how far unknown pixels are free, the revolution's structure, the model's ceiling."""
 
     depth_m: NDArray[np.float32]
     sigma: NDArray[np.float32]
+    free_m: NDArray[np.float32]
     structure: LidarDepth
     ceiling_m: float | None
 
@@ -166,8 +169,9 @@ class DepthSource:
                 source="fused",
             )
         known = built.depth_m > 0
-        depth = np.where(known, built.depth_m, network.depth_m)
-        sigma = np.where(known, built.sigma, np.where(network.depth_m > 0, _NETWORK_SIGMA, np.float32(np.inf)))
+        guess = np.maximum(network.depth_m, built.free_m)
+        depth = np.where(known, built.depth_m, guess)
+        sigma = np.where(known, built.sigma, np.where(guess > 0, _NETWORK_SIGMA, np.float32(np.inf)))
         message = f"{fit.message}; {_surfaces(built)}"
         return replace(
             result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source="fused"
@@ -201,15 +205,22 @@ class DepthSource:
         """Depth without a network: the local model first, then this revolution's structure; ``top``: a ceiling."""
         seen = None if local is None else local.ceiling_m
         structure = self.structure.estimate(points, up, camera_height_m, size, top if seen is None else seen)
-        depth, sigma = structure.depth_m, structure.sigma
+        depth, sigma, free = structure.depth_m, structure.sigma, np.zeros(size, np.float32)
         if local is not None and not structure.message:
             ceiling = structure.ceiling_height_m if structure.ceiling_height_m is not None else top
             if ceiling is None and camera_height_m is not None:
                 ceiling = self.config.lidar.ceiling_height_m - camera_height_m
             modelled = local.render(size, ceiling)
-            known = modelled.depth_m > 0
-            depth, sigma = np.where(known, modelled.depth_m, depth), np.where(known, modelled.sigma, sigma)
-        return _Built(depth, sigma, structure, seen)
+            # What this revolution measured plainly nearer has come since.
+            measured = (structure.origin == Origin.BEAM) | (structure.origin == Origin.BETWEEN)
+            come = measured & (depth < (1 - _MOVED) * modelled.depth_m)
+            known = (modelled.depth_m > 0) & ~come
+            # A surface that the structure assumes in space that beams have passed is none.
+            refuted = ~known & ~measured & (depth < modelled.free_m)
+            depth = np.where(known, modelled.depth_m, np.where(refuted, np.float32(0), depth))
+            sigma = np.where(known, modelled.sigma, np.where(refuted, np.float32(np.inf), sigma))
+            free = np.where(refuted, modelled.free_m, free)
+        return _Built(depth, sigma, free, structure, seen)
 
     def _lidar(
         self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int], local: LocalView | None

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numba import njit
 
-HIT, MOST, LEAST = 4, 12, -12
+HIT, MOST, LEAST = 4, 12, -8
 THROUGH = 2  # odds that a beam takes from the voxels of a column whose mean it passes; elsewhere 1
 OCCUPIED, FREE = 3, -2
 UNSEEN, OPEN, PLATE = -2, -1, -10  # values of the index of columns
@@ -347,7 +347,7 @@ def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, hig
 
 @njit(cache=True)
 def cast_rays(  # type: ignore[no-untyped-def]
-    key, index, codes, faces, origin, rays, cell, low, ceiling, assumed, reach, unseen, depth, kind
+    key, index, codes, faces, origin, rays, cell, low, ceiling, assumed, reach, unseen, depth, kind, free
 ):
     """First surface on every ray.
 
@@ -356,6 +356,7 @@ def cast_rays(  # type: ignore[no-untyped-def]
         ceiling: height of the level ceiling (inf: none); assumed: whether it is.
         reach: longest horizontal distance; unseen: metres of a ray through columns that nobody has seen, at most.
         depth: (M,) float32 and kind (M,) uint8, written; 0 where a ray ends nowhere.
+        free: (M,) float32, written: how far a ray came.
     """
     n, levels = key.shape[0], codes.shape[1]
     for i in range(len(rays)):
@@ -438,3 +439,4 @@ def cast_rays(  # type: ignore[no-untyped-def]
             depth[i], kind[i] = pending, pending_kind
         elif t >= limit - 1e-9:
             depth[i], kind[i] = limit, limit_kind
+        free[i] = depth[i] if kind[i] != NOTHING else max(t - missing / max(flat, 1e-6), 0.0)

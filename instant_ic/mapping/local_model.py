@@ -56,7 +56,7 @@ class LocalModelConfig:
     reach_m: Positive = 12.0
     height_m: Annotated[float, Range(2, 6)] = 4.0
     stride: Annotated[int, Range(1, 64)] = 4
-    behind_m: NotNegative = 0.4
+    behind_m: NotNegative = 0.5
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -78,11 +78,13 @@ class LocalDepth:
         depth_m: (H, W) float32 radial metres, 0 where the model does not know.
         sigma: (H, W) float32 relative standard deviation, inf where unknown.
         kind: (H, W) uint8, what each pixel shows (constants of ``kernels``).
+        free_m: (H, W) float32, nothing stands nearer than this.
     """
 
     depth_m: NDArray[np.float32]
     sigma: NDArray[np.float32]
     kind: NDArray[np.uint8]
+    free_m: NDArray[np.float32]
 
 
 class LocalModel:
@@ -164,9 +166,9 @@ class LocalModel:
         """
         config, cell = self.config, self.config.cell_m
         origin = np.asarray(model_from_camera[:3, 3], np.float64)
-        depth, kind = np.zeros(size, np.float32), np.zeros(size, np.uint8)
+        depth, kind, free = np.zeros(size, np.float32), np.zeros(size, np.uint8), np.zeros(size, np.float32)
         if self.revolutions == 0 or not np.isfinite(model_from_camera).all():
-            return LocalDepth(depth, np.full(size, np.inf, np.float32), kind)
+            return LocalDepth(depth, np.full(size, np.inf, np.float32), kind, free)
         measured = self.ceiling_m(origin)
         ceiling = measured if measured is not None else ceiling_m if ceiling_m is not None else math.inf
         ground = round((_FLOOR_M - _LOW_M) / cell)
@@ -183,9 +185,9 @@ class LocalModel:
         rays = _rays(*size) @ np.asarray(model_from_camera[:3, :3], np.float32).T
         kernels.cast_rays(
             self._key, self._index, codes, faces, origin, rays.reshape(-1, 3), cell, _LOW_M, ceiling, measured is None,
-            config.reach_m, _UNSEEN_M, depth.reshape(-1), kind.reshape(-1),
+            config.reach_m, _UNSEEN_M, depth.reshape(-1), kind.reshape(-1), free.reshape(-1),
         )  # fmt: skip
-        return LocalDepth(depth, _SIGMA[kind], kind)
+        return LocalDepth(depth, _SIGMA[kind], kind, free)
 
     def points(self) -> NDArray[np.float32]:
         """(N, 3) centres of the solid voxels in the model's frame, on the surface of their column."""
