@@ -7,16 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.console import demo_world
-from instant_ic.console.layers import PageLayer, PageLayers
+from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource
+from instant_ic.console.layers import PageLayers
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace.background import Background
-from instant_ic.vspace.layer_mesh import LayerMesh, layer_mesh
-from instant_ic.vspace.prior import ROOM, edge_quads
+from instant_ic.vspace.prior import ROOM
 from instant_ic.vspace.warp import PanoramaWarp
-
-NEAR_EDGE, FAR_EDGE = 0.05, 0.12
-"""Shares by which depths differ at an edge, of the first and the second layer."""
 
 
 def demo_layers(version: int, map_from_camera: Matrix, width: int = 1024, depth_width: int = 512) -> PageLayers:
@@ -28,34 +25,25 @@ def demo_layers(version: int, map_from_camera: Matrix, width: int = 1024, depth_
         width: of the panorama, pixels.
         depth_width: of its depth, pixels.
     """
-    eye = tuple(float(value) for value in map_from_camera[:3, 3])
+    x, y, z = (float(value) for value in map_from_camera[:3, 3])
     rotation = map_from_camera[:3, :3].astype(np.float32)
-    position = (eye[0], eye[1], eye[2])
-    rgb = demo_world.shade(position, equirect_directions(width, width // 2) @ rotation.T)[..., ::-1]
-    depth = demo_world.distances(position, equirect_directions(depth_width, depth_width // 2) @ rotation.T)
+    rgb = demo_world.shade((x, y, z), equirect_directions(width, width // 2) @ rotation.T)[..., ::-1]
+    depth = demo_world.distances((x, y, z), equirect_directions(depth_width, depth_width // 2) @ rotation.T)
     prior = PanoramaWarp(np.ascontiguousarray(rgb), depth, map_from_camera).prior
     behind = Background.of(prior)
     guessed = np.zeros(behind.inverse.shape, np.bool_)
     for quads in (behind.guessed, behind.sky):
         guessed[quads[:, 0], quads[:, 1]] = True
-    for axis in (0, 1):  # a quad has four pixels
-        guessed |= np.roll(guessed, 1, axis)
-    first = layer_mesh(prior.inverse_depth, edge_quads(prior.inverse_depth, NEAR_EDGE), prior.content == ROOM)
-    second = layer_mesh(behind.inverse, edge_quads(behind.inverse, FAR_EDGE), guessed)
-    layers = (_layer(rgb, first, seen=True), _layer(behind.rgb, second, seen=False))
-    return PageLayers(version, version, map_from_camera, (0.0, 0.0, position[2]), layers)
+    seen = Geometry(prior.inverse_depth, prior.content == ROOM, prior.depth_edge)
+    sources = [
+        LayerSource(number, bool(number), _jpeg(colours), (1.0, 1.0, 1.0), map_from_camera, lambda g=geometry: g)  # type: ignore[misc]
+        for number, (colours, geometry) in enumerate([(rgb, seen), (behind.rgb, Geometry(behind.inverse, guessed))])
+    ]
+    return PageLayers(version, (0.0, 0.0, z), LayerMeshes().layers(sources))
 
 
-def _layer(rgb: NDArray[np.uint8], mesh: LayerMesh, *, seen: bool) -> PageLayer:
-    image = _encoded(".jpg", np.ascontiguousarray(rgb[..., ::-1]))
-    confidence = b"" if seen else _encoded(".png", np.zeros((1, 2), np.uint8))
-    return PageLayer(
-        image, confidence, (1.0, 1.0, 1.0), mesh.size, mesh.corners, mesh.inverse_depth, mesh.triangles
-    )  # fmt: skip
-
-
-def _encoded(ending: str, image: NDArray[np.uint8]) -> bytes:
-    ok, data = cv2.imencode(ending, image)
+def _jpeg(rgb: NDArray[np.uint8]) -> bytes:
+    ok, data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]))
     if not ok:
-        raise ValueError(f"encoder of {ending} failed on an image of shape {image.shape}")
+        raise ValueError(f"JPEG encoder failed on an image of shape {rgb.shape}")
     return bytes(data.tobytes())

@@ -9,6 +9,7 @@ import pytest
 
 from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ProtocolError, ServerConfig
 from instant_ic.console import server as server_module
+from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource
 from instant_ic.console.layers import PageLayer, PageLayers
 from instant_ic.geometry.poses import pose_matrix
 
@@ -21,6 +22,7 @@ def layer(image=b"JPEG", **values):
         "image": image,
         "confidence": b"",
         "gain": (1.0, 0.9, 1.1),
+        "map_from_camera": pose_matrix(x=1.0, z=1.2, yaw=math.pi / 2),
         "size": (2, 4),
         "corners": np.array([[0, 0], [4, 0], [2, 2]], np.uint16),
         "inverse_depth": np.array([0.5, 0.25, 0.0], np.float32),
@@ -30,7 +32,7 @@ def layer(image=b"JPEG", **values):
 
 
 def layers(version, *each):
-    return PageLayers(version, 7, pose_matrix(x=1.0, z=1.2, yaw=math.pi / 2), (0.1, 0.0, 1.2), each or (layer(),))
+    return PageLayers(version, (0.1, 0.0, 1.2), each or (layer(),))
 
 
 def test_layout_of_a_frame_by_hand():
@@ -47,9 +49,9 @@ def test_layout_of_a_frame_by_hand():
         "inverse": [0, 12], "triangles": [12, 12], "corners": [24, 12], "image": [36, 4], "confidence": [40, 3],
     }  # fmt: skip
     assert len(sent.pop("id")) == 24
-    assert sent == {"size": [2, 4], "gain": [1.0, 0.9, 1.1]}
-    assert header.pop("q") == pytest.approx([0, 0, math.sqrt(0.5), math.sqrt(0.5)])
-    assert header == {"version": 3, "keyframe": 7, "p": [1.0, 0.0, 1.2], "mount": [0.1, 0.0, 1.2]}
+    assert sent.pop("q") == pytest.approx([0, 0, math.sqrt(0.5), math.sqrt(0.5)])
+    assert sent == {"size": [2, 4], "gain": [1.0, 0.9, 1.1], "p": [1.0, 0.0, 1.2]}
+    assert header == {"version": 3, "mount": [0.1, 0.0, 1.2]}
 
 
 def test_a_layer_that_the_page_holds_is_not_sent_again():
@@ -59,7 +61,8 @@ def test_a_layer_that_the_page_holds_is_not_sent_again():
     assert [one["parts"] is None for one in header["layers"]] == [True, False]
     assert payload.endswith(b"second")
     assert b"first" not in payload
-    assert layer(gain=(1.0, 1.0, 1.0)).digest != layer().digest  # other content, the same bytes
+    assert layer(gain=(1.0, 1.0, 1.0)).digest == layer().digest  # gain and pose are always sent
+    assert layer(size=(2, 5)).digest != layer().digest
 
 
 @pytest.mark.parametrize(
@@ -73,6 +76,7 @@ def test_a_layer_that_the_page_holds_is_not_sent_again():
         ({"inverse_depth": np.array([0.5], np.float32)}, "do not fit"),
         ({"triangles": np.array([[0, 1, 3]], np.uint32)}, r"indices below 3 \(got 3\)"),
         ({"triangles": np.array([0, 1, 2], np.uint32)}, "three corners"),
+        ({"map_from_camera": np.full((4, 4), math.nan)}, "map_from_camera must be 4 x 4 finite numbers"),
         ({"gain": (1.0, math.inf, 1.0)}, "gain must be 3 finite numbers"),
     ],
 )
@@ -197,3 +201,34 @@ def test_views_are_needed_unless_every_page_renders_the_newest_layers_by_itself(
         await until(lambda: server.drawn_ms() is None)
 
     asyncio.run(scenario())
+
+
+def source(key, behind, gain=(1.0, 1.0, 1.0), calls=None):
+    """Of a panorama of 8 x 16 pixels, 2 m away everywhere; a guess in one quad."""
+    shown = np.zeros((8, 16), np.bool_)
+    shown[3, 5] = True
+
+    def made():
+        if calls is not None:
+            calls.append(key)
+        return Geometry(np.full((8, 16), 0.5, np.float32), shown if behind else ~shown)
+
+    return LayerSource(key, behind, b"JPEG", gain, pose_matrix(), made)
+
+
+def test_meshes_are_made_once_and_what_was_seen_comes_before_all_guesses():
+    meshes, calls = LayerMeshes(), []
+    first = meshes.layers([source("a", False, calls=calls), source("b", True, calls=calls), source("c", False)])
+    assert [bool(one.confidence) for one in first] == [False, False, True]
+    again = meshes.layers([source("a", False, (0.9, 1.0, 1.0), calls), source("b", True, calls=calls)])
+    assert calls == ["a", "b"]
+    assert again[0].gain == (0.9, 1.0, 1.0)
+    assert again[0].digest == first[0].digest
+    assert again[1] is first[2]
+    PageLayers(1, (0.0, 0.0, 1.2), again).check()
+    # A guess in the quad right of and below (3, 5) has four pixels, each a square of its own at its rim.
+    columns, rows = again[1].corners.T
+    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (5, 7, 3, 5)
+    meshes.layers([source("d", False)])
+    meshes.layers([source("a", False, calls=calls)])
+    assert calls == ["a", "b", "a"]  # forgotten meanwhile

@@ -98,7 +98,7 @@ def test_a_bad_frame_of_layers_is_refused_and_the_ones_before_stay(open_page, ro
     expect_body(page, "blend", "1.00")
     demo.server.send_frame(FrameKind.LAYERS, {"version": 1, "layers": "none"}, b"")
     wait_until(lambda: page.faults, page, "the refusal")
-    assert "layers.keyframe must be" in page.faults[0]
+    assert "layers.mount must be" in page.faults[0]
     page.faults.clear()
     demo.place(1.9, 0.2, 0.1)
     wait_place(page, 1.9, 0.2, 0.1)
@@ -125,7 +125,7 @@ KEY = """async () => {
     let now = 1000;
     const images = new Images({name: "none", sample() {}}, {serverNow: () => now, roundTripMs: 10, connected: true,
         acknowledge() {}});
-    images.layers = {version: 1, keyframe: 1, q: [0, 0, 0, 1], p: [1, 2, 1.2], mount: [0.1, 0, 1.2]};
+    images.layers = {version: 1, mount: [0.1, 0, 1.2]};
     images.prediction.maxAccel = [0.8, 2];
     const pose = [1, 2, 0], twist = [0, 0];
     const state = {at_ms: 1000, mode: "virtual", shown: "virtual", robot: pose, vbot: pose, twist, lead: 1};
@@ -142,9 +142,9 @@ KEY = """async () => {
 def test_a_key_moves_the_view_before_a_new_state_arrives(open_page, room):
     page = open_layers(open_page, room)
     places = page.evaluate(KEY)
-    assert places[:3] == pytest.approx([0.1] * 3)  # at rest, the mount ahead of the keyframe
+    assert places[:3] == pytest.approx([1.1] * 3)  # at rest, the mount ahead of the robot
     # From 1020 ms on with 0.8 m/s²: after t seconds 0.4 t² m, shown with the page's smoothing of 50 ms.
     assert places[4] > places[2]
-    assert places[17] == pytest.approx(0.1 + 0.4 * 0.15**2, abs=0.002)
+    assert places[17] == pytest.approx(1.1 + 0.4 * 0.15**2, abs=0.002)
     # A state that is too old carries on no longer: no more than 250 ms after it.
-    assert places[-1] == pytest.approx(0.1 + 0.4 * 0.23**2, abs=0.002)
+    assert places[-1] == pytest.approx(1.1 + 0.4 * 0.23**2, abs=0.002)

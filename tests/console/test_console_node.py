@@ -420,8 +420,8 @@ def test_a_page_that_renders_by_itself_needs_no_views_and_the_arbiter_hears_how_
 def test_layers_that_no_page_could_render_are_a_fault_of_the_console(setup):
     _, node, server = setup
     mesh = np.zeros((3, 2), np.uint16), np.ones(3, np.float32), np.array([[0, 1, 2]], np.uint32)
-    good = PageLayer(b"JPEG", b"", (1.0, 1.0, 1.0), (2, 4), *mesh)
-    version = PageLayers(1, 1, np.eye(4), (0.0, 0.0, 1.2), (good,))
+    good = PageLayer(b"JPEG", b"", (1.0, 1.0, 1.0), np.eye(4), (2, 4), *mesh)
+    version = PageLayers(1, (0.0, 0.0, 1.2), (good,))
     node.feed.take_layers(version)
     assert server.layers == [version]
     node.feed.take_layers(dataclasses.replace(version, layers=(dataclasses.replace(good, image=b""),)))

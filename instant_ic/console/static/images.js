@@ -6,8 +6,8 @@
 /** @import { Link } from "./link.js" */
 /** @import { Look } from "./look.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
-/** @import { Camera, Layer } from "./layers.js" */
-/** @import { LayerData, LayersFrame, LayersHeader, PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
+/** @import { Camera, Layer, Surface } from "./layers.js" */
+/** @import { LayerData, LayersFrame, LayersHeader, Mesh, PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
 /** @import { Settings } from "./settings.js" */
 /** @import { Depth, GlViewer } from "./viewer.js" */
 import { coloured, fitColour, plain, Releasing } from "./colour.js";
@@ -59,7 +59,7 @@ export class Images {
     this.prediction = new Prediction();
     /** @type {LayersHeader | null} The layers that this page renders by itself; null: it shows rendered views. */
     this.layers = null;
-    /** @type {Map<string, Layer>} Those that are loaded, by id. */
+    /** @type {Map<string, Surface>} Those that are loaded, by id. */
     this._held = new Map();
     this._loads = 0; // counts loads, so that a late one of a lost link is dropped
     this.framesPerSecond = 0; // of what this page renders
@@ -128,7 +128,7 @@ export class Images {
       const layers = await Promise.all(frame.layers.map((data) => this._decodedLayer(data)));
       if (load === this._loads && !viewer.lost) {
         viewer.loadLayers(layers);
-        this._held = new Map(frame.layers.map(({ id }, i) => [id, layers[i]]));
+        this._held = new Map(frame.layers.map(({ id }, i) => [id, layers[i].surface]));
         this.layers = frame.header;
         this.changed = loaded = true;
       }
@@ -151,15 +151,10 @@ export class Images {
   }
 
   /** @param {LayerData} data @returns {Promise<Layer>} */
-  async _decodedLayer({ id, size, gain, mesh }) {
-    if (!mesh) {
-      const held = this._held.get(id);
-      if (!held) throw new Error(`layer ${id} is not here`);
-      return held;
-    }
-    const { image, confidence, ...numbers } = mesh;
-    const [colours, seen] = await Promise.all([decoded(image), confidence && decoded(confidence)]);
-    return { ...numbers, size, gain, image: colours, confidence: seen };
+  async _decodedLayer({ id, gain, q, p, mesh }) {
+    const surface = mesh ? await decodedSurface(mesh) : this._held.get(id);
+    if (!surface) throw new Error(`layer ${id} is not here`);
+    return { surface, gain, mapFromCamera: fromQuaternion(q), position: p };
   }
 
   /** Whether the layers take the place of rendered views. */
@@ -270,11 +265,11 @@ export class Images {
   }
 
   /**
-   * The v-bot's camera, in the keyframe's frame; null: its pose is unknown. While the real robot is shown, it stays where
+   * The v-bot's camera; null: its pose is unknown. While the real robot is shown, it stays where
    * the v-bot was last.
    * @param {LayersHeader} layers @param {Mat3} mapFromLook @param {[number, number]} tanHalf @returns {Camera | null}
    */
-  _camera({ p, q, mount }, mapFromLook, tanHalf) {
+  _camera({ mount }, mapFromLook, tanHalf) {
     const own = this.motion.own;
     if (own && (this._virtual || !this._now)) {
       const [x, y] = rotate(rotationZ(own[2]), mount);
@@ -282,12 +277,7 @@ export class Images {
     }
     if (!this._now) return null;
     this.place = this._now;
-    const panoramaFromMap = transpose(fromQuaternion(q));
-    return {
-      panoramaFromLook: multiply(panoramaFromMap, mapFromLook),
-      position: rotate(panoramaFromMap, [this._now[0] - p[0], this._now[1] - p[1], mount[2] - p[2]]),
-      tanHalf,
-    };
+    return { mapFromLook, position: [...this._now, mount[2]], tanHalf };
   }
 
   /**
@@ -368,6 +358,12 @@ export const shows = (state) => (state?.shown === "virtual" ? "virtual" : "real"
 
 /** @param {Blob} blob */
 const decoded = (blob) => createImageBitmap(blob, { colorSpaceConversion: "none" });
+
+/** @param {Mesh} mesh @returns {Promise<Surface>} */
+async function decodedSurface({ image, confidence, ...numbers }) {
+  const [colours, seen] = await Promise.all([decoded(image), confidence && decoded(confidence)]);
+  return { ...numbers, image: colours, confidence: seen };
+}
 
 /** @param {string} text base64 */
 const decodedPng = (text) =>

@@ -3,26 +3,34 @@
 
 /** @import { Colour } from "./colour.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
+import { multiply, rotate, transpose } from "./math.js";
 import { link } from "./program.js";
 
 /**
- * A layer as it arrives. The vertices are corners of the panorama's pixels; `size` is height and width of that lattice.
- * @typedef {object} Layer
+ * Triangles with an image. The vertices are corners of the panorama's pixels; `size` is height and width of that lattice.
+ * @typedef {object} Surface
  * @property {ImageBitmap} image colours, equirectangular
  * @property {ImageBitmap | null} confidence grey image: white was seen, black is a guess; null: all of it was seen
  * @property {[number, number]} size
  * @property {Uint16Array} corners column and row of each vertex
  * @property {Float32Array} inverse inverse depth of each vertex, 1/m
  * @property {Uint32Array} triangles
+ */
+/**
+ * A surface round a keyframe.
+ * @typedef {object} Layer
+ * @property {Surface} surface
  * @property {Vec3} gain factors of the colours
+ * @property {Mat3} mapFromCamera rotation of the keyframe
+ * @property {Vec3} position of the keyframe in the map frame, m
  */
 /**
  * @typedef {object} Camera
- * @property {Mat3} panoramaFromLook rotation of the view in the keyframe's frame
- * @property {Vec3} position of the view in the keyframe's frame, m
+ * @property {Mat3} mapFromLook rotation of the view
+ * @property {Vec3} position of the view in the map frame, m
  * @property {[number, number]} tanHalf tangents of half the field of view
  */
-/** @typedef {{vertices: WebGLVertexArrayObject, count: number, image: WebGLTexture, confidence: WebGLTexture, layer: Layer, buffers: WebGLBuffer[]}} Loaded */
+/** @typedef {{vertices: WebGLVertexArrayObject, count: number, image: WebGLTexture, confidence: WebGLTexture, surface: Surface, buffers: WebGLBuffer[]}} Loaded */
 
 const NEAR_M = 0.02;
 const IMAGE = 6, CONFIDENCE = 7; // texture units
@@ -116,19 +124,20 @@ export class LayerRenderer {
     this._beyond = link(gl, FULL, `#version 300 es\n${BEYOND}`);
     this._minification = slow ? gl.LINEAR_MIPMAP_NEAREST : gl.LINEAR_MIPMAP_LINEAR; // the CPU would read two levels
     this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
-    /** @type {Loaded[]} The nearest first. */
+    /** @type {(Loaded & {layer: Layer})[]} Each is shown where the ones before show nothing. */
     this._layers = [];
     this._empty = this._texture(null);
     /** @type {Map<WebGLProgram, Map<string, WebGLUniformLocation | null>>} */
     this._places = new Map();
   }
 
-  /** Replaces the layers, from the first one that differs. @param {Layer[]} layers */
+  /** Replaces the layers; surfaces that are here already stay. @param {Layer[]} layers */
   load(layers) {
-    const same = layers.findIndex((layer, i) => this._layers[i]?.layer !== layer);
-    const keep = same < 0 ? layers.length : same;
-    for (const old of this._layers.splice(keep)) this._forget(old);
-    for (const layer of layers.slice(keep)) this._layers.push(this._upload(layer));
+    /** @type {Map<Surface, Loaded>} */
+    const before = new Map(this._layers.map((loaded) => [loaded.surface, loaded]));
+    this._layers = layers.map((layer) => ({ ...(before.get(layer.surface) ?? this._upload(layer.surface)), layer }));
+    for (const { surface } of layers) before.delete(surface);
+    for (const old of before.values()) this._forget(old);
   }
 
   get ready() {
@@ -149,8 +158,6 @@ export class LayerRenderer {
     const gl = this._gl, program = this._program, at = this._place(program);
     gl.viewport(0, 0, width, height);
     gl.useProgram(program);
-    gl.uniformMatrix3fv(at("lookFromPanorama"), false, camera.panoramaFromLook); // transposed: row-major read by columns
-    gl.uniform3fv(at("position"), camera.position);
     gl.uniform2fv(at("tanHalf"), camera.tanHalf);
     gl.uniform3fv(at("offset"), tint.offset);
     gl.uniform1i(at("image"), IMAGE);
@@ -161,7 +168,11 @@ export class LayerRenderer {
     gl.stencilMask(0xff);
     gl.clear(gl.STENCIL_BUFFER_BIT);
     // Stencil bit k: layer k shows a surface here. A surface seen from behind hides, but shows the layers below.
-    this._layers.forEach(({ vertices, count, image, confidence, layer }, k) => {
+    this._layers.forEach(({ vertices, count, image, confidence, surface, layer }, k) => {
+      const panoramaFromMap = transpose(layer.mapFromCamera), [x, y, z] = camera.position, [px, py, pz] = layer.position;
+      // Transposed: row-major read by columns.
+      gl.uniformMatrix3fv(at("lookFromPanorama"), false, multiply(panoramaFromMap, camera.mapFromLook));
+      gl.uniform3fv(at("position"), rotate(panoramaFromMap, [x - px, y - py, z - pz]));
       gl.clear(gl.DEPTH_BUFFER_BIT);
       gl.stencilMask(1 << k);
       gl.stencilFunc(gl.EQUAL, 1 << k, (1 << k) - 1);
@@ -171,9 +182,9 @@ export class LayerRenderer {
       gl.bindTexture(gl.TEXTURE_2D, confidence);
       gl.activeTexture(gl.TEXTURE0 + IMAGE);
       gl.bindTexture(gl.TEXTURE_2D, image);
-      gl.uniform2fv(at("size"), layer.size);
+      gl.uniform2fv(at("size"), surface.size);
       gl.uniform3fv(at("gain"), times(layer.gain, tint.gain));
-      gl.uniform1i(at("soft"), Number(layer.confidence !== null));
+      gl.uniform1i(at("soft"), Number(surface.confidence !== null));
       gl.bindVertexArray(vertices);
       gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
     });
@@ -192,7 +203,7 @@ export class LayerRenderer {
     gl.stencilOp(gl.KEEP, gl.KEEP, gl.KEEP);
     gl.bindTexture(gl.TEXTURE_2D, last.image);
     gl.uniform1i(at("image"), IMAGE);
-    gl.uniformMatrix3fv(at("panoramaFromLook"), true, camera.panoramaFromLook);
+    gl.uniformMatrix3fv(at("panoramaFromLook"), true, multiply(transpose(last.layer.mapFromCamera), camera.mapFromLook));
     gl.uniform2fv(at("tanHalf"), camera.tanHalf);
     gl.uniform3fv(at("gain"), times(last.layer.gain, tint.gain));
     gl.uniform3fv(at("offset"), tint.offset);
@@ -212,24 +223,24 @@ export class LayerRenderer {
     };
   }
 
-  /** @param {Layer} layer @returns {Loaded} */
-  _upload(layer) {
+  /** @param {Surface} surface @returns {Loaded} */
+  _upload(surface) {
     const gl = this._gl, vertices = gl.createVertexArray(), buffers = [0, 1, 2].map(() => gl.createBuffer());
     gl.bindVertexArray(vertices);
     gl.bindBuffer(gl.ARRAY_BUFFER, buffers[0]);
-    gl.bufferData(gl.ARRAY_BUFFER, layer.corners, gl.STATIC_DRAW);
+    gl.bufferData(gl.ARRAY_BUFFER, surface.corners, gl.STATIC_DRAW);
     const corner = gl.getAttribLocation(this._program, "corner"), inverse = gl.getAttribLocation(this._program, "inverse");
     gl.enableVertexAttribArray(corner);
     gl.vertexAttribPointer(corner, 2, gl.UNSIGNED_SHORT, false, 0, 0);
     gl.bindBuffer(gl.ARRAY_BUFFER, buffers[1]);
-    gl.bufferData(gl.ARRAY_BUFFER, layer.inverse, gl.STATIC_DRAW);
+    gl.bufferData(gl.ARRAY_BUFFER, surface.inverse, gl.STATIC_DRAW);
     gl.enableVertexAttribArray(inverse);
     gl.vertexAttribPointer(inverse, 1, gl.FLOAT, false, 0, 0);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffers[2]);
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, layer.triangles, gl.STATIC_DRAW);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, surface.triangles, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    const confidence = layer.confidence ? this._texture(layer.confidence) : this._empty;
-    return { vertices, count: layer.triangles.length, image: this._texture(layer.image), confidence, layer, buffers };
+    const confidence = surface.confidence ? this._texture(surface.confidence) : this._empty;
+    return { vertices, count: surface.triangles.length, image: this._texture(surface.image), confidence, surface, buffers };
   }
 
   /** @param {Loaded} old */

@@ -178,20 +178,22 @@ const gridHeader = object({ resolution: number, width: number, height: number, x
 const MOST_LAYERS = 8; // bits of the stencil buffer
 const parts = object({ inverse: pair, triangles: pair, corners: pair, image: pair, confidence: pair });
 const layersHeader = object({
-  version: number, keyframe: number, q: quaternion, p: triple, mount: triple,
-  layers: list(object({ id: text, size: pair, gain: triple, parts: optional(parts) })),
+  version: number, mount: triple,
+  layers: list(object({ id: text, size: pair, gain: triple, q: quaternion, p: triple, parts: optional(parts) })),
 });
 
 /**
  * A layer: triangles round the keyframe, whose vertices are corners of the panorama's pixels.
  * @typedef {object} LayerData
- * @property {string} id equal for equal content
- * @property {[number, number]} size height and width of the lattice of corners
+ * @property {string} id of the mesh: equal for equal content
  * @property {[number, number, number]} gain factors of the colours
+ * @property {[number, number, number, number]} q rotation map_from_camera of the keyframe
+ * @property {[number, number, number]} p its position in the map frame, m
  * @property {Mesh | null} mesh null: as in the layers before, by its id
  */
 /**
  * @typedef {object} Mesh
+ * @property {[number, number]} size height and width of the lattice of corners
  * @property {Uint16Array} corners column and row of each vertex
  * @property {Float32Array} inverse inverse depth of each vertex, 1/m
  * @property {Uint32Array} triangles indices of vertices
@@ -241,9 +243,8 @@ export function frameNumber(buffer) {
 function decodeLayers(value, payload) {
   const { layers, ...header } = layersHeader(value, "layers");
   if (layers.length < 1 || layers.length > MOST_LAYERS) return refuse("layers", `1 to ${MOST_LAYERS} layers`, layers.length);
-  return { header, layers: layers.map((layer, i) => ({
-    id: layer.id, size: layer.size, gain: layer.gain,
-    mesh: layer.parts && decodeMesh(layer.parts, layer.size, payload, `layers[${i}]`) })) };
+  return { header, layers: layers.map(({ id, gain, q, p, size, parts: ranges }, i) => ({
+    id, gain, q, p, mesh: ranges && decodeMesh(ranges, size, payload, `layers[${i}]`) })) };
 }
 
 /**
@@ -272,7 +273,7 @@ function decodeMesh(ranges, [height, width], payload, name) {
   if (wrong >= 0) return refuse(`${name}.triangles[${wrong}]`, `below ${count}`, triangles[wrong]);
   const confidence = bytes("confidence", 1);
   return {
-    corners, inverse, triangles, image: new Blob([bytes("image", 1)]),
+    size: [height, width], corners, inverse, triangles, image: new Blob([bytes("image", 1)]),
     confidence: confidence.byteLength ? new Blob([confidence]) : null,
   };
 }

@@ -192,7 +192,7 @@ export class GlViewer {
     if (depth) this._upload(3, this._depth, depth.image);
   }
 
-  /** Replaces the layers that are rendered for a scene with their camera. @param {Layer[]} layers the nearest first */
+  /** Replaces the layers that are rendered for a scene with their camera. @param {Layer[]} layers */
   loadLayers(layers) {
     const first = this._layers === null;
     this._layers ??= new LayerRenderer(this.gl, this.slow);
@@ -201,8 +201,7 @@ export class GlViewer {
     // As for the other programs: not at the first switch.
     const buffer = this._targetForLayers(2, 2);
     this.gl.bindFramebuffer(this.gl.FRAMEBUFFER, buffer);
-    const camera = { panoramaFromLook: identity, position: /** @type {[number, number, number]} */ ([0, 0, 0]) };
-    this._layers.render({ ...camera, tanHalf: [1, 1] }, 2, 2, plain);
+    this._layers.render({ mapFromLook: identity, position: layers[0].position, tanHalf: [1, 1] }, 2, 2, plain);
     this.gl.bindFramebuffer(this.gl.FRAMEBUFFER, null);
   }
 

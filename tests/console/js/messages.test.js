@@ -67,9 +67,9 @@ test("frames that cannot be decoded are refused", () => {
 });
 
 // One triangle on a lattice of 2 x 4 pixels, as in test_console_layers.py.
-const LAYER = { id: "a", size: [2, 4], gain: [1, 0.9, 1.1],
+const LAYER = { id: "a", size: [2, 4], gain: [1, 0.9, 1.1], q: [0, 0, 0, 1], p: [1, 0, 1.2],
   parts: { inverse: [0, 12], triangles: [12, 12], corners: [24, 12], image: [36, 4], confidence: [40, 3] } };
-const LAYERS = { version: 3, keyframe: 7, q: [0, 0, 0, 1], p: [1, 0, 1.2], mount: [0.1, 0, 1.2], layers: [LAYER] };
+const LAYERS = { version: 3, mount: [0.1, 0, 1.2], layers: [LAYER] };
 
 function layersFrame(header = LAYERS, { inverse = [0.5, 0.25, 0], triangles = [0, 1, 2], corners = [0, 0, 4, 0, 2, 2] } = {}) {
   const parts = [new Float32Array(inverse), new Uint32Array(triangles), new Uint16Array(corners)].map((a) => new Uint8Array(a.buffer));
@@ -85,12 +85,13 @@ function layersFrame(header = LAYERS, { inverse = [0.5, 0.25, 0], triangles = [0
 test("layers: numbers and images by their ranges; a layer without parts is one that the page holds", async () => {
   const held = { ...LAYER, id: "b", parts: null };
   const { sequence, header, layers } = decodeFrame(layersFrame({ ...LAYERS, layers: [LAYER, held] }));
-  assert.deepEqual([sequence, header.version, header.p, "layers" in header], [9, 3, [1, 0, 1.2], false]);
-  const [{ size, gain, mesh }, second] = layers;
-  assert.deepEqual([size, gain, [...mesh.inverse], [...mesh.triangles]], [[2, 4], [1, 0.9, 1.1], [0.5, 0.25, 0], [0, 1, 2]]);
+  assert.deepEqual([sequence, header], [9, { version: 3, mount: [0.1, 0, 1.2] }]);
+  const [{ gain, q, p, mesh }, second] = layers;
+  assert.deepEqual([gain, q, p], [[1, 0.9, 1.1], [0, 0, 0, 1], [1, 0, 1.2]]);
+  assert.deepEqual([mesh.size, [...mesh.inverse], [...mesh.triangles]], [[2, 4], [0.5, 0.25, 0], [0, 1, 2]]);
   assert.deepEqual([...mesh.corners], [0, 0, 4, 0, 2, 2]);
   assert.deepEqual([await mesh.image.text(), await mesh.confidence.text()], ["JPEG", "PNG"]);
-  assert.deepEqual(second, { id: "b", size: [2, 4], gain: [1, 0.9, 1.1], mesh: null });
+  assert.deepEqual(second, { id: "b", gain, q, p, mesh: null });
 });
 
 test("layers that cannot be rendered are refused by the name of what is wrong", () => {
@@ -100,7 +101,7 @@ test("layers that cannot be rendered are refused by the name of what is wrong", 
   for (const [buffer, text] of [
     [layersFrame({ ...LAYERS, layers: [] }), /layers must be 1 to 8 layers \(got 0\)/],
     [layersFrame({ ...LAYERS, layers: Array(9).fill(LAYER) }), /layers must be 1 to 8 layers \(got 9\)/],
-    [layersFrame({ ...LAYERS, p: [1, 2] }), /layers\.p must be 3 numbers/],
+    [layersFrame({ ...LAYERS, mount: [1, 2] }), /layers\.mount must be 3 numbers/],
     [layersFrame(ranges({ image: [36, 99] })), /layers\[0\]\.image must be entries of 1 bytes within 43 bytes/],
     [layersFrame(ranges({ inverse: [0, 11] })), /layers\[0\]\.inverse must be entries of 4 bytes/],
     [layersFrame(ranges({ inverse: [-4, 12] })), /layers\[0\]\.inverse must be/],
