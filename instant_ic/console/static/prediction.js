@@ -9,7 +9,7 @@ import { advanced } from "./motion.js";
 const MOST_MS = 250; // longest time that is predicted
 const MOST_DELAY_MS = 100; // longest delay of a command that is predicted
 const STEP_MS = 10;
-const SETTLED_MS = 700; // a robot that has had a command for so long goes at the speed that its state reports
+const SETTLED_MS = 700; // from this age of a command on, the speed of the state counts
 
 export class Prediction {
   constructor() {
