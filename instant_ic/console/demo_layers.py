@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.console import demo_world
-from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource
+from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource, confidence_png
 from instant_ic.console.layers import PageLayers
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -34,10 +34,11 @@ def demo_layers(version: int, map_from_camera: Matrix, width: int = 1024, depth_
     guessed = np.zeros(behind.inverse.shape, np.bool_)
     for quads in (behind.guessed, behind.sky):
         guessed[quads[:, 0], quads[:, 1]] = True
+    guess = Geometry(behind.inverse, guessed, confidence=confidence_png(behind.sure / 255))
     seen = Geometry(prior.inverse_depth, prior.content == ROOM, prior.depth_edge)
     sources = [
         LayerSource(number, bool(number), _jpeg(colours), (1.0, 1.0, 1.0), map_from_camera, lambda g=geometry: g)  # type: ignore[misc]
-        for number, (colours, geometry) in enumerate([(rgb, seen), (behind.rgb, Geometry(behind.inverse, guessed))])
+        for number, (colours, geometry) in enumerate([(rgb, seen), (behind.rgb, guess)])
     ]
     return PageLayers(version, (0.0, 0.0, z), LayerMeshes().layers(sources))
 

@@ -12,7 +12,8 @@ from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import GridLayers
-from instant_ic.console.layers import PageLayers, page_layers
+from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
+from instant_ic.console.layers import MOST_LAYERS, PageLayers
 from instant_ic.console.protocol import FrameKind, ProtocolError
 from instant_ic.console.scene import Newest, Scene
 from instant_ic.console.server import PLAIN_HTTP, ConsoleServer
@@ -101,6 +102,7 @@ class PageFeed:
         self.watched = True
         self.server = server
         server.on_drawn = self.report_shown
+        self._meshes = LayerMeshes()
         self._mount = config.camera_mount.xyz
         self.scene = Scene(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
         self.display = Display(config.lead, self.scene)
@@ -140,7 +142,8 @@ class PageFeed:
     def layers_of(self, message: VspaceLayers) -> PageLayers | str:
         """What pages render of a version of the virtual space, or what is wrong with it. For a worker thread."""
         try:
-            return page_layers(layers_of(message), self._mount)
+            layers = layers_of(message)
+            return PageLayers(layers.version, self._mount, self._meshes.layers(layer_sources(layers))[:MOST_LAYERS])
         except ValueError as error:
             return str(error)
 

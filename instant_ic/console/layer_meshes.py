@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 
@@ -12,12 +13,11 @@ from numpy.typing import NDArray
 from instant_ic.console.layers import PageLayer
 from instant_ic.geometry.poses import Matrix
 from instant_ic.vspace.layer_mesh import layer_mesh
+from instant_ic.vspace.layers import Content, Kind, Layer, Layers, LayersError, decode_layer
 from instant_ic.vspace.prior import edge_quads
 
 BEHIND_EDGE = 0.12
 """Two neighbours of the guess are an edge when their depths differ by more than this share."""
-UNSEEN = bytes(cv2.imencode(".png", np.zeros((1, 2), np.uint8))[1].tobytes())
-"""Confidence of a layer that is a guess everywhere."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,13 @@ class Geometry:
         inverse_depth: in 1/m along the ray, > 0, (h, 2 h).
         shown: where there is a surface, (h, 2 h): by pixel, or for a guess by the quad right of and below it.
         edge: whether that quad crosses a depth edge, (h, 2 h); None: to be found here.
+        confidence: see ``PageLayer``.
     """
 
     inverse_depth: NDArray[np.float32]
     shown: NDArray[np.bool_]
     edge: NDArray[np.bool_] | NDArray[np.uint8] | None = None
+    confidence: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def _layer(source: LayerSource, before: PageLayer | None) -> PageLayer:
     )
     return PageLayer(
         image=source.colour,
-        confidence=UNSEEN if source.behind else b"",
+        confidence=geometry.confidence,
         gain=source.gain,
         map_from_camera=source.map_from_camera,
         size=mesh.size,
@@ -102,3 +104,35 @@ def _layer(source: LayerSource, before: PageLayer | None) -> PageLayer:
         inverse_depth=mesh.inverse_depth,
         triangles=mesh.triangles,
     )
+
+
+def layer_sources(layers: Layers) -> list[LayerSource]:
+    """The layers of a whole version of the virtual space.
+
+    Raises:
+        LayersError: there is none that a camera saw.
+    """
+    if not any(layer.kind is Kind.SEEN for layer in layers.layers):
+        raise LayersError("the layers hold no keyframe")
+    return [_source(layer) for layer in layers.layers]
+
+
+def _source(layer: Layer) -> LayerSource:
+    red, green, blue = (float(value) for value in layer.gain)
+    key = layer.kind, layer.keyframe_id, layer.colour_version, layer.geometry_version
+    return LayerSource(
+        key, layer.kind is Kind.BEHIND, layer.colour, (red, green, blue), layer.map_from_camera,
+        functools.partial(_geometry, layer),
+    )  # fmt: skip
+
+
+def _geometry(layer: Layer) -> Geometry:
+    decoded = decode_layer(layer)
+    if layer.kind is Kind.SEEN:
+        return Geometry(decoded.inverse_depth, decoded.content == Content.SURFACE, decoded.edge)
+    return Geometry(decoded.inverse_depth, decoded.content > Content.NOTHING, None, confidence_png(decoded.confidence))
+
+
+def confidence_png(confidence: NDArray[np.floating]) -> bytes:
+    """Encode shares (h, w) from 0 to 1 as a grey image."""
+    return bytes(cv2.imencode(".png", np.rint(255 * confidence).astype(np.uint8))[1].tobytes())

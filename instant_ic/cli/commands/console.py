@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
 def export_scene(args: argparse.Namespace) -> int:
     """Run ``ic console export-scene``; return the exit status."""
     from instant_ic.console.export_scene import scene_html
-    from instant_ic.console.layers import page_layers
+    from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
     from instant_ic.msg import MessageError, deserialize
     from instant_ic.vspace_messages import layers_of
 
@@ -51,16 +51,18 @@ def export_scene(args: argparse.Namespace) -> int:
     received = newest_of_bag(args.bag) if args.bag else newest_of_stack(args.timeout)
     try:
         message = deserialize(received.payload, received.type_name)
-        layers = page_layers(layers_of(message), (0.0, 0.0, 0.0))
+        version = layers_of(message)
+        layers = LayerMeshes().layers(layer_sources(version))
     except (ValueError, MessageError) as error:
         raise UserError(f"{LAYERS}: {error}") from error
+    newest = version.layers[0].keyframe_id
     made = time.strftime("%Y-%m-%d %H:%M", time.localtime(message.header.stamp.sec))
     try:
-        args.output.write_text(scene_html(f"Keyframe {layers.keyframe}, {made}", layers.layers), encoding="utf-8")
+        args.output.write_text(scene_html(f"Keyframe {newest}, {made}", layers), encoding="utf-8")
     except OSError as error:
         raise UserError(f"{args.output} cannot be written: {error.strerror}") from error
-    triangles = sum(len(layer.triangles) for layer in layers.layers)
-    print(f"wrote {args.output}: keyframe {layers.keyframe}, {triangles} triangles")
+    triangles = sum(len(layer.triangles) for layer in layers)
+    print(f"wrote {args.output}: keyframe {newest}, {triangles} triangles")
     return 0
 
 

@@ -7,7 +7,7 @@ import { plain } from "./colour.js";
 import { elementOf, byId } from "./dom.js";
 import { LayerRenderer } from "./layers.js";
 import { Look } from "./look.js";
-import { clamp, lookRotation, rotate } from "./math.js";
+import { clamp, fromQuaternion, lookRotation, multiply, rotate } from "./math.js";
 
 const SPEED_M_S = 0.8;
 /** @type {Record<string, [number, number]>} Forward, left. */
@@ -30,21 +30,26 @@ async function run() {
   byId("title").textContent = scene.title;
   /** @type {Layer[]} */
   const layers = await Promise.all(scene.layers.map(async (/** @type {Record<string, any>} */ layer) => ({
-    image: await decoded(layer.image),
-    confidence: layer.confidence ? await decoded(layer.confidence) : null,
-    size: layer.size,
+    surface: {
+      image: await decoded(layer.image),
+      confidence: layer.confidence ? await decoded(layer.confidence) : null,
+      size: layer.size,
+      corners: new Uint16Array(bytes(layer.corners).buffer),
+      inverse: new Float32Array(bytes(layer.inverse).buffer),
+      triangles: new Uint32Array(bytes(layer.triangles).buffer),
+    },
     gain: layer.gain,
-    corners: new Uint16Array(bytes(layer.corners).buffer),
-    inverse: new Float32Array(bytes(layer.inverse).buffer),
-    triangles: new Uint32Array(bytes(layer.triangles).buffer),
+    mapFromCamera: fromQuaternion(layer.q),
+    position: layer.p,
   })));
+  const [{ mapFromCamera, position: start }] = layers;
   const renderer = new LayerRenderer(gl, false);
   renderer.load(layers);
   const look = new Look(canvas);
   /** @type {Set<string>} */
   const held = new Set();
-  /** @type {Vec3} Position in the keyframe's frame. */
-  let place = [0, 0, 0];
+  /** @type {Vec3} In the map frame. */
+  let place = start;
   let before = performance.now();
   /** @param {number} now */
   const frame = (now) => {
@@ -54,8 +59,9 @@ async function run() {
     look.step(seconds);
     const [forward, left] = [...held].map((key) => KEYS[key]).reduce((a, b) => [a[0] + b[0], a[1] + b[1]], [0, 0]);
     const way = SPEED_M_S * seconds;
-    const [x, y] = rotate(lookRotation(look.yaw, 0), [way * clamp(forward, -1, 1), way * clamp(left, -1, 1), 0]);
-    place = [place[0] + x, place[1] + y, 0];
+    const ahead = multiply(mapFromCamera, lookRotation(look.yaw, 0));
+    const [x, y] = rotate(ahead, [way * clamp(forward, -1, 1), way * clamp(left, -1, 1), 0]);
+    place = [place[0] + x, place[1] + y, place[2]];
     const width = Math.round(canvas.clientWidth * devicePixelRatio);
     const height = Math.round(canvas.clientHeight * devicePixelRatio);
     const key = [...place, look.yaw, look.pitch, look.vfov, width, height].join();
@@ -63,13 +69,13 @@ async function run() {
     canvas.dataset.drawn = key;
     canvas.width = width;
     canvas.height = height;
-    const tan = Math.tan(look.vfov / 2), panoramaFromLook = lookRotation(look.yaw, look.pitch);
-    renderer.render({ panoramaFromLook, position: place, tanHalf: [tan * width / Math.max(height, 1), tan] }, width, height, plain);
+    const tan = Math.tan(look.vfov / 2), mapFromLook = multiply(mapFromCamera, lookRotation(look.yaw, look.pitch));
+    renderer.render({ mapFromLook, position: place, tanHalf: [tan * width / Math.max(height, 1), tan] }, width, height, plain);
   };
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.code === "Home") {
-      place = [0, 0, 0];
+      place = start;
       look.centre();
     } else if (Object.hasOwn(KEYS, event.code)) held.add(event.code);
     else return;
