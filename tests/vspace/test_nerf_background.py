@@ -11,7 +11,7 @@ from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace import KeyframeError, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.background import Background, level_planes
 from instant_ic.vspace.background_kernels import in_front
-from instant_ic.vspace.canvas import CpuCanvas, Picture
+from instant_ic.vspace.canvas import continued, Picture
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
 from instant_ic.vspace.view import perspective_rays
@@ -189,7 +189,7 @@ def test_guesses_are_mixed_in_by_hand():
     colour[[0, 5, 6, 11]], colour[1:5], colour[7:11] = 0.2, 1.0, 1.0
     seen = np.tile(np.array([1, 0, 0, 0, 0, 1], np.float32), 2)
     share = np.tile(np.array([0, 1, 0.5, 0.25, 0, 0], np.float32), 2)
-    image = CpuCanvas().continued(Picture(colour, depth, seen, share), (2, 6), False)
+    image = continued(Picture(colour, depth, seen, share), (2, 6), False)
     # From around it is 0.2 everywhere: 0.2 + share · 0.8.
     assert image[0, :, 0] == pytest.approx([0.2, 1.0, 0.6, 0.4, 0.2, 0.2])
 
