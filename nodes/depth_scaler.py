@@ -16,6 +16,7 @@ from instant_ic.depth.metric_depth import MetricDepth
 from instant_ic.depth.node_config import DepthScalerConfig
 from instant_ic.depth.sources import DepthResult, DepthSource
 from instant_ic.geometry.transforms import TransformError
+from instant_ic.mapping.local_model import warm_up
 from instant_ic.mapping.mapper import CloudError, LocalMapper
 from instant_ic.msg import (
     CompressedImage,
@@ -48,6 +49,8 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     live_parameters = tuple(one.name for one in fields(DepthScalerConfig))
 
     def setup(self) -> None:
+        if self.config.source != "network":
+            warm_up()
         self.source = DepthSource(self.config.depth_source)
         self.selector = KeyframeSelector(self.config.keyframes)
         self.inputs, self.trigger, self.requests = RecentInputs(), RevolutionTrigger(), DepthRequests()

@@ -11,7 +11,7 @@ _PERCENT = {  # of one core, while driving in the virtual space; standing needs 
     "navigator": 6.0,
     "grid_slam": 5.0,
     "crawler_base": 4.0,
-    "depth_scaler": 4.0,
+    "depth_scaler": 10.0,
     "depth_estimator": 2.0,
     "operator_recorder": 2.0,
     "virtual_robot": 2.0,

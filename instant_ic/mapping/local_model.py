@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.projections import equirect_directions
+from instant_ic.jit import leave_out_blas
 from instant_ic.mapping import kernels
 
 Floats = NDArray[np.floating]
@@ -215,6 +216,7 @@ def _rays(height: int, width: int) -> NDArray[np.float32]:
 
 def warm_up() -> None:
     """Compile the kernels, or load them from numba's cache."""
+    leave_out_blas()
     model = LocalModel()
     # A box ahead with a wall behind it.
     y, z = (each.ravel() for each in np.meshgrid(np.arange(-0.5, 0.5, 0.02), np.arange(0.0, 0.8, 0.02)))

@@ -132,7 +132,7 @@ def test_what_the_first_drive_needs_is_compiled_ahead_in_one_variant() -> None:
     assert len(fill_kernels.pull_push.signatures) == 1
 
 
-@pytest.mark.parametrize("node", ["virtual_robot", "crawler_base", "theta_camera", "depth_scaler", "console"])
+@pytest.mark.parametrize("node", ["virtual_robot", "crawler_base", "theta_camera", "console"])
 def test_nodes_without_kernels_do_not_load_numba(node: str) -> None:
     code = f"import sys\nfrom instant_ic.bus.node_files import node_class\nnode_class({node!r})"
     code += "\nprint('numba' in sys.modules)"

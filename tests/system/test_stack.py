@@ -89,7 +89,7 @@ RECORDED_LOOPS = {
     "console": 7.1,
     "crawler_base": 2.6,
     "depth_estimator": 1.9,
-    "depth_scaler": 3.9,
+    "depth_scaler": 8.9,  # 3.9 measured before, and 5.0 of the local model (benchmarks/local_model.py)
     "grid_slam": 2.7,
     "launcher": 0.9,
     "navigator": 1.9,
