@@ -30,7 +30,8 @@ def warm_up(config: VirtualSpaceConfig) -> None:
     space = VirtualSpace(small)
     rgb = np.zeros((32, 64, 3), np.uint8)
     rgb[::2] = 255
-    depth = np.full((32, 64), 4.0, np.float32)
+    below = np.sin((np.arange(32) - 15.5) * (math.pi / 32))[:, None]
+    depth = np.repeat(np.minimum(4.0, 1.2 / np.maximum(below, 0.1)), 64, 1).astype(np.float32)  # walls and a floor
     depth[12:20, 28:36] = 2.0  # something behind which nobody has seen
     aside = np.eye(4)
     aside[1, 3] = 1.0
