@@ -11,7 +11,7 @@ from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace import KeyframeError, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.background import Background, level_planes
 from instant_ic.vspace.background_kernels import in_front
-from instant_ic.vspace.canvas import continued, Picture
+from instant_ic.vspace.canvas import Picture, continued
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
 from instant_ic.vspace.view import perspective_rays
