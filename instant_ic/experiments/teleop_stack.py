@@ -171,6 +171,15 @@ class SilentPage:
     def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
         pass
 
+    def send_layers(self, layers: Any) -> None:
+        pass
+
+    def drawn_ms(self) -> float | None:
+        return None  # it shows rendered views
+
+    def needs_views(self) -> bool:
+        return True
+
     def show(self, *kinds: Any) -> None:
         pass
 
