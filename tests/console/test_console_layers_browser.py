@@ -148,3 +148,35 @@ def test_a_key_moves_the_view_before_a_new_state_arrives(open_page, room):
     assert places[17] == pytest.approx(1.1 + 0.4 * 0.15**2, abs=0.002)
     # A state that is too old carries on no longer: no more than 250 ms after it.
     assert places[-1] == pytest.approx(1.1 + 0.4 * 0.23**2, abs=0.002)
+
+
+# The robots are 7 cm apart at the switch back, as the camera's image is older than the pose, and drive at 0.3 m/s.
+BACK = """async () => {
+    const {Images} = await import("/static/images.js");
+    let now = 0;
+    const images = new Images({name: "none", sample() {}}, {serverNow: () => now, roundTripMs: 10, connected: true,
+        acknowledge() {}});
+    images.layers = {version: 1, mount: [0.1, 0, 1.2]};
+    images.colourReleaseMs = 0;
+    images.panorama = {q: [0, 0, 0, 1], captured_ms: 0};
+    const places = [];
+    for (; now < 2000; now += 10) {
+        const back = now >= 1500, robot = [0.0003 * now + 0.07, 0, 0], vbot = [0.0003 * now, 0, 0];
+        const [mode, shown] = back ? ["real", "real"] : ["returning", "virtual"];
+        images.panorama.captured_ms = now;
+        const state = {at_ms: now, mode, shown, robot, vbot, twist: [0.3, 0], lead: 0};
+        const {camera, blend} = images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
+        places.push([camera.position[0], blend]);
+    }
+    return places;
+}"""
+
+
+def test_on_the_way_back_the_view_goes_on_from_where_the_vbot_was(open_page, room):
+    places = np.array(open_layers(open_page, room).evaluate(BACK))
+    steps = np.diff(places[100:, 0])
+    assert steps == pytest.approx(0.003, abs=0.0035)  # 10 ms at 0.3 m/s; one frame may stand still
+    assert places[170, 0] == pytest.approx(0.1 + 0.0003 * 1700, abs=0.01)  # standing still it would be 0.55, with the robot 0.68
+    assert places[140, 1] == 1
+    assert 0 < places[160, 1] < 1
+    assert places[190, 1] == 0

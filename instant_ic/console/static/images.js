@@ -70,6 +70,8 @@ export class Images {
     this.place = null;
     /** @type {[number, number] | null} Position of the v-bot's camera. */
     this._now = null;
+    /** @type {[number, number] | null} Position of the real robot's camera in the last scene, if it was shown. */
+    this._followed = null;
     this._lead = 0; // 0: rendered position, 1: present position of the v-bot
     this._virtual = false;
     // Time since which images of each kind are made at the shown robot; server's clock.
@@ -265,15 +267,17 @@ export class Images {
   }
 
   /**
-   * The v-bot's camera; null: its pose is unknown. While the real robot is shown, it stays where
-   * the v-bot was last.
+   * The v-bot's camera; null: its pose is unknown. Once the real robot is shown again, it goes on from where it was with
+   * that robot, so that both images of the dissolve move alike.
    * @param {LayersHeader} layers @param {Mat3} mapFromLook @param {[number, number]} tanHalf @returns {Camera | null}
    */
   _camera({ mount }, mapFromLook, tanHalf) {
-    const own = this.motion.own;
-    if (own && (this._virtual || !this._now)) {
-      const [x, y] = rotate(rotationZ(own[2]), mount);
-      this._now = [own[0] + x, own[1] + y];
+    const { own } = this.motion, before = this._followed;
+    if (own) {
+      const [dx, dy] = rotate(rotationZ(own[2]), mount), x = own[0] + dx, y = own[1] + dy;
+      if (this._virtual || !this._now) this._now = [x, y];
+      else if (before) this._now = [this._now[0] + x - before[0], this._now[1] + y - before[1]];
+      this._followed = this._virtual ? null : [x, y];
     }
     if (!this._now) return null;
     this.place = this._now;
