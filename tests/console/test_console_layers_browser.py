@@ -176,7 +176,7 @@ def test_on_the_way_back_the_view_goes_on_from_where_the_vbot_was(open_page, roo
     places = np.array(open_layers(open_page, room).evaluate(BACK))
     steps = np.diff(places[100:, 0])
     assert steps == pytest.approx(0.003, abs=0.0035)  # 10 ms at 0.3 m/s; one frame may stand still
-    assert places[170, 0] == pytest.approx(0.1 + 0.0003 * 1700, abs=0.01)  # standing still it would be 0.55, with the robot 0.68
+    assert places[170, 0] == pytest.approx(0.1 + 0.0003 * 1700, abs=0.01)  # if it stood still 0.55
     assert places[140, 1] == 1
     assert 0 < places[160, 1] < 1
     assert places[190, 1] == 0
