@@ -232,7 +232,10 @@ class PageFeed:
             self._outputs.report_shown(self.display.report(self._clock.now_ns(), self._clock.steady_ns()))
 
     def _request_view(self) -> None:
-        if not (self.watched and self.server.needs_views()):
+        if not self.watched:
+            return
+        # In REAL too: the arbiter switches by the expected PSNR, which VspaceStatus has of the newest view.
+        if self.display.with_vbot and not self.server.needs_views():
             return
         status = self._inputs.vspace.message
         renders = status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)

@@ -417,6 +417,19 @@ def test_a_page_that_renders_by_itself_needs_no_views_and_the_arbiter_hears_how_
     assert (shown.view_id, shown.view_age_s < 0.1) == (1, True)
 
 
+def test_in_real_views_tell_the_expected_psnr_although_the_page_renders_by_itself(setup):
+    bus, _, server = setup
+    publish_tree(bus)
+    for _ in range(60):
+        server.drawn = server.now_ms()
+        bus.publish("/vspace/status", vspace_status(VspaceStatus.READY), latched=True)
+        bus.publish("/ic/state", control(bus, ControlState.REAL), latched=True)
+        bus.advance(0.05)
+        if bus.messages("/view/request"):
+            bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
+    assert len(bus.messages("/view/request")) in (3, 4)  # one a second
+
+
 def test_layers_that_no_page_could_render_are_a_fault_of_the_console(setup):
     _, node, server = setup
     mesh = np.zeros((3, 2), np.uint16), np.ones(3, np.float32), np.array([[0, 1, 2]], np.uint32)
