@@ -12,7 +12,7 @@ from instant_ic.depth.inputs import RecentInputs
 from instant_ic.depth.sources import DepthResult, DepthSource, without_body
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.mapping.mapper import LocalMapper, LocalView
+from instant_ic.mapping.mapper import LocalMapper, LocalView, correction
 
 
 @dataclass(frozen=True)
@@ -112,10 +112,11 @@ class MetricDepth:
         return points_at(revolution.xyz(), revolution.time_s, revolution.stamp_ns, camera_from_lidar)
 
     def map_from_camera(self, camera: str, stamp_ns: int) -> Matrix:
-        """Odometry at the image's time with the newest correction: the map as known at present.
+        """Odometry and its correction at the image's time: tracks slip in a turn, so one second later the correction is
+        another by degrees.
 
         Raises:
             TransformError: the poses are not known.
         """
-        map_from_odom = self.transforms.lookup(self.config.frames.map, self.config.frames.odom)
+        map_from_odom = correction(self.transforms, self.config.frames.map, self.config.frames.odom, stamp_ns)
         return map_from_odom @ self.transforms.lookup(self.config.frames.odom, camera, stamp_ns)

@@ -16,6 +16,8 @@ from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.mapping.local_model import LocalDepth, LocalModel, LocalModelConfig
 
 _JUMP_M, _JUMP_RAD = 0.2, math.radians(2.0)
+_DRIFT = 0.3
+"""Share of the motion since the last look by which odometry may drift; a larger change of the correction is a jump."""
 _BACK_NS = 1_000_000_000
 _MOST_POINTS = 200_000
 _ENOUGH_POINTS = 16_000
@@ -118,7 +120,7 @@ class LocalMapper:
             waited_s = (stamp_ns - self._taken_ns) / 1e9
             if moved_m < self.config.every_m and 0 <= waited_s < self.config.every_s:
                 return False
-        model_from_odom = self._model_from_odom(odom_from_lidar[:3, 3])
+        model_from_map = self._model_from_map_at(middle_ns, odom_from_lidar)
         points = xyz()
         if len(points) != len(time_s):
             raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is left out")
@@ -127,7 +129,7 @@ class LocalMapper:
         first = self.model.revolutions % step
         lidar = points_at(
             points[first::step], time_s[first::step], stamp_ns,
-            lambda at_ns: model_from_odom @ self.transforms.lookup(self.odom_frame, frame, at_ns),
+            lambda at_ns: model_from_map @ self._map_from(frame, at_ns),
         )  # fmt: skip
         if len(lidar) == 0:
             raise CloudError("a revolution without a finite point is left out")
@@ -137,24 +139,33 @@ class LocalMapper:
             advance_m = max(moved_m, min(since_s, self.config.every_s) * model.keep_m / model.keep_s)
         # At rest revolutions are few, and what has gone shall not stay for long.
         stride = 1 if moved_m < self.config.every_m else 0
-        self.model.add(lidar, (model_from_odom @ odom_from_lidar)[:3, 3], advance_m, stride)
+        self.model.add(lidar, (model_from_map @ self._map_from(frame, middle_ns))[:3, 3], advance_m, stride)
         self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar
         return True
 
-    def _model_from_odom(self, odom_place: NDArray[np.float64]) -> Matrix:
-        """Pose of odometry in the model, with the newest correction."""
+    def _map_from(self, frame: str, stamp_ns: int) -> Matrix:
+        """Pose of a sensor in the map at a time; by odometry alone where there is no map."""
+        return self._correction(stamp_ns) @ self.transforms.lookup(self.odom_frame, frame, stamp_ns)
+
+    def _correction(self, stamp_ns: int) -> Matrix:
         try:
-            map_from_odom = self.transforms.lookup(self.map_frame, self.odom_frame)
+            return correction(self.transforms, self.map_frame, self.odom_frame, stamp_ns)
         except TransformError:
-            map_from_odom = np.eye(4) if self._map_from_odom is None else self._map_from_odom
-        before = map_from_odom if self._map_from_odom is None else self._map_from_odom
-        place = np.append(odom_place, 1.0)
-        if float(np.linalg.norm(((map_from_odom - before) @ place)[:3])) > _JUMP_M or (
-            _angle(before, map_from_odom) > _JUMP_RAD
-        ):
-            self._model_from_map = self._model_from_map @ before @ inverse(map_from_odom)
+            return np.eye(4) if self._map_from_odom is None else self._map_from_odom
+
+    def _model_from_map_at(self, stamp_ns: int, odom_from_sensor: Matrix) -> Matrix:
+        """Pose of the map in the model; a jump of the map since the last call moves the model with the robot."""
+        map_from_odom = self._correction(stamp_ns)
+        if self._map_from_odom is not None and self._taken_at is not None:
+            before = self._map_from_odom
+            moved_m = float(np.linalg.norm(odom_from_sensor[:3, 3] - self._taken_at[:3, 3]))
+            shift = (map_from_odom - before) @ np.append(odom_from_sensor[:3, 3], 1.0)
+            if float(np.linalg.norm(shift[:3])) > _JUMP_M + _DRIFT * moved_m or (
+                _angle(before, map_from_odom) > _JUMP_RAD + _DRIFT * _angle(self._taken_at, odom_from_sensor)
+            ):
+                self._model_from_map = self._model_from_map @ before @ inverse(map_from_odom)
         self._map_from_odom = map_from_odom
-        return self._model_from_map @ map_from_odom
+        return self._model_from_map
 
     def model_from_camera(self, camera: str, stamp_ns: int) -> Matrix:
         """Pose of a camera in the model.
@@ -163,7 +174,7 @@ class LocalMapper:
             TransformError: the pose is not known.
         """
         odom_from_camera = self.transforms.lookup(self.odom_frame, camera, stamp_ns)
-        return self._model_from_odom(odom_from_camera[:3, 3]) @ odom_from_camera
+        return self._model_from_map_at(stamp_ns, odom_from_camera) @ self._map_from(camera, stamp_ns)
 
     def cloud(self) -> NDArray[np.float32]:
         """(N, 3) points of the model in the map frame; (0, 3) before the first revolution."""
@@ -191,6 +202,18 @@ class LocalView:
         """Depth image; ``ceiling_m`` over the camera is assumed where no ceiling was seen."""
         over_floor = None if ceiling_m is None else ceiling_m + float(self.model_from_camera[2, 3])
         return self.model.render(self.model_from_camera, size, over_floor)
+
+
+def correction(transforms: TransformBuffer, map_frame: str, odom_frame: str, stamp_ns: int) -> Matrix:
+    """Pose of odometry in the map at a time, or the newest where that time is not covered.
+
+    Raises:
+        TransformError: there is none.
+    """
+    try:
+        return transforms.lookup(map_frame, odom_frame, stamp_ns)
+    except TransformError:
+        return transforms.lookup(map_frame, odom_frame)
 
 
 def _angle(first: Matrix, second: Matrix) -> float:

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from instant_ic.depth.inputs import RecentInputs
 from instant_ic.depth.lidar_depth import LidarDepthConfig
+from instant_ic.depth.metric_depth import Frames, MetricDepth, MetricDepthConfig
 from instant_ic.depth.sources import DepthSource, SourceConfig
 from instant_ic.geometry.poses import Matrix, pose_matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -190,6 +192,32 @@ def test_a_small_correction_is_followed_and_a_jump_is_not_seen() -> None:
     robot = np.array([6.0, -3.0]) + 1.5 * ahead
     along = (mapper.cloud()[:, :2] - robot) @ ahead
     assert np.quantile(along, 0.999) == pytest.approx(7.5, abs=0.15)
+
+
+def test_odometry_that_slips_in_a_turn_does_not_turn_the_model() -> None:
+    transforms = TransformBuffer()
+    transforms.set("base_link", "velodyne", 0, pose_matrix(0, 0, 0.6), static=True)
+    transforms.set("base_link", "camera", 0, pose_matrix(0, 0, 1.2), static=True)
+    mapper = LocalMapper(transforms)
+    points, origin = measured(0.0, (), 0)
+    for k in range(31):  # 0.8 rad/s, of which odometry sees nine tenths; SLAM knows better ten times a second
+        true, seen = 0.08 * k, 0.072 * k
+        transforms.set("odom", "base_link", k * S // 10, pose_matrix(yaw=seen))
+        transforms.set("map", "odom", k * S // 10, pose_matrix(yaw=true - seen))
+        turned = (points - origin) @ pose_matrix(yaw=true)[:3, :3]
+        mapper.revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=turned: p)
+    pose = mapper.model_from_camera("camera", 2 * S)  # an image one second old
+    np.testing.assert_allclose(pose, pose_matrix(0, 0, 1.2, yaw=1.6), atol=1e-9)
+    depth = MetricDepth(
+        DepthSource(),
+        transforms,
+        RecentInputs(),
+        MetricDepthConfig(Frames("map", "odom", "base_link"), 64, -70.0, 0.3),
+        mapper,
+    )
+    np.testing.assert_allclose(depth.map_from_camera("camera", 2 * S), pose, atol=1e-9)
+    with pytest.raises(TransformError):
+        depth.map_from_camera("nowhere", 2 * S)
 
 
 def test_bad_revolutions_are_refused_with_the_reason() -> None:
