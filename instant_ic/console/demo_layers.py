@@ -35,7 +35,7 @@ def demo_layers(version: int, map_from_camera: Matrix, width: int = 1024, depth_
     for quads in (behind.guessed, behind.sky):
         guessed[quads[:, 0], quads[:, 1]] = True
     guess = Geometry(behind.inverse, guessed, confidence=confidence_png(behind.sure / 255))
-    seen = Geometry(prior.inverse_depth, prior.content == ROOM, prior.depth_edge)
+    seen = Geometry(prior.inverse_depth, prior.content == ROOM)
     sources = [
         LayerSource(number, bool(number), _jpeg(colours), (1.0, 1.0, 1.0), map_from_camera, lambda g=geometry: g)  # type: ignore[misc]
         for number, (colours, geometry) in enumerate([(rgb, seen), (behind.rgb, guess)])

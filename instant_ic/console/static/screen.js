@@ -23,7 +23,7 @@ const LOOK_MS = 100; // shortest interval between two look messages
 const MAX_FOV = radians(149);
 const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
-const SLOW_PIXELS = 0.5, SLOW_VIEW_PIXELS = 0.36; // share of the window's pixels per axis; a rendered view has fewer
+const SLOW_PIXELS = 0.5, SLOW_VIEW_PIXELS = 0.36, SLOW_LAYER_PIXELS = 0.42; // share of the window's pixels per axis
 const SLOW_MAP_MS = 200;
 const REPORT_MS = 500; // longest interval between two reports of the shown state while the camera is shown
 const IDLE_MS = 200; // longest interval between two frames while messages arrive
@@ -184,7 +184,7 @@ export class Screen {
    */
   _renderView(scene) {
     const { viewer, images, look } = this;
-    const resized = fit(viewer.canvas, viewer.slow ? (scene.blend === 1 && !scene.camera ? SLOW_VIEW_PIXELS : SLOW_PIXELS) : 1);
+    const resized = fit(viewer.canvas, viewer.slow ? slowPixels(scene) : 1);
     const viewpoint = scene.camera?.position ?? scene.moved;
     const key = rounded([scene.blend], 4) + (scene.blend > 0 ? rounded(viewpoint, 3) : "");
     const direction = [...scene.mapFromLook, look.vfov];
@@ -247,6 +247,12 @@ export class Screen {
     const [x, y, yaw] = motion.pose;
     return [x + Math.cos(yaw) * cx - Math.sin(yaw) * cy, y + Math.sin(yaw) * cx + Math.cos(yaw) * cy, cz];
   }
+}
+
+/** Share of the window's pixels per axis when the CPU renders: few for a scene that costs much, or has few itself. @param {Scene} scene */
+function slowPixels({ blend, camera }) {
+  if (blend < 1) return SLOW_PIXELS;
+  return camera ? SLOW_LAYER_PIXELS : SLOW_VIEW_PIXELS;
 }
 
 /** @param {readonly number[] | null | undefined} values @param {number} digits */

@@ -115,7 +115,8 @@ void main() {
 export const SAMPLE = /** @type {const} */ ([40, 24]), SAMPLE_FINE = 4;
 /** Largest motion over depth; nearer surfaces are moved by no more than this. */
 export const MOST_PARALLAX = 0.5;
-const MOST_REST_MS = 100; // longest pause between two frames that the CPU renders
+// Pause between two frames that the CPU renders, as a share of the time that it takes for one, and the longest.
+const REST = 0.3, MOST_REST_MS = 100;
 
 /** @typedef {{image: ImageBitmap, near_m: number}} Depth Grey; value v is the depth near_m * 255 / v along the axis. */
 /** @typedef {{1: number[], 2: number[], weights: number[]}} Samples Colours by kind of image. */
@@ -162,7 +163,7 @@ export class GlViewer {
     /** @type {WebGLFramebuffer | null} */
     this._samples = null;
     this._renderedAt = 0;
-    /** The next frame pauses for as long as the CPU took for this one, so that messages and new views are not delayed. */
+    /** The next frame pauses, so that messages and new views are not delayed. */
     this.restUntil = 0;
     // A program is translated at its first use; that must not delay the first frame after a switch.
     gl.viewport(0, 0, 1, 1);
@@ -226,7 +227,7 @@ export class GlViewer {
     gl.deleteSync(this._fence);
     this._fence = null;
     const now = performance.now();
-    this.restUntil = now + Math.min(now - this._renderedAt, MOST_REST_MS);
+    this.restUntil = now + Math.min(REST * (now - this._renderedAt), MOST_REST_MS);
     return false;
   }
 
