@@ -103,6 +103,10 @@ class BagReader:
             raise BagError(
                 f"bag {path} cannot be read: {type(error).__name__}: {error}; if it was cut: ic bag recover {path}"
             ) from None
+        for connection in self._reader.connections:
+            if not (isinstance(connection.topic, str) and isinstance(connection.msgtype, str)):
+                self._reader.close()
+                raise BagError(f"bag {path} is damaged: topic {connection.topic!r} has the type {connection.msgtype!r}")
         self._repeated: dict[str, Counter[str]] = {}
         self._repeated_ns: dict[str, int] = {}
         try:

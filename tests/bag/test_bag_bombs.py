@@ -160,6 +160,23 @@ def test_computed_column_of_an_sqlite_bag_is_limited(tmp_path: Path, small_limit
         list(bag.messages())
 
 
+def test_sqlite_topic_without_a_type_is_an_error_with_the_bag(tmp_path: Path) -> None:
+    import sqlite3
+
+    path = ros2_bag(CompressionMode.NONE, StoragePlugin.SQLITE3)(tmp_path)
+    with sqlite3.connect(next(path.glob("*.db3"))) as database:
+        columns = [row[1] for row in database.execute("PRAGMA table_info(topics)")]
+        row = database.execute("SELECT * FROM topics").fetchone()
+        database.execute("DROP TABLE topics")
+        database.execute(f"CREATE TABLE topics({', '.join(columns)})")  # as it was, but NULL is possible
+        values = [None if column == "type" else value for column, value in zip(columns, row, strict=True)]
+        database.execute(f"INSERT INTO topics VALUES ({', '.join('?' * len(columns))})", values)
+    database.close()
+    file = next(path.glob("*.db3"))
+    with pytest.raises(BagError, match=r"is damaged: topic '.*' has the type None"):
+        BagReader(file)
+
+
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "bz2"])
 def test_whole_frames_come_whole_and_cut_ones_as_far_as_they_go(compression: str) -> None:
     import bz2
