@@ -14,8 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.vspace.layer_kernels import corner_values, count_triangles, lattice_errors, write_triangles
-
 TOLERANCE = 0.004
 """Largest error of the inverse depth, in 1/m: it moves a view from 0.5 m aside, 640 pixels wide, by 0.6 pixels."""
 
@@ -52,9 +50,13 @@ def layer_mesh(
         shown: (h, w) false where the layer has no surface.
         tolerance: largest error of the inverse depth, in 1/m.
 
+    Needs numba.
+
     Raises:
         ValueError: shapes that do not fit, or values that are not finite and positive.
     """
+    from instant_ic.vspace.layer_kernels import corner_values, count_triangles, lattice_errors, write_triangles
+
     height, width = inverse_depth.shape
     if width != 2 * height or height < 2 or depth_edge.shape != shown.shape or shown.shape != (height, width):
         raise ValueError(

@@ -9,7 +9,7 @@ import pytest
 
 from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ProtocolError, ServerConfig
 from instant_ic.console import server as server_module
-from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource
+from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource, confidence_png
 from instant_ic.console.layers import PageLayer, PageLayers
 from instant_ic.geometry.poses import pose_matrix
 
@@ -211,7 +211,8 @@ def source(key, behind, gain=(1.0, 1.0, 1.0), calls=None):
     def made():
         if calls is not None:
             calls.append(key)
-        return Geometry(np.full((8, 16), 0.5, np.float32), shown if behind else ~shown)
+        confidence = confidence_png(np.zeros((1, 2))) if behind else b""
+        return Geometry(np.full((8, 16), 0.5, np.float32), shown if behind else ~shown, confidence)
 
     return LayerSource(key, behind, b"JPEG", gain, pose_matrix(), made)
 
