@@ -8,7 +8,7 @@ from typing import Any
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node, NodeError, main
 from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
-from instant_ic.bus.node import Timer
+from instant_ic.bus.node import Subscription, Timer
 from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.access import AccessError, offer_sign_in
 from instant_ic.console.config import ConsoleConfig
@@ -69,14 +69,17 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.feed = feed = PageFeed(config, self.server, self.tf, inputs, self, self.clock, self.diagnose)
         self.subscribe("/camera/image/compressed", CompressedImage, feed.take_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", RenderedView, feed.take_view, qos=SENSOR)
-        mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms a keyframe, which commands must not wait for
-        self.subscribe("/vspace/layers", VspaceLayers, mesher.submit, qos=LATCHED)
+        self.mesher = self.background(
+            feed.layers_of, feed.take_layers
+        )  # 30 ms a keyframe: commands must not wait for it
+        self.layers: Subscription | None = None
         self.subscribe("/map", OccupancyGrid, partial(feed.grids.take, FrameKind.MAP), qos=LATCHED)
         self.subscribe("/costmap", OccupancyGrid, partial(feed.grids.take, FrameKind.COSTMAP), qos=SENSOR)
         self.subscribe("/diagnostics", DiagnosticArray, feed.take_diagnostics, qos=RELIABLE)
         self.subscribe("/heartbeat", NodeStatus, feed.take_heartbeat, qos=RELIABLE)
         self.timer(1.0, feed.send_health)
         self.page_timers: list[Timer] = []
+        self.server.on_renders = lambda: self.call_soon(self.feed_layers, True)
         self.server.on_watched = lambda watched: self.call_soon(self.feed_page, watched)
         self.feed_page(self.run_dir is None)  # in lockstep there are no pages that could come
         for warning in self.server.warnings:
@@ -97,6 +100,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         """Send everything as long as there is a page; without one, only keep what a new page gets at once."""
         self.feed.watched = watched
         self.be_patient(not watched)
+        if not watched:
+            self.feed_layers(False)
         for timer in self.page_timers:
             timer.cancel()
         rates = (
@@ -105,6 +110,14 @@ class ConsoleNode(Node[ConsoleConfig]):
             (1.0 / self.config.map_rate_hz, self.feed.send_grids),
         )
         self.page_timers = [self.timer(*rate) for rate in rates] if watched else []
+
+    def feed_layers(self, wanted: bool) -> None:
+        """Take the layers of the virtual space while a page can render them: they cost `nerf` CPU too."""
+        if wanted and self.layers is None:
+            self.layers = self.subscribe("/vspace/layers", VspaceLayers, self.mesher.submit, qos=LATCHED)
+        elif not wanted and self.layers is not None:
+            self.drop(self.layers)
+            self.layers = None
 
     def reconfigure(self, config: ConsoleConfig) -> None:
         super().reconfigure(config)

@@ -155,6 +155,8 @@ class ConsoleServer:
         self.page = page or {}
         self.on_watched: Callable[[bool], None] = lambda watched: None
         """Called on the server's thread when the first page comes (True) and when the last one has gone (False)."""
+        self.on_renders: Callable[[], None] = lambda: None
+        """Called on the server's thread when a page says for the first time that it can render the virtual space."""
         self.on_drawn: Callable[[], None] = lambda: None
         """Called on the server's thread when :meth:`drawn_ms` has changed."""
         self.gate = DriveGate(self.config.drive)
@@ -761,6 +763,9 @@ class ConsoleServer:
     def _on_drawn(self, session: Session, message: dict[str, Any], now: float) -> None:
         version, state_ms = whole(message, "version"), number(message, "state_ms", 0.0, self.now_ms())
         before = self.drawn_ms()
+        if not session.renders:
+            session.renders = True
+            self.on_renders()
         if version == 0:
             session.drawn = None
         else:

@@ -74,6 +74,8 @@ class Session:
         self.chokes = False
         """Whether too many replies are pending, which means that the client does not read."""
         self.away = False
+        self.renders = False
+        """Whether the page can render the virtual space by itself, once it has layers."""
         self.drawn: tuple[int, float] | None = None
         """Version of the layers that the page renders by itself, and time of the newest state that it has shown
         (server's clock, ms); None: it needs rendered views."""

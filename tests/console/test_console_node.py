@@ -430,6 +430,20 @@ def test_in_real_views_tell_the_expected_psnr_although_the_page_renders_by_itsel
     assert len(bus.messages("/view/request")) in (3, 4)  # one a second
 
 
+def test_layers_are_taken_while_a_page_can_render_them(setup):
+    _, node, _ = setup
+
+    def taken():
+        return "/vspace/layers" in [subscription.raw.topic for subscription in node.subscriptions]
+
+    assert not taken()
+    node.server.on_renders()
+    node.spin_once()
+    assert taken()
+    node.feed_page(False)
+    assert not taken()
+
+
 def test_layers_that_no_page_could_render_are_a_fault_of_the_console(setup):
     _, node, server = setup
     mesh = np.zeros((3, 2), np.uint16), np.ones(3, np.float32), np.array([[0, 1, 2]], np.uint32)

@@ -54,11 +54,11 @@ export class Screen {
     /** Rotation and field of view of the last drawn image. @type {number[]} */
     this._direction = [];
     this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
-    this._reported = "0"; // the server takes a page for one that needs rendered views
+    this._reported = this._unreported;
     this._reportedAt = 0;
     link.addEventListener("open", () => {
       this._sentLook = "";
-      this._reported = "0";
+      this._reported = this._unreported;
     });
     document.addEventListener("visibilitychange", () => { this._steppedAt = performance.now(); });
   }
@@ -69,6 +69,14 @@ export class Screen {
     this.state = state;
     if (!same || performance.now() - this._frameAt > IDLE_MS) this.wake();
     else if (!this._wanted) this._reportShown();
+  }
+
+  /**
+   * What the server takes for granted: a page that needs rendered views. The first report of one with WebGL says that it
+   * can do without.
+   */
+  get _unreported() {
+    return this.viewer.name === "webgl" ? "" : "0";
   }
 
   /** Reports that the newest state is on the screen, if this page renders the virtual space by itself. */
