@@ -24,6 +24,7 @@ from instant_ic.experiments.teleop_stack import CAMERA_HEIGHT_M, STEP_S, Simulat
 from instant_ic.experiments.teleop_worlds import make_course
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import ControlState
+from instant_ic.vspace import State
 
 CHROMIUM_FLAGS = [
     "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
@@ -63,6 +64,15 @@ class Page(_Page):
     def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
         super().send_frame(kind, header, payload, client)
         self.server.send_frame(kind, header, self.photo() if kind.name == "PANORAMA" else payload)
+
+    def send_layers(self, layers: Any) -> None:
+        self.server.send_layers(layers)
+
+    def drawn_ms(self) -> float | None:
+        return self.server.drawn_ms()
+
+    def needs_views(self) -> bool:
+        return self.server.needs_views()
 
     def show(self, *kinds: Any) -> None:
         self.server.show(*kinds)
@@ -121,7 +131,8 @@ def film(args: argparse.Namespace) -> list[bytes]:
         lead_max_m = stack.nodes["console"].config.lead.max_m
         page_values = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M], "lead_max_m": lead_max_m}
         server = ConsoleServer(operator, ServerConfig(port=0, drive=patient), page_values)
-        stack.page = stack.nodes["console"].server = page_in = Page(stack, server)
+        stack.page = stack.nodes["console"].feed.server = page_in = Page(stack, server)
+        stack.nodes["console"].feed_layers(True)
         server.start()
         try:
             with sync_playwright() as playwright:
@@ -173,8 +184,7 @@ def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator, args
 
 
 def vspace_ready(stack: SimulatedStack) -> bool:
-    status = stack.nodes["console"].vspace.message
-    return status is not None and int(status.state) == status.READY
+    return stack.nodes["nerf"].schedule.state == State.READY
 
 
 def write(frames: list[bytes], args: argparse.Namespace) -> None:
