@@ -88,6 +88,20 @@ def test_bookmarks_by_key_and_by_name_and_the_robot_is_held_while_one_is_typed(d
     start_driving(driver, shared_demo)
 
 
+def test_a_key_drives_at_once_when_the_bookmarks_are_closed(driver, shared_demo):
+    driver.locator("#more-open").click()
+    driver.locator("#marks-open").click()
+    # Both in one task, so that the key comes before the dialog's "close" event, as it can on a busy machine.
+    driver.evaluate(
+        "() => { document.querySelector('#marks').close();"
+        "document.body.dispatchEvent(new KeyboardEvent('keydown', { code: 'KeyW', bubbles: true })); }"
+    )
+    wait_until(lambda: moving(shared_demo), driver, "the key drives")
+    driver.keyboard.down("w")  # so that the browser sends its release
+    driver.keyboard.up("w")
+    wait_stopped(driver, shared_demo)
+
+
 def test_the_last_minute_is_kept(driver, shared_demo):
     driver.locator("#more-open").click()
     driver.get_by_role("button", name="Save the last minute").click()

@@ -102,7 +102,7 @@ export class Drive extends EventTarget {
   }
 
   _update() {
-    if (this.link.away) {
+    if (this.link.away()) {
       this._held.clear();
       this._stick = [0, 0];
     }

@@ -22,7 +22,8 @@ export class Link extends EventTarget {
     /** @type {number | null} Delay of the last drive command. */
     this.commandAgeMs = null;
     this.commandHz = 0; // drive commands accepted in the last second
-    this.away = false; // the operator does something else, such as typing
+    /** Whether the operator does something else, such as typing. @type {() => boolean} */
+    this.away = () => false;
     this.connected = false;
     this.everConnected = false;
     /** @type {WebSocket | null} */
@@ -127,7 +128,7 @@ export class Link extends EventTarget {
   }
 
   _ping(leaving = false) {
-    this.send({ type: "ping", client_ms: performance.now(), away: leaving || document.hidden || this.away });
+    this.send({ type: "ping", client_ms: performance.now(), away: leaving || document.hidden || this.away() });
   }
 
   /** @param {string | ArrayBuffer} data */

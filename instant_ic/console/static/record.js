@@ -33,7 +33,9 @@ export class Recording {
     byId("snapshot").addEventListener("click", () => this._send({ type: "snapshot" }));
     byId("mark").addEventListener("click", () => this.mark());
     byId("marks-open").addEventListener("click", () => this._openMarks());
-    byId("marks").addEventListener("close", () => { link.away = false; });
+    // Asked each time: the dialog's "close" event can come after the next key, which would then be lost.
+    const marks = elementOf("marks", HTMLDialogElement);
+    link.away = () => marks.open;
     byId("mark-form").addEventListener("submit", (event) => {
       event.preventDefault();
       this.mark(name.value.trim());
@@ -74,7 +76,6 @@ export class Recording {
 
   _openMarks() {
     this.drive.stop("the bookmark dialog is open");
-    this.link.away = true;
     elementOf("marks", HTMLDialogElement).showModal();
   }
 

@@ -99,10 +99,10 @@ test("a refused WebSocket asks why; 401 shows the sign-in", async () => {
 test("pings say whether the operator is away: typing, hidden or leaving", () => {
   connect();
   const last = () => socket().sent.at(-1);
-  link.away = true;
+  link.away = () => true;
   time.advance(50);
   assert.deepEqual([last().type, last().away], ["ping", true]);
-  link.away = false;
+  link.away = () => false;
   time.advance(50);
   assert.equal(last().away, false);
   document.hidden = true;
