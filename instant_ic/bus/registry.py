@@ -185,22 +185,29 @@ class Claim:
         self.stem = stem
         self._what = what
         self.json_path = stem.with_name(stem.name + ".json")
-        lock_path = stem.with_name(stem.name + ".lock")
-        try:
-            own_folder(stem.parent)
-            self._fd = open_lock(lock_path, create=True)
-        except OSError as error:
-            raise RegistryError(f"{what}: {error}") from error
+        self._lock_path = stem.with_name(stem.name + ".lock")
         deadline = time.monotonic() + timeout_s
-        while True:
-            try:
-                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    os.close(self._fd)
-                    raise RegistryError(f"{what} already exists: another process holds {lock_path}") from None
-                time.sleep(0.02)
+        while not self._lock():
+            if time.monotonic() > deadline:
+                raise RegistryError(f"{what} already exists: another process holds {self._lock_path}")
+            time.sleep(0.02)
+
+    def _lock(self) -> bool:
+        """Try to lock the file that the path names now: the holder before may have removed the one just opened."""
+        try:
+            own_folder(self.stem.parent)
+            self._fd = open_lock(self._lock_path, create=True)
+        except FileNotFoundError:  # the empty folder was swept in between
+            return False
+        except OSError as error:
+            raise RegistryError(f"{self._what}: {error}") from error
+        with suppress(BlockingIOError):
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_at(self._fd, self._lock_path):
+                return True
+        os.close(self._fd)
+        self._fd = -1
+        return False
 
     def write(self, content: dict[str, Any]) -> None:
         """Replace the JSON file atomically.
@@ -218,9 +225,10 @@ class Claim:
             raise RegistryError(f"{self._what} cannot be registered: {error}") from error
 
     def release(self) -> None:
-        """Remove the JSON file and release the lock; a second call does nothing."""
+        """Remove the JSON file and the lock; a second call does nothing."""
         if self._fd >= 0:
             self.json_path.unlink(missing_ok=True)
+            self._lock_path.unlink(missing_ok=True)
             os.close(self._fd)
             self._fd = -1
 
@@ -249,6 +257,14 @@ def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
     claim = Claim(stem, f"publisher of {topic} by node {node}")
     socket.unlink(missing_ok=True)
     return claim, socket
+
+
+def _is_at(fd: int, path: Path) -> bool:
+    """Whether this path still names the open file, and no other one or none."""
+    try:
+        return os.fstat(fd).st_ino == path.lstat().st_ino
+    except FileNotFoundError:
+        return False
 
 
 def _alive(lock_path: Path | str) -> bool:
@@ -359,21 +375,28 @@ def list_nodes(run_dir: Path) -> list[NodeInfo]:
 
 
 def sweep(run_dir: Path) -> int:
-    """Remove the files that dead processes left; returns how many entries were removed."""
+    """Remove what dead processes left, and topics' empty folders; returns how many entries were removed."""
     swept = 0
     for lock_path in [*(run_dir / "topics").glob("*/*.lock"), *(run_dir / "nodes").glob("*.lock")]:
-        fd = open_lock(lock_path)
+        try:
+            fd = open_lock(lock_path)
+        except FileNotFoundError:  # its process has just ended
+            continue
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             continue
         else:
+            if not _is_at(fd, lock_path):  # its process has just ended, and another may have the name
+                continue
             stem = lock_path.with_suffix("")
-            # The lock file itself stays: a waiting process would otherwise lock a file that no path names.
             leftovers = [p for s in (".json", ".sock", ".tmp") if (p := stem.with_name(stem.name + s)).exists()]
-            for path in leftovers:
+            for path in (*leftovers, lock_path):
                 path.unlink(missing_ok=True)
             swept += bool(leftovers)
         finally:
             os.close(fd)
+    for folder in (run_dir / "topics").glob("*"):
+        with suppress(OSError):  # not empty
+            folder.rmdir()
     return swept

@@ -78,6 +78,8 @@ def run_stack(
                 shutdown=description.shutdown,
             ).run()
         finally:
+            for folder in folders:
+                registry.sweep(folder)
             output.close(status)
         return status
 

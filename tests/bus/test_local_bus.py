@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -162,7 +163,25 @@ def test_sweep_clears_what_the_dead_left_and_nothing_else(transport, talker, run
     process.kill()
     process.wait(10)
     assert registry.sweep(run_dir) >= 5
-    assert list(run_dir.glob("topics/*/*.sock")) == []
+    assert list(run_dir.glob("topics/*")) == [] == list(run_dir.glob("nodes/*"))
+
+
+def test_a_name_that_passes_on_is_locked_in_the_file_that_its_path_names(run_dir):
+    stem = run_dir / "nodes" / "walker"
+    registry.prepare(run_dir)
+    for _ in range(20):
+        first = registry.Claim(stem, "node walker")
+        with ThreadPoolExecutor() as pool:
+            waiting = pool.submit(registry.Claim, stem, "node walker", 30.0)
+            first.release()
+            registry.sweep(run_dir)
+            second = waiting.result()
+        second.write({"name": "walker"})
+        assert registry.sweep(run_dir) == 0 and second.json_path.exists()
+        with pytest.raises(registry.RegistryError, match="already exists"):
+            registry.Claim(stem, "node walker", timeout_s=0.0)
+        second.release()
+        assert list(run_dir.glob("nodes/*")) == []
 
 
 def test_second_node_of_a_name_is_refused(talker, run_dir):
