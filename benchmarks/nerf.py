@@ -6,14 +6,13 @@ CPU time of the process is measured instead of wall time, so that other load on 
 machine's own speed affects it fully, so hash encoding and iterations are measured beside a peer in the same run. The
 peer is nerfstudio's ``HashEncoding(implementation="torch")`` if nerfstudio is installed, else
 ``benchmarks/peer_hash.py``, which performs the same operations in torch; ``peer`` names it. The scene is the
-simulator's corridor (true depth, 1024 × 512 panorama), or the box room of the tests. GPU figures are ``not measured``
-without a GPU.
+simulator's corridor (true depth, 1024 × 512 panorama), or the box room of the tests. ``benchmarks/gpu.py`` measures a
+GPU.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import math
 import platform
@@ -24,20 +23,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numba import njit
 from peer_hash import peer_encoding
 
-from instant_ic import paths
-from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace import FieldConfig, PictureConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.nerf import kernels
-from instant_ic.vspace.prior import fill_holes
 from instant_ic.vspace.warm_up import warm_up
 
 SIZES = ((320, 180), (640, 360), (1280, 720))
@@ -168,48 +162,6 @@ def scene(world: str) -> tuple[Any, Any, list[Any], list[Any]]:
     return renderer.render(keyframe, 1024, 512), keyframe, poses, truth
 
 
-def point_warp(picture: Any, depth_m: Any, pose: Any, view_pose: Any, width: int, height: int) -> Any:
-    """Render the panorama's pixels as points, nearest on top; holes are filled from their surroundings."""
-    directions = equirect_directions(*picture.shape[1::-1])
-    depth = cv2.resize(depth_m, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    points = (directions * depth[..., None]).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3] - view_pose[:3, 3]
-    x, y, z = (points @ view_pose[:3, :3]).T
-    focal = 0.5 * width / math.tan(FOV / 2)
-    ahead = x > 0.05
-    u = np.rint(0.5 * (width - 1) - focal * y[ahead] / x[ahead]).astype(int)
-    v = np.rint(0.5 * (height - 1) - focal * z[ahead] / x[ahead]).astype(int)
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    at, far = (v * width + u)[inside], x[ahead][inside]
-    order = np.argsort(-far, kind="stable")  # the nearest is written last
-    image, seen = np.zeros((height * width, 3), np.float32), np.zeros(height * width, bool)
-    image[at[order]] = picture.reshape(-1, 3)[ahead][inside][order]
-    seen[at] = True
-    return fill_holes(image.reshape(height, width, 3), seen.reshape(height, width)).astype(np.uint8)
-
-
-def against_warp(picture: Any, pose: Any, poses: list[Any], truth: list[Any], iterations: int) -> dict[str, Any]:
-    """PSNR (dB) and SSIM of the views after few iterations, with true depth and with the shipped model's."""
-    estimate = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1).estimate(picture.rgb)
-    true = cv2.resize(picture.depth_m, estimate.shape[::-1], interpolation=cv2.INTER_AREA)
-    known = (estimate > 0) & (true > 0)
-    estimate = (estimate * np.median(true[known] / estimate[known])).astype(np.float32)
-    error = float(np.mean(np.abs(estimate[known] / true[known] - 1)))
-    field_only = PictureConfig(panorama_until_db=30.0, field_from_db=30.0)
-    result: dict[str, Any] = {"iterations": iterations, "model_depth_error": round(error, 3)}
-    for name, depth, sigma in (("true_depth", picture.depth_m, 0.02), ("model_depth", estimate, 0.08)):
-        views: dict[str, list[Any]] = {
-            "point_warp": [point_warp(picture.rgb, depth, pose, p, *SIZES[0]) for p in poses]
-        }
-        for label, colour in (("ours", PictureConfig()), ("field_only", field_only)):
-            space = VirtualSpace(VirtualSpaceConfig(picture=colour))
-            space.set_keyframe(picture.rgb, depth, pose, sigma)
-            space.train(iterations=iterations)
-            views[label] = [space.render(p, *SIZES[0], FOV).rgb for p in poses]
-        for label, drawn in views.items():
-            result[f"{name}_{label}"] = scores(drawn, truth)
-    return result
-
-
 def shown(source: str) -> VirtualSpaceConfig:
     """``field``: the field alone; ``shown``: the default; ``density``: the field alone, as density."""
     alone = PictureConfig(panorama_until_db=30.0, field_from_db=30.0)
@@ -262,29 +214,6 @@ def scores(drawn: list[Any], truth: list[Any]) -> list[tuple[float, float]]:
     return [(round(psnr_db(a, b), 2), round(ssim(a, b), 3)) for a, b in zip(drawn, truth, strict=True)]
 
 
-def geometries(world: str, seconds: float) -> dict[str, Any]:
-    """Views of the field alone after the same CPU time with each geometry."""
-    picture, pose, poses, truth = scene(world)
-    result = {}
-    for name, source in (("distance", "field"), ("density", "density")):
-        space = VirtualSpace(shown(source))
-        space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
-        spent = 0.0
-        while spent < seconds and not space.status.converged:
-            start = time.process_time()
-            space.train(iterations=5)
-            spent += time.process_time() - start
-        drawn = [space.render(p, *SIZES[0], FOV) for p in poses]
-        picture_s = cpu_seconds(lambda space=space: space.render(poses[1], *SIZES[0], FOV), 3)
-        result[name] = {
-            "cpu_s": round(spent, 1),
-            "iterations": space.status.iterations,
-            "views": scores([view.rgb for view in drawn], truth),
-            "frame_320x180_cpu_ms": round(picture_s * 1e3, 1),
-        }
-    return result
-
-
 def pictures(world: str, train_ms: float = 30.0) -> dict[str, Any]:
     """CPU milliseconds per view and views per second on one thread, alone and with a slice of training each."""
     picture, pose, poses, _ = scene(world)
@@ -314,83 +243,11 @@ def pictures(world: str, train_ms: float = 30.0) -> dict[str, Any]:
     return result
 
 
-def gpu(world: str, seconds: float) -> dict[str, Any] | str:
-    """Time to quality and rendering on a GPU, with the backend that ``cuda`` selects.
-
-    tiny-cuda-nn's encoding is measured beside it if installed. Wall time is used, because a GPU's work is not CPU time.
-    """
-    import torch
-
-    if not torch.cuda.is_available():
-        return "not measured: torch finds no CUDA device"
-    picture, pose, poses, truth = scene(world)
-    space = VirtualSpace(dataclasses.replace(shown("field"), device="cuda"))
-    start, curve = time.perf_counter(), []
-    space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
-    while time.perf_counter() - start < seconds and not space.status.converged:
-        space.train(iterations=10)
-        views = [psnr_db(space.render(p, *SIZES[0], FOV).rgb, t) for p, t in zip(poses, truth, strict=True)]
-        curve.append((time.perf_counter() - start, statistics.mean(views)))
-    final = curve[-1][1]
-
-    def fps(width: int, height: int, training: bool) -> float:
-        times = []
-        for _ in range(20):
-            begin = time.perf_counter()
-            space.render(poses[1], width, height, FOV)
-            if training:
-                space.train(iterations=1)
-            times.append(time.perf_counter() - begin)
-        return round(1 / statistics.median(times), 1)
-
-    return {
-        "device": space.status.device,
-        "within_1_db_s": round(next(row[0] for row in curve if row[1] >= final - 1), 2),
-        "final_psnr_db": round(final, 2),
-        "fps": {f"{w}x{h}": {"alone": fps(w, h, False), "while_training": fps(w, h, True)} for w, h in SIZES},
-        "hash_8x2_T17_ns": gpu_hash(8, 2),
-    }
-
-
-def gpu_hash(levels: int, features: int, samples: int = 1 << 18) -> dict[str, Any]:
-    """Nanoseconds per sample, forward and backward, of the peers on the GPU."""
-    import torch
-
-    points = torch.from_numpy(wall_points(samples)).cuda()
-    points = (points - points.amin(dim=0)) / 4.0 % 1.0
-    encodings: dict[str, Any] = {}
-    name, peer = peer_encoding(levels, features, LOG2_TABLE, 16, 640)
-    encodings[name] = peer.cuda()
-    try:
-        import tinycudann
-    except ImportError:
-        pass
-    else:
-        settings = {
-            "otype": "HashGrid", "n_levels": levels, "n_features_per_level": features,
-            "log2_hashmap_size": LOG2_TABLE, "base_resolution": 16, "per_level_scale": 40 ** (1 / (levels - 1)),
-        }  # fmt: skip
-        encodings["tiny-cuda-nn"] = tinycudann.Encoding(3, settings)
-    result: dict[str, Any] = {}
-    for label, encoding in encodings.items():
-        times = []
-        for _ in range(12):
-            torch.cuda.synchronize()
-            start = time.perf_counter()
-            encoding(points).float().sum().backward()
-            torch.cuda.synchronize()
-            times.append(time.perf_counter() - start)
-        result[label] = round(statistics.median(times[2:]) / samples * 1e9, 2)
-    if "tiny-cuda-nn" not in result:
-        result["tiny-cuda-nn"] = "not measured: not installed"
-    return result
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0, help="CPU seconds of training, at most (default 60)")
     parser.add_argument("--world", choices=("corridor", "room"), default="corridor")
-    parts = ("hash", "iteration", "quality", "pictures", "geometry", "warp", "gpu")
+    parts = ("hash", "iteration", "quality", "pictures")
     parser.add_argument("--only", choices=parts, action="append", help="this part; may be given several times")
     arguments = parser.parse_args()
     wanted, world, seconds = arguments.only or parts, arguments.world, arguments.seconds
@@ -415,12 +272,6 @@ def main() -> None:
     result["peak_rss_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
     if "pictures" in wanted:
         result["pictures"] = pictures(world)
-    if "geometry" in wanted:
-        result["geometry"] = {f"{s:g}_cpu_s": geometries(world, s) for s in (seconds / 8, seconds / 2)}
-    if "warp" in wanted and world == "corridor":
-        result["against_warp"] = against_warp(*scene(world), 60)
-    if "gpu" in wanted:
-        result["gpu"] = gpu(world, seconds)
     print(json.dumps(result, indent=2))
 
 
