@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """The bus compared with other middleware: latency, throughput and fan-out between processes, in one run.
 
-    python benchmarks/bus.py --json bus.json --plot docs/images/bus_latency.png      (about 12 minutes)
-    python benchmarks/bus.py --quick                                                 (about 2 minutes)
+    python benchmarks/bus.py --json bus.json     (about 12 minutes)
+    python benchmarks/bus.py --quick             (about 2 minutes)
 
 All transports send the same frames at the same pace, alternating within one run, so that other load on the machine
 affects all of them alike. Latency is measured from before the send call until the receiver has read one byte of every
@@ -42,10 +42,7 @@ NAMES = {
     "iceoryx2": "iceoryx2",
     "ecal": "eCAL",
     "lcm": "LCM udpm",
-    "inline": "Instant IC, sockets only",
-    "shared": "Instant IC, shared memory only",
 }
-LATENCY_ONLY = ("inline", "shared")
 
 
 class Peer:
@@ -144,7 +141,7 @@ def free_port() -> int:
 def addresses(folder: Path) -> dict[str, str]:
     """Address of each transport."""
     return {
-        **{name: str(folder / name) for name in ("ours", "image", "inline", "shared", "iceoryx2", "ecal")},
+        **{name: str(folder / name) for name in ("ours", "image", "iceoryx2", "ecal")},
         "zmq": f"ipc://{folder}/zmq",
         "zenoh_shm": f"tcp/127.0.0.1:{free_port()}",
         "lcm": f"udpm://239.255.76.67:{free_port()}?ttl=0&recv_buf_size=4194304",
@@ -216,17 +213,16 @@ def measure(transports: list[str], rounds: int, count: int, flood_s: float, note
                 pair.close()
         for transport in pairs:
             result["latency"][transport] = {t: summary(latency[transport][t], sent[transport][t]) for t in topics}
-        for transport in [t for t in pairs if t not in LATENCY_ONLY]:
+        for transport in pairs:
             try:
                 result["throughput"][transport] = flood(transport, address[transport], flood_s)
                 note(f"throughput, {transport}")
             except RuntimeError as error:
                 note(f"{transport}: throughput not measured: {error}")
-        fan = [t for t in pairs if t not in LATENCY_ONLY]
         gathered: dict[str, list[float]] = defaultdict(list)
         fan_sent: dict[str, int] = defaultdict(int)
         for _ in range(max(1, rounds // 2)):
-            for transport in fan:
+            for transport in pairs:
                 try:
                     pair = open_pair(transport, address[transport], {"m5": SIZES["m5"]}, FANOUT)
                 except RuntimeError as error:
@@ -239,7 +235,7 @@ def measure(transports: list[str], rounds: int, count: int, flood_s: float, note
                 gathered[transport] += [value for g in got for value in g["latencies_us"]]
                 fan_sent[transport] += written["sent"] * FANOUT
             note("fan-out")
-        result["fanout"] = {t: summary(gathered[t], fan_sent[t]) for t in fan if t in gathered}
+        result["fanout"] = {t: summary(gathered[t], fan_sent[t]) for t in pairs if t in gathered}
     return result
 
 
@@ -294,43 +290,15 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def plot(result: dict[str, Any], path: Path) -> None:
-    """Plot latency over size, p50 with p99 above it."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7.5, 4.5), layout="constrained")
-    sizes = list(SIZES.values())
-    for transport, cells in result["latency"].items():
-        if transport in LATENCY_ONLY:
-            continue
-        own = transport in ("ours", "image")
-        median = [cells[t]["p50_us"] or float("nan") for t in SIZES]
-        (line,) = axes.loglog(sizes, median, "o-", label=NAMES[transport], lw=2.5 if own else 1.2, zorder=3 + own)
-        high = [cells[t]["p99_us"] or float("nan") for t in SIZES]
-        axes.loglog(sizes, high, ":", color=line.get_color(), lw=0.8)
-    axes.set_xticks(sizes, list(LABELS.values()))
-    axes.minorticks_off()
-    axes.set_xlabel("message")
-    axes.set_ylabel("µs from sending to read (line p50, dots p99)")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw latency over size")
     parser.add_argument("--quick", action="store_true", help="fewer messages")
     parser.add_argument(
         "--only",
         nargs="+",
         choices=list(NAMES),
-        default=[t for t in NAMES if t not in ("inline", "shared")],
+        default=list(NAMES),
         metavar="TRANSPORT",
         help=", ".join(NAMES),
     )
@@ -351,8 +319,6 @@ def main() -> int:
     text = json.dumps(result, indent=2)
     if args.json:
         args.json.write_text(text + "\n")
-    if args.plot:
-        plot(result, args.plot)
     print(text)
     print(table(result), file=sys.stderr)
     return 0

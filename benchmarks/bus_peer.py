@@ -82,24 +82,6 @@ def ours_pub(topics, address):
     return lambda topic, frame: publishers[topic].publish_bytes(frame)
 
 
-def inline_pub(topics, address):
-    return _ours_pub_sharing_from(1 << 40, topics, address)
-
-
-def shared_pub(topics, address):
-    return _ours_pub_sharing_from(1, topics, address)
-
-
-def _ours_pub_sharing_from(size, topics, address):
-    from instant_ic.bus import local_publisher
-
-    local_publisher.SHARED_FROM_BYTES = size
-    return ours_pub(topics, address)
-
-
-inline_sub = shared_sub = ours_sub
-
-
 def ours_node(address, name):
     from pathlib import Path
 

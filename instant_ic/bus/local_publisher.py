@@ -32,7 +32,7 @@ from instant_ic.bus.transport import Buffer, Payload, PublisherStats, TransportE
 
 SHARED_FROM_BYTES = 96 << 10
 """Messages of this size and more go through shared memory. Below it, copying through a socket costs less than the
-bookkeeping (``benchmarks/bus.py --only inline shared``)."""
+bookkeeping (docs/benchmarks.md)."""
 
 SLOTS_A_READER = 5
 """How many slots each reader adds to a publisher's limit; see also :data:`~.local_subscription.VIEWS_HELD`."""
