@@ -15,6 +15,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from instant_ic.calibration.edges import CUES, UPRIGHT, find_floor, lidar_edges, picture_edges
 from instant_ic.config.ranges import Positive, Range, check_ranges
@@ -267,12 +268,8 @@ def _turned(camera_from_lidar: Matrix, yaw_rad: float) -> Matrix:
 def _moved(camera_from_lidar: Matrix, units: Floats) -> Matrix:
     """Apply a small motion (6,), in ``_UNIT`` in the camera's frame, to the pose."""
     step = np.asarray(units) * _UNIT
-    angle = float(np.linalg.norm(step[3:]))
     change = np.eye(4)
-    if angle > 1e-12:
-        k = step[3:] / angle
-        cross = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
-        change[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    change[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix()
     change[:3, 3] = step[:3]
     return np.asarray(change @ camera_from_lidar)
 
@@ -280,10 +277,7 @@ def _moved(camera_from_lidar: Matrix, units: Floats) -> Matrix:
 def _correction(before: Matrix, after: Matrix) -> NDArray[np.float64]:
     """Motion (6,) in the camera's frame, metres and radians, from one pose to another; inverse of ``_moved``."""
     change = after @ np.linalg.inv(before)
-    angle = math.acos(float(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1)))
-    axis = np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2
-    factor = angle / math.sin(angle) if 1e-9 < angle < math.pi - 1e-6 else 1.0
-    return np.asarray(np.concatenate([change[:3, 3], axis * factor]), np.float64)
+    return np.concatenate([change[:3, 3], Rotation.from_matrix(change[:3, :3]).as_rotvec()])
 
 
 def _around(level: _Level, camera_from_lidar: Matrix, step_deg: float) -> tuple[Matrix, float]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibration_sim import BASE_FROM_CAMERA, BASE_FROM_LIDAR, perturbed, record
 from scipy.spatial.transform import Rotation
 
 from instant_ic.bag import BagReader, BagWriter
@@ -24,7 +25,6 @@ from instant_ic.calibration.mount import (
 from instant_ic.calibration.overlay import before_and_after, overlay
 from instant_ic.cli.main import main
 from instant_ic.config.params import build, load_file
-from instant_ic.experiments.calibration_sim import BASE_FROM_CAMERA, BASE_FROM_LIDAR, perturbed, record
 from instant_ic.geometry.poses import inverse, pose_matrix
 
 QUICK = CalibrationConfig(blur_px=(8.0, 2.0, 1.0), yaw_step_deg=4.0)

@@ -111,10 +111,9 @@ def _guess(text: str) -> Matrix:
 
 def _xyz_rpy(pose: Matrix) -> tuple[list[float], list[float]]:
     """Metres, and roll, pitch, yaw in degrees about fixed axes, rounded."""
-    import numpy as np
+    from scipy.spatial.transform import Rotation
 
-    r = pose[:3, :3]
-    rpy = np.degrees([np.arctan2(r[2, 1], r[2, 2]), np.arcsin(np.clip(-r[2, 0], -1, 1)), np.arctan2(r[1, 0], r[0, 0])])
+    rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", degrees=True)
     return [round(float(v), 4) + 0.0 for v in pose[:3, 3]], [round(float(v), 3) + 0.0 for v in rpy]
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from instant_ic.bag import BagWriter
 from instant_ic.bus import LATCHED, SENSOR, QoS
@@ -27,10 +28,8 @@ def perturbed(pose: Matrix, distance_m: float, angle_deg: float, seed: int) -> M
     """Pose (4, 4) shifted by a distance and rotated by an angle about its own centre, both in random directions."""
     rng = np.random.default_rng([53, seed])
     shift, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    angle = math.radians(angle_deg)
     change = np.eye(4)
-    change[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    change[:3, :3] = Rotation.from_rotvec(math.radians(angle_deg) * axis).as_matrix()
     change[:3, 3] = distance_m * shift
     return np.asarray(pose @ change)
 
