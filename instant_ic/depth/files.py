@@ -40,8 +40,13 @@ def load_picture(path: str | Path) -> NDArray[np.uint8]:
     return np.ascontiguousarray(picture[..., ::-1], np.uint8)
 
 
-def load_depth(path: str | Path) -> NDArray[np.float32]:
+def load_depth(path: str | Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
     """Depth (H, W) float32 in metres, 0 = unknown: also what is not finite, not above 0, or 10 km and farther.
+
+    Args:
+        path: of the file.
+        png_unit_m: metres per unit of a PNG (Stanford 2D-3D-S: 1/512, Matterport3D: 1/4000). Its largest value, 65535,
+            is unknown.
 
     Raises:
         DepthFileError: missing, damaged, of another kind or shape, or without any known depth.
@@ -52,7 +57,7 @@ def load_depth(path: str | Path) -> NDArray[np.float32]:
         raise DepthFileError(f"{path}: depth is read from {', '.join(DEPTH_SUFFIXES)}, not {kind or 'a bare name'!r}")
     _check_readable(path)
     if kind == ".png":
-        values = _png(path)
+        values = _png(path, png_unit_m)
     elif kind == ".exr":
         values = _exr(path)
     else:
@@ -77,7 +82,7 @@ def _check_readable(path: str | Path) -> None:
         raise DepthFileError(f"{path}: the file is empty")
 
 
-def _png(path: Path) -> NDArray[Any]:
+def _png(path: Path, unit_m: float) -> NDArray[Any]:
     import cv2
 
     values = load_image(path, cv2.IMREAD_UNCHANGED)
@@ -86,10 +91,10 @@ def _png(path: Path) -> NDArray[Any]:
     if values.dtype != np.uint16 or values.ndim != 2:
         channels = 1 if values.ndim == 2 else values.shape[2]
         raise DepthFileError(
-            f"{path}: depth as PNG has one channel of 16 bits, millimetres "
+            f"{path}: depth as PNG has one channel of 16 bits "
             f"(got {channels} of {8 * values.dtype.itemsize} bits: an image of depth?)"
         )
-    return values * np.float32(1e-3)
+    return np.where(values < 65535, values * np.float32(unit_m), np.float32(0))
 
 
 def _numpy(path: Path) -> NDArray[Any]:

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES, DepthFileError, load_depth
+from instant_ic.depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES
 
-_PNG_UNKNOWN_M = 65.5345
 _NEAREST_MEDIAN_M, _FARTHEST_MEDIAN_M = 0.05, 150.0
 
 
@@ -46,25 +45,6 @@ def pair(pictures: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, P
         names = ", ".join(sorted(path.name for path in found)[:5]) or "nothing"
         raise PairError(f"no depth file has the stem of an image ({pictures[0].name}, ... against {names}, ...)")
     return pairs
-
-
-def load_truth(path: Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
-    """Ground-truth radial depth (H, W) in metres, 0 = unknown; see ``depth.files.load_depth``.
-
-    Args:
-        path: of the file.
-        png_unit_m: metres per PNG unit (Stanford2D3D: 1/512, Matterport3D: 1/4000). The largest value, 65535, is
-            unknown.
-
-    Raises:
-        DepthFileError: as ``load_depth``; also if all pixels are unknown.
-    """
-    depth = load_depth(path)
-    if path.suffix.lower() == ".png":
-        depth = np.where(depth < _PNG_UNKNOWN_M, depth * np.float32(png_unit_m / 1e-3), np.float32(0))
-        if not depth.any():
-            raise DepthFileError(f"{path}: contains no known depth: all values are 0 or 65535")
-    return depth
 
 
 def unit_warning(depth_m: NDArray[np.floating]) -> str:

@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES, DepthFileError, load_depth, load_picture
-from instant_ic.limits import load_image
 from instant_ic.training.dataset import DatasetError, Sample
 
 _HELD_OUT_SHARE = 0.08
@@ -48,13 +47,11 @@ class Layout:
         looks_like: description of the expected files, for messages.
         pictures: lists the images of a folder, each with its depth file.
         units_per_m: units per metre of the PNG values.
-        missing: PNG value of unknown depth, besides 0.
     """
 
     looks_like: str
     pictures: Callable[[Path], Iterator[Pair]]
     units_per_m: float = 1000.0
-    missing: int = 65535
 
 
 def _matterport(folder: Path) -> Iterator[Pair]:
@@ -163,8 +160,7 @@ class FolderDataset:
         pair, (height, width) = self.pairs[index], self.size
         rgb = load_picture(pair.rgb)
         layout = LAYOUTS[self.layout]
-        plain_png = pair.depth.suffix.lower() == ".png"
-        depth = _png_depth(pair.depth, layout) if plain_png else load_depth(pair.depth)
+        depth = load_depth(pair.depth, 1 / layout.units_per_m)
         for path, shape in ((pair.rgb, rgb.shape), (pair.depth, depth.shape)):
             if shape[1] != 2 * shape[0]:
                 raise DatasetError(f"{path}: {shape[1]} x {shape[0]} is not an equirect panorama (2:1)")
@@ -188,18 +184,6 @@ class FolderDataset:
             raise DatasetError(f"{self.folder}: all {len(self)} panoramas are in scenes reserved for evaluation; "
                                "add scenes for training")  # fmt: skip
         return np.flatnonzero(~held), np.flatnonzero(held)
-
-
-def _png_depth(path: Path, layout: Layout) -> NDArray[np.float32]:
-    """Depth (H, W) in metres, 0 = unknown, from a 16-bit PNG in the data set's own unit."""
-    import cv2
-
-    values = load_image(path, cv2.IMREAD_UNCHANGED)
-    if values is None or values.dtype != np.uint16 or values.ndim != 2:
-        what = "damaged" if values is None else f"{values.dtype} of shape {values.shape}"
-        raise DepthFileError(f"{path}: depth must be a single-channel 16-bit PNG (got {what})")
-    known = (values > 0) & (values != layout.missing)
-    return np.where(known, values / np.float32(layout.units_per_m), 0).astype(np.float32)
 
 
 def open_folder(name: str, size: tuple[int, int]) -> FolderDataset:

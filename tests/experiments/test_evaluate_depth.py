@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from instant_ic.cli.main import main
-from instant_ic.depth.files import DepthFileError
+from instant_ic.depth.files import DepthFileError, load_depth
 from instant_ic.depth.metrics import depth_metrics
 from instant_ic.experiments import depth_pictures, depth_worlds
 from instant_ic.experiments.depth import DepthEvaluationError, DepthSettings, Evaluator, LidarSettings, look_up, report
-from instant_ic.experiments.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
+from instant_ic.experiments.depth_files import PairError, find_pictures, pair, unit_warning
 from instant_ic.experiments.depth_lidar import Errors, measure, measure_world
 from instant_ic.experiments.depth_pictures import Sheets
 from instant_ic.experiments.depth_worlds import FIRST_SEED, held_out, scenes
@@ -285,13 +285,13 @@ def test_units_that_look_wrong_are_told():
 def test_a_png_has_its_own_unit_and_unknown_values(tmp_path):
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), np.array([[512, 1024], [0, 65535]], np.uint16))
-    assert np.allclose(load_truth(path, 1 / 512), [[1, 2], [0, 0]])
-    assert np.allclose(load_truth(path), [[0.512, 1.024], [0, 0]])
+    assert np.allclose(load_depth(path, 1 / 512), [[1, 2], [0, 0]])
+    assert np.allclose(load_depth(path), [[0.512, 1.024], [0, 0]])
     cv2.imwrite(str(path), np.full((4, 8), 65535, np.uint16))
-    with pytest.raises(DepthFileError, match=r"a.png: contains no known depth"):
-        load_truth(path)
+    with pytest.raises(DepthFileError, match=r"a.png: no known depth"):
+        load_depth(path)
     np.save(tmp_path / "b.npy", np.full((4, 8), 70.0))
-    assert np.all(load_truth(tmp_path / "b.npy", 1 / 512) == 70)
+    assert np.all(load_depth(tmp_path / "b.npy", 1 / 512) == 70)
 
 
 def test_pages_of_pictures(tmp_path, monkeypatch):

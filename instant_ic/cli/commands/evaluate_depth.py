@@ -65,11 +65,11 @@ def add_kind(kinds: Any) -> None:
 def evaluate_depth(args: argparse.Namespace) -> int:
     """Run ``ic evaluate depth``; return the exit status."""
     from instant_ic.cli.progress import progress
-    from instant_ic.depth.files import DepthFileError, load_picture
+    from instant_ic.depth.files import DepthFileError, load_depth, load_picture
     from instant_ic.depth.manifest import ManifestError
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel, InferenceError
     from instant_ic.experiments.depth import DepthEvaluationError, DepthSettings, Evaluator, LidarSettings, report
-    from instant_ic.experiments.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
+    from instant_ic.experiments.depth_files import PairError, find_pictures, pair, unit_warning
     from instant_ic.experiments.depth_pictures import Sheets
     from instant_ic.paths import shipped_file
 
@@ -108,7 +108,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
             try:
                 if args.depth and truth is None:
                     raise PairError(f"{image}: no depth file has this stem")
-                truth_m = load_truth(truth, args.png_unit) if truth is not None else None
+                truth_m = load_depth(truth, args.png_unit) if truth is not None else None
                 warning = unit_warning(truth_m) if truth_m is not None else ""
                 if warning:
                     warnings.append(f"{truth}: {warning}")
