@@ -6,8 +6,9 @@ import argparse
 import json
 import os
 import sys
-from pathlib import Path
 from typing import Any
+
+from instant_ic.cli.evaluations import add_options, check_outputs, counted, errors_for_the_user
 
 
 def add_kind(kinds: Any) -> None:
@@ -23,55 +24,25 @@ def add_kind(kinds: Any) -> None:
         ),
         epilog="example: ic evaluate follow --episodes 50 --seed 0 --json follow.json --plot follow.png",
     )
-    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="number of drives (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the rooms and all noise (default: %(default)s)")
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="drives in parallel (default: all cores)"
-    )
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="plot the drives here, the worst first")
-    parser.add_argument(
-        "--timeout", type=float, default=3600.0, metavar="S", help="time limit (default: %(default)g s)"
-    )
+    add_options(parser, 50, os.cpu_count() or 1, 3600.0, "the drives, the worst first,")
     parser.set_defaults(func=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run ``ic evaluate follow``; return the exit status."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
     from instant_ic.experiments import follow
 
-    console = Console(stderr=True)
-    for path in (args.json, args.plot):
-        if path is not None and not path.parent.is_dir():
-            console.print(f"ic evaluate follow: the folder {path.parent} does not exist", style="red", markup=False)
-            return 1
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    try:
-        with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
-            task = progress.add_task("starting", total=args.episodes)
-            contacts = 0
+    check_outputs(args)
+    contacts = 0
+    with errors_for_the_user(), counted("starting", args.episodes) as advance:
 
-            def show_progress(episode: follow.Episode) -> None:
-                nonlocal contacts
-                contacts += episode.contacts + episode.people_contacts
-                progress.update(task, advance=1, description=f"driving, {contacts} contacts")
-                if not console.is_terminal:
-                    console.print(f"episode {episode.index}: {'reached' if episode.reached else episode.reason}")
+        def show_progress(episode: follow.Episode) -> None:
+            nonlocal contacts
+            contacts += episode.contacts + episode.people_contacts
+            how = "reached" if episode.reached else episode.reason
+            advance(f"driving, {contacts} contacts", f"episode {episode.index}: {how}")
 
-            episodes = follow.evaluate(args.episodes, args.seed, args.jobs, show_progress, args.timeout)
-    except (ValueError, RuntimeError, TimeoutError) as error:
-        console.print(f"ic evaluate follow: {error}", style="red", markup=False)
-        return 1
+        episodes = follow.evaluate(args.episodes, args.seed, args.jobs, show_progress, args.timeout)
     figures = follow.report(episodes, args.seed)
     if args.json:
         args.json.write_text(json.dumps(figures, indent=2) + "\n")
@@ -81,9 +52,8 @@ def run(args: argparse.Namespace) -> int:
     sys.stdout.write(json.dumps(figures, indent=2) + "\n")
     for row in each:
         if row["contacts"] or row["people_contacts"] or (row["reachable"] and not row["reached"]):
-            console.print(
-                f"episode {row['index']}: {row['contacts'] + row['people_contacts']} contacts, "
-                f"{'reached' if row['reached'] else 'not reached: ' + row['reason']}",
-                markup=False,
+            how = "reached" if row["reached"] else f"not reached: {row['reason']}"
+            print(
+                f"episode {row['index']}: {row['contacts'] + row['people_contacts']} contacts, {how}", file=sys.stderr
             )
     return 0

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
-import signal
 import sys
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from instant_ic.cli.errors import UserError
+from instant_ic.cli.evaluations import (
+    add_options,
+    add_stack_options,
+    check_outputs,
+    counted,
+    errors_for_the_user,
+    use_one_thread_for_matrices,
+)
 
 
 def add_kind(kinds: Any) -> None:
@@ -29,17 +35,12 @@ def add_kind(kinds: Any) -> None:
         ),
         epilog="example: ic evaluate teleop --episodes 50 --seed 0 --json teleop.json --plot teleop.png",
     )
-    parser.add_argument(
-        "--episodes", type=int, default=50, metavar="N", help="number of courses (default: %(default)s)"
+    add_options(parser, 50, os.cpu_count() or 1, 7200.0, "paths, and bars by method,")
+    worlds = (
+        "corridors (random), or a world of the simulator: corridor, where the operator drives straight on, "
+        "random:SEED or a mesh file, where the operator drives to random visible places"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the courses and all noise (default: %(default)s)")
-    parser.add_argument(
-        "--world",
-        default="corridors",
-        metavar="W",
-        help="corridors (random), or a world of the simulator: corridor, where the operator drives straight on, "
-        "random:SEED or a mesh file, where the operator drives to random visible places (default: %(default)s)",
-    )
+    add_stack_options(parser, worlds, "virtual_robot.vbot.ease_m_s:=0.05")
     parser.add_argument(
         "--methods", default="ic,stop,shared", metavar="M,M", help="ic, stop, shared (default: %(default)s)"
     )
@@ -58,65 +59,28 @@ def add_kind(kinds: Any) -> None:
         default="fused",
         help="depth source of the virtual space: network and LiDAR, or LiDAR only (default: %(default)s)",
     )
-    parser.add_argument(
-        "-p",
-        "--param",
-        action="append",
-        default=[],
-        metavar="NODE.KEY:=VALUE",
-        help="override a parameter, for example virtual_robot.vbot.ease_m_s:=0.05; repeatable",
-    )
-    parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="drives in parallel (default: all cores)"
-    )
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here, updated after each drive")
     parser.add_argument("--resume", action="store_true", help="keep the drives in --json and run only the missing ones")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="plot paths, and bars by method, here")
     parser.add_argument(
         "--video", type=Path, metavar="OUT.mp4", help="write a split-view video of the first course and method here"
-    )
-    parser.add_argument(
-        "--timeout", type=float, default=7200.0, metavar="S", help="time limit (default: %(default)g s)"
     )
     parser.set_defaults(func=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run ``ic evaluate teleop``; return the exit status."""
-    # The matrices are small: threads of the linear algebra would only compete for cores. Read when numpy loads.
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    wrong = _wrong_usage(args)
-    if wrong:
-        console.print(f"ic evaluate teleop: {wrong}", style="red", markup=False)
-        return 1
-    try:
-        return _evaluate(args, console)
-    except (ValueError, RuntimeError, TimeoutError) as error:
-        console.print(f"ic evaluate teleop: {error}", style="red", markup=False)
-        return 1
-
-
-def _wrong_usage(args: argparse.Namespace) -> str:
-    """Text of the error in the arguments; empty where there is none."""
-    for path in (args.json, args.plot, args.video):
-        if path is not None and not path.parent.is_dir():
-            return f"the folder {path.parent} does not exist"
-    if args.video is not None and args.video.suffix.lower() != ".mp4":
-        return f"{args.video}: the name must end in .mp4"
+    use_one_thread_for_matrices()
+    check_outputs(args, video=".mp4")
     if args.operator == "recorded" and args.log is None:
-        return "--operator recorded needs --log: a bag or a CSV file"
+        raise UserError("--operator recorded needs --log: a bag or a CSV file")
     if args.operator == "scripted" and args.log is not None:
-        return "--log needs --operator recorded"
+        raise UserError("--log needs --operator recorded")
     if args.resume and args.json is None:
-        return "--resume needs --json: the file written by the earlier run"
-    return ""
+        raise UserError("--resume needs --json: the file written by the earlier run")
+    with errors_for_the_user():
+        return _evaluate(args)
 
 
-def _evaluate(args: argparse.Namespace, console: Any) -> int:
+def _evaluate(args: argparse.Namespace) -> int:
     from instant_ic.experiments import teleop, teleop_results
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
@@ -126,7 +90,7 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
     drives: list[teleop.Drive] = []
     if args.resume and args.json.exists():
         drives = teleop_results.load(args.json, settings)
-    status = _drive_all(args, console, settings, drives)
+    status = _drive_all(args, settings, drives)
     if not drives:
         return status
     drives = teleop_results.in_order(drives)
@@ -138,79 +102,43 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
     if args.video and not status:
         from instant_ic.experiments.teleop_plot import Video
 
-        with Video(args.video) as video, console.status("rendering the video"):
+        with Video(args.video) as video:
             teleop.run_episode(settings, 0, video.on_step, methods[:1])
     each = figures.pop("each")
     sys.stdout.write(json.dumps(figures, indent=2) + "\n")
     for row in each:
         if row["contacts"] or not row["completed"]:
-            console.print(
-                f"episode {row['index']}, {row['method']}: {row['contacts']} contacts, "
-                f"{'completed' if row['completed'] else 'not completed: ' + (row['reason'] or 'given up')}",
-                markup=False,
-            )
+            how = "completed" if row["completed"] else f"not completed: {row['reason'] or 'given up'}"
+            line = f"episode {row['index']}, {row['method']}: {row['contacts']} contacts, {how}"
+            print(line, file=sys.stderr)
     return status
 
 
-def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: list[Any]) -> int:
+def _drive_all(args: argparse.Namespace, settings: Any, drives: list[Any]) -> int:
     """Run the missing drives; return the exit status. Finished drives are kept however the run ends."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
     from instant_ic.experiments import teleop, teleop_results
 
-    planned, known = settings.episodes * len(settings.methods), len(drives)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    status, words = 0, ""
-    # A drive takes minutes on a slow core: estimate the remaining time from all drives, not from the last 30 s.
-    day_s = 86400.0
-    with Progress(*columns, TimeRemainingColumn(), console=console, speed_estimate_period=day_s) as progress:
-        task = progress.add_task("driving", total=planned - known)
+    planned = settings.episodes * len(settings.methods)
+    status, why = 0, ""
+    with counted("driving", planned - len(drives)) as advance:
 
         def show_progress(drive: teleop.Drive) -> None:
             drives.append(drive)
             if args.json:
                 teleop_results.save(args.json, teleop_results.in_order(drives), settings)
+            how = "completed" if drive.completed else f"not completed: {drive.reason or 'given up'}"
             contacts = sum(drive.contacts for drive in drives)
-            progress.update(task, advance=1, description=f"driving, {contacts} contacts")
-            if not console.is_terminal:
-                how = "completed" if drive.completed else f"not completed: {drive.reason or 'given up'}"
-                console.print(f"episode {drive.index}, {drive.method}: {how}", markup=False)
+            advance(f"driving, {contacts} contacts", f"episode {drive.index}, {drive.method}: {how}")
 
         try:
-            with _stopped_by_sigterm():
-                teleop.evaluate(settings, args.jobs, show_progress, args.timeout, tuple(drives))
+            teleop.evaluate(settings, args.jobs, show_progress, args.timeout, tuple(drives))
         except (ValueError, RuntimeError, TimeoutError) as error:
             if not drives:
                 raise
-            status, words = 1, str(error)
+            status, why = 1, str(error)
         except KeyboardInterrupt:
-            status, words = 130, "interrupted"
+            status, why = 130, "interrupted"
     if status:
         kept = f"; they are saved in {args.json}, continue with --resume" if args.json and drives else ""
-        words = f"ic evaluate teleop: {words}; {len(drives)} of {planned} drives are done{kept}"
-        console.print(words, style="red", markup=False)
+        print(f"ic: {why}; {len(drives)} of {planned} drives are done{kept}", file=sys.stderr)
     return status
-
-
-@contextlib.contextmanager
-def _stopped_by_sigterm() -> Iterator[None]:
-    """Make SIGTERM end the drives as Ctrl-C does."""
-
-    def stop(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,96 @@
+"""Options, checks and progress of the kinds of ``ic evaluate`` that drive many courses."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from instant_ic.cli.errors import UserError
+
+_DAY_S = 86400.0
+
+
+def add_options(parser: argparse.ArgumentParser, episodes: int, jobs: int, timeout_s: float, plot: str) -> None:
+    """Add the options of every kind, with their defaults; ``plot`` says what the plot shows."""
+    add = parser.add_argument
+    add("--episodes", type=int, default=episodes, metavar="N", help="number of courses (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of the courses and all noise (default: %(default)s)")
+    add("--jobs", type=int, default=jobs, metavar="N", help="courses in parallel (default: %(default)s)")
+    add("--json", type=Path, metavar="OUT", help="write all figures here")
+    add("--plot", type=Path, metavar="OUT.png", help=f"plot {plot} here")
+    add("--timeout", type=float, default=timeout_s, metavar="S", help="time limit (default: %(default)g s)")
+
+
+def add_stack_options(parser: argparse.ArgumentParser, world: str, example: str) -> None:
+    """Add the options of the kinds that run the nodes; ``world`` explains the worlds, ``example`` is a parameter."""
+    parser.add_argument("--world", default="corridors", metavar="W", help=f"{world} (default: %(default)s)")
+    parser.add_argument(
+        "-p",
+        "--param",
+        action="append",
+        default=[],
+        metavar="NODE.KEY:=VALUE",
+        help=f"override a parameter, for example {example}; repeatable",
+    )
+
+
+def use_one_thread_for_matrices() -> None:
+    """Keep linear algebra, whose matrices are small here, from competing for cores; call it before numpy loads."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+def check_outputs(args: argparse.Namespace, **suffixes: str) -> None:
+    """Check the files to write before hours of driving.
+
+    Raises:
+        UserError: a folder is missing, or a file of an option in ``suffixes`` has another suffix.
+    """
+    for path in (getattr(args, name, None) for name in ("json", "plot", *suffixes)):
+        if path is not None and not path.parent.is_dir():
+            raise UserError(f"the folder {path.parent} does not exist")
+    for name, suffix in suffixes.items():
+        path = getattr(args, name)
+        if path is not None and path.suffix.lower() != suffix:
+            raise UserError(f"{path}: the name must end in {suffix}")
+    if args.timeout <= 0:
+        raise UserError(f"--timeout must be > 0 (got {args.timeout:g})")
+
+
+@contextmanager
+def errors_for_the_user() -> Iterator[None]:
+    """Turn what an evaluation raises for a wrong value, a failed drive or the time limit into a ``UserError``."""
+    try:
+        yield
+    except (ValueError, RuntimeError, TimeoutError) as error:
+        raise UserError(str(error)) from error
+
+
+@contextmanager
+def counted(what: str, total: int) -> Iterator[Callable[[str, str], None]]:
+    """Yield a function for each finished drive: it takes the text of the bar, and a line for a log without one."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    # A drive takes minutes on a slow core: the remaining time follows from all drives, not from the last 30 s.
+    with Progress(*columns, TimeRemainingColumn(), console=console, speed_estimate_period=_DAY_S) as bar:
+        task = bar.add_task(what, total=total)
+
+        def advance(text: str, line: str) -> None:
+            bar.update(task, advance=1, description=text)
+            if not console.is_terminal:
+                console.print(line, markup=False)
+
+        yield advance
