@@ -1,20 +1,16 @@
-"""Speed of writing and reading bags, compared with rosbags' writer, and the cost of recording.
+"""Speed of writing and reading bags, compared with rosbags' and foxglove-sdk's writers.
 
     python benchmarks/bags.py [--seconds 3] [--folder /tmp] [--out result.json]
 
 Prints JSON. ``write``: messages of each size in one bag, MB/s of payload into the page cache, with and without zstd.
-``read``: the same bag with our reader. ``record``: a publisher process sends 5.5 MB images at 30 Hz (and 20 kB messages
-at 200 Hz) to the recorder node in its own process; reported are the recorder's CPU in % of one core and lost messages.
+``read``: the same bag with our reader.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -22,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 
 SIZES = {"20 kB": 20_000, "200 kB": 200_000, "1.2 MB": 1_200_000, "5.5 MB": 5_500_000}
 IMAGE = "sensor_msgs/msg/Image"
@@ -112,69 +107,6 @@ def read_speed(root: Path, payload: bytes, seconds: float) -> dict[str, float]:
     return found
 
 
-_PUBLISH = """
-import sys, time
-from pathlib import Path
-sys.path.insert(0, {root!r})
-from instant_ic.bus.qos import SENSOR
-from instant_ic.bus.local_transport import LocalTransport
-from benchmarks.bags import picture
-transport = LocalTransport(Path({run!r}), "camera", time.time_ns)
-out = transport.advertise("/image", "sensor_msgs/msg/Image", SENSOR)
-payload = picture({size})
-while out.subscriber_count == 0:
-    time.sleep(0.02)
-due = time.monotonic()
-for _ in range({count}):
-    due += 1 / {hz}
-    time.sleep(max(0, due - time.monotonic()))
-    out.send(payload)
-time.sleep(1.0)
-transport.close()
-"""
-
-
-def recording(root: Path, size: int, hz: float, seconds: float, words: list[str]) -> dict[str, Any]:
-    """CPU and lost messages of a recorder while a publisher sends."""
-    from instant_ic.bag import BagReader
-
-    run, bag = Path(tempfile.mkdtemp(prefix="ic-")), root / f"record{time.monotonic_ns()}"
-    environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(run)}
-    count = int(hz * seconds)
-    code = _PUBLISH.format(root=str(Path(__file__).resolve().parents[1]), run=str(run), size=size, count=count, hz=hz)
-    ic = [sys.executable, "-m", "instant_ic.cli.main", "bag", "record", "-o", str(bag), "/image", *words]
-    recorder = subprocess.Popen(ic, env=environment, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        # The publisher starts after the recorder has subscribed, so that the recorder's start-up is not counted.
-        publisher = subprocess.Popen([sys.executable, "-c", code], env=environment)
-        while not (bag / f"{bag.name}.mcap").exists():
-            time.sleep(0.05)
-        time.sleep(2.0)
-        process = psutil.Process(recorder.pid)
-        before, began_s = process.cpu_times(), time.monotonic()
-        publisher.wait(seconds * 3 + 60)
-        after, took_s = process.cpu_times(), time.monotonic() - began_s
-        recorder.terminate()
-        recorder.wait(60)
-        with BagReader(bag) as reader:
-            lost = json.loads(reader.custom.get("instant_ic.lost", "{}"))
-            overflow = json.loads(reader.custom.get("instant_ic.overflow", "{}"))
-            got = reader.count
-    finally:
-        recorder.kill()
-        recorder.wait(10)
-        shutil.rmtree(run, ignore_errors=True)
-        shutil.rmtree(bag, ignore_errors=True)
-    cpu = (after.user + after.system - before.user - before.system) / took_s * 100
-    return {
-        "MB/s": round(size * hz / 1e6, 1),
-        "cpu_percent": round(cpu, 1),
-        "sent": count,
-        "recorded": got,
-        "lost": sum(lost.values()) + sum(overflow.values()),
-    }
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=3.0, help="about 200 MB a second of each measurement")
@@ -189,7 +121,7 @@ def main() -> None:
         writers["foxglove-sdk"] = foxglove
     except ImportError:
         pass
-    result: dict[str, Any] = {"write_MB_per_s": {}, "read_MB_per_s": {}, "zstd_size": {}, "record": {}}
+    result: dict[str, Any] = {"write_MB_per_s": {}, "read_MB_per_s": {}, "zstd_size": {}}
     try:
         for name, size in SIZES.items():
             payload = picture(size)
@@ -202,10 +134,6 @@ def main() -> None:
                     if compressed:
                         result["zstd_size"].setdefault(name, {})[writer] = share
             result["read_MB_per_s"][name] = read_speed(root, payload, args.seconds)
-        for name, size, hz in (("5.5 MB, 30 Hz", 5_500_000, 30.0), ("20 kB, 200 Hz", 20_000, 200.0)):
-            for words in ([], ["--compression"]):
-                key = f"{name}{', zstd' if words else ''}"
-                result["record"][key] = recording(root, size, hz, 2 * args.seconds, words)
     finally:
         shutil.rmtree(root, ignore_errors=True)
     text = json.dumps(result, indent=2)

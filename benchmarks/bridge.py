@@ -1,7 +1,6 @@
 """Bridge between two machines: latency of commands, age of images and state with and without the bridge, CPU; as JSON.
 
 python benchmarks/bridge.py [SECONDS]     # seconds per scenario, default 20
-python benchmarks/bridge.py --cut         # as root: real stacks in two network namespaces, cable disconnected
 python benchmarks/bridge.py --losses      # seconds until the link detects a loss and until it is back
 
 Commands go 20 times per second from the station to the robot; images (200 kB, 10 per second) and states (20 per second)
@@ -12,7 +11,6 @@ the other way. Two bridges with CURVE and the shipped topic lists run in their o
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import platform
 import statistics
@@ -38,7 +36,6 @@ from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.experiments.impaired_link import ImpairedLink, Impairment
 from instant_ic.experiments.stack import Observer, _NoParameters, free_port
-from instant_ic.experiments.two_machines import TwoMachines, drive_and_cut, missing
 from instant_ic.msg import (
     CompressedImage,
     Odometry,
@@ -252,19 +249,7 @@ def losses(repeat: int) -> dict[str, Any]:
     }
 
 
-def cut() -> dict[str, Any]:
-    """Robot and station in two network namespaces; the cable is disconnected while the robot drives."""
-    if why := missing():
-        raise SystemExit(why)
-    with tempfile.TemporaryDirectory(prefix="ic2") as name, TwoMachines(Path(name), 20, 5) as machines:
-        with machines.robot() as robot, machines.station(depth=False, vspace=False) as station:
-            return {"network": machines.made_by, **dataclasses.asdict(drive_and_cut(machines, robot, station))}
-
-
 def main() -> None:
-    if sys.argv[1:] == ["--cut"]:
-        print(json.dumps(cut(), indent=2))
-        return
     if sys.argv[1:] == ["--losses"]:
         print(json.dumps({"repeat": 10, **losses(10)}, indent=2))
         return

@@ -66,14 +66,12 @@ class DepthSettings:
         lidar: simulated LiDAR that measures the ground truth; None: the network's metres are scored unscaled.
         camera_height_m: above the floor.
         method: of the scaler; empty for its default.
-        max_depth_m: ground truth beyond this is ignored; None: no limit.
     """
 
     source: str = "fused"
     lidar: LidarSettings | None = None
     camera_height_m: float = 1.2
     method: str = ""
-    max_depth_m: float | None = None
 
     def __post_init__(self) -> None:
         if self.source != "network" and self.lidar is None:
@@ -82,8 +80,8 @@ class DepthSettings:
             raise DepthEvaluationError("a scaling method needs LiDAR points: add --lidar (and --depth)")
         if self.method and self.source == "lidar":
             raise DepthEvaluationError("source lidar does not scale a network: omit the method")
-        if not self.camera_height_m > 0 or (self.max_depth_m is not None and not self.max_depth_m > 0):
-            raise DepthEvaluationError("camera height and largest depth must be above 0")
+        if not self.camera_height_m > 0:
+            raise DepthEvaluationError(f"the camera's height must be above 0 (got {self.camera_height_m})")
 
 
 @dataclass(frozen=True)
@@ -189,8 +187,6 @@ class Evaluator:
         if truth_m is not None:
             known = np.isfinite(truth_m) & (truth_m > 0)
             truth = np.where(known, truth_m, 0).astype(np.float32)
-            if settings.max_depth_m is not None:
-                known &= truth <= settings.max_depth_m
             if not known.any():
                 raise DepthEvaluationError(f"{name}: the ground truth has no valid pixel")
         if settings.lidar is not None and points is None:
@@ -228,7 +224,7 @@ class Evaluator:
             if raw is not None and self.model is not None and self.model.manifest.output_kind == "metric":
                 before = depth_metrics(look_up(raw, truth.shape), truth, known)
             if sigma is not None:
-                share = _within_sigma(depth, sigma, nearest(truth, depth.shape), settings.max_depth_m)
+                share = _within_sigma(depth, sigma, nearest(truth, depth.shape))
         return Scored(
             name, rgb, depth, truth, None if points is None else points.astype(np.float32), before, after, weighted,
             shape, share, between - begin, end - between, cpu_s, fit,
@@ -257,10 +253,8 @@ def nearest(values: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
     return values[np.ix_(rows, columns)]
 
 
-def _within_sigma(depth: Floats, sigma: Floats, truth: Floats, max_depth_m: float | None) -> float | None:
+def _within_sigma(depth: Floats, sigma: Floats, truth: Floats) -> float | None:
     known = (truth > 0) & (depth > 0) & np.isfinite(sigma)
-    if max_depth_m is not None:
-        known &= truth <= max_depth_m
     if not known.any():
         return None
     return float((np.abs(depth[known] - truth[known]) <= sigma[known] * truth[known]).mean())
@@ -288,7 +282,6 @@ def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: Mod
         "method": settings.method or (ScalerConfig().method if settings.lidar and model else None),
         "lidar": asdict(settings.lidar) if settings.lidar else None,
         "camera_height_m": settings.camera_height_m,
-        "max_depth_m": settings.max_depth_m,
         "count": len(scored),
         "fits_ok": sum(bool(row["fit"]["ok"]) for row in scored) if settings.lidar else None,
         "mean": mean,

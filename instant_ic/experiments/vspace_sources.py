@@ -48,7 +48,6 @@ class VspaceSettings:
         panorama_width: of the keyframes, pixels.
         keyframes: 1, or more, each a metre behind the next on the path.
         step_m, reach_m: distances from the last panorama are multiples of ``step_m`` up to ``reach_m``.
-        depth_source: depth source of ``ours``, see ``depth.sources``.
         seed: of LiDAR noise, training and the changed colours.
     """
 
@@ -62,7 +61,6 @@ class VspaceSettings:
     keyframes: int = 1
     step_m: float = 0.25
     reach_m: float = 4.0
-    depth_source: str = "fused"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -109,7 +107,7 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
     raw = model.estimate(rgb)
     points = measure_world(renderer, pose, LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, Errors(seed=settings.seed))
     scaler = ScalerConfig(output_kind=model.manifest.output_kind)
-    source = DepthSource(SourceConfig(source=settings.depth_source, scaler=scaler))
+    source = DepthSource(SourceConfig(scaler=scaler))
     result = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M)
     if not result.ok:
         raise ValueError(

@@ -50,7 +50,6 @@ def add_kind(kinds: Any) -> None:
                         help="scaling: median_ratio, max_ratio, ransac, sector (default: the scaler's)")  # fmt: skip
     parser.add_argument("--png-unit", type=float, default=1e-3, metavar="M",
                         help="metres per unit of a depth PNG (default: %(default)g)")  # fmt: skip
-    parser.add_argument("--max-depth", type=float, metavar="M", help="ignore true depth beyond this")
     parser.add_argument("--threads", type=int, default=2, help="CPU threads of the model (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
     parser.add_argument(
@@ -88,7 +87,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     try:
         lidar = LidarSettings(args.lidar_height, args.noise, args.outliers, args.seed) if args.lidar else None
         source = args.source or ("fused" if lidar else "network")
-        settings = DepthSettings(source, lidar, args.camera_height, args.method, args.max_depth)
+        settings = DepthSettings(source, lidar, args.camera_height, args.method)
         model = None
         if source != "lidar":
             model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads)

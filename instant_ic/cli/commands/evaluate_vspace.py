@@ -41,15 +41,11 @@ def add_kind(kinds: Any) -> None:
     parser.add_argument("--times", metavar="S,S,...", help="training times at which ours and field are measured")
     parser.add_argument("--size", default="640x360", metavar="WxH", help="size of the images (default: %(default)s)")
     parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="horizontal field of view (default: 90)")
-    parser.add_argument("--panorama-width", type=int, default=2048, metavar="PX", help="default: %(default)s")
     parser.add_argument(
         "--keyframes", type=int, default=1, metavar="K", help="number of panoramas, 1 m apart (default: 1)"
     )
     parser.add_argument("--step", type=float, default=0.25, metavar="M", help="step between distances (default: 0.25)")
     parser.add_argument("--reach", type=float, default=4.0, metavar="M", help="longest distance (default: 4)")
-    parser.add_argument(
-        "--depth-source", choices=("network", "lidar", "fused"), default="fused", help="of ours (default: %(default)s)"
-    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here")
     parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write the curves here")
@@ -78,11 +74,9 @@ def run(args: argparse.Namespace) -> int:
             times=tuple(_numbers(args.times, "--times")) if args.times else (),
             size=_size(args.size),
             fov_deg=args.fov,
-            panorama_width=args.panorama_width,
             keyframes=args.keyframes,
             step_m=args.step,
             reach_m=args.reach,
-            depth_source=args.depth_source,
             seed=args.seed,
         )
         start = _start(args.start) if args.start else None
