@@ -52,7 +52,7 @@ class Remembered:
 
 def evaluators(model: Remembered, share: float, method: str) -> dict[str, Evaluator]:
     """One evaluator per source; the unscaled source uses no LiDAR and therefore has no outliers."""
-    lidar = LidarSettings(LIDAR_HEIGHT_M, outliers=share)
+    lidar = LidarSettings(outliers=share, height_m=LIDAR_HEIGHT_M)
     made = {
         source: Evaluator(DepthSettings(source, lidar, method=method if source != "lidar" else ""), model)
         for source in SOURCES[1:]

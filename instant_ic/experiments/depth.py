@@ -43,18 +43,15 @@ class DepthEvaluationError(ValueError):
 
 
 @dataclass(frozen=True)
-class LidarSettings:
-    """The simulated VLP-16 next to the camera; see ``depth_lidar``."""
+class LidarSettings(Errors):
+    """The simulated VLP-16 above or below the camera, with its errors; see ``depth_lidar``."""
 
     height_m: float = 0.6
-    noise_m: float = 0.02
-    outliers: float = 0.0
-    seed: int = 0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.height_m > 0:
             raise DepthEvaluationError(f"the LiDAR's height must be above 0 (got {self.height_m})")
-        Errors(self.noise_m, self.outliers, self.seed)
 
 
 @dataclass(frozen=True)
@@ -192,11 +189,7 @@ class Evaluator:
         if settings.lidar is not None and points is None:
             if truth is None:
                 raise DepthEvaluationError(f"{name}: the simulated LiDAR needs ground-truth depth")
-            lidar = settings.lidar
-            points = measure(
-                truth, lidar.height_m, settings.camera_height_m,
-                noise_m=lidar.noise_m, outliers=lidar.outliers, seed=lidar.seed,
-            )  # fmt: skip
+            points = measure(truth, settings.lidar.height_m, settings.camera_height_m, settings.lidar)
         if self.model is not None and not self._warm:
             self.model.estimate(rgb)  # warm-up: the first run allocates memory
             self._warm = True

@@ -54,12 +54,9 @@ def measure(
     depth_m: Floats,
     lidar_height_m: float,
     camera_height_m: float,
-    rings: int = 16,
-    noise_m: float = 0.02,
-    outliers: float = 0.0,
-    seed: int = 0,
+    errors: Errors | None = None,
 ) -> NDArray[np.float32]:
-    """Simulate one revolution of a LiDAR on the camera's vertical, from a level depth image.
+    """Simulate one revolution of a VLP-16 on the camera's vertical, from a level depth image.
 
     LiDAR and camera share a vertical axis, so each beam stays in one column of the image. There the image is a profile
     of the room, and a beam ends where it first meets the profile. A beam gives no point where it passes behind a
@@ -68,8 +65,7 @@ def measure(
     Args:
         depth_m: (H, W) radial depth of a level panorama, metres; 0 or not finite is unknown.
         lidar_height_m, camera_height_m: above the same floor.
-        rings: beams between -15 and 15 degrees (VLP-16: 16).
-        noise_m, outliers, seed: see ``Errors``.
+        errors: of the ranges; the default ones by default.
 
     Returns:
         (N, 3) points in the camera's frame, metres.
@@ -79,9 +75,6 @@ def measure(
     """
     if depth_m.ndim != 2 or min(depth_m.shape) < 4:
         raise ValueError(f"depth_m must be (H, W) (got {depth_m.shape})")
-    if rings < 1:
-        raise ValueError(f"rings must be 1 or more (got {rings})")
-    errors = Errors(noise_m, outliers, seed)
     below_m = lidar_height_m - camera_height_m
     if not math.isfinite(below_m):
         raise ValueError(f"heights must be numbers (got {lidar_height_m}, {camera_height_m})")
@@ -97,12 +90,12 @@ def measure(
     across, up = radius * np.cos(elevation)[:, None], radius * np.sin(elevation)[:, None] - below_m
 
     points = []
-    for omega in np.radians(np.linspace(-15, 15, rings) if rings > 1 else np.zeros(1)):
+    for omega in np.radians(np.linspace(-15, 15, 16)):
         range_m = _first_crossing(across, up, depth_edge, omega)
         hit = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
         points.append(_on_rays(omega, azimuth[hit], range_m[hit]))
     true = np.concatenate(points)
-    return _measured(true, errors, np.array([0.0, 0.0, below_m]))
+    return _measured(true, errors or Errors(), np.array([0.0, 0.0, below_m]))
 
 
 def measure_world(

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from instant_ic.bus import LATCHED
 from instant_ic.console.client import ConsoleClient
 from instant_ic.experiments.stack import Stack, StackError
-from instant_ic.geometry.poses import compose2, pose2_from_matrix
-from instant_ic.msg import matrix_from_pose, message_type, stamp_ns
-
-FOOTPRINT_M = (0.60, 0.50)
+from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.msg import matrix_from_pose, message_type
 
 
 @dataclass
@@ -34,9 +32,6 @@ class DriveRecord:
     contact: bool = False
     ready_seconds: list[float] = field(default_factory=list)
     """For each keyframe: seconds from its arrival until the virtual space was ready to be shown."""
-    view_stamps_ns: list[int] = field(default_factory=list)
-    view_bytes: list[int] = field(default_factory=list)
-    view_size: tuple[int, int] = (0, 0)
     render_ms: list[float] = field(default_factory=list)
 
 
@@ -82,31 +77,12 @@ class DriveRecorder:
             self.record.ready_seconds.append(float(message.ready_seconds))
 
     def _on_view(self, message: Any) -> None:
-        self.record.view_stamps_ns.append(stamp_ns(message))
-        self.record.view_bytes.append(len(message.image.data))
-        self.record.view_size = (int(message.width), int(message.height))
         self.record.render_ms.append(float(message.render_ms))
 
     @property
     def ready(self) -> bool:
         """Whether the virtual space is ready to be shown."""
         return self.vspace is not None and self.vspace.state == self.vspace.READY
-
-
-def footprint_clearance(pose: NDArray[np.float64], box: tuple[float, float, float, float]) -> float:
-    """Distance in metres between the crawler's footprint and an axis-aligned box; 0 if they overlap.
-
-    Args:
-        pose: (x, y, yaw) of the crawler.
-        box: x_min, y_min, x_max, y_max.
-    """
-    length, width = FOOTPRINT_M
-    xs = np.linspace(-length / 2, length / 2, 25)
-    ys = np.linspace(-width / 2, width / 2, 21)
-    points = np.array([compose2(pose, (x, y, 0.0))[:2] for x in xs for y in ys])
-    gap_x = np.maximum(np.maximum(box[0] - points[:, 0], points[:, 0] - box[2]), 0)
-    gap_y = np.maximum(np.maximum(box[1] - points[:, 1], points[:, 1] - box[3]), 0)
-    return float(np.hypot(gap_x, gap_y).min())
 
 
 @contextlib.asynccontextmanager

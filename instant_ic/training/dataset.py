@@ -74,16 +74,6 @@ class PanoramaDataset:
     def __len__(self) -> int:
         return len(self.world)
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width."""
-        return int(self.rgb.shape[1]), int(self.rgb.shape[2])
-
-    def brightness(self, samples: int = 64) -> float:
-        """Mean byte of about ``samples`` evenly chosen panoramas, for the manifest of a model trained on them."""
-        step = max(1, len(self) // samples)
-        return round(float(np.mean([self.rgb[i].mean() for i in range(0, len(self), step)])), 1)
-
     def __getitem__(self, index: int) -> Sample:
         return Sample(np.asarray(self.rgb[index]), np.asarray(self.depth[index], np.float32), int(self.world[index]))
 

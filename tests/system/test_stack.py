@@ -14,12 +14,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from instant_ic.bus import registry
 from instant_ic.experiments.budget import cpu_percent, reference_loop, usage
-from instant_ic.experiments.drive import DriveRecord, DriveRecorder, drive_through_obstacle, footprint_clearance
+from instant_ic.experiments.drive import DriveRecord, DriveRecorder, drive_through_obstacle
 from instant_ic.experiments.stack import Stack, free_ports, processes_of
+from instant_ic.geometry.poses import compose2
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState
 from instant_ic.sim.render import EquirectRenderer
@@ -123,6 +125,22 @@ def test_obstacle_stands_where_these_tests_think():
     directions = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     ranges, _ = EquirectRenderer(corridor_world()).cast(origins, directions)
     assert ranges == pytest.approx([1, 1, 0.5, 0.5], abs=1e-3)
+
+
+def footprint_clearance(pose: NDArray[np.float64], box: tuple[float, float, float, float]) -> float:
+    """Distance in metres between the crawler's footprint and an axis-aligned box; 0 if they overlap.
+
+    Args:
+        pose: (x, y, yaw) of the crawler.
+        box: x_min, y_min, x_max, y_max.
+    """
+    length, width = 0.60, 0.50
+    xs = np.linspace(-length / 2, length / 2, 25)
+    ys = np.linspace(-width / 2, width / 2, 21)
+    points = np.array([compose2(pose, (x, y, 0.0))[:2] for x in xs for y in ys])
+    gap_x = np.maximum(np.maximum(box[0] - points[:, 0], points[:, 0] - box[2]), 0)
+    gap_y = np.maximum(np.maximum(box[1] - points[:, 1], points[:, 1] - box[3]), 0)
+    return float(np.hypot(gap_x, gap_y).min())
 
 
 def test_real_robot_never_touches_the_obstacle_that_the_virtual_one_drives_through(outcome):

@@ -25,7 +25,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_folder_gives_back_what_was_written(folder: Path) -> None:
     data = PanoramaDataset(folder)
-    assert (len(data), data.size, data.info["kind"]) == (12, (8, 16), "stripes")
+    assert (data.rgb.shape, data.info["kind"]) == ((12, 8, 16, 3), "stripes")
     for index, sample in enumerate(stripes(12, 4)):
         np.testing.assert_array_equal(data[index].rgb, sample.rgb)
         np.testing.assert_array_equal(data[index].depth_m, sample.depth_m)

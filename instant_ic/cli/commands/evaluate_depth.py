@@ -85,7 +85,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     if args.source not in (None, "network") and not args.lidar:
         raise UserError(f"--source {args.source} needs LiDAR points: give --depth and --lidar too", 2)
     try:
-        lidar = LidarSettings(args.lidar_height, args.noise, args.outliers, args.seed) if args.lidar else None
+        lidar = LidarSettings(args.noise, args.outliers, args.seed, args.lidar_height) if args.lidar else None
         source = args.source or ("fused" if lidar else "network")
         settings = DepthSettings(source, lidar, args.camera_height, args.method)
         model = None
