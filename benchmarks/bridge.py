@@ -54,7 +54,7 @@ SCENARIOS: dict[str, list[str] | None] = {
     "bridge over loopback": [],
     "bridge, 20 ms ± 5 ms": ["--delay-ms=20", "--jitter-ms=5"],
     "bridge, 20 ms ± 5 ms, 1 % stalls of 0.2 s": ["--delay-ms=20", "--jitter-ms=5", "--stall-share=0.01"],
-    "bridge, 20 ms ± 5 ms, 10 Mbit/s (pictures need 16)": ["--delay-ms=20", "--jitter-ms=5", "--rate-mbit=10"],
+    "bridge, 20 ms ± 5 ms, 10 Mbit/s (images need 16)": ["--delay-ms=20", "--jitter-ms=5", "--rate-mbit=10"],
 }
 
 

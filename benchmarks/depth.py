@@ -139,7 +139,7 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=2, help="of the model (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument(
-        "--sheets", type=Path, metavar="DIR", help="sheets of pictures of the fused source, 5 %% outliers"
+        "--sheets", type=Path, metavar="DIR", help="sheets of images of the fused source, 5 %% outliers"
     )
     args = parser.parse_args()
     if args.sheets:

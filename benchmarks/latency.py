@@ -185,7 +185,7 @@ class Robot:
                     self.tell(step)
                     step += 1
                 self.stack.observer.rest(due - time.monotonic())
-        except Exception as error:  # noqa: BLE001 - reported by whoever waits
+        except Exception as error:  # noqa: BLE001 - reported in the waiting thread
             self.error = f"{type(error).__name__}: {error}"
 
     def tell(self, step: int) -> None:
@@ -347,7 +347,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument("--width", type=int, default=960)
     parser.add_argument("--height", type=int, default=600)
-    parser.add_argument("--wait", type=float, default=180.0, help="seconds for the nodes to come up (default 180)")
+    parser.add_argument("--wait", type=float, default=180.0, help="seconds for the nodes to start (default 180)")
     args = parser.parse_args()
     if args.presses < 2:
         parser.error("--presses must be 2 or more")

@@ -42,7 +42,7 @@ BEYOND_X_M = 5.6
 """Map x behind the box where the key is released."""
 POLL_MS = 60
 """Between two looks at the stack while the browser runs; each look costs CPU too."""
-# Counts what the page really draws: several draw calls of one animation frame count once.
+# Counts what the page renders: several draw calls of one animation frame count as one.
 WATCH_PAGE = """
 window.__keys = [];
 window.addEventListener('keydown', e => {
@@ -242,7 +242,7 @@ def is_passage(modes: list[int]) -> bool:
 
 
 Sample = tuple[Usage, float, int, int]
-"""Usage of the stack, CPU seconds of the browser, camera images, frames drawn by the page."""
+"""Usage of the stack, CPU seconds of the browser, camera images, frames rendered by the page."""
 
 
 def sample(page: Any, run_dir: Path, watch: Watch) -> Sample:
