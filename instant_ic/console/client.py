@@ -13,7 +13,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import aiohttp
 
-from instant_ic.console.protocol import Frame, FrameKind, decode_frame, parse_text
+from instant_ic.console.protocol import Frame, FrameKind, Parts, decode_frame, parse_text
 
 
 class ConsoleClient:
@@ -53,6 +53,7 @@ class ConsoleClient:
         self.acknowledge = acknowledge
         self.messages: dict[str, dict[str, Any]] = {}
         self.frames: dict[FrameKind, Frame] = {}
+        self._parts = Parts()
         self.frame_counts: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
         self.refused: list[str] = []
         self.errors: list[str] = []
@@ -208,6 +209,11 @@ class ConsoleClient:
                 self._news.notify_all()
 
     async def _on_frame(self, frame: Frame) -> None:
+        if frame.kind is FrameKind.PART:
+            await self.send({"type": "ack", "kind": int(frame.kind), "seq": frame.sequence})
+            if (whole := self._parts.take(frame)) is None:
+                return
+            frame = whole
         self.frames[frame.kind] = frame
         self.frame_counts[frame.kind] += 1
         if self.acknowledge:

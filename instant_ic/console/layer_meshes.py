@@ -19,8 +19,6 @@ from instant_ic.vspace.prior import edge_quads
 EDGE_RATIO = 0.2
 """Two neighbours are an edge when their depths differ by more than this share. Where the depth is noisy, smaller steps
 are no edges: as squares of their own they would look like shards (0.7 dB in the corridor's live keyframes)."""
-TOLERANCE = 0.01
-"""Largest error of the triangles' inverse depth, in 1/m: half of the triangles, and no worse on live keyframes."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ def _layer(source: LayerSource, before: PageLayer | None) -> PageLayer:
     if source.behind:
         for axis in (0, 1):  # a quad has four pixels
             shown = shown | np.roll(shown, 1, axis)
-    mesh = layer_mesh(geometry.inverse_depth, edge_quads(geometry.inverse_depth, EDGE_RATIO), shown, TOLERANCE)
+    mesh = layer_mesh(geometry.inverse_depth, edge_quads(geometry.inverse_depth, EDGE_RATIO), shown)
     return PageLayer(
         image=source.colour,
         confidence=geometry.confidence,

@@ -8,7 +8,8 @@ Binary frame, little endian::
     offset 4   uint32  sequence number, counted for each kind and client
     offset 8   uint32  length of the header, bytes
     offset 12          header: JSON, UTF-8
-    then               payload: JPEG or PNG; for LAYERS the parts of all layers, by the ranges in the header
+    then               payload: JPEG or PNG; for LAYERS the parts of all layers, by the ranges in the header; for PART
+                       a piece of a whole frame from ``start`` on, which has ``size`` bytes
 
 docs/console.md lists the fields of every message and header.
 """
@@ -38,6 +39,7 @@ class FrameKind(IntEnum):
     MAP = 3  # 8-bit grey PNG: 0..100 occupied %, 255 unknown; row 0 is the highest y
     COSTMAP = 4  # the same layout; 0..100 cost
     LAYERS = 5  # the virtual space as layers of triangles
+    PART = 6  # piece of the payload of a frame that is too large for one message
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,31 @@ def decode_frame(data: bytes) -> Frame:
     if not isinstance(header, dict):
         raise ProtocolError(f"binary frame: header is {type(header).__name__}, not an object")
     return Frame(frame_kind, sequence, header, data[end:])
+
+
+class Parts:
+    """Puts frames together that come as pieces, in order."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+
+    def take(self, part: Frame) -> Frame | None:
+        """Take a piece; return the frame once it is complete.
+
+        Raises:
+            ProtocolError: a piece is missing, or what they make is no frame.
+        """
+        start, size = part.header.get("start"), part.header.get("size")
+        if start == 0:
+            self._data.clear()
+        if start != len(self._data):
+            raise ProtocolError(f"part.start must be {len(self._data)} (got {start})")
+        self._data += part.payload
+        if len(self._data) != size:
+            return None
+        whole = bytes(self._data)
+        self._data.clear()
+        return decode_frame(whole)
 
 
 def parse_text(text: str) -> dict[str, Any]:

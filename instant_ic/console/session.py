@@ -6,7 +6,7 @@ import asyncio
 import json
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from aiohttp import web
@@ -19,6 +19,7 @@ from instant_ic.web_access import TokenBucket
 MAX_REPLIES = 256  # pending, about one second of a page's traffic; a client with more does not read
 # Smallest first: an image must not delay the state, nor a map an image.
 FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.LAYERS, FrameKind.MAP, FrameKind.COSTMAP)
+PART_BYTES = 64 * 1024  # a larger frame of layers is sent in pieces: on a slow link it would hold up pongs for seconds
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,7 @@ class Session:
         self._frames: dict[FrameKind, PendingFrame | PendingLayers] = {}
         self._sent_frames: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
         self._unacknowledged: dict[FrameKind, int] = {}
+        self._parts: deque[Frame] = deque()  # of the layers that are being sent; their sequence numbers are still open
         self._last_sent: dict[FrameKind, float] = {}
         self._foreground: frozenset[FrameKind] = frozenset({FrameKind.PANORAMA})
         self._background_period_s = 0.0
@@ -145,6 +147,8 @@ class Session:
         if self._texts:
             return self._texts.pop(next(iter(self._texts)))
         for kind in FRAME_ORDER:
+            if kind is FrameKind.LAYERS and self._parts and FrameKind.PART not in self._unacknowledged:
+                return self._next_part()
             if kind not in self._frames or kind in self._unacknowledged or self._held_back(kind, now):
                 continue
             pending = self._frames.pop(kind)
@@ -153,8 +157,20 @@ class Session:
             self._last_sent[kind] = now
             if isinstance(pending, PendingLayers):
                 self._offered = pending.layers.digests
-            return encode_frame(Frame(kind, self._sent_frames[kind], *pending.content(self._held)))
+            data = encode_frame(Frame(kind, self._sent_frames[kind], *pending.content(self._held)))
+            if kind is not FrameKind.LAYERS or len(data) <= PART_BYTES:
+                return data
+            self._parts.extend(
+                Frame(FrameKind.PART, 0, {"start": start, "size": len(data)}, data[start : start + PART_BYTES])
+                for start in range(0, len(data), PART_BYTES)
+            )
+            return self._next_part()
         return None
+
+    def _next_part(self) -> bytes:
+        part, sequence = self._parts.popleft(), self._sent_frames[FrameKind.PART] + 1
+        self._sent_frames[FrameKind.PART] = self._unacknowledged[FrameKind.PART] = sequence
+        return encode_frame(replace(part, sequence=sequence))
 
     def _held_back(self, kind: FrameKind, now: float) -> bool:
         if kind in self._foreground or kind not in (FrameKind.PANORAMA, FrameKind.VIEW):

@@ -7,6 +7,9 @@ from numba import njit
 
 from instant_ic.vspace.nerf.kernels import _OPTIONS
 
+SAME_SURFACE = 0.1
+"""Pixels round a corner show the same surface when their inverse depths differ by no more than this share."""
+
 
 @njit(**_OPTIONS)
 def corner_values(inverse, torn):  # type: ignore[no-untyped-def]
@@ -161,6 +164,41 @@ def count_triangles(errors, alone, shown, tile, limit):  # type: ignore[no-untyp
 
 
 @njit(**_OPTIONS)
+def _inner_slope(own, inner, shown):  # type: ignore[no-untyped-def]
+    """Change of the inverse depth to a pixel from the one on its inner side; 0 where that is another surface."""
+    same = shown and abs(own - inner) <= SAME_SURFACE * min(own, inner)
+    return own - inner if same else np.float32(0)
+
+
+@njit(**_OPTIONS)
+def _continued(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-def]
+    """Inverse depth at a corner of a pixel, its surface continued; ``down``, ``right``: 0 or 1, which corner."""
+    height, width = inverse.shape
+    own = inverse[v, u]
+    side, above = (u + 1 - 2 * right) % width, min(max(v + 1 - 2 * down, 0), height - 1)
+    slope = _inner_slope(own, inverse[v, side], shown[v, side]) + _inner_slope(own, inverse[above, u], shown[above, u])
+    return own + np.float32(0.5) * slope
+
+
+@njit(**_OPTIONS)
+def _edge_value(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-def]
+    """Inverse depth at a corner of a pixel on a depth edge: the mean of the pixels around that show the same surface."""
+    height, width = inverse.shape
+    own = _continued(inverse, shown, v, u, down, right)
+    total, count = own, 1
+    for dv in (0, 1):
+        for du in (0, 1):
+            row, column = v + down - 1 + dv, (u + right - 1 + du) % width
+            if (row == v and column == u) or row < 0 or row >= height or not shown[row, column]:
+                continue
+            value = _continued(inverse, shown, row, column, 1 - dv, 1 - du)
+            if abs(value - own) <= SAME_SURFACE * min(value, own):
+                total += value
+                count += 1
+    return total / np.float32(count)
+
+
+@njit(**_OPTIONS)
 def write_triangles(errors, alone, shown, torn, inverse, corners, tile, limit, places, values, indices):  # type: ignore[no-untyped-def]
     """Write vertices and triangles; returns the number of vertices."""
     height, width = alone.shape
@@ -185,7 +223,10 @@ def write_triangles(errors, alone, shown, torn, inverse, corners, tile, limit, p
                 row, column = v + k // 2, (u + k % 2) % width
                 if torn[row, column] or at[row, column] < 0:
                     places[used, 0], places[used, 1] = column, row
-                    values[used] = inverse[v, u] if torn[row, column] else corners[row, column]
+                    if torn[row, column]:
+                        values[used] = _edge_value(inverse, shown, v, u, k // 2, k % 2)
+                    else:
+                        values[used] = corners[row, column]
                     square[k] = used
                     if not torn[row, column]:
                         at[row, column] = used

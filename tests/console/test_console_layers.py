@@ -4,6 +4,7 @@ import asyncio
 import dataclasses
 import math
 
+import aiohttp
 import numpy as np
 import pytest
 
@@ -11,6 +12,8 @@ from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, Protocol
 from instant_ic.console import server as server_module
 from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource, confidence_png
 from instant_ic.console.layers import PageLayer, PageLayers
+from instant_ic.console.protocol import Parts, decode_frame
+from instant_ic.console.session import PART_BYTES
 from instant_ic.geometry.poses import pose_matrix
 
 WAIT_S = 20.0
@@ -122,6 +125,37 @@ async def until(predicate):
 async def next_layers(client, count):
     await client.wait_for(lambda c: c.frame_counts[FrameKind.LAYERS] == count, WAIT_S)
     return sent_parts(client), client.frames[FrameKind.LAYERS].sequence
+
+
+def test_texts_go_between_the_pieces_of_large_layers_and_one_piece_at_a_time(server):
+    image = bytes(range(256)) * 1000
+    server.send_layers(layers(1, layer(image)))
+
+    async def scenario():
+        url = server.url.replace("http", "ws") + "ws"
+        async with aiohttp.ClientSession() as http, http.ws_connect(url) as socket:
+            collected, parts, pieces = None, Parts(), 0
+            while collected is None:
+                message = await socket.receive(WAIT_S)
+                if message.type is not aiohttp.WSMsgType.BINARY:
+                    continue
+                part = decode_frame(message.data)
+                assert part.kind is FrameKind.PART
+                assert len(part.payload) <= PART_BYTES
+                pieces += 1
+                collected = parts.take(part)
+                for number in range(3):  # the next piece waits for the acknowledgement, pongs do not
+                    await socket.send_json({"type": "ping", "client_ms": number})
+                    while (answer := await socket.receive_json(timeout=WAIT_S))["type"] != "pong":
+                        pass
+                    assert answer["client_ms"] == number
+                await socket.send_json({"type": "ack", "kind": int(FrameKind.PART), "seq": part.sequence})
+            assert pieces == -(-(len(image) + 500) // PART_BYTES)
+            assert collected.kind is FrameKind.LAYERS
+            start, length = collected.header["layers"][0]["parts"]["image"]
+            assert collected.payload[start : start + length] == image
+
+    asyncio.run(scenario())
 
 
 def test_each_page_gets_a_version_once_and_only_what_it_lacks(server):

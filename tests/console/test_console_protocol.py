@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from instant_ic.console.protocol import (
     Frame,
     FrameKind,
+    Parts,
     ProtocolError,
     decode_frame,
     encode_frame,
@@ -58,6 +59,21 @@ def test_any_bytes_are_a_frame_or_a_protocol_error(data):
 def test_what_is_wrong_with_a_frame_is_told(data, words):
     with pytest.raises(ProtocolError, match=words):
         decode_frame(data)
+
+
+def test_pieces_make_the_frame_they_are_of_and_a_missing_one_is_told():
+    whole = encode_frame(Frame(FrameKind.LAYERS, 7, {"a": 1}, b"layers"))
+
+    def part(start, end):
+        return Frame(FrameKind.PART, 1, {"start": start, "size": len(whole)}, whole[start:end])
+
+    parts = Parts()
+    assert parts.take(part(0, 9)) is None
+    assert parts.take(part(0, 5)) is None  # a new frame takes the place of an unfinished one
+    assert parts.take(part(5, 20)) is None
+    with pytest.raises(ProtocolError, match=r"part.start must be 20 \(got 21\)"):
+        parts.take(part(21, 24))
+    assert parts.take(part(20, len(whole))) == Frame(FrameKind.LAYERS, 7, {"a": 1}, b"layers")
 
 
 @given(st.text(max_size=40))

@@ -1,9 +1,9 @@
 // @ts-check
 // The WebSocket: reconnects, keeps the server's clock, and passes on checked messages and frames.
 
-/** @import { Frame, Pong } from "./messages.js" */
+/** @import { Frame, PartFrame, Pong } from "./messages.js" */
 import { ServerClock } from "./clock.js";
-import { decodeFrame, frameNumber, MessageError, parseMessage } from "./messages.js";
+import { decodeFrame, frameNumber, MessageError, PART, parseMessage, Parts } from "./messages.js";
 
 const PING_MS = 50; // the server counts a driver as lost after beat_timeout_s (0.25 s)
 const SILENCE_MS = 1000; // the link counts as lost after this silence
@@ -30,6 +30,7 @@ export class Link extends EventTarget {
     this._socket = null;
     this._retryMs = FIRST_RETRY_MS;
     this._heard = 0;
+    this._parts = new Parts();
     this._sequence = 0;
     this._connect();
     setInterval(() => this._beat(), PING_MS);
@@ -65,7 +66,7 @@ export class Link extends EventTarget {
     return true;
   }
 
-  /** @param {Pick<Frame, "kind" | "sequence">} frame @param {boolean} loaded false: the page could not use it */
+  /** @param {Pick<Frame | PartFrame, "kind" | "sequence">} frame @param {boolean} loaded false: the page could not use it */
   acknowledge(frame, loaded = true) {
     this.send({ type: "ack", kind: frame.kind, seq: frame.sequence, ...(loaded ? {} : { loaded }) });
   }
@@ -136,7 +137,9 @@ export class Link extends EventTarget {
     this._heard = performance.now();
     try {
       if (typeof data !== "string") {
-        this.dispatchEvent(new CustomEvent("frame", { detail: decodeFrame(data) }));
+        const frame = decodeFrame(data);
+        if (frame.kind === PART) this._collect(frame);
+        else this.dispatchEvent(new CustomEvent("frame", { detail: frame }));
         return;
       }
       const message = parseMessage(data);
@@ -148,6 +151,15 @@ export class Link extends EventTarget {
       const frame = typeof data === "string" ? null : frameNumber(data);
       if (frame) this.acknowledge(frame, false); // else the server would wait, and send no other one
     }
+  }
+
+  /** @param {PartFrame} part */
+  _collect(part) {
+    this.acknowledge(part);
+    const socket = this._socket;
+    this._parts.take(part)?.arrayBuffer().then((whole) => {
+      if (socket === this._socket) this._receive(whole);
+    });
   }
 
   /** @param {Pong} message */

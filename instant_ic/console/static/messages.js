@@ -165,8 +165,8 @@ function parsed(json) {
 
 // ---- binary frames -------------------------------------------------------------------------------
 
-export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4, LAYERS = 5;
-const KINDS = /** @type {const} */ ([PANORAMA, VIEW, MAP, COSTMAP, LAYERS]);
+export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4, LAYERS = 5, PART = 6;
+const KINDS = /** @type {const} */ ([PANORAMA, VIEW, MAP, COSTMAP, LAYERS, PART]);
 const PREFIX_BYTES = 12;
 const VERSION = 1;
 
@@ -175,6 +175,7 @@ const viewHeader = object({
   captured_ms: number, q: quaternion, p: triple, fov: number, mask: text, depth: text, depth_near_m: number, mount: triple,
 });
 const gridHeader = object({ resolution: number, width: number, height: number, x: number, y: number });
+const partHeader = object({ start: number, size: number });
 const MOST_LAYERS = 8; // bits of the stencil buffer
 const parts = object({ inverse: pair, triangles: pair, corners: pair, image: pair, confidence: pair });
 const layersHeader = object({
@@ -209,8 +210,38 @@ const layersHeader = object({
 /** @typedef {{kind: 2, sequence: number, header: ViewHeader, payload: Blob}} ViewFrame */
 /** @typedef {{kind: 3 | 4, sequence: number, header: GridHeader, payload: Blob}} GridFrame */
 /** @typedef {PanoramaFrame | ViewFrame | GridFrame | LayersFrame} Frame */
+/** @typedef {{kind: 6, sequence: number, header: ReturnType<typeof partHeader>, payload: Blob}} PartFrame */
 
-/** Decodes a binary frame; throws MessageError. @param {ArrayBuffer} buffer @returns {Frame} */
+/** Puts frames together that come as pieces, in order. */
+export class Parts {
+  constructor() {
+    /** @type {Blob[]} */
+    this._pieces = [];
+    this._size = 0;
+  }
+
+  /**
+   * Takes a piece; returns the bytes of the frame once it is complete, else null. Throws MessageError.
+   * @param {PartFrame} part
+   */
+  take({ header: { start, size }, payload }) {
+    if (start === 0) this._clear();
+    if (start !== this._size) return refuse("part.start", String(this._size), start);
+    this._pieces.push(payload);
+    this._size += payload.size;
+    if (this._size !== size) return null;
+    const whole = new Blob(this._pieces);
+    this._clear();
+    return whole;
+  }
+
+  _clear() {
+    this._pieces = [];
+    this._size = 0;
+  }
+}
+
+/** Decodes a binary frame; throws MessageError. @param {ArrayBuffer} buffer @returns {Frame | PartFrame} */
 export function decodeFrame(buffer) {
   const view = new DataView(buffer), size = buffer.byteLength;
   if (size < PREFIX_BYTES) return refuse("frame", `at least ${PREFIX_BYTES} bytes long`, size);
@@ -225,13 +256,14 @@ export function decodeFrame(buffer) {
     case VIEW: return { kind, sequence, header: viewHeader(header, "view"), payload };
     case MAP:
     case COSTMAP: return { kind, sequence, header: gridHeader(header, "grid"), payload };
-    default: return refuse("frame.kind", "1 to 5", kind);
+    case PART: return { kind, sequence, header: partHeader(header, "part"), payload };
+    default: return refuse("frame.kind", "1 to 6", kind);
   }
 }
 
 /**
  * Kind and sequence of a frame, even of one that cannot be decoded; null: it has none.
- * @param {ArrayBuffer} buffer @returns {Pick<Frame, "kind" | "sequence"> | null}
+ * @param {ArrayBuffer} buffer @returns {Pick<Frame | PartFrame, "kind" | "sequence"> | null}
  */
 export function frameNumber(buffer) {
   if (buffer.byteLength < PREFIX_BYTES) return null;

@@ -138,3 +138,24 @@ test("a frame that is refused is acknowledged as not loaded, so that the next on
   assert.match(said.mock.calls[0].arguments[0], /layers\.version must be a finite number/);
   assert.ok(!events.some(([name]) => name === "frame"));
 });
+
+test("a frame that comes in pieces is put together, and each piece is acknowledged at once", async () => {
+  connect();
+  const said = mock.method(console, "error", () => {});
+  const json = new TextEncoder().encode(JSON.stringify({ resolution: 1, width: 2, height: 1, x: 0, y: 0 }));
+  const whole = new Uint8Array([1, 3, 0, 0, 7, 0, 0, 0, json.length, 0, 0, 0, ...json, 65, 66]);
+  const piece = (start, end, sequence) => {
+    const header = new TextEncoder().encode(JSON.stringify({ start, size: whole.length }));
+    return new Uint8Array([1, 6, 0, 0, sequence, 0, 0, 0, header.length, 0, 0, 0, ...header, ...whole.slice(start, end)]).buffer;
+  };
+  socket().deliver(piece(0, 20, 1));
+  assert.deepEqual(socket().sent.at(-1), { type: "ack", kind: 6, seq: 1 });
+  assert.deepEqual(events, ["open"]);
+  socket().deliver(piece(20, whole.length, 2));
+  await new Promise(setImmediate);
+  const [[name, frame]] = events.slice(1);
+  assert.deepEqual([name, frame.kind, frame.sequence, frame.header.width], ["frame", 3, 7, 2]);
+  assert.equal(await frame.payload.text(), "AB");
+  socket().deliver(piece(20, whole.length, 3));
+  assert.match(said.mock.calls[0].arguments[0], /part\.start must be 0 \(got 20\)/);
+});

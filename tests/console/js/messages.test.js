@@ -58,7 +58,7 @@ test("frames that cannot be decoded are refused", () => {
   const header = { captured_ms: 3, q: null };
   for (const [buffer, text] of [
     [frame(1, header, { version: 2 }), /version must be 1/],
-    [frame(9, header), /kind must be 1 to 5/],
+    [frame(9, header), /kind must be 1 to 6/],
     [frame(1, header, { length: 999 }), /at least 1011 bytes/],
     [frame(2, header), /view\.q must be a list/],
     [frame(3, header), /grid\.resolution must be a finite number/],

@@ -1,0 +1,145 @@
+#!/usr/bin/env python3
+"""Measures the views that the operator's page renders by itself against the truth, and prints JSON.
+
+    python benchmarks/page.py [--worlds corridor random:41 small_house.glb] [--keyframes 1] [--json OUT]
+
+Keyframes 1 m apart, their depth from the shipped model and a simulated VLP-16, and ten views round the newest one:
+ahead, on a curve, turned. ``page``: read back from the page's canvas in headless Chromium; ``page_plain``: with the
+look-ups that the page uses where the CPU renders; ``cpu``: ``VirtualSpace.render`` of the same keyframes. PSNR in dB
+against the simulator's truth, supersampled 3 × 3: ``seen`` of the pixels that a keyframe has seen, ``all`` of the whole
+view. The page shows what nobody has seen blurred and paler, the CPU's view does not, so only ``seen`` compares like
+with like. Target: no view of the page is more than 0.3 dB below the CPU's there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+from instant_ic import paths
+from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
+from instant_ic.console.layers import PageLayers
+from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+from instant_ic.experiments.page_renderer import PageRenderer
+from instant_ic.experiments.vspace import path_poses, start_pose
+from instant_ic.experiments.vspace_sources import VspaceSettings, take_shot
+from instant_ic.geometry.image_quality import psnr_db
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.sim.render import EquirectRenderer
+from instant_ic.sim.worlds import make_world
+from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.layers import LayerEncoder
+
+CHROMIUM_FLAGS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run"]
+FOV = math.pi / 2
+MOST_BELOW_DB = 0.3
+JPEG_QUALITY = 95
+AHEAD_M, CURVE_M = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0), (0.75, 1.25)
+TURNED = ((0.5, 0.8), (0.25, -1.5))
+"""Distance ahead in m, and turn in rad."""
+
+
+def views(world: Any, start: tuple[float, float, float]) -> dict[str, Any]:
+    """Poses of the views by name."""
+    poses = dict(zip([f"{m:g} m ahead" for m in AHEAD_M], path_poses(world, start, "straight", AHEAD_M), strict=False))
+    curve = path_poses(world, start, "curve", CURVE_M)
+    poses |= dict(zip([f"{m:g} m on a curve" for m in CURVE_M], curve, strict=False))
+    for ahead, turn in TURNED:
+        for pose in path_poses(world, start, "straight", [ahead]):
+            poses[f"{ahead:g} m ahead, turned by {math.degrees(turn):.0f} degrees"] = pose @ pose_matrix(yaw=turn)
+    return poses
+
+
+def measure(
+    name: str,
+    size: tuple[int, int],
+    keyframes: int,
+    model: Any,
+    pages: dict[str, PageRenderer],
+    strips: Path | None,
+) -> dict[str, Any]:
+    """Figures of one world."""
+    world = make_world(name)
+    renderer = EquirectRenderer(world)
+    start = start_pose(world, None)
+    shots = [
+        take_shot(renderer, pose, VspaceSettings(), model)
+        for behind in range(keyframes - 1, -1, -1)
+        for pose in path_poses(world, start, "straight", (-float(behind),))
+    ]
+    space, images = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu", keyframes=keyframes)), []
+    for shot in shots:
+        jpeg = cv2.imencode(".jpg", shot.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+        rgb = cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        space.set_keyframe(rgb, shot.result.depth_m, shot.pose, shot.result.sigma)
+        images.insert(0, jpeg.tobytes())
+    encoded = LayerEncoder().encode(space._shown, list(range(len(images), 0, -1)), images)
+    layers = PageLayers(1, (0.0, 0.0, 0.0), LayerMeshes().layers(layer_sources(encoded)))
+    for page in pages.values():
+        page.load(layers)
+    result: dict[str, Any] = {
+        "keyframes": len(shots),
+        "triangles": sum(len(layer.triangles) for layer in layers.layers),
+        "frame_kB": round(len(layers.frame(frozenset())[1]) / 1e3),
+        "views": {},
+    }
+    for number, (view, pose) in enumerate(views(world, start).items()):
+        truth = renderer.render_perspective(pose, *size, FOV, supersample=3).rgb
+        drawn = space.render(pose, *size, FOV)
+        seen = drawn.confidence > 0
+        shown = {"cpu": drawn.rgb} | {key: page.render(pose, FOV) for key, page in pages.items()}
+        result["views"][view] = {
+            key: {"seen": round(psnr_db(rgb[seen], truth[seen]), 2), "all": round(psnr_db(rgb, truth), 2)}
+            for key, rgb in shown.items()
+        }
+        if strips is not None:
+            strip = np.hstack([truth, *shown.values()])[..., ::-1]
+            cv2.imwrite(str(strips / f"{Path(name.replace(':', '-')).stem}-{number}.jpg"), strip)
+    rows = list(result["views"].values())
+    for part in ("seen", "all"):
+        result[part] = {
+            "mean_db": {key: round(float(np.mean([row[key][part] for row in rows])), 2) for key in rows[0]},
+            "worst_below_cpu_db": {
+                key: round(max(row["cpu"][part] - row[key][part] for row in rows), 2) for key in pages
+            },
+        }
+    return result
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", nargs="+", default=["corridor", "random:41"], help="names or mesh files")
+    parser.add_argument("--keyframes", type=int, default=1, help="that are shown together (default 1)")
+    parser.add_argument("--size", default="1280x720")
+    parser.add_argument("--strips", type=Path, metavar="FOLDER", help="save truth, cpu, page, page_plain side by side")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
+    args = parser.parse_args()
+    width, height = (int(n) for n in args.size.split("x"))
+    size = width, height
+    model = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1)
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        pages = {"page": PageRenderer(browser, *size), "page_plain": PageRenderer(browser, *size, full=False)}
+        worlds = {
+            Path(name).name: measure(name, size, args.keyframes, model, pages, args.strips) for name in args.worlds
+        }
+    below = max(worst for world in worlds.values() for worst in world["seen"]["worst_below_cpu_db"].values())
+    result = {"size": args.size, "target_below_db": MOST_BELOW_DB, "met": below <= MOST_BELOW_DB, "worlds": worlds}
+    text = json.dumps(result, indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
