@@ -154,6 +154,7 @@ def test_what_cannot_be_saved_is_told(driver, shared_demo, monkeypatch):
 
 def test_link_rates_and_readiness_are_told(driver, shared_demo):
     wait_until(lambda: re.fullmatch(r"\d+ ms · (good|fair|poor)", text_of(driver, "#link-ms")), driver, "the link")
+    wait_until(lambda: re.fullmatch(r"\d+ ms", text_of(driver, "#camera-ms")), driver, "the camera's latency")
     assert text_of(driver, "#vspace") == "Virtual space ready · 26 dB here · 97 % seen · within 2.0 m"
     assert text_of(driver, "#battery") == "24.6 V · 81 %"
     wait_until(lambda: re.fullmatch(r"\d+ · \d+ /s", text_of(driver, "#rates")), driver, "rates of pictures")

@@ -63,6 +63,12 @@ export class Images {
     this._held = new Map();
     this._loads = 0; // counts loads, so that a late one of a lost link is dropped
     this.framesPerSecond = 0; // of what this page renders
+    /** @type {number | null} Time from the capture of a camera image to the end of its first rendering. */
+    this.cameraMs = null;
+    /** @type {PanoramaHeader | null} The camera image of the frame that is being rendered. */
+    this._rendering = null;
+    /** @type {PanoramaHeader | null} That of the last such frame. */
+    this._rendered = null;
     this.shownMs = 0; // time of the newest state that is shown, server's clock
     this.moves = false; // the v-bot moves, as far as this page knows
     this.leadMaxM = 0; // largest distance by which a view is moved from its rendered position; 0: never moved
@@ -190,6 +196,20 @@ export class Images {
     const recent = this._arrivals[kind].filter((t) => now - t < 3000);
     if (recent.length < 2) return 0;
     return (1000 * (recent.length - 1)) / (now - recent[0]);
+  }
+
+  /** Notes that a frame with the newest images is being rendered. */
+  startFrame() {
+    this._rendering = this.blend < 1 ? this.panorama : null;
+  }
+
+  /** Notes that the last frame is rendered. */
+  endFrame() {
+    const { _rendering: image } = this, now = this.link.serverNow();
+    this._rendering = null;
+    if (!image || image === this._rendered || now === null) return;
+    this._rendered = image;
+    this.cameraMs = now - image.captured_ms;
   }
 
   /** Header of the shown image. */

@@ -114,6 +114,7 @@ export class Screen {
   /** @param {number} now ms of this page's clock */
   _frame(now) {
     if (this.viewer.busy) return this._request();
+    this.images.endFrame();
     if (!this._wanted) return;
     const pause = this.viewer.slow ? SLOW_FRAME_MS / (this.images.changed ? 2 : 1) : 0;
     const left = Math.max(this._frameAt + pause, this.viewer.restUntil) - now;
@@ -122,7 +123,9 @@ export class Screen {
       return;
     }
     this._wanted = this._renderFrame(now);
-    if (this._wanted || this.viewer.busy) this._request();
+    if (this.viewer.busy) return this._request();
+    this.images.endFrame();
+    if (this._wanted) this._request();
   }
 
   /** Sends the look direction, and renders what has changed; returns whether something moves. @param {number} now */
@@ -204,6 +207,7 @@ export class Screen {
     this._viewKey = key;
     this._direction = direction;
     images.changed = false;
+    images.startFrame();
     viewer.render(scene);
     // For measurements: the rendered image and its position.
     const { motion, view, panorama, place } = images;
