@@ -288,8 +288,8 @@ def part(virtual: bool, args: argparse.Namespace) -> dict[str, Any]:
                 page.goto(f"http://127.0.0.1:{port}/")
                 shows = f'body[data-driver="you"][data-blend="{int(virtual)}.00"][data-image="live"]'
                 page.locator(shows).wait_for(timeout=args.wait * 1000)
-                page.wait_for_timeout(4000)  # the layers come in this time too
-                robot.views = 0
+                page.wait_for_timeout(2000)
+                until_it_renders(page, robot, args.wait)
                 rows = press_keys(page, robot, ["KeyW", "KeyA", "KeyS", "KeyD"] if virtual else ["KeyW", "KeyS"], args)
                 browser.close()
             finally:
@@ -313,6 +313,17 @@ def wait(robot: Robot, condition: Callable[[], bool], timeout_s: float, what: st
         if robot.error or time.monotonic() > deadline:
             raise RuntimeError(f"no {what} within {timeout_s:g} s; {robot.error}\n{robot.stack.log_tail()}")
         time.sleep(0.02)
+
+
+def until_it_renders(page: Any, robot: Robot, timeout_s: float) -> None:
+    """Wait until the page needs no more views, because the layers are there; then count views from 0."""
+    deadline = time.monotonic() + timeout_s
+    robot.views = 1
+    while robot.views:
+        if time.monotonic() > deadline:
+            raise RuntimeError(f"the page does not render by itself within {timeout_s:g} s\n{robot.stack.log_tail()}")
+        robot.views = 0
+        page.wait_for_timeout(3000)
 
 
 def press_keys(page: Any, robot: Robot, keys: list[str], args: argparse.Namespace) -> list[dict[str, Any]]:

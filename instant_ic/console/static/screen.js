@@ -47,7 +47,7 @@ export class Screen {
     this._guide = elementOf("guide", HTMLCanvasElement);
     this._compass = elementOf("compass-tape", HTMLCanvasElement);
     this._rate = new FrameRate();
-    this._frameAt = this._steppedAt = performance.now();
+    this._frameAt = this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;
     this._timer = 0;
     this._latencyAt = this._mapAt = this._lookAt = 0;
@@ -117,7 +117,7 @@ export class Screen {
     this.images.endFrame();
     if (!this._wanted) return;
     const pause = this.viewer.slow ? SLOW_FRAME_MS / (this.images.changed ? 2 : 1) : 0;
-    const left = Math.max(this._frameAt + pause, this.viewer.restUntil) - now;
+    const left = Math.max(this._viewAt + pause, this.viewer.restUntil) - now;
     if (left > 0) {
       this._timer = setTimeout(() => this._request(), left);
       return;
@@ -207,6 +207,7 @@ export class Screen {
     this._viewKey = key;
     this._direction = direction;
     images.changed = false;
+    this._viewAt = this._frameAt; // only such a frame costs a pause: in the first after a key nothing has moved yet
     images.startFrame();
     viewer.render(scene);
     // For measurements: the rendered image and its position.
