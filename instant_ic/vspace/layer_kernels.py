@@ -182,7 +182,7 @@ def _continued(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-de
 
 @njit(**_OPTIONS)
 def _edge_value(inverse, shown, v, u, down, right):  # type: ignore[no-untyped-def]
-    """Inverse depth at a corner of a pixel on a depth edge: the mean of the pixels around that show the same surface."""
+    """Inverse depth at a corner of a pixel on a depth edge: the mean of those around that show its surface."""
     height, width = inverse.shape
     own = _continued(inverse, shown, v, u, down, right)
     total, count = own, 1
