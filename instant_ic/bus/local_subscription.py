@@ -152,6 +152,8 @@ class LocalSubscription:
                     self._complain(path, f"{path} cannot be connected: {error}")
                     continue
             self._connected.add(path)
+            # From now on its messages are known, also one that is read after it has left.
+            self._sources.setdefault(bytes.fromhex(info.id), _Source(info))
         present = {str(info.socket) for info in self.publishers}
         self._left = {path: self._left.get(path, now) for path in self._connected - present}
 
@@ -239,10 +241,8 @@ class LocalSubscription:
         now = time.monotonic()
         if now >= self._looked_up.get(publisher, 0.0):
             self._look_up(now)
-            for info in self.publishers:
-                if bytes.fromhex(info.id) == publisher:
-                    self._sources[publisher] = source = _Source(info)
-                    return source
+            if publisher in self._sources:
+                return self._sources[publisher]
             if len(self._looked_up) < _MOST_UNKNOWN:
                 self._looked_up[publisher] = now + _LOOK_S
         raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")

@@ -111,8 +111,9 @@ def test_publisher_killed_and_restarted_is_heard_again(transport, talker, run_di
     assert inbox.raw.stats.lost == 0
 
 
+@pytest.mark.parametrize("said_before", [["known"], []])
 def test_publisher_that_leaves_the_registry_long_after_the_last_look_is_heard_for_the_grace(
-    transport, run_dir, monkeypatch
+    transport, run_dir, monkeypatch, said_before
 ):
     def say(text: str) -> None:
         publisher.send(serialize(String(data=text)))
@@ -126,13 +127,15 @@ def test_publisher_that_leaves_the_registry_long_after_the_last_look_is_heard_fo
         publisher = sender.advertise("/chatter", "std_msgs/msg/String", RELIABLE)
         inbox = Inbox(transport, "/chatter")
         wait_for(lambda: publisher.subscriber_count)
-        say("known")
-        wait_for(lambda: inbox.poll() == ["known"])
+        for text in said_before:
+            say(text)
+        wait_for(lambda: inbox.poll() == said_before)
         ahead_s = 1000.0
         next(run_dir.glob("topics/chatter/*.json")).unlink()
         wait_for(lambda: inbox.raw.publishers == [])
         say("late")
-        wait_for(lambda: inbox.poll() == ["known", "late"])
+        wait_for(lambda: inbox.poll() == [*said_before, "late"])
+        assert inbox.raw.stats.rejected == 0
         ahead_s = 2000.0
         wait_for(lambda: publisher.subscriber_count == 0)
     finally:
