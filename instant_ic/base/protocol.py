@@ -19,25 +19,16 @@ class Command(IntEnum):
 
     SET_TIMEOUT = 14
     READ_TIMEOUT = 15
-    READ_ENCODER_1 = 16
-    READ_ENCODER_2 = 17
-    READ_SPEED_1 = 18
-    READ_SPEED_2 = 19
-    RESET_ENCODERS = 20
     READ_VERSION = 21
     READ_MAIN_BATTERY = 24
-    DUTY_BOTH = 34
     SPEED_BOTH = 37
     SPEED_ACCELERATION_BOTH = 40
     READ_ENCODERS = 78
     READ_STATUS = 90
-    READ_SPEEDS = 108
 
 
 WRITE_DATA_BYTES: dict[int, int] = {
     Command.SET_TIMEOUT: 1,
-    Command.RESET_ENCODERS: 0,
-    Command.DUTY_BOTH: 4,
     Command.SPEED_BOTH: 8,
     Command.SPEED_ACCELERATION_BOTH: 12,
 }

@@ -121,7 +121,7 @@ def open_serial(config: RoboclawConfig) -> SerialPort:
         ) from error
 
 
-_MOVING = (Command.DUTY_BOTH, Command.SPEED_BOTH, Command.SPEED_ACCELERATION_BOTH)
+_MOVING = (Command.SPEED_BOTH, Command.SPEED_ACCELERATION_BOTH)
 
 
 def _tenths(timeout_s: float) -> int:
@@ -246,10 +246,6 @@ class Roboclaw:
                 f"{_tenths(self.config.watchdog_s) / 10:.1f} s: it has restarted. Check its supply voltage."
             )
 
-    def reset_encoders(self) -> None:
-        """Set both counts to zero (command 20)."""
-        self._write(Command.RESET_ENCODERS)
-
     def watchdog_s(self) -> float:
         """Watchdog time of the controller, seconds; 0 is off (command 15)."""
         return self._read(Command.READ_TIMEOUT, 1)[0] * 0.1
@@ -257,14 +253,6 @@ class Roboclaw:
     def encoders(self) -> NDArray[np.int64]:
         """Counts of M1 and M2 modulo 2^32, (2,) (command 78)."""
         return np.array(struct.unpack(">II", self._read(Command.READ_ENCODERS, 8)), np.int64)
-
-    def speeds_pps(self) -> NDArray[np.float64]:
-        """Measured speeds of M1 and M2, pulses/s, (2,) (commands 18 and 19)."""
-        speeds = []
-        for command in (Command.READ_SPEED_1, Command.READ_SPEED_2):
-            speed, backwards = struct.unpack(">IB", self._read(command, 5))
-            speeds.append(-float(speed) if backwards else float(speed))
-        return np.array(speeds)
 
     def battery_v(self) -> float:
         """Main battery voltage, volts (command 24)."""

