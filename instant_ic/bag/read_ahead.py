@@ -9,6 +9,8 @@ from types import TracebackType
 
 from instant_ic.bag.files import BagMessage
 
+_MOST_BYTES = 64_000_000
+
 
 class ReadAhead:
     """Iterates over messages that a separate thread reads; a context manager.
@@ -16,13 +18,11 @@ class ReadAhead:
     Args:
         messages: messages to read; only that thread uses them until :meth:`close`.
         stop: ends the iteration, even while the disk does not respond.
-        max_bytes: size of the buffer.
     """
 
-    def __init__(self, messages: Iterator[BagMessage], stop: threading.Event, max_bytes: int = 64_000_000) -> None:
+    def __init__(self, messages: Iterator[BagMessage], stop: threading.Event) -> None:
         self._messages = messages
         self._stop = stop
-        self._max_bytes = max_bytes
         self._ready: deque[BagMessage] = deque()
         self._bytes = 0
         self._ended = False
@@ -68,7 +68,7 @@ class ReadAhead:
             for message in self._messages:
                 with self._condition:
                     # Wait until a message is taken. In a pause that never happens, and close() ends the wait.
-                    self._condition.wait_for(lambda: self._bytes < self._max_bytes or self._closed)
+                    self._condition.wait_for(lambda: self._bytes < _MOST_BYTES or self._closed)
                     if self._closed:
                         return
                     self._ready.append(message)

@@ -34,13 +34,12 @@ class Recovered:
     skipped: dict[str, str]
 
 
-def recover(source: Path, target: Path, compressed: bool = False) -> Recovered:
+def recover(source: Path, target: Path) -> Recovered:
     """Copy every readable message into a new bag: all complete chunks, and the complete messages of a truncated chunk.
 
     Args:
         source: bag folder or ``.mcap`` file.
         target: folder of the new bag, which must not exist.
-        compressed: compress the new bag.
 
     Raises:
         BagError: nothing can be read, or the target cannot be written.
@@ -50,7 +49,7 @@ def recover(source: Path, target: Path, compressed: bool = False) -> Recovered:
     damaged: list[str] = []
     skipped: dict[str, str] = {}
     # Sorted only within chunks, and chunks of a recorder may overlap slightly: readers sort by the new index.
-    with BagWriter(target, compressed) as writer:
+    with BagWriter(target) as writer:
         for number, file in enumerate(files):
             scan = McapScan(file)
             for message in scan.messages():

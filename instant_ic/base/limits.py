@@ -42,10 +42,9 @@ class TwistLimiter:
         self.w = _towards(self.w, 0.0, w_deceleration * dt_s)
         return self.v, self.w
 
-    def reset(self, v: float = 0.0, w: float = 0.0) -> None:
-        """Restart from a twist, for example after an emergency stop."""
-        self.v = v
-        self.w = w
+    def reset(self) -> None:
+        """Restart from standing, for example after an emergency stop."""
+        self.v = self.w = 0.0
 
 
 def _towards(value: float, target: float, step: float) -> float:

@@ -9,6 +9,7 @@ from instant_ic.base.config import OdometryNoiseConfig, SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
 from instant_ic.geometry.poses import planar_covariance
 
+_MAX_TRACK_SPEED = 3.0  # m/s; a reading that implies more is rejected
 UNMEASURED_VARIANCE = 1e6
 """Variance of z, roll and pitch, which encoders do not measure."""
 
@@ -40,22 +41,15 @@ class WheelOdometry:
             stays, and integration continues from the new reading.
     """
 
-    def __init__(
-        self,
-        geometry: SkidSteerConfig,
-        noise: OdometryNoiseConfig | None = None,
-        max_track_speed: float = 3.0,
-    ) -> None:
+    def __init__(self, geometry: SkidSteerConfig, noise: OdometryNoiseConfig | None = None) -> None:
         """Start at the origin of odom.
 
         Args:
             geometry: tracks and encoders.
             noise: growth of the uncertainty.
-            max_track_speed: largest plausible track speed, m/s; a reading that implies more is rejected.
         """
         self.kinematics = SkidSteer(geometry)
         self.noise = noise or OdometryNoiseConfig()
-        self.max_track_speed = max_track_speed
         self.rejected = 0
         self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
@@ -84,7 +78,7 @@ class WheelOdometry:
             self._last = last
             return None
         tracks = self.kinematics.tracks_from_motors(unwrap_counts(last[0], counts))
-        if np.abs(tracks).max() > self.max_track_speed * dt_s:
+        if np.abs(tracks).max() > _MAX_TRACK_SPEED * dt_s:
             self.rejected += 1
             return None
         step = self.kinematics.twist_from_tracks(tracks)

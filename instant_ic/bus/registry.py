@@ -30,6 +30,7 @@ from instant_ic.private import make_folder, open_file
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
 _FILE_TIME_STEP_NS = 50_000_000  # more than the kernel's
+_PREDECESSOR_S = 2.0  # how long a claim waits for a predecessor that is shutting down
 _MAX_IPC_PATH = 107  # sockaddr_un.sun_path less its final zero
 
 
@@ -175,18 +176,17 @@ class Claim:
     Args:
         stem: path without suffix, for the ``.lock`` and the ``.json`` file.
         what: description for error messages.
-        timeout_s: how long to wait for a predecessor that is shutting down.
 
     Raises:
         RegistryError: another live process holds the name.
     """
 
-    def __init__(self, stem: Path, what: str, timeout_s: float = 2.0) -> None:
+    def __init__(self, stem: Path, what: str) -> None:
         self.stem = stem
         self._what = what
         self.json_path = stem.with_name(stem.name + ".json")
         self._lock_path = stem.with_name(stem.name + ".lock")
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + _PREDECESSOR_S
         while not self._lock():
             if time.monotonic() > deadline:
                 raise RegistryError(f"{what} already exists: another process holds {self._lock_path}")

@@ -31,17 +31,17 @@ def _axial(width: int, height: int, fov_rad: float) -> NDArray[np.float32]:
     return along
 
 
-def encode_depth(depth_m: NDArray[np.floating], fov_rad: float, width: int = WIDTH) -> tuple[bytes, float]:
+def encode_depth(depth_m: NDArray[np.floating], fov_rad: float) -> tuple[bytes, float]:
     """Encode the depth of a perspective image for display.
 
     Args:
         depth_m: (H, W) along the rays, metres; 0 where nothing is hit.
         fov_rad: horizontal field of view.
-        width: columns of the result; each of its pixels takes the nearest depth inside it.
 
     Returns:
-        Grey PNG, (h, ``width``), and the axial depth in metres that the value 255 stands for: v means
-        ``near_m * 255 / v``, 0 means no depth. Without any depth the PNG is empty and the number is 0.
+        Grey PNG, (h, ``WIDTH``), each pixel with the nearest depth inside it, and the axial depth in metres that the
+        value 255 stands for: v means ``near_m * 255 / v``, 0 means no depth. Without any depth the PNG is empty and
+        the number is 0.
 
     Raises:
         ValueError: the array is not an image, or the field of view is invalid.
@@ -54,7 +54,7 @@ def encode_depth(depth_m: NDArray[np.floating], fov_rad: float, width: int = WID
     axial = np.asarray(depth_m, np.float32) * _axial(columns, rows, round(fov_rad, 6))
     known = np.isfinite(axial) & (axial > 0)
     inverse = np.where(known, 1 / np.maximum(np.where(known, axial, 1), NEAREST_M), 0).astype(np.float32)
-    width = min(width, columns)
+    width = min(WIDTH, columns)
     height = max(1, round(rows * width / columns))
     # A moved edge drags a fringe of its background along: dilation keeps the edge whole and stretches the background.
     cell = math.ceil(columns / width) + 1

@@ -15,6 +15,11 @@ class TransformError(LookupError):
     """No such frame, no path between two frames, or no value at the requested time."""
 
 
+_TOLERANCE_NS = 200_000_000
+"""How far beyond its newest value a look-up may reach; it then returns the newest value. Drivers stamp data a little
+later than the last odometry that arrived."""
+
+
 @dataclass
 class _Edge:
     """One child frame: its parent, and its poses over time."""
@@ -30,13 +35,10 @@ class TransformBuffer:
 
     Args:
         cache_s: how much of the past is kept for moving frames.
-        tolerance_s: how far beyond the newest value a look-up may reach; it then returns the newest value.
-            Drivers stamp data a little later than the last odometry that arrived.
     """
 
-    def __init__(self, cache_s: float = 30.0, tolerance_s: float = 0.2) -> None:
+    def __init__(self, cache_s: float = 30.0) -> None:
         self._cache_ns = int(cache_s * 1e9)
-        self._tolerance_ns = int(tolerance_s * 1e9)
         self._edges: dict[str, _Edge] = {}
         self._lock = threading.Lock()
 
@@ -135,12 +137,12 @@ class TransformBuffer:
             return edge.matrices[at]
         if at == 0:
             late = (edge.stamps_ns[0] - stamp_ns) / 1e9
-            if late * 1e9 <= self._tolerance_ns:
+            if late * 1e9 <= _TOLERANCE_NS:
                 return edge.matrices[0]
             raise TransformError(f"{edge.parent} → {frame}: asked for {late:.3f} s before the oldest value")
         if at == len(edge.stamps_ns):
             ahead_ns = stamp_ns - edge.stamps_ns[-1]
-            if ahead_ns <= self._tolerance_ns:
+            if ahead_ns <= _TOLERANCE_NS:
                 return edge.matrices[-1]
             raise TransformError(f"{edge.parent} → {frame}: asked for {ahead_ns / 1e9:.3f} s after the newest value")
         before, after = edge.stamps_ns[at - 1], edge.stamps_ns[at]

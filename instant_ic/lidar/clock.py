@@ -16,10 +16,10 @@ class DeviceClock:
 
     JUMP_NS = 500_000_000
     JUMP_PACKETS = 20
+    MAX_DRIFT_PPM = 50.0
 
-    def __init__(self, max_drift_ppm: float = 50.0) -> None:
+    def __init__(self) -> None:
         """Start without an offset; the first packet sets it."""
-        self.max_drift_ppm = max_drift_ppm
         self.resets = 0
         self._device_us: int | None = None
         self._offset_ns: float = 0.0
@@ -59,7 +59,7 @@ class DeviceClock:
                 self.resets += 1
             return self._device_us
         self._jumped = 0
-        drift_ns = max(step, 0) * 1e-3 * self.max_drift_ppm
+        drift_ns = max(step, 0) * 1e-3 * self.MAX_DRIFT_PPM
         self._offset_ns = min(sample_ns, self._offset_ns + drift_ns)
         return self._device_us
 

@@ -12,7 +12,6 @@ from typing import Any
 
 from instant_ic.msg.convert import (
     HARD_STOP,
-    POINT_DTYPE,
     battery_message,
     cloud_array,
     cloud_message,
@@ -55,7 +54,6 @@ from instant_ic.msg.types import (
 
 __all__ = [
     "HARD_STOP",
-    "POINT_DTYPE",
     "MessageError",
     "battery_message",
     "cloud_array",

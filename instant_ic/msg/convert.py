@@ -19,16 +19,6 @@ from instant_ic.geometry.poses import (
 )
 from instant_ic.msg.types import MessageError, message_type
 
-POINT_DTYPE = np.dtype(
-    {
-        "names": ["x", "y", "z", "intensity", "ring", "time"],
-        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<f4"],
-        "offsets": [0, 4, 8, 12, 16, 18],
-        "itemsize": 22,
-    }
-)
-"""A point of ``/lidar/points``, laid out as by ros-drivers/velodyne; ``time`` is seconds after the header's stamp."""
-
 _POINT_FIELD_TYPES = {
     1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8",
 }  # fmt: skip

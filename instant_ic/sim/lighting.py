@@ -16,6 +16,10 @@ F32 = npt.NDArray[np.float32]
 _PIECE_M = 0.7
 #: Ambient light, which stands for further bounces, as a share of the light on a lamp-lit wall.
 _AMBIENT = 0.34
+#: Median light of vertical surfaces after baking (the exposure).
+_LEVEL = 0.72
+#: Rays per corner of a mesh file's triangle.
+_MESH_RAYS = 24
 #: Largest distance of an occluder.
 _AMBIENT_REACH_M = 1.6
 
@@ -179,20 +183,19 @@ def _smooth(light: F32, valid: npt.NDArray[np.bool_], world: World) -> None:
         light[part] = (total / np.maximum(share, 1e-3)[..., None]).reshape(-1, 3)
 
 
-def bake(world: World, rays: int = 48, level: float = 0.72) -> None:
+def bake(world: World, rays: int = 48) -> None:
     """Compute ``world.light`` in place.
 
     Args:
         world: a procedural world (rectangles only).
         rays: rays per texel for bounce and occlusion.
-        level: median light of vertical surfaces after baking (the exposure).
     """
     fields: list[npt.NDArray[np.generic]] = [value for value in vars(world).values() if isinstance(value, np.ndarray)]
-    parts: list[str | npt.NDArray[np.generic]] = [*fields, world.textures.mean, f"{rays} {level} {world.two_sided}"]
-    world.light[:] = kept("light", parts, lambda: {"light": _baked(world, rays, level)})["light"]
+    parts: list[str | npt.NDArray[np.generic]] = [*fields, world.textures.mean, f"{rays} {world.two_sided}"]
+    world.light[:] = kept("light", parts, lambda: {"light": _baked(world, rays)})["light"]
 
 
-def _baked(world: World, rays: int, level: float) -> F32:
+def _baked(world: World, rays: int) -> F32:
     points, owner = _texel_points(world)
     normals = world.normal[owner]
     direct = _direct(world, points, normals)
@@ -202,10 +205,10 @@ def _baked(world: World, rays: int, level: float) -> F32:
     _smooth(light, valid, world)
     upright = np.abs(normals[:, 2]) < 0.5
     reference = np.median(light[upright & valid].mean(axis=1)) if (upright & valid).any() else light.mean()
-    return np.asarray(light * np.float32(level / max(float(reference), 1e-6)), np.float32)
+    return np.asarray(light * np.float32(_LEVEL / max(float(reference), 1e-6)), np.float32)
 
 
-def bake_mesh(world: World, rays: int = 24) -> None:
+def bake_mesh(world: World) -> None:
     """Compute ambient light with occlusion for a mesh from a file: ``light_linear`` of each triangle, on both sides.
 
     The mesh has no lamps, so the light is a soft sky inside the rooms, stronger from above and dimmer near objects.
@@ -214,7 +217,7 @@ def bake_mesh(world: World, rays: int = 24) -> None:
     count = len(triangles)
     centre = triangles.mean(axis=1)
     value = np.zeros((count, 3))
-    directions = _cosine_directions(rays)
+    directions = _cosine_directions(_MESH_RAYS)
     tangent, bitangent = _frames(world.normal)
     for corner in range(3):
         point = centre + 0.92 * (triangles[:, corner] - centre)
@@ -227,7 +230,7 @@ def bake_mesh(world: World, rays: int = 24) -> None:
                 direction = (x * tangent + y * bitangent + z * normal).astype(np.float32)
                 distance, _ = world.caster.cast(start, direction)
                 total += np.minimum(distance / _AMBIENT_REACH_M, 1.0) * (0.75 + 0.25 * direction[:, 2])
-            best = np.maximum(best, total / rays)
+            best = np.maximum(best, total / _MESH_RAYS)
         value[:, corner] = 0.20 + 0.85 * best
     # Affine function on the triangle's plane through the values at its corners, constant along the normal.
     edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=1)

@@ -50,12 +50,11 @@ def _spawn(world: World) -> tuple[float, float, float]:
     return (float(xy[best, 0]), float(xy[best, 1]), 0.0)
 
 
-def load_world(path: str | Path, y_up: bool | None = None) -> World:
+def load_world(path: str | Path) -> World:
     """Load a world from a mesh file: apply node transforms, repeat textures, bake soft light.
 
     Args:
         path: the file.
-        y_up: whether y is up in the file; by default true for glTF and false for other formats (z up).
 
     Raises:
         ValueError: the file cannot be read or has no triangles.
@@ -72,7 +71,7 @@ def load_world(path: str | Path, y_up: bool | None = None) -> World:
     sources: list[str | npt.NDArray[np.floating]] = []
     known: dict[int, int] = {}
     parts: list[dict[str, npt.NDArray[Any]]] = []
-    for part in mesh_parts(scene, is_y_up(path) if y_up is None else y_up):
+    for part in mesh_parts(scene, is_y_up(path)):
         if part.image is None or part.corner_uv is None:
             key, corner_uv = -1, np.zeros((*part.faces.shape, 2))
         else:

@@ -19,6 +19,8 @@ from instant_ic.base.protocol import (
     encode_reply,
 )
 
+MAX_SPEED_PPS = 4000.0
+
 
 class RoboclawEmulator:
     """State of the controller and of two motors with encoders.
@@ -41,11 +43,10 @@ class RoboclawEmulator:
         packets: valid frames.
     """
 
-    def __init__(self, address: int = 0x80, max_speed_pps: float = 4000.0, ideal_motors: bool = True) -> None:
+    def __init__(self, address: int = 0x80, ideal_motors: bool = True) -> None:
         if address not in ADDRESSES:
             raise ValueError(f"address must be in 0x80..0x87 (got 0x{address:02x})")
         self.address = address
-        self.max_speed_pps = max_speed_pps
         self.ideal_motors = ideal_motors
         self.target_speed_pps: NDArray[np.float64] = np.zeros(2)
         self.setpoint_pps: NDArray[np.float64] = np.zeros(2)
@@ -151,7 +152,7 @@ class RoboclawEmulator:
     def _drive(self, speed_pps: NDArray[np.float64], acceleration_pps2: float) -> None:
         if self._emergency_stopped:
             return
-        self.target_speed_pps[:] = np.clip(speed_pps, -self.max_speed_pps, self.max_speed_pps)
+        self.target_speed_pps[:] = np.clip(speed_pps, -MAX_SPEED_PPS, MAX_SPEED_PPS)
         self.acceleration_pps2 = acceleration_pps2
 
     def _read(self, command: int) -> bytes | None:

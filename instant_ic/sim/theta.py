@@ -15,14 +15,13 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.camera.config import PREVIEW_FORMATS
 from instant_ic.config.ranges import NotNegative, Percent, PositiveInt, Range, check_ranges
 from instant_ic.limits import load_image
 from instant_ic.pace import current
 
 log = logging.getLogger(__name__)
 
-#: Formats of the live preview (Z1, firmware 2.21.1): width, height, frames per second.
-PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
 BOUNDARY = "---osclivepreview---"
 #: Delay of an image with which the stack still works as with a punctual camera, seconds.
 ACCEPTABLE_DELAY_S = 0.06

@@ -130,21 +130,18 @@ class World:
     def _masks(self) -> dict[tuple[float, float, float], OccupancyMask]:
         return {}
 
-    def sample_free_poses(
-        self, rng: np.random.Generator, n: int, clearance_m: float = 0.35, up_to_m: float = 1.9
-    ) -> npt.NDArray[np.float64]:
+    def sample_free_poses(self, rng: np.random.Generator, n: int, clearance_m: float = 0.35) -> npt.NDArray[np.float64]:
         """Random poses (n, 3), x, y, yaw, that are reachable from the spawn pose.
 
         Args:
             rng: source of randomness.
             n: number of poses.
-            clearance_m: smallest distance to objects between 0.03 m and ``up_to_m`` above the floor.
-            up_to_m: height below which objects count.
+            clearance_m: smallest distance to objects between 0.03 m and 1.9 m above the floor.
 
         Raises:
             ValueError: no pose has this much clearance.
         """
-        mask = self.occupied(0.03, up_to_m, 0.05)
+        mask = self.occupied(0.03, 1.9, 0.05)
         cells = mask.reachable(self.spawn[:2], clearance_m)
         if len(cells) == 0:
             raise ValueError(f"world {self.name!r} has no place with {clearance_m} m of clearance")

@@ -169,20 +169,22 @@ def test_sweep_clears_what_the_dead_left_and_nothing_else(transport, talker, run
     assert list(run_dir.glob("topics/*")) == [] == list(run_dir.glob("nodes/*"))
 
 
-def test_a_name_that_passes_on_is_locked_in_the_file_that_its_path_names(run_dir):
+def test_a_name_that_passes_on_is_locked_in_the_file_that_its_path_names(run_dir, monkeypatch):
     stem = run_dir / "nodes" / "walker"
     registry.prepare(run_dir)
     for _ in range(20):
         first = registry.Claim(stem, "node walker")
         with ThreadPoolExecutor() as pool:
-            waiting = pool.submit(registry.Claim, stem, "node walker", 30.0)
+            monkeypatch.setattr(registry, "_PREDECESSOR_S", 30.0)
+            waiting = pool.submit(registry.Claim, stem, "node walker")
             first.release()
             registry.sweep(run_dir)
             second = waiting.result()
         second.write({"name": "walker"})
         assert registry.sweep(run_dir) == 0 and second.json_path.exists()
+        monkeypatch.setattr(registry, "_PREDECESSOR_S", 0.0)
         with pytest.raises(registry.RegistryError, match="already exists"):
-            registry.Claim(stem, "node walker", timeout_s=0.0)
+            registry.Claim(stem, "node walker")
         second.release()
         assert list(run_dir.glob("nodes/*")) == []
 

@@ -20,8 +20,8 @@ from instant_ic.control.costmap import LETHAL
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.states import Reason
 from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.msg import (
-    POINT_DTYPE,
     Bool,
     CompressedImage,
     ControlState,

@@ -15,8 +15,8 @@ from instant_ic.depth.lidar_depth import LidarDepthConfig
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.geometry.poses import inverse, pose_matrix, transform_points
 from instant_ic.geometry.projections import equirect_directions
+from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.msg import (
-    POINT_DTYPE,
     DepthModelInfo,
     PointCloud2,
     TFMessage,

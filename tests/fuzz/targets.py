@@ -207,7 +207,7 @@ def _parse_replies() -> Callable[[bytes], object]:
 
 
 def _parse_requests() -> Callable[[bytes], object]:
-    from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
+    from instant_ic.sim.roboclaw_emulator import MAX_SPEED_PPS, RoboclawEmulator
 
     def parse(data: bytes) -> None:
         emulator = RoboclawEmulator()
@@ -215,7 +215,7 @@ def _parse_requests() -> Callable[[bytes], object]:
         emulator.advance(0.005)
         emulator.feed(data[len(data) // 2 :])
         emulator.advance(0.05)
-        assert abs(emulator.setpoint_pps).max() <= emulator.max_speed_pps
+        assert abs(emulator.setpoint_pps).max() <= MAX_SPEED_PPS
 
     return parse
 

@@ -15,8 +15,8 @@ from instant_ic.bus.node import Publisher
 from instant_ic.cli.main import main
 from instant_ic.cli.observer import Observer
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.msg import (
-    POINT_DTYPE,
     PointCloud2,
     TFMessage,
     cloud_message,

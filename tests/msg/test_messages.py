@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from instant_ic import msg
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.lidar.decode import POINT_DTYPE
 
 
 def round_trip(message):
@@ -43,7 +44,7 @@ def test_image_with_padded_rows_and_too_few_bytes():
 
 
 def test_cloud_keeps_the_ros_layout():
-    points = np.zeros(3, msg.POINT_DTYPE)
+    points = np.zeros(3, POINT_DTYPE)
     points["x"], points["ring"], points["time"] = [1, 2, 3], [0, 7, 15], [0, 0.05, 0.1]
     out = round_trip(msg.cloud_message(points, "velodyne", 9))
     assert out.point_step == 22
