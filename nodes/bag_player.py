@@ -14,10 +14,11 @@ from instant_ic.bag.player import BagPlayer, PlayOptions
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
-from instant_ic.config.ranges import NotNegative, Positive
+from instant_ic.config.ranges import NotNegative
 from instant_ic.msg import message_type, register_type, to_time
 
 _BASE_PERIOD_S = 0.5
+_WAIT_S = 60.0  # for the nodes of wait_for
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,6 @@ class BagPlayerConfig(PlayOptions):
         publish_clock: whether to publish ``/clock``.
         delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
         wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
-        wait_timeout_s: seconds to wait for these nodes before giving up.
         linger_s: seconds that the player stays after the last message, so that other nodes finish their work.
         force: play commands and states although a base is running, which may move the robot.
     """
@@ -40,7 +40,6 @@ class BagPlayerConfig(PlayOptions):
     publish_clock: bool = True
     delay_s: NotNegative = 0.5
     wait_for: tuple[str, ...] = ()
-    wait_timeout_s: Positive = 60.0
     linger_s: NotNegative = 1.0
     force: bool = False
 
@@ -169,7 +168,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             self._publish_time(self.player.start_ns)
         if not self.config.wait_for:
             return
-        deadline_s = time.monotonic() + self.config.wait_timeout_s
+        deadline_s = time.monotonic() + _WAIT_S
         missing: list[str] = []
         while time.monotonic() < deadline_s:
             self._publish_time(self.player.start_ns)
@@ -177,7 +176,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             missing = missing_readers(self.config.wait_for, registry.list_nodes(self.run_dir), publishers)
             if not missing or self._stop.wait(0.1):
                 return
-        raise NodeError(f"waited {self.config.wait_timeout_s:.0f} s for {', '.join(missing)}")
+        raise NodeError(f"waited {_WAIT_S:.0f} s for {', '.join(missing)}")
 
     def teardown(self) -> None:
         """End the thread and close the bag."""

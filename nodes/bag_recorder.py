@@ -33,10 +33,8 @@ class BagRecorderConfig(RecordOptions):
         exclude: names or patterns of the topics to leave out.
         discovery_period_s: seconds between searches for new topics.
         duration_s: seconds after which recording ends; 0 records until stopped.
-        parameters: whether to save the nodes' parameters in the bag's metadata.
         start_paused: record only after a resume command.
         snapshot_after_s: seconds after the request that a snapshot also holds.
-        snapshot_on_estop: write a snapshot at each emergency stop.
     """
 
     path: str = ""
@@ -44,10 +42,8 @@ class BagRecorderConfig(RecordOptions):
     exclude: tuple[str, ...] = ()
     discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
     duration_s: NotNegative = 0.0
-    parameters: bool = True
     start_paused: bool = False
     snapshot_after_s: NotNegative = 2.0
-    snapshot_on_estop: bool = True
 
     def folder(self) -> Path:
         """Folder of the bag."""
@@ -60,7 +56,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     """Discovers topics, passes their bytes to the recorder, reports size and losses."""
 
     name = "bag_recorder"
-    live_parameters = ("duration_s", "snapshot_after_s", "snapshot_on_estop")
+    live_parameters = ("duration_s", "snapshot_after_s")
     recorder: Recorder | None = None
     on_demand: OnDemand | None = None
     _next_nodes_s = 0.0
@@ -139,7 +135,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     def _discover(self) -> None:
         assert self.recorder is not None and self.run_dir is not None
         nodes: list[registry.NodeInfo] = []
-        if self.config.parameters and time.monotonic() >= self._next_nodes_s:
+        if time.monotonic() >= self._next_nodes_s:
             self._next_nodes_s = time.monotonic() + 2.0
             nodes = registry.list_nodes(self.run_dir)
         for recorder in (self.recorder, self.on_demand):
@@ -179,7 +175,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         """Write a snapshot at each stop, except one that was latched before this recorder started."""
         before = self._stopped.get(who)
         self._stopped[who] = stopped
-        if stopped and before is False and self.config.snapshot_on_estop:
+        if stopped and before is False:
             self._snapshot("estop")
 
     def _report(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Literal
 
 from instant_ic.bus import ERROR, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.camera.config import FilesConfig, ThetaConfig, VideoConfig
@@ -13,7 +13,7 @@ from instant_ic.camera.loop import CameraLoop, ReconnectConfig
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.camera.theta import ThetaCamera, ThetaClient, ThetaState
 from instant_ic.camera.video import VideoCamera
-from instant_ic.config.ranges import Positive, Range, Share, check_ranges
+from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import CompressedImage, compressed_image_message
@@ -21,6 +21,9 @@ from instant_ic.msg import CompressedImage, compressed_image_message
 USER_VARIABLE = "INSTANT_IC_THETA_USER"
 PASSWORD_VARIABLE = "INSTANT_IC_THETA_PASSWORD"
 """Environment variable for the credentials: parameters are visible in ``ic param`` and in files."""
+
+_BATTERY_LOW = 0.2  # share of the charge
+_BOARD_HOT_C = 70.0
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,6 @@ class ThetaCameraConfig:
         camera_mount: the camera's pose on base_link.
         silence_s: seconds without an image that cause a warning; four times as long is an error.
         health_period_s: seconds between requests for the Theta's battery and temperature.
-        battery_low: battery charge below which to warn, 0-1.
-        board_hot_c: board temperature from which on to warn, degrees Celsius.
         theta: live preview.
         video: stream through OpenCV.
         files: images from files.
@@ -48,8 +49,6 @@ class ThetaCameraConfig:
     camera_mount: Mount = CAMERA_MOUNT
     silence_s: Positive = 2.0
     health_period_s: Positive = 10.0
-    battery_low: Share = 0.2
-    board_hot_c: Annotated[float, Range(-40, 150)] = 70.0
     theta: ThetaConfig = field(default_factory=ThetaConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     files: FilesConfig = field(default_factory=FilesConfig)
@@ -63,7 +62,7 @@ class ThetaCameraConfig:
 
 class ThetaCameraNode(Node[ThetaCameraConfig]):
     name = "theta_camera"
-    live_parameters = ("silence_s", "battery_low", "board_hot_c", "camera_mount")
+    live_parameters = ("silence_s", "camera_mount")
 
     def setup(self) -> None:
         """Create the topics, the mount and the loop that reads the camera."""
@@ -151,8 +150,8 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         if isinstance(health, str):
             self.diagnose("health", WARN, health)
             return
-        low = health.battery is not None and health.battery < self.config.battery_low
-        hot = health.board_temperature_c is not None and health.board_temperature_c >= self.config.board_hot_c
+        low = health.battery is not None and health.battery < _BATTERY_LOW
+        hot = health.board_temperature_c is not None and health.board_temperature_c >= _BOARD_HOT_C
         text = [
             *(["battery is low: charge it"] if low else []),
             *(["it is getting hot"] if hot else []),

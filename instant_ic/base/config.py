@@ -117,7 +117,6 @@ class ControllerConfig:
         roboclaw: serial link.
         geometry: tracks and encoders.
         limits: speeds and accelerations.
-        odometry: growth of the odometry's uncertainty.
         command_timeout_s: largest age of a command; older commands are dropped, and without a newer one the base
             stops hard.
         health_period_s: time between reads of battery, status and the controller's watchdog.
@@ -126,7 +125,6 @@ class ControllerConfig:
     roboclaw: RoboclawConfig = field(default_factory=RoboclawConfig)
     geometry: SkidSteerConfig = field(default_factory=SkidSteerConfig)
     limits: LimitsConfig = field(default_factory=LimitsConfig)
-    odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
     command_timeout_s: Annotated[float, Range(above=0, high=2)] = 0.25
     health_period_s: Positive = 0.25
 
@@ -149,7 +147,6 @@ class CrawlerBaseConfig(ControllerConfig):
         battery_full_v: main battery when full, volts.
         battery_empty_v: voltage of the main battery when it needs charging, volts; lower voltages warn.
         recent_s: seconds for which repeats, dropped commands and impossible readings remain a warning.
-        connect_grace_s: seconds after the start for which a missing controller is not an error yet.
         command_source: name of the only node whose commands are obeyed; empty: any node.
         accept_unstamped: also obey commands without a stamp, with their arrival time as stamp.
     """
@@ -160,7 +157,6 @@ class CrawlerBaseConfig(ControllerConfig):
     battery_full_v: Positive = 25.2
     battery_empty_v: Positive = 21.0
     recent_s: Positive = 10.0
-    connect_grace_s: NotNegative = 5.0
     command_source: str = "arbiter"
     accept_unstamped: bool = False
 

@@ -82,7 +82,7 @@ class BaseController:
         """
         self.config = config
         self.roboclaw = Roboclaw(config.roboclaw, open_port)
-        self.odometry = WheelOdometry(config.geometry, config.odometry)
+        self.odometry = WheelOdometry(config.geometry)
         self.limiter = TwistLimiter(config.limits)
         self._now_ns = now_ns
         self._steady_ns = steady_ns

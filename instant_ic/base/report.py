@@ -9,6 +9,8 @@ from instant_ic.base.controller import BaseController, Health
 from instant_ic.base.recent import RecentCount
 from instant_ic.diagnosis import Diagnosis, Level
 
+_CONNECT_GRACE_S = 5.0  # after the start, for which a missing controller is not an error yet
+
 
 class BaseReport:
     """Turns states and counters of a controller into diagnoses.
@@ -30,7 +32,7 @@ class BaseReport:
     def link(self, connected: bool, text: str, steady_ns: int) -> Diagnosis:
         """A change of the serial link; soon after the start, a missing controller is only a warning."""
         self._linked |= connected
-        starting = not self._linked and steady_ns - self._started_ns < self.config.connect_grace_s * 1e9
+        starting = not self._linked and steady_ns - self._started_ns < _CONNECT_GRACE_S * 1e9
         return Diagnosis("link", Level.OK if connected else Level.WARN if starting else Level.ERROR, text)
 
     def recent(self, steady_ns: int) -> Iterator[Diagnosis]:

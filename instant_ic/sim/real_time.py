@@ -35,13 +35,11 @@ class DevicesConfig(SimulationConfig):
 
     Attributes:
         panorama: image file that the camera shows instead of the world; empty: the world.
-        pcap: VLP-16 recording to send instead of simulated packets; empty: the world.
-        pcap_loop: whether to restart the recording at its end.
+        pcap: VLP-16 recording to send, again and again, instead of simulated packets; empty: the world.
     """
 
     panorama: str = ""
     pcap: str = ""
-    pcap_loop: bool = True
 
 
 class SimulatedDevices:
@@ -74,7 +72,7 @@ class SimulatedDevices:
         simulation, lidar = self._simulation, config.lidar
         if lidar.enabled and config.pcap:
             path = Path(config.pcap).expanduser()
-            self.scanner = CaptureReplay(path, lidar.host, lidar.data_port, lidar.position_port, config.pcap_loop)
+            self.scanner = CaptureReplay(path, lidar.host, lidar.data_port, lidar.position_port)
         elif lidar.enabled:
             self.scanner = Vlp16Server(simulation.scanner)
         if config.camera.enabled:

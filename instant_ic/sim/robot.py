@@ -17,6 +17,8 @@ FloatArray = npt.NDArray[np.float64]
 
 #: A contact ends when the robot is this far from its pose at contact, metres and radians.
 _LET_GO = 0.015
+#: Time constant of the slip.
+_SLIP_TIME_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,6 @@ class RobotConfig:
             at set point zero, where friction ends the motion.
         slip: standard deviation of the share of a track's motion that is lost; 0 disables slip.
         turn_slip: relative standard deviation of the effective track width; 0 disables it.
-        slip_time_s: time constant of the slip.
         encoder_noise_pulses: standard deviation of the encoder counts while a track moves.
     """
 
@@ -42,7 +43,6 @@ class RobotConfig:
     rolling_resistance: NotNegative = 0.5
     slip: Annotated[float, Range(0, below=0.5)] = 0.02
     turn_slip: Annotated[float, Range(0, below=0.5)] = 0.05
-    slip_time_s: Positive = 1.0
     encoder_noise_pulses: NotNegative = 2.0
 
     def __post_init__(self) -> None:
@@ -129,7 +129,7 @@ class TrackedRobot:
             noise = self._rng.normal(0, config.encoder_noise_pulses, 2)
             self._jitter = np.where(moving, noise, self._jitter)
 
-        keep = math.exp(-dt_s / config.slip_time_s)
+        keep = math.exp(-dt_s / _SLIP_TIME_S)
         spread = np.asarray([config.slip, config.slip, config.turn_slip]) * math.sqrt(1 - keep * keep)
         self._slip = keep * self._slip + spread * self._rng.standard_normal(3)
         twist = self.kinematics.twist_from_tracks(mean * (1 - self._slip[:2]))
