@@ -192,7 +192,6 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             self.diagnose("types", WARN, f"recorded without type definition, which is unknown here: {named}")
 
     def teardown(self) -> None:
-        """Complete the bag."""
         if self.recorder is None:
             return
         self.spin_once()  # messages already in the queues belong to the bag

@@ -80,7 +80,6 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
     _no_commands = ""
 
     def setup(self) -> None:
-        """Open the session."""
         if self.run_dir is None:
             raise NodeError("the gateway needs the real bus and a real Zenoh session: it cannot run in lockstep")
         if self.namespace:
@@ -119,7 +118,6 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             return error
 
     def opened(self, session: RosSession | ZenohError) -> None:
-        """Join the ROS graph."""
         if isinstance(session, ZenohError):
             self.diagnose("link", WARN, f"{session}; trying again (is the router running? ic run zenoh_router)")
             return
@@ -141,7 +139,6 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             self._opener.submit(None)
 
     def look(self) -> None:
-        """Follow new and removed topics."""
         if self.session is None:
             return
         self.outgoing.reconcile(self._watch.topics())
@@ -164,7 +161,6 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self.diagnose("topics", level, text, **values, **refused)
 
     def teardown(self) -> None:
-        """Leave the ROS graph."""
         if self.session is not None:
             self.session.close()
 

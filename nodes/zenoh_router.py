@@ -38,7 +38,6 @@ class ZenohRouterNode(Node[ZenohRouterConfig]):
         self.timer(1.0, self.report)
 
     def report(self) -> None:
-        """Report the connected peers."""
         info = self.session.info
         self.diagnose("link", OK, f"{len(info.peers_zid())} peers, {len(info.routers_zid())} other routers")
 

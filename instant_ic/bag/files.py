@@ -127,7 +127,6 @@ class BagReader:
         self.close()
 
     def close(self) -> None:
-        """Close the files. Idempotent."""
         if self._reader.is_open:
             self._reader.close()
 
@@ -143,7 +142,6 @@ class BagReader:
 
     @property
     def count(self) -> int:
-        """Messages in the bag."""
         return int(self._reader.message_count) - sum(topics.total() for topics in self._repeated.values())
 
     @property

@@ -65,7 +65,6 @@ class PartInfo:
 
     @property
     def count(self) -> int:
-        """Messages in the file."""
         return sum(self.counts.values())
 
 

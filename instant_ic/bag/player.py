@@ -110,7 +110,6 @@ class BagPlayer:
         self._now_s: Callable[[], float] = time.monotonic
 
     def close(self) -> None:
-        """Close the bag."""
         self._reader.close()
 
     def _why_not(self, topic: TopicSummary) -> str:
@@ -131,7 +130,6 @@ class BagPlayer:
 
     @property
     def paused(self) -> bool:
-        """Whether playback is paused."""
         return self._paused
 
     def set_rate(self, rate: float) -> None:
@@ -147,7 +145,6 @@ class BagPlayer:
             self._rate = rate
 
     def pause(self) -> None:
-        """Pause playback."""
         self._paused = True
 
     def resume(self) -> None:

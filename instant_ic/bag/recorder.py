@@ -223,7 +223,6 @@ class Recorder:
 
     @property
     def topics(self) -> Collection[str]:
-        """Subscribed topics."""
         return self._losses.keys()
 
     @property

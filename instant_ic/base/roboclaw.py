@@ -170,7 +170,6 @@ class Roboclaw:
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open."""
         return self._port is not None
 
     def connect(self) -> str:

@@ -70,7 +70,6 @@ class Parameters:
         return refused
 
     def close(self) -> None:
-        """End the threads."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 

@@ -110,7 +110,6 @@ class Graph:
 
     @property
     def topics(self) -> set[str]:
-        """All topics of the graph."""
         return {*self.published, *self.subscribed}
 
     def encode(self) -> str:

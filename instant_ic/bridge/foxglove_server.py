@@ -183,7 +183,6 @@ class FoxgloveServer:
 
     @property
     def topics(self) -> list[str]:
-        """Topics on offer."""
         return sorted(self._channels)
 
     @property

@@ -54,7 +54,6 @@ class ClockFilter:
 
     @property
     def ready(self) -> bool:
-        """Whether there is an estimate."""
         return bool(self._samples)
 
     @property

@@ -52,7 +52,6 @@ class Peer:
 
     @property
     def fingerprint(self) -> str:
-        """See :func:`fingerprint`."""
         return fingerprint(self.public_key)
 
 
@@ -66,7 +65,6 @@ class Identity:
 
     @property
     def fingerprint(self) -> str:
-        """See :func:`fingerprint`."""
         return fingerprint(self.public_key)
 
 
@@ -339,5 +337,4 @@ class AllowList:
         return self._peers.get(public_key)
 
     def __len__(self) -> int:
-        """Number of allowed hosts."""
         return len(self._peers)

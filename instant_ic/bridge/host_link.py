@@ -144,7 +144,6 @@ class HostLink(ABC):
     # -- for the node ------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     def stop(self, timeout_s: float = 3.0) -> None:

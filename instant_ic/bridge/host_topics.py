@@ -118,7 +118,6 @@ class TopicCounts:
         return self.expired + self.overflowed + self.lost
 
     def add(self, other: TopicCounts) -> None:
-        """Add the counts of ``other``."""
         for name in ("messages", "bytes", "thinned", "superseded", "expired", "overflowed", "lost", "not_driving"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.newest_age_ns = other.newest_age_ns or self.newest_age_ns

@@ -63,7 +63,6 @@ class Outgoing:
 
     @property
     def topics(self) -> list[str]:
-        """Exported topics."""
         return sorted(self._topics)
 
     def reconcile(self, present: Sequence[TopicInfo]) -> None:

@@ -369,7 +369,6 @@ class RosSubscription:
 
     @property
     def lost(self) -> int:
-        """Lost messages of all publishers."""
         return sum(self.lost_by.values())
 
     def _heard(self, sample: Any) -> None:

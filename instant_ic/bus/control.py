@@ -82,7 +82,6 @@ class ControlServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop accepting requests."""
         try:
             self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread from accept()
         except OSError as error:

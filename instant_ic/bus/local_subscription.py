@@ -322,7 +322,6 @@ class LocalSubscription:
     # -- on the node's thread --------------------------------------------------------------------
 
     def take(self) -> list[Received]:
-        """See :class:`~.transport.RawSubscription`."""
         if not self._queue:
             return []
         with self._lock:
@@ -331,5 +330,4 @@ class LocalSubscription:
         return messages
 
     def close(self) -> None:
-        """End the subscription."""
         self._on_close(self)

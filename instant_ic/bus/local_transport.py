@@ -58,18 +58,15 @@ class Waker:
             os.eventfd_write(self.fd, 1)
 
     def clear(self) -> None:
-        """Reset the event."""
         self._set = False
         if self._written:
             self._written = False
             self.drain()
 
     def is_set(self) -> bool:
-        """Whether the event is set."""
         return self._set
 
     def rest(self, timeout: float) -> None:
-        """Wait for the event only."""
         self._poll.poll(1000.0 * timeout)
 
     def drain(self) -> None:

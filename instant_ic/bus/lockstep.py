@@ -185,7 +185,6 @@ class LockstepBus:
         self._run()
 
     def advance(self, seconds: float) -> None:
-        """Advance the clock."""
         self.advance_to(self.clock.now_ns() + int(seconds * 1e9))
 
     def records(self, topic: str) -> list[Record]:
@@ -213,7 +212,6 @@ class LockstepBus:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """See :meth:`__enter__`."""
         self.close()
 
     # -- for publishers and subscriptions --------------------------------------------------------

@@ -93,7 +93,6 @@ class Subscription:
         self.raw: RawSubscription  # set by the node right after construction
 
     def close(self) -> None:
-        """Stop receiving messages."""
         self.raw.close()
 
 

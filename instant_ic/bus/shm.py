@@ -125,7 +125,6 @@ class Slot:
         self.sequence = sequence
 
     def unlock(self) -> None:
-        """Let readers use the message."""
         fcntl.flock(self.fd, fcntl.LOCK_UN)
 
     def view(self, size: int) -> memoryview:
@@ -243,7 +242,6 @@ class SlotMapping:
         return False
 
     def release(self) -> None:
-        """Unlock the slot."""
         fcntl.flock(self._fd, fcntl.LOCK_UN)
         self.held = False
 

@@ -78,7 +78,6 @@ class Stats:
             self.lost_by = {**self.lost_by, publisher: self.lost_by.get(publisher, 0) + count}
 
     def add(self, now_ns: int, size: int) -> None:
-        """Count one message."""
         self.count += 1
         self.bytes += size
         self.newest_ns = now_ns

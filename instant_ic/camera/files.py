@@ -88,7 +88,6 @@ class FileCamera(Camera):
         return Frame(jpeg, self._stamp_ns(), width, height)
 
     def close(self) -> None:
-        """Drop the loaded images."""
         self._paths = []
         self._loaded.clear()
         self._index = 0

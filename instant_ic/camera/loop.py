@@ -63,7 +63,6 @@ class CameraLoop(threading.Thread):
         self._end = threading.Event()
 
     def run(self) -> None:
-        """Connect and read until `end`."""
         backoff = Backoff(self._reconnect.min_s, self._reconnect.max_s)
         try:
             while not self._end.is_set():

@@ -95,7 +95,6 @@ class ProcessParameters:
     nice: Annotated[int, Range(0, 19)] = 0
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         check_ranges(self)
 
 

@@ -39,7 +39,6 @@ class Range:
     below: float | None = None
 
     def __contains__(self, value: float) -> bool:
-        """Whether a value is allowed."""
         return (
             math.isfinite(value)
             and (self.low is None or value >= self.low)

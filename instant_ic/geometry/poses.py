@@ -152,7 +152,6 @@ def compose2(a: ArrayLike, b: ArrayLike) -> Pose2:
 
 
 def inverse2(a: ArrayLike) -> Pose2:
-    """Inverse of a planar pose."""
     x, y, yaw = np.asarray(a, dtype=np.float64).tolist()
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([-c * x - s * y, s * x - c * y, wrap_angle(-yaw)])

@@ -101,7 +101,6 @@ class TransformBuffer:
         return inverse(common_from_target) @ common_from_source
 
     def frames(self) -> frozenset[str]:
-        """Names of all known frames."""
         with self._lock:
             return self._frames()
 

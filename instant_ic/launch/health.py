@@ -282,7 +282,6 @@ class HealthMonitor:
         return None
 
     def close(self) -> None:
-        """Disconnect from the bus."""
         for transport in self._transports.values():
             transport.close()
 

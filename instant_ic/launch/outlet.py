@@ -110,7 +110,6 @@ class LogFile:
         self._rotate()
 
     def write(self, data: bytes) -> None:
-        """Append output."""
         try:
             if self._size + len(data) > self._max_bytes:
                 self.close()

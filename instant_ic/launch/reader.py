@@ -156,7 +156,6 @@ class _Actions:
 
     @property
     def context(self) -> Context:
-        """Context of the scope."""
         return self.scope.context
 
     def read(self, body: Value) -> None:

@@ -51,6 +51,5 @@ class StackLock:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Release the lock."""
         os.ftruncate(self._descriptor, 0)
         os.close(self._descriptor)

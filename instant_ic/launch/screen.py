@@ -116,21 +116,17 @@ class Screen:
         self._held_back: list[tuple[str, str]] = []
 
     def __enter__(self) -> Screen:
-        """Show the table."""
         self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Remove the table."""
         self.stop()
 
     def start(self) -> None:
-        """Show the table."""
         if self._live is not None:
             self._live.start()
 
     def stop(self) -> None:
-        """Remove the table."""
         if self._live is not None:
             self._live.stop()
 

@@ -64,17 +64,14 @@ class Value:
 
     @property
     def is_null(self) -> bool:
-        """Whether the value is empty."""
         return isinstance(self.node, yaml.ScalarNode) and self.node.tag == _NO_VALUE
 
     @property
     def is_list(self) -> bool:
-        """Whether it is a list."""
         return isinstance(self.node, yaml.SequenceNode)
 
     @property
     def is_mapping(self) -> bool:
-        """Whether it is a mapping."""
         return isinstance(self.node, yaml.MappingNode)
 
     @property

@@ -79,7 +79,6 @@ class _Silence:
         self._active_s = 0.0
 
     def look(self, beat_s: float | None, pid: int, since_last_look_s: float) -> None:
-        """Record the newest heartbeat."""
         if beat_s is None or beat_s != self.beat_s:
             self.beat_s, self.lasts_s, self.told = beat_s, 0.0, False
             self._active_s = _active_s(pid)

@@ -23,7 +23,6 @@ def text_of(value: Value | None, context: Context) -> str | None:
 
 
 def plain_text(value: Value | None) -> str | None:
-    """The text as written."""
     return value.text() if value is not None else None
 
 

@@ -33,7 +33,6 @@ class CapturePlayer:
 
     @property
     def ended(self) -> bool:
-        """Whether all datagrams were returned."""
         return self._next is None
 
     def due(self, steady_ns: int) -> Iterator[Datagram]:

@@ -66,5 +66,4 @@ class CaptureReplay:
                 self._began_s = max(self._began_s + self._period_s, time_s - self._period_s)
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()

@@ -87,7 +87,6 @@ class SimulatedDevices:
             log.info("RoboClaw on %s (%s)", link, self._base.device)
 
     def close(self) -> None:
-        """Close the devices."""
         for device in (self._base, self.camera, self.scanner):
             if device is not None:
                 device.close()

@@ -272,7 +272,6 @@ class Vlp16Server:
             self._next_position_s = time_s + self.POSITION_PERIOD_S
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
     def _send(self, payload: bytes, port: int) -> None:
