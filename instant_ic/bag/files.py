@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rosbags.interfaces import Connection
@@ -21,6 +20,7 @@ from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
 from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.qos import QoS
+from instant_ic.closing import Closing
 from instant_ic.msg import deserialize
 
 guard_rosbags()
@@ -66,7 +66,7 @@ class PartSummary:
     count: int
 
 
-class BagReader:
+class BagReader(Closing):
     """Reads a bag; a context manager.
 
     Latched values that a recorder repeats at the start of each file are counted once and returned once.
@@ -117,14 +117,6 @@ class BagReader:
             raise BagError(
                 f"bag {path}: {REPEATED} in metadata.yaml is wrong ({error}): ic bag reindex {path}"
             ) from None
-
-    def __enter__(self) -> BagReader:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         if self._reader.is_open:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterator
-from types import TracebackType
 
 from instant_ic.bag.files import BagMessage
+from instant_ic.closing import Closing
 
 _MOST_BYTES = 64_000_000
 
 
-class ReadAhead:
+class ReadAhead(Closing):
     """Iterates over messages that a separate thread reads; a context manager.
 
     Args:
@@ -31,14 +31,6 @@ class ReadAhead:
         self._condition = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="read ahead", daemon=True)
         self._thread.start()
-
-    def __enter__(self) -> ReadAhead:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self, timeout_s: float = 5.0) -> None:
         """End the thread and drop the buffered messages."""

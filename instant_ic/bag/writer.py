@@ -6,13 +6,13 @@ import errno
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 
 from instant_ic.bag.errors import BagError, DiskFullError
 from instant_ic.bag.latched import LatchedValue, LatchedValues
 from instant_ic.bag.mcap_writer import Buffer, McapWriter, Schema
 from instant_ic.bag.metadata import PartInfo, Topic, channel_metadata, schema_or_unknown, write_metadata
 from instant_ic.bus.qos import SENSOR, QoS
+from instant_ic.closing import Closing
 from instant_ic.private import make_folder
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -34,7 +34,7 @@ class _Part:
     repeats: int = 0
 
 
-class BagWriter:
+class BagWriter(Closing):
     """Writes a bag folder; a context manager; not thread-safe.
 
     Each completed file is listed in ``metadata.yaml`` immediately. A killed recorder leaves a bag that opens, and
@@ -81,15 +81,6 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"bag {path} cannot be created: {error.strerror or error}") from None
         self._open_part()
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the bag, also after an exception: a partial recording is still useful."""
-        self.close()
 
     @property
     def count(self) -> int:

@@ -14,8 +14,7 @@ import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from instant_ic.bridge.zenoh_format import (
     ADMIN_SPACE,
@@ -28,6 +27,7 @@ from instant_ic.bridge.zenoh_format import (
     TopicQoS,
     data_key,
 )
+from instant_ic.closing import Closing
 from instant_ic.paths import shipped_file
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
@@ -174,7 +174,7 @@ def _words(error: Exception) -> str:
     return re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error)).strip()
 
 
-class RosSession:
+class RosSession(Closing):
     """Nodes of the ROS graph in one Zenoh session. A context manager.
 
     Args:
@@ -192,14 +192,6 @@ class RosSession:
         self.gid_head = os.urandom(SENDER_SIZE)
         self._ids = itertools.count()
         self._watch: Any = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the session with all its tokens, publishers and subscriptions."""

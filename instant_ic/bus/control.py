@@ -226,6 +226,9 @@ class NodeControl:
         run_dir: run directory of the stack.
         node: name of the node.
         timeout_s: time to wait for each answer.
+
+    Raises:
+        ControlError: by each method, where the node is not running, does not answer or refuses.
     """
 
     def __init__(self, run_dir: Path, node: str, timeout_s: float = 5.0) -> None:
@@ -234,19 +237,11 @@ class NodeControl:
         self.timeout_s = timeout_s
 
     def describe(self) -> list[ParameterInfo]:
-        """Every parameter of the node.
-
-        Raises:
-            ControlError: the node is not running or does not answer.
-        """
+        """Every parameter of the node."""
         return [ParameterInfo(**entry) for entry in self.request({"op": "describe"})["parameters"]]
 
     def get(self) -> dict[str, Any]:
-        """Value of every parameter.
-
-        Raises:
-            ControlError: see :meth:`describe`.
-        """
+        """Value of every parameter."""
         values: dict[str, Any] = self.request({"op": "get"})["values"]
         return values
 
@@ -255,7 +250,7 @@ class NodeControl:
 
         Raises:
             ParameterError: a value is refused; the message says why.
-            ControlError: see :meth:`describe`; :class:`NodeBusyError` when the node's thread is busy.
+            NodeBusyError: the node's thread is busy.
         """
         changed: dict[str, Any] = self.request({"op": "set", "values": {k: plain(v) for k, v in values.items()}})[
             "changed"
@@ -263,27 +258,15 @@ class NodeControl:
         return changed
 
     def log_level(self, level: str | None = None) -> str:
-        """The node's log level, after setting it if ``level`` is given.
-
-        Raises:
-            ControlError: see :meth:`describe`, or the level does not exist.
-        """
+        """The node's log level, after setting it if ``level`` is given."""
         return str(self.request({"op": "log_level", "level": level})["level"])
 
     def status(self) -> dict[str, Any]:
-        """``pid``, ``threads``, ``busy`` (the callback its thread is running, or empty) and ``busy_s`` (for how long).
-
-        Raises:
-            ControlError: see :meth:`describe`.
-        """
+        """``pid``, ``threads``, ``busy`` (the callback its thread runs, or empty) and ``busy_s`` (for how long)."""
         return self.request({"op": "status"})
 
     def call(self, command: str, **arguments: Any) -> Any:
-        """Run one of the node's ``commands`` and return its result.
-
-        Raises:
-            ControlError: see :meth:`describe`; or the command does not exist; or the node refuses it, with a reason.
-        """
+        """Run one of the node's ``commands`` and return its result."""
         return self.request({"op": "call", "command": command, "arguments": arguments})["result"]
 
     def request(self, request: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.node import Node
 from instant_ic.bus.qos import LATCHED, QoS
 from instant_ic.bus.transport import Payload, PublisherStats, Received, Stats, joined
+from instant_ic.closing import Closing
 from instant_ic.msg import deserialize, serialize, type_name
 
 NodeT = TypeVar("NodeT", bound=Node[Any])
@@ -110,7 +111,7 @@ class _Transport:
         pass
 
 
-class LockstepBus:
+class LockstepBus(Closing):
     """Drives nodes with a manual clock.
 
     Args:
@@ -206,13 +207,6 @@ class LockstepBus:
             node.close()
         self.nodes.clear()
         self._transports.clear()
-
-    def __enter__(self) -> LockstepBus:
-        """Return the bus; leaving the block closes the nodes."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # -- for publishers and subscriptions --------------------------------------------------------
 

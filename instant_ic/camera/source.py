@@ -1,11 +1,12 @@
 """Base class of all cameras."""
 
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
+
+from instant_ic.closing import Closing
 
 
 class CameraError(ConnectionError):
@@ -29,7 +30,7 @@ class Frame:
     height: int
 
 
-class Camera(ABC):
+class Camera(Closing):
     """A source of frames.
 
     Example:
@@ -72,11 +73,6 @@ class Camera(ABC):
     def __enter__(self) -> Self:
         self.connect()
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _stamp_ns(self) -> int:
         return self._now_ns() - self._latency_ns

@@ -82,31 +82,13 @@ def decode_depth(png: bytes, near_m: float) -> NDArray[np.float32]:
     return grey.astype(np.float32) * np.float32(1 / (255 * near_m))
 
 
-def reproject(
-    picture: NDArray[np.uint8], inverse: NDArray[np.float32], moved_m: NDArray[np.floating], fov_rad: float
-) -> NDArray[np.uint8]:
-    """Reproject an image to a moved camera; the same computation as the page's shader, for use without a page.
-
-    Each pixel searches its source position iteratively against the depth there, starting at the nearest depth, so that
-    near surfaces cover far ones. Areas that open up behind an edge are filled with the far side.
-
-    Args:
-        picture: (H, W, C), perspective.
-        inverse: (h, w) of ``decode_depth``.
-        moved_m: (3,) in the image's camera frame (x forward, y left, z up).
-        fov_rad: horizontal field of view.
-    """
-    rows, columns = picture.shape[:2]
-    half = math.tan(fov_rad / 2) * np.array([1, rows / columns])
-    x, y = (2 * np.arange(columns) + 1) / columns - 1, 1 - (2 * np.arange(rows) + 1) / rows
-    here = np.stack(np.meshgrid(x, y), axis=2).astype(np.float32)
-    return _sample(picture, positions_before(here, inverse, moved_m, half)).astype(np.uint8)
-
-
 def positions_before(
     here: NDArray[np.float32], inverse: NDArray[np.float32], moved_m: NDArray[np.floating], half: NDArray[np.floating]
 ) -> NDArray[np.float32]:
-    """Positions in an image of what a moved camera sees at given positions, as ``reproject`` and the shader find them.
+    """Positions in an image of what a moved camera sees at given positions, as the page's shader finds them.
+
+    Each position is found iteratively against the depth there, starting at the nearest depth, so that near surfaces
+    cover far ones. Areas that open up behind an edge show the far side.
 
     Args:
         here: (H, W, 2) positions; 0 is the image's centre, 1 its right and its upper edge.

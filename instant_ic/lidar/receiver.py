@@ -7,9 +7,9 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from types import TracebackType
 from typing import NamedTuple, Self
 
+from instant_ic.closing import Closing
 from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES, check_data_packet
 from instant_ic.lidar.sources import SourceGuard
 from instant_ic.pace import current
@@ -66,7 +66,7 @@ class Received(NamedTuple):
     """True from the data port, False from the position port."""
 
 
-class PacketReceiver:
+class PacketReceiver(Closing):
     """Receives on both ports of the sensor.
 
     Example:
@@ -125,11 +125,6 @@ class PacketReceiver:
     def __enter__(self) -> Self:
         self.connect()
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def read(self, timeout_s: float) -> Iterator[Received]:
         """Yield the sensor's datagrams; wait at most ``timeout_s`` for the first one and yield nothing on a time-out.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from instant_ic.console import demo_world
-from instant_ic.geometry.depth_picture import NEAREST_M, decode_depth, encode_depth, reproject
+from instant_ic.geometry.depth_picture import NEAREST_M, decode_depth, encode_depth, positions_before
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import perspective_directions
 
@@ -62,6 +62,16 @@ def test_what_is_no_depth_picture_is_refused(png):
         decode_depth(png, 1.0)
     with pytest.raises(ValueError, match="shape"):
         encode_depth(np.zeros((2, 2, 2)), FOV)
+
+
+def reproject(picture, inverse, moved_m, fov_rad):
+    """An image as a moved camera sees it, by ``positions_before``."""
+    rows, columns = picture.shape[:2]
+    half = math.tan(fov_rad / 2) * np.array([1, rows / columns])
+    x, y = (2 * np.arange(columns) + 1) / columns - 1, 1 - (2 * np.arange(rows) + 1) / rows
+    at = positions_before(np.stack(np.meshgrid(x, y), axis=2).astype(np.float32), inverse, moved_m, half)
+    u, v = (1 + at[..., 0]) * (columns / 2) - 0.5, (1 - at[..., 1]) * (rows / 2) - 0.5
+    return cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
 
 
 def test_a_point_moves_by_its_parallax():
