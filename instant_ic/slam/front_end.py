@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +20,6 @@ RECOVERY_MARGIN = 0.1
 """Minimum score gain of the wide search over the first search."""
 START_KEYFRAMES = 4
 """Maximum number of keyframes taken at the start pose before the robot moves."""
-LOST_SCANS = 10
-"""Number of lost scans in a row after which a new local map starts: a second at 10 Hz."""
 WINDOW_PER_M, WINDOW_PER_RAD, TURN_WINDOW_PER_M = 0.4, 0.4, 0.2
 """Growth of the search window with the odometry step: translation per metre, rotation per radian and per metre; twice
 the default σ of the odometry."""
@@ -42,7 +41,7 @@ class SlamStatus(enum.StrEnum):
     LOST = "lost"
     """No match; the pose comes from odometry, and its covariance grows."""
     RESTARTED = "restarted"
-    """Lost for several scans; a new local map starts at the odometry pose."""
+    """The robot is lost; a new session starts at the odometry pose, apart from the map so far."""
     NO_POINTS = "no points"
     """No points, only infinite ranges, or too few points; the pose comes from odometry."""
     TIME_BACKWARDS = "time backwards"
@@ -87,7 +86,6 @@ class FrontEnd:
         self.config = config
         self.trajectory = Trajectory()
         self._field = LikelihoodField(config.field, config.match.recovery_translation_m + 0.5)
-        self._lost_scans = 0
         self._covariance = np.zeros((3, 3))
         self._known: FloatArray | None = None
         self._built_at = np.zeros(2)
@@ -100,7 +98,6 @@ class FrontEnd:
     def use_known_map(self, points: FloatArray, pose: FloatArray) -> None:
         """Switch to matching against the surfaces (n, 2) of a known map, starting at ``pose`` (3,)."""
         self._known = points
-        self._lost_scans = 0
         self._build_known(pose)
 
     def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
@@ -131,8 +128,17 @@ class FrontEnd:
             min(window.rotation_rad, match.recovery_rotation_rad),
         )
 
-    def track(self, scan: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
-        """Match a scan that has at least ``match.min_points`` points."""
+    def track(
+        self, scan: ScanPoints, guess: Guess, stamp_ns: int, accept: Callable[[FloatArray, float], bool] | None = None
+    ) -> Track:
+        """Match a scan that has at least ``match.min_points`` points.
+
+        Args:
+            scan: its points.
+            guess: predicted pose.
+            stamp_ns: of the scan.
+            accept: gets the pose (3,) and the score of a match; the scan becomes a keyframe only if it returns True.
+        """
         config = self.config.match
         points = self._match_points(scan)
         if len(self.trajectory) == 0:
@@ -149,17 +155,25 @@ class FrontEnd:
             if recovered.score >= config.min_score and recovered.score > match.score + margin:
                 match, status = recovered, SlamStatus.RECOVERED
         if match.score < config.min_score:
-            return self._lost(scan, guess, match.score, stamp_ns)
+            return Track(guess.pose, self._grown_covariance(guess), match.score, SlamStatus.LOST, None)
 
-        self._lost_scans = 0
+        accepted = accept is None or accept(match.pose, match.score)
         self._covariance = match.covariance
         added: Keyframe | None = None
         if self.in_known_map:
             if math.hypot(*(match.pose[:2] - self._built_at)) > KNOWN_MAP_STEP_M:
                 self._build_known(match.pose)
-        elif self._moved(match.pose) or self._first_was_poor(match, status):
+        elif accepted and (self._moved(match.pose) or self._first_was_poor(match, status)):
             added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
         return Track(match.pose, match.covariance, match.score, status, added)
+
+    def restart(self, scan: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
+        """Start a new local map and trajectory with a scan, at the predicted pose."""
+        self._known = None
+        self.trajectory = Trajectory()
+        covariance = self._grown_covariance(guess)
+        keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
+        return Track(guess.pose, covariance, 0.0, SlamStatus.RESTARTED, keyframe)
 
     def dead_reckon(self, guess: Guess) -> Track:
         """Use the guess as the pose of a scan with too few points."""
@@ -173,17 +187,6 @@ class FrontEnd:
         config = self.config.match
         window = Window(config.recovery_translation_m, config.recovery_rotation_rad)
         return match_scan(self._field, points, guess.pose, guess.sigma, window)
-
-    def _lost(self, scan: ScanPoints, guess: Guess, score: float, stamp_ns: int) -> Track:
-        """Handle a failed match: continue on odometry, and start a new local map if the failures persist."""
-        self._lost_scans += 1
-        covariance = self._grown_covariance(guess)
-        if self._lost_scans < LOST_SCANS:
-            return Track(guess.pose, covariance, score, SlamStatus.LOST, None)
-        self._lost_scans = 0
-        self._known = None
-        keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
-        return Track(guess.pose, covariance, score, SlamStatus.RESTARTED, keyframe)
 
     def _grown_covariance(self, guess: Guess) -> FloatArray:
         self._covariance = self._covariance + turned(np.diag(guess.sigma**2), float(guess.pose[2]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -15,14 +15,18 @@ from instant_ic.geometry.poses import compose2, inverse2, relative2
 from instant_ic.jit import leave_out_blas
 from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.front_end import FrontEnd, Guess, SlamStatus, Track, constant_velocity
+from instant_ic.slam.integrity import Integrity, IntegrityMonitor, mixture
+from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.localization import Place, SavedMap
 from instant_ic.slam.loop_closure import QUERY_KEYFRAMES, LoopClosure, Outcome, correction
 from instant_ic.slam.map_files import load_graph, load_grid, save_graph, save_grid
 from instant_ic.slam.motion import MotionMonitor
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.pose_graph import Edge
-from instant_ic.slam.scan import FloatArray, Scan, scan_points
+from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
 
+MOST_JOIN_CONTRADICTION = 0.1
+"""Contradiction of a session with the saved map above which they are not joined; a right place has 0.03."""
 MAX_ODOMETRY_GAP_S = 5.0
 """The encoders keep counting across a shorter gap; after a longer one they may have been reset."""
 
@@ -41,13 +45,16 @@ class SlamResult:
 
     Attributes:
         map_from_base: (3,) at the scan's stamp.
-        covariance: (3, 3) x, y, yaw in the map frame: match covariance plus drift since the last loop closure.
+        covariance: (3, 3) x, y, yaw in the map frame: match covariance plus drift since the last loop closure, wider
+            the less the pose is trusted.
         score: 0..1, mean likelihood field value over the points.
         status: outcome of the scan.
         keyframe_added: whether the map has changed.
         anchor: moves with the map, so that this scan's pose can be read after later corrections; None before the first
             keyframe.
-        localized: False while the robot is not yet located in a saved map; the pose is then in a separate frame.
+        localized: False while the robot is not yet located in a saved map, or is lost; the pose is then in a separate
+            frame.
+        integrity: probability of being lost, and bounds of the error.
     """
 
     map_from_base: FloatArray
@@ -57,6 +64,12 @@ class SlamResult:
     keyframe_added: bool
     anchor: Anchor | None = None
     localized: bool = True
+    integrity: Integrity = field(default_factory=lambda: Integrity(0.0, 0.0, 0.0))
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the scan was matched and its pose may be used."""
+        return self.status.matched and self.localized and self.integrity.trusted
 
 
 class GridSlam:
@@ -75,6 +88,7 @@ class GridSlam:
         front_end: matches scans and makes keyframes.
         loop_closure: finds loops and optimises the keyframes' poses.
         motion: compares wheel odometry with scan matching.
+        monitor: probability of being lost.
     """
 
     def __init__(self, config: SlamConfig | None = None, saved: SavedMap | None = None) -> None:
@@ -84,6 +98,8 @@ class GridSlam:
         self.loop_closure = LoopClosure(self.config)
         self.map = OccupancyMap(self.config.map)
         self.motion = MotionMonitor()
+        self.monitor = IntegrityMonitor()
+        self._saved_cells: tuple[SavedMap, OccupancyMap] | None = None  # a saved map, to compare scans with
         self.map_from_base: FloatArray = np.zeros(3)
         self.odom_from_base: FloatArray = np.zeros(3)
         self.map_from_odom: FloatArray = np.zeros(3)
@@ -98,6 +114,7 @@ class GridSlam:
         # Background work: keyframes handed to the loop closure, whether a job is running, whether one has failed.
         self._handed_over = 0
         self._busy = False
+        self._job_of = self.front_end.trajectory
         self._broken = False
         self._merged = 0
         self._edges: list[Edge] = []
@@ -121,20 +138,21 @@ class GridSlam:
         points = scan_points(scan, mount, self.config.map.no_return_clear_m)
         guess = self._guess(odometry, scan.stamp_ns)
         if len(points.points) >= self.config.match.min_points:
-            track = self.front_end.track(points, guess, scan.stamp_ns)
+            track = self._track(points, guess, scan.stamp_ns)
         elif self._stamp_ns is None:  # nothing to match against yet: the next scan becomes the first one
             return self._unplaced(SlamStatus.NO_POINTS)
         else:
             track = self.front_end.dead_reckon(guess)
+            self.monitor.unmatched(False, self._elapsed_s(scan.stamp_ns))
         if track.keyframe is not None:
             self.map.insert(track.keyframe.map_from_base, track.keyframe.scan)
         self._follow(track, odometry, scan.stamp_ns)
-        if track.status is SlamStatus.RESTARTED and self.saved is not None and not self.saved.extends:
-            self.saved.located = False
         anchor = self.front_end.trajectory.last
         covariance = track.covariance + anchor.drift
+        integrity = self.monitor.integrity(covariance, self.localized)
+        covariance = mixture(covariance, integrity.lost_probability)
         added = track.keyframe is not None
-        return SlamResult(track.pose, covariance, track.score, track.status, added, anchor, self.localized)
+        return SlamResult(track.pose, covariance, track.score, track.status, added, anchor, self.localized, integrity)
 
     @property
     def localized(self) -> bool:
@@ -159,6 +177,10 @@ class GridSlam:
         files = save_grid(stem, self.grid())
         if self.saved is not None and self.saved.unchanged:
             return files  # this map was loaded, and its graph, if any, exists where it came from
+        return [*files, save_graph(stem, *self._graph())]
+
+    def _graph(self) -> tuple[list[Keyframe], list[Edge]]:
+        """The keyframes that have not been removed, and the edges between them."""
         keyframes = self.front_end.trajectory.keyframes
         known = max((edge.b for edge in self._edges), default=0) + 1
         edges = list(self._edges)
@@ -167,7 +189,7 @@ class GridSlam:
         kept = [k for k, keyframe in enumerate(keyframes) if keyframe.merged_into is None]
         row = {k: index for index, k in enumerate(kept)}
         edges = [replace(edge, a=row[edge.a], b=row[edge.b]) for edge in edges]
-        return [*files, save_graph(stem, [keyframes[k] for k in kept], edges)]
+        return [keyframes[k] for k in kept], edges
 
     def set_pose(self, map_from_base: ArrayLike) -> None:
         """Set the robot's pose in the saved map (3,). An error of 1 m and 60° is acceptable; scan matching refines it.
@@ -206,6 +228,7 @@ class GridSlam:
             self._handed_over += len(new)
             job = (lambda: self.loop_closure.update(new)) if new else None
         self._busy = job is not None
+        self._job_of = self.front_end.trajectory
         return job
 
     def take_over(self, outcome: Place | Outcome | None) -> None:
@@ -216,12 +239,16 @@ class GridSlam:
                 its copy of the keyframes is incomplete.
         """
         self._busy = False
+        if self._job_of is not self.front_end.trajectory:
+            return  # of the session before
         if outcome is None:
             self._broken = self.localized
         elif isinstance(outcome, Outcome):
             self._take_over_loops(outcome)
         elif outcome.found is not None and self.saved is not None and not self.saved.located:
             moved = correction(outcome.keyframe.map_from_base, outcome.found.pose)
+            if self._contradiction_in(self.saved, moved) > MOST_JOIN_CONTRADICTION:
+                return
             self._join(self.saved, moved, outcome.found.covariance, outcome.map)
 
     def finish(self) -> None:
@@ -260,6 +287,7 @@ class GridSlam:
             keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
         self._move(moved)
         saved.located = True
+        self.monitor.restart()
         if not saved.extends:
             own[-1].drift = covariance
             self.front_end.use_known_map(saved.localizer.points, self.map_from_base)
@@ -276,6 +304,56 @@ class GridSlam:
         self.map = rebuilt
         for keyframe in self.front_end.trajectory.keyframes[count:]:
             self.map.insert(keyframe.map_from_base, keyframe.scan)
+
+    # -- integrity ------------------------------------------------------------------------------
+
+    def _track(self, points: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
+        """Match a scan. While the pose is in doubt no scan enters the map; a lost robot starts a new session."""
+        elapsed_s = self._elapsed_s(stamp_ns)
+
+        def accept(pose: FloatArray, score: float) -> bool:
+            self.monitor.matched(self._compared_map().contradiction(pose, points), score, elapsed_s)
+            return not self.monitor.doubts
+
+        track = self.front_end.track(points, guess, stamp_ns, accept)
+        if track.status is SlamStatus.LOST:
+            self.monitor.unmatched(True, elapsed_s)
+        return self._new_session(points, guess, stamp_ns) if self.monitor.lost else track
+
+    def _elapsed_s(self, stamp_ns: int) -> float:
+        return 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
+
+    def _compared_map(self) -> OccupancyMap:
+        """The map that scans are compared with: the one that they are matched in."""
+        in_saved = self.saved is not None and self.front_end.in_known_map
+        return self._cells_of(self.saved) if in_saved else self.map  # type: ignore[arg-type]
+
+    def _cells_of(self, saved: SavedMap) -> OccupancyMap:
+        if self._saved_cells is None or self._saved_cells[0] is not saved:
+            self._saved_cells = saved, OccupancyMap.of_grid(saved.grid)
+        return self._saved_cells[1]
+
+    def _new_session(self, points: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
+        """Leave the map as it is and map apart from it, until the robot is found in it."""
+        if self.localized and not self.front_end.in_known_map:
+            try:
+                self.saved = SavedMap(self.config, self.map.grid(), self._graph())
+            except ValueError:
+                self.saved = None  # a map without a wall or a free cell: nothing to find the robot in
+        elif self.saved is not None:
+            self.saved.located = False
+        self.loop_closure = LoopClosure(self.config)
+        version, self.map = self.map.version, OccupancyMap(self.config.map)
+        self.map.version = version + 1
+        self._handed_over, self._merged, self._edges = 0, 0, []
+        self.monitor.restart()
+        return self.front_end.restart(points, guess, stamp_ns)
+
+    def _contradiction_in(self, saved: SavedMap, moved: FloatArray) -> float:
+        """Mean contradiction of the recent keyframes with a saved map, moved into it by ``moved`` (3,)."""
+        recent = self.front_end.trajectory.recent(QUERY_KEYFRAMES)
+        shares = [self._cells_of(saved).contradiction(compose2(moved, k.map_from_base), k.scan) for k in recent]
+        return float(np.mean(shares))
 
     # -- pose -------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from instant_ic.slam.config import MapConfig
+from instant_ic.slam.integrity import contradiction
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
 GROW_CELLS = 64
@@ -170,6 +171,19 @@ class OccupancyMap:
             scan.points, scan.clear_ends, self.config.max_range_m, *self._log_odds,
         )  # fmt: skip
         self.version += 1
+
+    @classmethod
+    def of_grid(cls, grid: OccupancyGrid) -> OccupancyMap:
+        """A map with the walls, the free and the unknown cells of a grid, to compare scans with."""
+        made = cls(MapConfig(resolution_m=grid.resolution))
+        made._first = np.round(grid.origin / grid.resolution).astype(np.int64)
+        made._cells = np.where(grid.values >= 50, made._log_odds[3], made._log_odds[2]).astype(np.float32)
+        made._seen = (grid.values >= 0).astype(np.int32)
+        return made
+
+    def contradiction(self, map_from_base: FloatArray, scan: ScanPoints) -> float:
+        """Share of a scan's rays, 0..1, that contradict the map: see `integrity.contradiction`."""
+        return contradiction(self._cells, self._seen, self.origin, self.config.resolution_m, map_from_base, scan)
 
     def grid(self) -> OccupancyGrid:
         """Return the current map; 0×0 before the first scan."""

@@ -1,0 +1,385 @@
+"""SLAM under faults: each fault is put into a log at several places; error, detection, false alarms and recovery.
+
+The clean run is the reference: a pose is wrong if it is more than `WRONG_M` from the clean run's pose of the same scan.
+Relations or ground truth are not needed, so any log will do.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.poses import compose2, relative2
+from instant_ic.slam import GridSlam, SlamConfig, SlamResult
+from instant_ic.slam.grid_slam import warm_up
+from instant_ic.slam.localization import SavedMap
+from instant_ic.slam.logs import LogEntry, LogError
+from instant_ic.slam.scan import FloatArray
+
+WRONG_M = 0.5
+"""A pose farther from the reference is wrong."""
+KIDNAP_M = 3.0
+"""Smallest distance of a kidnapping."""
+GAP_S = 10.0
+"""Duration of a gap in the scans, and of blindness."""
+HEADING_JUMP_RAD = math.radians(85.0)
+YAW_SCALE = 0.2
+HORIZON_S, LEAST_SCANS, MOST_SCANS = 60.0, 100, 400
+"""How long a fault at a place is followed: in seconds, and at least and at most in scans."""
+WARM_UP_SCANS = 15
+"""Scans from the start in the saved map to the kidnapping."""
+STEADY_SCANS = 10
+"""The robot has recovered when this many scans in a row are trusted and right."""
+RANGE_NOISE_M = 0.01
+"""Added to scans shown for the second time: they must not be equal to those in the map."""
+
+
+@dataclass(frozen=True)
+class Faulted:
+    """Part of a log with a fault.
+
+    Attributes:
+        entries: what the robot sees.
+        source: (n,) index of the clean log's entry that was measured at the same place.
+    """
+
+    entries: list[LogEntry]
+    source: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class CleanRun:
+    """Run without a fault: poses (n, 3) online and after the last optimisation, trust (n,), and the final state."""
+
+    online: FloatArray
+    final: FloatArray
+    trusted: NDArray[np.bool_]
+    slam: GridSlam
+
+    def errors(self, poses: FloatArray, source: NDArray[np.intp], anchor: int | None) -> FloatArray:
+        """Distance (n,) of ``poses`` (n, 3) from the reference.
+
+        The map may have been optimised since the reference was published, and be optimised again in the run with the
+        fault. The nearest of the reference online, at the end, and relative to the pose of scan ``anchor`` therefore
+        counts; None: no anchor.
+        """
+        references = [self.online[source], self.final[source]]
+        if anchor is not None:
+            start = compose2(self.online[anchor], relative2(self.final[anchor], np.zeros(3)))
+            references.append(np.array([compose2(start, pose) for pose in self.final[source]]))
+        return np.min([np.hypot(*(poses - reference)[:, :2].T) for reference in references], axis=0)
+
+
+Place = tuple[Sequence[LogEntry], int, int, FloatArray, np.random.Generator]
+
+
+def _part(entries: Sequence[LogEntry], at: int) -> range:
+    """Indices of the scans from ``at`` for the time that a fault is followed."""
+    end_ns = entries[at].scan.stamp_ns + int(HORIZON_S * 1e9)
+    last = at
+    while last < len(entries) and last - at < MOST_SCANS:
+        if entries[last].scan.stamp_ns > end_ns and last - at >= LEAST_SCANS:
+            break
+        last += 1
+    return range(at, last)
+
+
+def _moved_odometry(entry: LogEntry, moved: FloatArray) -> LogEntry:
+    return entry if entry.odom_pose is None else replace(entry, odom_pose=compose2(moved, entry.odom_pose))
+
+
+def heading_jump(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
+    """Odometry turns by 85° between two scans, and stays so."""
+    before = entries[at - 1].odom_pose
+    moved = np.zeros(3)
+    if before is not None:
+        turned = compose2(before, [0.0, 0.0, HEADING_JUMP_RAD * rng.choice([-1.0, 1.0])])
+        moved = compose2(turned, relative2(before, np.zeros(3)))
+    part = range(at, end)
+    return Faulted([_moved_odometry(entries[k], moved) for k in part], np.array(part))
+
+
+def gap(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
+    """No scans for ten seconds; odometry goes on."""
+    until_ns = entries[at - 1].scan.stamp_ns + int(GAP_S * 1e9)
+    part = [k for k in range(at, end) if entries[k].scan.stamp_ns >= until_ns]
+    return Faulted([entries[k] for k in part], np.array(part, dtype=np.intp))
+
+
+def blind(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
+    """Scans without a return for ten seconds; odometry goes on."""
+    until_ns = entries[at - 1].scan.stamp_ns + int(GAP_S * 1e9)
+    shown = [_with_ranges(e, np.full(len(e.scan.ranges), np.inf)) if e.scan.stamp_ns < until_ns else e
+             for e in entries[at:end]]  # fmt: skip
+    return Faulted(shown, np.arange(at, end))
+
+
+def kidnap(
+    entries: Sequence[LogEntry], at: int, end: int, there: int, rng: np.random.Generator
+) -> Faulted:
+    """The robot of scan ``at`` − 1 is put down where scan ``there`` was taken; its odometry stands meanwhile."""
+    part = _part(entries, there)[: end - at]
+    odometry, here = entries[at - 1].odom_pose, entries[there].odom_pose
+    moved = np.zeros(3) if odometry is None or here is None else compose2(odometry, relative2(here, np.zeros(3)))
+    step_ns = int(np.median(np.diff([entry.scan.stamp_ns for entry in entries])))
+    begin_ns = entries[at - 1].scan.stamp_ns + step_ns - entries[there].scan.stamp_ns
+    shown = []
+    for k in part:
+        entry = _moved_odometry(entries[k], moved)
+        ranges = entry.scan.ranges + RANGE_NOISE_M * rng.standard_normal(len(entry.scan.ranges))
+        entry = _with_ranges(entry, ranges)
+        shown.append(replace(entry, scan=replace(entry.scan, stamp_ns=entry.scan.stamp_ns + begin_ns)))
+    return Faulted(shown, np.array(part))
+
+
+def _with_ranges(entry: LogEntry, ranges: FloatArray) -> LogEntry:
+    return replace(entry, scan=replace(entry.scan, ranges=ranges))
+
+
+def _scaled_yaw(entries: Sequence[LogEntry], factor: float) -> list[LogEntry]:
+    """The log with each turn of the odometry ``factor`` times as large."""
+    out: list[LogEntry] = []
+    pose: FloatArray | None = None
+    last: FloatArray | None = None
+    for entry in entries:
+        if entry.odom_pose is not None:
+            if pose is None or last is None:
+                pose = entry.odom_pose
+            else:
+                step = relative2(last, entry.odom_pose)
+                pose = compose2(pose, [step[0], step[1], factor * step[2]])
+            last = entry.odom_pose
+            entry = replace(entry, odom_pose=pose)
+        out.append(entry)
+    return out
+
+
+def _without_third(entries: Sequence[LogEntry], rng: np.random.Generator) -> list[LogEntry]:
+    """The log with a third of the beams, one sector, at zero."""
+    count = len(entries[0].scan.ranges)
+    first = int(rng.integers(count))
+    out = []
+    for entry in entries:
+        ranges = np.array(entry.scan.ranges, dtype=np.float64)
+        ranges[(first + np.arange(len(ranges) // 3)) % len(ranges)] = 0.0
+        out.append(_with_ranges(entry, ranges))
+    return out
+
+
+def whole_log_faults(entries: Sequence[LogEntry], rng: np.random.Generator) -> dict[str, Callable[[], Faulted]]:
+    """Faults that last from the first scan to the last, by name."""
+    everything = np.arange(len(entries))
+
+    def every(n: int) -> Faulted:
+        return Faulted(list(entries[::n]), everything[::n])
+
+    return {
+        "yaw_scale_plus": lambda: Faulted(_scaled_yaw(entries, 1 + YAW_SCALE), everything),
+        "yaw_scale_minus": lambda: Faulted(_scaled_yaw(entries, 1 - YAW_SCALE), everything),
+        "every_2nd_scan": lambda: every(2),
+        "every_5th_scan": lambda: every(5),
+        "no_odometry": lambda: Faulted([replace(entry, odom_pose=None) for entry in entries], everything),
+        "third_of_beams_zero": lambda: Faulted(_without_third(entries, rng), everything),
+    }
+
+
+PLACE_FAULTS: dict[str, Callable[[Sequence[LogEntry], int, int, np.random.Generator], Faulted]] = {
+    "heading_jump_85deg": heading_jump,
+    "gap_10s": gap,
+    "blind_10s": blind,
+}
+KIDNAPPINGS = ("kidnapped_mapping", "kidnapped_localized")
+FAULTS = (*PLACE_FAULTS, *KIDNAPPINGS, "yaw_scale_plus", "yaw_scale_minus", "every_2nd_scan", "every_5th_scan",
+          "no_odometry", "third_of_beams_zero")  # fmt: skip
+
+
+def _steps(slam: GridSlam, entries: Sequence[LogEntry], last_ns: int | None = None) -> Iterator[SlamResult]:
+    """Run the SLAM over entries; background work runs between the scans."""
+    for entry in entries:
+        scan = entry.scan
+        if last_ns is not None and scan.stamp_ns <= last_ns:
+            scan = replace(scan, stamp_ns=last_ns + 1_000_000)
+        last_ns = scan.stamp_ns
+        result = slam.process(scan, entry.odom_pose, entry.base_from_laser)
+        yield result
+        job = slam.background_job()
+        if job is not None:
+            slam.take_over(job())
+
+
+@dataclass(frozen=True)
+class FaultRun:
+    """One fault at one place: errors (n,) in metres, trust (n,) and time (n,) in seconds since the fault."""
+
+    error_m: FloatArray
+    trusted: NDArray[np.bool_]
+    time_s: FloatArray
+
+    def figures(self) -> dict[str, float | int | None]:
+        """Figures of one place; None where it never happened."""
+        wrong = self.error_m > WRONG_M
+        right = self.trusted & ~wrong
+        onset = int(np.argmax(wrong)) if wrong.any() else None
+        detected = recovered = None
+        if onset is not None:
+            alarms = np.flatnonzero(~self.trusted[onset:])
+            detected = onset + int(alarms[0]) if len(alarms) else None
+            runs = np.convolve(right, np.ones(STEADY_SCANS), "valid") >= STEADY_SCANS
+            back = np.flatnonzero(runs[onset:])
+            recovered = onset + int(back[0]) if len(back) else None
+        return {
+            "max_error_m": float(self.error_m.max()),
+            "end_error_m": float(self.error_m[-1]),
+            "wrong_scans": int(wrong.sum()),
+            "trusted_wrong_scans": int((wrong & self.trusted).sum()),
+            "untrusted_right_scans": int((~wrong & ~self.trusted).sum()),
+            "detected_after_scans": None if detected is None or onset is None else detected - onset,
+            "recovered_after_s": None if recovered is None else float(self.time_s[recovered]),
+            "right_at_end": bool(right[-1]),
+        }
+
+
+def _run(slam: GridSlam, faulted: Faulted, clean: CleanRun, anchor: int | None, last_ns: int | None) -> FaultRun:
+    results = list(_steps(slam, faulted.entries, last_ns))
+    poses = np.array([result.map_from_base for result in results])
+    stamps = np.array([entry.scan.stamp_ns for entry in faulted.entries])
+    trusted = np.array([result.trusted for result in results])
+    start = stamps[0] if last_ns is None else last_ns
+    return FaultRun(clean.errors(poses, faulted.source, anchor), trusted, (stamps - start) * 1e-9)
+
+
+def summary(runs: Sequence[dict[str, float | int | None]]) -> dict[str, object]:
+    """Figures of one fault over its places."""
+    wrong = [run for run in runs if run["wrong_scans"]]
+    scans = [run["detected_after_scans"] for run in wrong if run["detected_after_scans"] is not None]
+    seconds = [run["recovered_after_s"] for run in wrong if run["recovered_after_s"] is not None]
+    trusted_wrong = [int(run["trusted_wrong_scans"] or 0) for run in runs]
+    return {
+        "places": len(runs),
+        "went_wrong": len(wrong),
+        "detected": len(scans),
+        "scans_to_detection_max": max(scans, default=None),
+        "trusted_wrong_scans_median": float(np.median(trusted_wrong)) if runs else None,
+        "trusted_wrong_scans_max": max(trusted_wrong, default=None),
+        "over_10_trusted_wrong_scans": sum(count > 10 for count in trusted_wrong),
+        "recovered": len(seconds),
+        "recovery_s_median": float(np.median(np.array(seconds, dtype=np.float64))) if seconds else None,
+        "right_at_end": sum(bool(run["right_at_end"]) for run in runs),
+        "end_error_m_max": max((float(run["end_error_m"] or 0.0) for run in runs), default=None),
+        "runs": list(runs),
+    }
+
+
+def evaluate_faults(
+    entries: Sequence[LogEntry],
+    config: SlamConfig | None = None,
+    *,
+    places: int = 5,
+    seed: int = 0,
+    faults: Sequence[str] = FAULTS,
+    on_step: Callable[[str], None] | None = None,
+) -> dict[str, object]:
+    """Put each fault into the log and compare with the clean run; figures for JSON, by fault.
+
+    Args:
+        entries: the log.
+        config: defaults when None.
+        places: number of places for a fault at a place; chosen by ``seed``, the same for every fault.
+        seed: of the places and of all other choices.
+        faults: names of `FAULTS`.
+        on_step: called with the name of what runs next.
+
+    Raises:
+        LogError: the log is too short.
+        ValueError: an unknown fault, or no place asked for.
+    """
+    unknown = [name for name in faults if name not in FAULTS]
+    if unknown:
+        raise ValueError(f"unknown fault {unknown[0]!r}; known: {', '.join(FAULTS)}")
+    if places < 1:
+        raise ValueError(f"places must be at least 1 (got {places})")
+    if len(entries) < 2 * LEAST_SCANS:
+        raise LogError(f"the log has {len(entries)} scans: too few to put faults into it ({2 * LEAST_SCANS} needed)")
+    warm_up(config)
+    rng = np.random.default_rng(seed)
+    first, last = max(WARM_UP_SCANS + 1, len(entries) // 5), len(entries) - LEAST_SCANS // 2
+    at = np.sort(rng.choice(np.arange(first, last), size=min(places, last - first), replace=False))
+    tell = on_step or (lambda name: None)
+    tell("clean")
+    clean, before = _clean_run(entries, config, [int(k) for k in at])
+    alarms = int((clean.trusted[:-1] & ~clean.trusted[1:]).sum())
+    hours = max((entries[-1].scan.stamp_ns - entries[0].scan.stamp_ns) / 3.6e12, 1e-9)
+    report: dict[str, object] = {
+        "clean": {"scans": len(entries), "hours": hours, "false_alarms": alarms, "false_alarms_per_hour": alarms / hours}
+    }
+    saved = clean.slam.grid()
+    for name in [name for name in faults if name in (*PLACE_FAULTS, *KIDNAPPINGS)]:
+        tell(name)
+        runs = []
+        for k, slam in before:
+            own = np.random.default_rng([seed, k])
+            end = _part(entries, k).stop
+            start_ns = entries[k - 1].scan.stamp_ns
+            if name in PLACE_FAULTS:
+                faulted = PLACE_FAULTS[name](entries, k, end, own)
+            else:
+                away = np.hypot(*(clean.final - clean.final[k - 1])[: len(entries) - LEAST_SCANS, :2].T)
+                far = np.flatnonzero(away > KIDNAP_M)
+                if len(far) == 0:
+                    continue
+                faulted = kidnap(entries, k, end, int(own.choice(far)), own)
+            if len(faulted.entries) == 0:
+                continue
+            if name == "kidnapped_localized":
+                slam = _localized(config, SavedMap(config or SlamConfig(), saved), entries, k, clean)
+                runs.append(_run(slam, faulted, clean, None, start_ns).figures())
+            else:
+                runs.append(_run(copy.deepcopy(slam), faulted, clean, k - 1, start_ns).figures())
+        report[name] = summary(runs)
+    makers = whole_log_faults(entries, rng)
+    for name in [name for name in faults if name in makers]:
+        tell(name)
+        faulted = makers[name]()
+        slam = GridSlam(config)
+        run = _run(slam, faulted, clean, None, None)
+        errors = run.error_m
+        report[name] = {**run.figures(), "mean_error_m": float(errors.mean()), "p99_error_m": float(np.percentile(errors, 99))}
+    return report
+
+
+def _clean_run(
+    entries: Sequence[LogEntry], config: SlamConfig | None, at: Sequence[int]
+) -> tuple[CleanRun, list[tuple[int, GridSlam]]]:
+    """The run without a fault, and copies of the SLAM before the scans ``at``."""
+    slam = GridSlam(config)
+    before: list[tuple[int, GridSlam]] = []
+    online, trusted, anchors = [], [], []
+    for k, result in enumerate(_steps(slam, entries)):
+        online.append(result.map_from_base)
+        trusted.append(result.trusted)
+        anchors.append((result.anchor, result.map_from_base if result.anchor is None
+                        else relative2(result.anchor.pose(), result.map_from_base)))  # fmt: skip
+        if k + 1 in at:
+            # The generator has not run the background work of this scan yet: that belongs to the copy, too.
+            before.append((k + 1, copy.deepcopy(slam)))
+    slam.finish()
+    final = [there if anchor is None else compose2(anchor.pose(), there) for anchor, there in anchors]
+    return CleanRun(np.array(online), np.array(final), np.array(trusted), slam), before
+
+
+def _localized(
+    config: SlamConfig | None, saved: SavedMap, entries: Sequence[LogEntry], at: int, clean: CleanRun
+) -> GridSlam:
+    """A robot that localises in the clean run's map and has just seen scan ``at`` − 1."""
+    slam = GridSlam(config, saved)
+    for k in range(at - WARM_UP_SCANS, at):
+        entry = entries[k]
+        slam.process(entry.scan, entry.odom_pose, entry.base_from_laser)
+        if k == at - WARM_UP_SCANS:
+            slam.set_pose(clean.final[k])
+    return slam

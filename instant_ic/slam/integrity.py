@@ -1,0 +1,249 @@
+"""Integrity of the pose: tells a right pose from a plausible one, and bounds the error.
+
+A wrong pose may still fit the local map by its score. What gives it away is the scan's rays: they pass through walls of
+the map, or end in space that the map shows as free. Neither happens where the robot only sees something new. The
+contradiction counts together with a drop of the match score, both against their recent level: a map that has drifted
+contradicts new scans too, but gradually, and at a good score.
+
+`IntegrityMonitor` is a Bayes filter on one bit, lost or not. The log-likelihood ratio of a scan was chosen on the Intel
+log and a generated office, with robots put down elsewhere; docs/slam.md has the figures on other logs. While the
+monitor doubts, the map must not grow: otherwise the scan agrees with its own copy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from instant_ic.slam.scan import FloatArray, ScanPoints
+
+POINTS = 120
+"""Number of rays compared with the map, evenly chosen."""
+RANGE_M, SLACK_M = 12.0, 0.25
+"""Farther hits are not compared; a wall and a hit this close together agree."""
+OCCUPIED_LOG_ODDS = 1.0
+"""A cell above is a wall: two hits more than rays through it."""
+LEAST_KNOWN = 20
+"""Fewer comparable rays count as so many: five of five are little evidence."""
+FULL_CONTRADICTION, FULL_DROP = 0.12, 0.2
+"""Share of contradicted rays, and drop of the score, above their levels, which are full evidence together."""
+EVIDENCE = 2.0
+"""Limit of a scan's log-likelihood ratio: no single scan decides."""
+EVIDENCE_S = 0.1
+"""Scans closer in time see the same scene: their evidence counts in proportion to the time between them."""
+LEVEL_SHARE = 0.1
+"""Weight of a new scan in the levels."""
+FLOOR = -6.0
+"""Least log-odds of being lost. Higher makes false alarms, lower delays detection."""
+DOUBT = -4.5
+"""Log-odds above which scans are kept out of the map: a single bad scan is enough."""
+LOST = 4.0
+"""Log-odds above which the doubt is confirmed."""
+UNSEEN_S, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 0.6, -1.0
+"""After a second without a matched scan the log-odds grow by this much a second, up to a limit."""
+LONGEST_DOUBT = 30
+"""Scans after which a doubt that is less likely than not is dropped: the robot has driven on, and its map must grow."""
+UNTRUSTED = 0.5
+"""Probability of being lost from which a pose must not be used."""
+BOUND_SIGMAS, BOUND_YAW_SIGMAS = 3.717, 3.291
+"""99.9 % of a Gaussian in the plane, and on a line, lie within so many σ."""
+LOST_SIGMA_M, LOST_SIGMA_RAD = 10.0, math.pi / math.sqrt(3.0)
+"""σ of the pose of a lost robot: a building, and any heading."""
+
+
+@njit(cache=True)
+def compare_rays(cells, seen, origin, resolution, pose, laser, points, reach, slack, occupied):  # type: ignore[no-untyped-def]
+    """Count how the rays of a scan agree with a map.
+
+    Args:
+        cells: float32 (H, W) log-odds.
+        seen: int32 (H, W), 0 where the map is unknown.
+        origin: (2,) corner of cell (0, 0).
+        resolution: metres per cell.
+        pose: map_from_base (3,).
+        laser: (2,) the laser's centre in the base frame.
+        points: (n, 2) hits in the base frame.
+        reach: metres; farther hits are left out.
+        slack: metres between a wall and a hit that agree.
+        occupied: log-odds above which a cell is a wall.
+
+    Returns:
+        Numbers of rays that the map knows something about, that pass through a wall, and that end in free space.
+    """
+    height, width = cells.shape
+    cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
+    x0 = (pose[0] + cos_yaw * laser[0] - sin_yaw * laser[1] - origin[0]) / resolution
+    y0 = (pose[1] + sin_yaw * laser[0] + cos_yaw * laser[1] - origin[1]) / resolution
+    r = int(slack / resolution)
+    known = through = free = 0
+    for i in range(points.shape[0]):
+        x = (pose[0] + cos_yaw * points[i, 0] - sin_yaw * points[i, 1] - origin[0]) / resolution
+        y = (pose[1] + sin_yaw * points[i, 0] + cos_yaw * points[i, 1] - origin[1]) / resolution
+        length = math.hypot(x - x0, y - y0)
+        if length * resolution > reach or length < 1.0:
+            continue
+        crossed = False
+        for k in range(int(length - slack / resolution)):
+            u, v = math.floor(x0 + (x - x0) * k / length), math.floor(y0 + (y - y0) * k / length)
+            if 0 <= u < width and 0 <= v < height and seen[v, u] != 0 and cells[v, u] > occupied:
+                crossed = True
+                break
+        wall = unknown = False
+        ix, iy = math.floor(x), math.floor(y)
+        for v in range(iy - r, iy + r + 1):
+            for u in range(ix - r, ix + r + 1):
+                if u < 0 or v < 0 or u >= width or v >= height or seen[v, u] == 0:
+                    unknown = True
+                elif cells[v, u] > 0.0:
+                    wall = True
+        if not wall and not unknown:
+            free += 1
+        if crossed:
+            through += 1
+        if crossed or wall or not unknown:
+            known += 1
+    return known, through, free
+
+
+def contradiction(
+    cells: NDArray[np.float32],
+    seen: NDArray[np.int32],
+    origin: FloatArray,
+    resolution: float,
+    pose: FloatArray,
+    scan: ScanPoints,
+) -> float:
+    """Share of a scan's rays, 0..1, that contradict a map: through its walls, or ending in its free space.
+
+    Args:
+        cells: log-odds (H, W).
+        seen: (H, W), 0 where the map is unknown.
+        origin: (2,) corner of cell (0, 0).
+        resolution: metres per cell.
+        pose: map_from_base (3,).
+        scan: of the robot at that pose.
+    """
+    points = scan.points
+    if len(points) > POINTS:
+        points = np.ascontiguousarray(points[(np.arange(POINTS) * len(points)) // POINTS])
+    known, through, free = compare_rays(
+        cells, seen, origin, resolution, pose, scan.origin, points, RANGE_M, SLACK_M, OCCUPIED_LOG_ODDS
+    )
+    return min(1.0, (through + free) / max(known, LEAST_KNOWN))
+
+
+@dataclass(frozen=True)
+class Integrity:
+    """Trust in a pose.
+
+    Attributes:
+        lost_probability: 0..1, that the robot is somewhere else.
+        position_bound_m: protection level: the position error is below it with a probability of 99.9 %, if scan
+            matching and drift err as their covariance says.
+        heading_bound_rad: the same for the heading, at most π.
+    """
+
+    lost_probability: float
+    position_bound_m: float
+    heading_bound_rad: float
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the pose may be used."""
+        return self.lost_probability < UNTRUSTED
+
+
+class IntegrityMonitor:
+    """Probability of being lost, from scan to scan.
+
+    Attributes:
+        contradiction: of the last scan.
+    """
+
+    def __init__(self) -> None:
+        self.contradiction = 0.0
+        self._log_odds = FLOOR
+        self._unseen_s = 0.0
+        self._doubtful_scans = 0
+        self._score_level: float | None = None
+        self._contradiction_level = 0.0
+
+    @property
+    def doubts(self) -> bool:
+        """Whether scans must stay out of the map."""
+        return self._log_odds > DOUBT
+
+    @property
+    def lost(self) -> bool:
+        """Whether the doubt is confirmed."""
+        return self._log_odds >= LOST
+
+    @property
+    def lost_probability(self) -> float:
+        """Probability of being lost, 0..1."""
+        return 1.0 / (1.0 + math.exp(-self._log_odds))
+
+    def matched(self, contradicted: float, score: float, elapsed_s: float) -> None:
+        """Take in a scan that fits somewhere.
+
+        Args:
+            contradicted: share of its rays that contradict the map as it was before, 0..1; see `contradiction`.
+            score: of the match, 0..1.
+            elapsed_s: since the scan before.
+        """
+        self.contradiction = contradicted
+        level = score if self._score_level is None else self._score_level
+        excess = min(max(contradicted - self._contradiction_level, 0.0) / FULL_CONTRADICTION, 1.0)
+        drop = min(max(level - score, 0.0) / FULL_DROP, 1.0)
+        self._unseen(elapsed_s)
+        self._unseen_s = 0.0
+        self._weigh(EVIDENCE * (2.0 * math.sqrt(excess * drop) - 1.0), elapsed_s)
+        if self._score_level is None or not self.doubts:
+            self._score_level = level + LEVEL_SHARE * (score - level)
+            self._contradiction_level += LEVEL_SHARE * (contradicted - self._contradiction_level)
+
+    def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:
+        """Take in a scan without a match: one that fits nowhere near, or one without points."""
+        if fits_nowhere:
+            self._weigh(EVIDENCE, elapsed_s)
+        self._unseen(elapsed_s)
+
+    def _unseen(self, elapsed_s: float) -> None:
+        """Let the doubt grow with the time without a matched scan."""
+        before = max(self._unseen_s - UNSEEN_S, 0.0)
+        self._unseen_s += elapsed_s
+        grown = UNSEEN_PER_S * (max(self._unseen_s - UNSEEN_S, 0.0) - before)
+        if self._log_odds < UNSEEN_MOST:
+            self._log_odds = min(self._log_odds + grown, UNSEEN_MOST)
+
+    def restart(self) -> None:
+        """Begin anew in another map: nothing is known against the pose."""
+        self.__init__()  # type: ignore[misc]
+
+    def integrity(self, covariance: FloatArray, localized: bool) -> Integrity:
+        """Trust in a pose of this ``covariance`` (3, 3); a robot without a place in its saved map is lost."""
+        lost = self.lost_probability if localized else 1.0
+        mixed = mixture(covariance, lost)
+        sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(mixed[:2, :2])[-1]), 0.0))
+        heading = BOUND_YAW_SIGMAS * math.sqrt(max(float(mixed[2, 2]), 0.0))
+        return Integrity(lost, BOUND_SIGMAS * sigma_m, min(heading, math.pi))
+
+    def _weigh(self, evidence: float, elapsed_s: float) -> None:
+        self._log_odds += evidence * min(1.0, max(elapsed_s, 0.0) / EVIDENCE_S)
+        self._log_odds = min(max(self._log_odds, FLOOR), LOST + EVIDENCE)
+        self._doubtful_scans = self._doubtful_scans + 1 if self.doubts else 0
+        if self._doubtful_scans > LONGEST_DOUBT and self._log_odds < 0.0:
+            self._log_odds, self._doubtful_scans = FLOOR, 0
+
+
+def mixture(covariance: FloatArray, lost_probability: float) -> FloatArray:
+    """Covariance (3, 3) of a pose that is wrong with a probability; below the monitor's floor the pose's own."""
+    floor = 1.0 / (1.0 + math.exp(-FLOOR))
+    p = min(max((lost_probability - floor) / (1.0 - floor), 0.0), 1.0)
+    lost = np.diag(np.square([LOST_SIGMA_M, LOST_SIGMA_M, LOST_SIGMA_RAD]))
+    mixed: FloatArray = (1.0 - p) * covariance + p * lost
+    return mixed
