@@ -129,7 +129,7 @@ class FrontEnd:
         )
 
     def track(
-        self, scan: ScanPoints, guess: Guess, stamp_ns: int, accept: Callable[[FloatArray, float], bool] | None = None
+        self, scan: ScanPoints, guess: Guess, stamp_ns: int, accept: Callable[[FloatArray, float, bool], bool] | None = None
     ) -> Track:
         """Match a scan that has at least ``match.min_points`` points.
 
@@ -137,7 +137,8 @@ class FrontEnd:
             scan: its points.
             guess: predicted pose.
             stamp_ns: of the scan.
-            accept: gets the pose (3,) and the score of a match; the scan becomes a keyframe only if it returns True.
+            accept: gets the pose (3,) and the score of a match, and whether only the wide search has found it; the scan
+                becomes a keyframe only if it returns True.
         """
         config = self.config.match
         points = self._match_points(scan)
@@ -157,7 +158,7 @@ class FrontEnd:
         if match.score < config.min_score:
             return Track(guess.pose, self._grown_covariance(guess), match.score, SlamStatus.LOST, None)
 
-        accepted = accept is None or accept(match.pose, match.score)
+        accepted = accept is None or accept(match.pose, match.score, status is SlamStatus.RECOVERED)
         self._covariance = match.covariance
         added: Keyframe | None = None
         if self.in_known_map:

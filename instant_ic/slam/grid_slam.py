@@ -27,6 +27,10 @@ from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
 
 MOST_JOIN_CONTRADICTION = 0.1
 """Contradiction of a session with the saved map above which they are not joined; a right place has 0.03."""
+NEAR_M, NEAR_RAD = 1.5, 0.4
+"""A session found this close to where odometry says needs no second finding."""
+AGREE_M, AGREE_RAD, CONFIRM_AFTER = 0.3, 0.1, 1.0
+"""Two findings of a session agree within the first two; metres and radians between them, together."""
 MAX_ODOMETRY_GAP_S = 5.0
 """The encoders keep counting across a shorter gap; after a longer one they may have been reset."""
 
@@ -99,6 +103,8 @@ class GridSlam:
         self.map = OccupancyMap(self.config.map)
         self.motion = MotionMonitor()
         self.monitor = IntegrityMonitor()
+        self._apart = False  # a session began after the robot was lost in the map being made
+        self._found_before: tuple[Keyframe, FloatArray] | None = None
         self._saved_cells: tuple[SavedMap, OccupancyMap] | None = None  # a saved map, to compare scans with
         self.map_from_base: FloatArray = np.zeros(3)
         self.odom_from_base: FloatArray = np.zeros(3)
@@ -247,9 +253,8 @@ class GridSlam:
             self._take_over_loops(outcome)
         elif outcome.found is not None and self.saved is not None and not self.saved.located:
             moved = correction(outcome.keyframe.map_from_base, outcome.found.pose)
-            if self._contradiction_in(self.saved, moved) > MOST_JOIN_CONTRADICTION:
-                return
-            self._join(self.saved, moved, outcome.found.covariance, outcome.map)
+            if self._recognized(self.saved, moved, outcome.keyframe):
+                self._join(self.saved, moved, outcome.found.covariance, outcome.map)
 
     def finish(self) -> None:
         """After the last scan: optimise with all loops, and rebuild the map from the result."""
@@ -311,8 +316,9 @@ class GridSlam:
         """Match a scan. While the pose is in doubt no scan enters the map; a lost robot starts a new session."""
         elapsed_s = self._elapsed_s(stamp_ns)
 
-        def accept(pose: FloatArray, score: float) -> bool:
-            self.monitor.matched(self._compared_map().contradiction(pose, points), score, elapsed_s)
+        def accept(pose: FloatArray, score: float, recovered: bool) -> bool:
+            contradicted = self._compared_map().contradiction(pose, points)
+            self.monitor.matched(contradicted, score, elapsed_s, recovered)
             return not self.monitor.doubts
 
         track = self.front_end.track(points, guess, stamp_ns, accept)
@@ -338,6 +344,7 @@ class GridSlam:
         if self.localized and not self.front_end.in_known_map:
             try:
                 self.saved = SavedMap(self.config, self.map.grid(), self._graph())
+                self._apart = True
             except ValueError:
                 self.saved = None  # a map without a wall or a free cell: nothing to find the robot in
         elif self.saved is not None:
@@ -346,14 +353,36 @@ class GridSlam:
         version, self.map = self.map.version, OccupancyMap(self.config.map)
         self.map.version = version + 1
         self._handed_over, self._merged, self._edges = 0, 0, []
+        self._found_before = None
         self.monitor.restart()
         return self.front_end.restart(points, guess, stamp_ns)
 
-    def _contradiction_in(self, saved: SavedMap, moved: FloatArray) -> float:
-        """Mean contradiction of the recent keyframes with a saved map, moved into it by ``moved`` (3,)."""
+    def _recognized(self, saved: SavedMap, moved: FloatArray, keyframe: Keyframe) -> bool:
+        """Whether the place that ``moved`` (3,) moves the recent keyframes to may be taken for theirs.
+
+        They must not contradict the map there. The map of a session before is not complete: the true place may be
+        missing in it, and another one look like it. A place far from where odometry says must therefore be found
+        twice, from two places.
+        """
         recent = self.front_end.trajectory.recent(QUERY_KEYFRAMES)
         shares = [self._cells_of(saved).contradiction(compose2(moved, k.map_from_base), k.scan) for k in recent]
-        return float(np.mean(shares))
+        if float(np.mean(shares)) > MOST_JOIN_CONTRADICTION:
+            return False
+        here = keyframe.map_from_base
+        step = relative2(here, compose2(moved, here))
+        if not self._apart or (math.hypot(step[0], step[1]) < NEAR_M and abs(step[2]) < NEAR_RAD):
+            return True
+        before, self._found_before = self._found_before, (keyframe, moved)
+        if before is None:
+            return False
+        apart = relative2(compose2(before[1], here), compose2(moved, here))
+        if math.hypot(apart[0], apart[1]) > AGREE_M or abs(apart[2]) > AGREE_RAD:
+            return False
+        way = relative2(before[0].map_from_base, here)
+        if math.hypot(way[0], way[1]) + abs(way[2]) >= CONFIRM_AFTER:
+            return True
+        self._found_before = before
+        return False
 
     # -- pose -------------------------------------------------------------------------------------
 

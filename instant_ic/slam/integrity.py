@@ -23,6 +23,8 @@ from instant_ic.slam.scan import FloatArray, ScanPoints
 
 POINTS = 120
 """Number of rays compared with the map, evenly chosen."""
+RECOVERED = 1.6
+"""Evidence of a scan that only the wide search matches, at least: it stays out of the map."""
 RANGE_M, SLACK_M = 12.0, 0.25
 """Farther hits are not compared; a wall and a hit this close together agree."""
 OCCUPIED_LOG_ODDS = 1.0
@@ -31,6 +33,8 @@ LEAST_KNOWN = 20
 """Fewer comparable rays count as so many: five of five are little evidence."""
 FULL_CONTRADICTION, FULL_DROP = 0.12, 0.2
 """Share of contradicted rays, and drop of the score, above their levels, which are full evidence together."""
+LONG_DROP, LONG_DROP_SHARE = 0.4, 0.6
+"""A drop of the score this large is neutral to weak evidence without a contradiction: the place may be new."""
 EVIDENCE = 2.0
 """Limit of a scan's log-likelihood ratio: no single scan decides."""
 EVIDENCE_S = 0.1
@@ -39,8 +43,8 @@ LEVEL_SHARE = 0.1
 """Weight of a new scan in the levels."""
 FLOOR = -6.0
 """Least log-odds of being lost. Higher makes false alarms, lower delays detection."""
-DOUBT = -4.5
-"""Log-odds above which scans are kept out of the map: a single bad scan is enough."""
+DOUBT = -5.8
+"""Log-odds above which scans are kept out of the map: any evidence is enough."""
 LOST = 4.0
 """Log-odds above which the doubt is confirmed."""
 UNSEEN_S, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 0.6, -1.0
@@ -187,13 +191,14 @@ class IntegrityMonitor:
         """Probability of being lost, 0..1."""
         return 1.0 / (1.0 + math.exp(-self._log_odds))
 
-    def matched(self, contradicted: float, score: float, elapsed_s: float) -> None:
+    def matched(self, contradicted: float, score: float, elapsed_s: float, recovered: bool = False) -> None:
         """Take in a scan that fits somewhere.
 
         Args:
             contradicted: share of its rays that contradict the map as it was before, 0..1; see `contradiction`.
             score: of the match, 0..1.
             elapsed_s: since the scan before.
+            recovered: only the wide search has matched it.
         """
         self.contradiction = contradicted
         level = score if self._score_level is None else self._score_level
@@ -201,7 +206,13 @@ class IntegrityMonitor:
         drop = min(max(level - score, 0.0) / FULL_DROP, 1.0)
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
-        self._weigh(EVIDENCE * (2.0 * math.sqrt(excess * drop) - 1.0), elapsed_s)
+        long_drop = min(max(level - score, 0.0) / LONG_DROP, 1.0)
+        share = max(math.sqrt(excess * drop), LONG_DROP_SHARE * long_drop)
+        evidence = EVIDENCE * (2.0 * share - 1.0)
+        if recovered:
+            self._weigh(max(evidence, RECOVERED), EVIDENCE_S)
+        else:
+            self._weigh(evidence, elapsed_s)
         if self._score_level is None or not self.doubts:
             self._score_level = level + LEVEL_SHARE * (score - level)
             self._contradiction_level += LEVEL_SHARE * (contradicted - self._contradiction_level)
