@@ -49,6 +49,8 @@ class ArbiterInbox:
     """3D points; None: not used."""
     shown: Latest
     vspace: Latest
+    integrity: Latest | None = None
+    """Trust in the pose; None: not used."""
     button_ns: int | None = None
     """Last report of the robot's own emergency stop, steady clock."""
 
@@ -109,6 +111,7 @@ class ArbiterInbox:
         report = page_report(self.shown.message)
         return ArbiterInputs(
             robot_pose=pose,
+            pose_lost_probability=self._pose_lost_probability(),
             robot_velocity=velocity,
             operator_command=self._twist("command"),
             operator_gone=self.operator_gone(),
@@ -134,6 +137,11 @@ class ArbiterInbox:
     def _twist(self, key: str) -> tuple[float, float]:
         message = self.sources[key].message
         return (0.0, 0.0) if message is None else twist_values(message)
+
+    def _pose_lost_probability(self) -> float:
+        message = None if self.integrity is None else self.integrity.message
+        probability = 0.0 if message is None else float(message.lost_probability)
+        return probability if 0.0 <= probability <= 1.0 else 1.0  # NaN too: such a report is no reason to drive on
 
     def _arrived_ns(self, latest: Latest) -> int:
         return self.clock.steady_ns() - round(latest.age_s * 1e9)

@@ -17,6 +17,7 @@ from instant_ic.msg import (
     OccupancyGrid,
     OccupancyGridUpdate,
     Odometry,
+    PoseIntegrity,
     PoseWithCovariance,
     PoseWithCovarianceStamped,
     String,
@@ -59,6 +60,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.update_out = self.publisher("/map_updates", OccupancyGridUpdate, qos=RELIABLE)
         self.saved_out = self.publisher("/slam/saved", String, qos=RELIABLE)
         self.pose_out = self.publisher("/pose", PoseWithCovarianceStamped, qos=SENSOR)
+        self.integrity_out = self.publisher("/slam/integrity", PoseIntegrity, qos=SENSOR)
         self.restart()
         # The laser's mount is fixed: /tf, which carries a message per odometry, is not needed.
         self.mounts = TransformBuffer()
@@ -141,7 +143,19 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.placed_ns = stamp
         if odometry is None:
             self.tf_broadcast(config.odom_frame, config.base_frame, matrix_from_pose2(slam.odom_from_base), stamp)
-        if result.localized:
+        integrity = result.integrity
+        self.integrity_out.publish(
+            PoseIntegrity(
+                header=header(config.map_frame, stamp),
+                lost_probability=integrity.lost_probability,
+                position_bound_m=integrity.position_bound_m,
+                heading_bound_rad=integrity.heading_bound_rad,
+                localized=result.localized,
+                status=result.status.value,
+            )
+        )
+        # A robot that is lost keeps the frames that it had: it may drive on, slowly, until its place is recognized.
+        if slam.in_map_frame:
             map_from_odom = self.limiter.follow(slam.map_from_odom, slam.odom_from_base, stamp)
             self.tf_broadcast(config.map_frame, config.odom_frame, matrix_from_pose2(map_from_odom), stamp)
             pose = pose_message(matrix_from_pose2(result.map_from_base))

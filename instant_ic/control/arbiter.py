@@ -83,6 +83,7 @@ class Arbiter:
         self._no_view_fits = False  # the last entry was abandoned
         self._hard = False  # the last command was a hard stop
         self._yaw_gap_before = 0.0  # in the previous step
+        self._stopped_for_pose = False  # since the pose was last trusted
         self._stopped_by = Notice(Reason.STARTING, "waiting for the sensors")
         self._awaits_operator = False  # STOPPED because the operator's link was lost
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
@@ -162,6 +163,7 @@ class Arbiter:
 
     def _stop(self, snapshot: Snapshot, now_ns: int) -> None:
         self._stopped_by = stop_notice(snapshot)
+        self._stopped_for_pose |= snapshot.pose_lost
         lost = () if estop_pressed(snapshot) else snapshot.lost
         self._awaits_operator = any(stale.source.reason == Reason.OPERATOR_LOST for stale in lost)
 
@@ -201,6 +203,8 @@ class Arbiter:
         wanted_m_s = min(abs(command[0]), self._sources.vbot_limit_m_s(inputs, self.mode))
         slow = self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * wanted_m_s
         self._slow_since_ns = _kept(self._slow_since_ns, now_ns) if slow else None
+        trust, lost = self.config.pose_trust, inputs.pose_lost_probability
+        self._stopped_for_pose = self._stopped_for_pose and lost >= trust.slow
         snapshot = Snapshot(
             config=self.config,
             predictor=self.predictor,
@@ -227,6 +231,7 @@ class Arbiter:
             since_return_s=self._since_s(self._returned_ns, now_ns, math.inf),
             awaits_operator=self._awaits_operator,
             slow_s=self._since_s(self._slow_since_ns, now_ns, 0.0),
+            pose_lost=lost >= trust.stop and not self._stopped_for_pose,
         )
         self._no_view_fits = self._no_view_fits and not _may_enter_again(snapshot)
         self._leading_back = self._leads_back(snapshot)

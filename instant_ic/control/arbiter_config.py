@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import MotionLimits
@@ -13,6 +14,8 @@ from instant_ic.control.planner import PlannerConfig
 from instant_ic.control.prediction import PredictionConfig
 from instant_ic.control.safety import CollisionMonitorConfig
 from instant_ic.control.subgoal import SubgoalConfig
+
+_Probability: TypeAlias = Annotated[float, Range(above=0, high=1)]
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,26 @@ class SwitchConfig:
 
 
 @dataclass(frozen=True)
+class PoseTrustConfig:
+    """What the robot may do when the SLAM doubts its pose.
+
+    Attributes:
+        slow: probability of being lost from which the r-bot drives slowly and does not switch.
+        stop: probability of being lost from which the r-bot stops, until the operator lets go of the controls.
+        speed_m_s: speed limit in m/s from the first of the two on.
+    """
+
+    slow: _Probability = 0.1
+    stop: _Probability = 0.5
+    speed_m_s: Positive = 0.15
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if self.stop < self.slow:
+            raise ValueError(f"stop must be >= slow (got {self.stop}, {self.slow})")
+
+
+@dataclass(frozen=True)
 class ArbiterConfig:
     """Configuration of the arbiter's library part.
 
@@ -96,3 +119,4 @@ class ArbiterConfig:
     subgoal: SubgoalConfig = field(default_factory=SubgoalConfig)
     switch: SwitchConfig = field(default_factory=SwitchConfig)
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
+    pose_trust: PoseTrustConfig = field(default_factory=PoseTrustConfig)

@@ -92,7 +92,10 @@ class CommandRules:
         elif s.mode == Mode.RETURNING:
             notice = Notice(Reason.SWITCHING_TO_CAMERA, "you drive the robot; switching back to the camera")
         paced = self._paced(command, s)
-        if not blocked:
+        if not blocked and s.pose_doubtful:
+            text = "the robot is not sure of its place: drive slowly, by the camera, until it is recognized"
+            notice = Notice(notice.reason, text)
+        elif not blocked:
             notice = Notice(notice.reason, notice.text + self.sources.slowed(s.inputs, s.mode, abs(command[0])))
         sent = self.monitored(paced, s.inputs)
         if sent.action in ("approach", "stop") and not blocked:
@@ -121,8 +124,11 @@ class CommandRules:
         return command[0] * factor, command[1] * factor
 
     def _paced(self, command: Twist2, s: Snapshot) -> Twist2:
-        """The command slowed to what the image rate allows, with the same curvature."""
-        factor = min(1.0, self.sources.speed_limit_m_s(s.inputs, s.mode) / max(abs(command[0]), 1e-9))
+        """The command slowed to what the image rate and the trust in the pose allow, with the same curvature."""
+        limit = self.sources.speed_limit_m_s(s.inputs, s.mode)
+        if s.pose_doubtful:
+            limit = min(limit, self.config.pose_trust.speed_m_s)
+        factor = min(1.0, limit / max(abs(command[0]), 1e-9))
         return command[0] * factor, command[1] * factor
 
 

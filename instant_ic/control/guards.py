@@ -22,6 +22,10 @@ def source_lost(s: Snapshot) -> bool:
     return bool(s.lost)
 
 
+def pose_lost(s: Snapshot) -> bool:
+    return s.pose_lost
+
+
 def vspace_lost(s: Snapshot) -> bool:
     return s.inputs.vspace.failed or min(s.inputs.age("vspace"), s.in_mode_s) > s.config.timeouts.vspace
 
@@ -110,6 +114,7 @@ GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {
     for guard in (
         estop_pressed,
         source_lost,
+        pose_lost,
         vspace_lost,
         obstacle_and_ready,
         vspace_not_ready,
@@ -161,6 +166,8 @@ def against_switch(s: Snapshot) -> Notice | None:
     """Reason against a switch although an obstacle is ahead, except that there is no way round it; None for none."""
     inputs, switch, vspace = s.inputs, s.config.switch, s.vspace
     assert inputs.robot_pose is not None
+    if s.pose_doubtful:
+        return Notice(Reason.POSE_DOUBTFUL, "the robot is not sure of its place")
     if abs(s.command[0]) < switch.min_switch_speed_m_s:
         return Notice(Reason.NO_ROOM_TO_TURN, "there is no room to turn")
     if inputs.age("vspace") > s.config.timeouts.vspace:
@@ -197,6 +204,8 @@ def stop_notice(s: Snapshot) -> Notice:
         return Notice(Reason.ESTOP, "emergency stop")
     if s.lost:
         return stale_notice(s.lost)
+    if s.pose_lost:
+        return Notice(Reason.POSE_LOST, "the robot has lost its place")
     if s.inputs.vspace.failed:
         return Notice(Reason.VSPACE_FAILED, f"the virtual space failed: {s.inputs.vspace.message}")
     return Notice(Reason.VSPACE_LOST, "the virtual space is silent")

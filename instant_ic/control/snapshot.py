@@ -42,6 +42,8 @@ class ArbiterInputs:
 
     robot_pose: NDArray[np.float64] | None = None
     """(3,) map_from_base of the r-bot; None while unknown."""
+    pose_lost_probability: float = 0.0
+    """0..1, that the r-bot is somewhere else; 0 without a report."""
     robot_velocity: Twist2 = (0.0, 0.0)
     operator_command: Twist2 = (0.0, 0.0)
     operator_gone: bool = False
@@ -130,6 +132,8 @@ class Snapshot:
     """STOPPED because the operator's link was lost."""
     slow_s: float
     """Seconds for which the v-bot has driven slower than commanded."""
+    pose_lost: bool = False
+    """The SLAM is lost, and the robot has not been stopped for it yet."""
     no_view_fits: bool = False
     """An entry was abandoned, and neither has a view fitted since nor has the operator let go."""
     leading_back: bool = False
@@ -137,6 +141,11 @@ class Snapshot:
     subgoal: Subgoal | None = None
     against_switch: Notice | None = None
     """REAL with an obstacle ahead: reason against a switch; None: nothing speaks against it."""
+
+    @property
+    def pose_doubtful(self) -> bool:
+        """Whether the r-bot must drive slowly because its pose may be wrong."""
+        return self.inputs.pose_lost_probability >= self.config.pose_trust.slow
 
     @property
     def obstacle_ahead(self) -> bool:

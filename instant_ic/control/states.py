@@ -64,6 +64,7 @@ class Reason(IntEnum):
     WALL_AHEAD = 29
     NO_SPACE_BEHIND = 30
     NO_WAY_ROUND = 31
+    POSE_DOUBTFUL = 32
     # Held or stopped: nothing may move
     ESTOP = 50
     ESTOP_BUTTON = 51
@@ -74,6 +75,7 @@ class Reason(IntEnum):
     RELEASE_CONTROLS = 56
     VSPACE_FAILED = 57
     VSPACE_LOST = 58
+    POSE_LOST = 59
     # Held or stopped: a source is stale
     SCAN_STALE = 70
     POINTS_STALE = 71
@@ -137,19 +139,23 @@ class Transition:
 TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.REAL, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.REAL, Mode.STOPPED, "source_lost", "stop"),
+    Transition(Mode.REAL, Mode.STOPPED, "pose_lost", "stop"),
     Transition(Mode.REAL, Mode.ENTERING, "obstacle_and_ready", "call_vbot"),
     Transition(Mode.ENTERING, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.ENTERING, Mode.STOPPED, "source_lost", "stop"),
+    Transition(Mode.ENTERING, Mode.STOPPED, "pose_lost", "stop"),
     Transition(Mode.ENTERING, Mode.REAL, "vspace_not_ready", "hand_back"),
     Transition(Mode.ENTERING, Mode.REAL, "no_view_in_time", "abandon_entry"),
     Transition(Mode.ENTERING, Mode.REAL, "way_free", "hand_back"),
     Transition(Mode.ENTERING, Mode.VIRTUAL, "view_fits", "place_vbot"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "source_lost", "stop"),
+    Transition(Mode.VIRTUAL, Mode.STOPPED, "pose_lost", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "vspace_lost", "stop"),
     Transition(Mode.VIRTUAL, Mode.RETURNING, "rejoined", "ease_vbot"),
     Transition(Mode.RETURNING, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "source_lost", "stop"),
+    Transition(Mode.RETURNING, Mode.STOPPED, "pose_lost", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "vspace_lost", "stop"),
     Transition(Mode.RETURNING, Mode.VIRTUAL, "unsafe_again", "drive_vbot_on"),
     Transition(Mode.RETURNING, Mode.REAL, "image_fits", "hand_back"),
@@ -161,6 +167,8 @@ GUARDS: dict[str, str] = {
     "estop_pressed": "the emergency stop is latched",
     "source_lost": "a source that this state needs has been silent for stop_after_s (camera, views: for twice their "
     "time-out, if that is longer)",
+    "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more; once the operator has let go, the "
+    "r-bot may drive slowly until its place is recognized",
     "vspace_lost": "the virtual space has failed, or its node is silent",
     "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, the r-bot has a way "
     "round; after an abandoned entry, also: a view fits, or the operator let go",

@@ -119,9 +119,7 @@ def blind(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generat
     return Faulted(shown, np.arange(at, end))
 
 
-def kidnap(
-    entries: Sequence[LogEntry], at: int, end: int, there: int, rng: np.random.Generator
-) -> Faulted:
+def kidnap(entries: Sequence[LogEntry], at: int, end: int, there: int, rng: np.random.Generator) -> Faulted:
     """The robot of scan ``at`` − 1 is put down where scan ``there`` was taken; its odometry stands meanwhile."""
     part = _part(entries, there)[: end - at]
     odometry, here = entries[at - 1].odom_pose, entries[there].odom_pose
@@ -315,7 +313,12 @@ def evaluate_faults(
     alarms = int((clean.trusted[:-1] & ~clean.trusted[1:]).sum())
     hours = max((entries[-1].scan.stamp_ns - entries[0].scan.stamp_ns) / 3.6e12, 1e-9)
     report: dict[str, object] = {
-        "clean": {"scans": len(entries), "hours": hours, "false_alarms": alarms, "false_alarms_per_hour": alarms / hours}
+        "clean": {
+            "scans": len(entries),
+            "hours": hours,
+            "false_alarms": alarms,
+            "false_alarms_per_hour": alarms / hours,
+        }
     }
     saved = clean.slam.grid()
     for name in [name for name in faults if name in (*PLACE_FAULTS, *KIDNAPPINGS)]:
@@ -348,7 +351,11 @@ def evaluate_faults(
         slam = GridSlam(config)
         run = _run(slam, faulted, clean, None, None)
         errors = run.error_m
-        report[name] = {**run.figures(), "mean_error_m": float(errors.mean()), "p99_error_m": float(np.percentile(errors, 99))}
+        report[name] = {
+            **run.figures(),
+            "mean_error_m": float(errors.mean()),
+            "p99_error_m": float(np.percentile(errors, 99)),
+        }
     return report
 
 

@@ -129,7 +129,11 @@ class FrontEnd:
         )
 
     def track(
-        self, scan: ScanPoints, guess: Guess, stamp_ns: int, accept: Callable[[FloatArray, float, bool], bool] | None = None
+        self,
+        scan: ScanPoints,
+        guess: Guess,
+        stamp_ns: int,
+        accept: Callable[[FloatArray, float, bool], bool] | None = None,
     ) -> Track:
         """Match a scan that has at least ``match.min_points`` points.
 

@@ -103,6 +103,7 @@ class GridSlam:
         self.map = OccupancyMap(self.config.map)
         self.motion = MotionMonitor()
         self.monitor = IntegrityMonitor()
+        self._framed = saved is None
         self._apart = False  # a session began after the robot was lost in the map being made
         self._found_before: tuple[Keyframe, FloatArray] | None = None
         self._saved_cells: tuple[SavedMap, OccupancyMap] | None = None  # a saved map, to compare scans with
@@ -164,6 +165,11 @@ class GridSlam:
     def localized(self) -> bool:
         """Whether the robot is located in the saved map; True without one."""
         return self.saved is None or self.saved.located
+
+    @property
+    def in_map_frame(self) -> bool:
+        """Whether the pose continues one in the map's frame; False until the robot is located in a saved map."""
+        return self._framed
 
     def grid(self) -> OccupancyGrid:
         """The map: int8 array (H, W) of −1, 0..100, resolution, origin (2,)."""
@@ -291,7 +297,7 @@ class GridSlam:
         for keyframe in own:
             keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
         self._move(moved)
-        saved.located = True
+        saved.located = self._framed = True
         self.monitor.restart()
         if not saved.extends:
             own[-1].drift = covariance

@@ -43,8 +43,8 @@ LEVEL_SHARE = 0.1
 """Weight of a new scan in the levels."""
 FLOOR = -6.0
 """Least log-odds of being lost. Higher makes false alarms, lower delays detection."""
-DOUBT = -5.8
-"""Log-odds above which scans are kept out of the map: any evidence is enough."""
+DOUBT = -5.5
+"""Log-odds above which scans are kept out of the map: a quarter of a scan's evidence is enough."""
 LOST = 4.0
 """Log-odds above which the doubt is confirmed."""
 UNSEEN_S, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 0.6, -1.0
@@ -174,6 +174,7 @@ class IntegrityMonitor:
         self._unseen_s = 0.0
         self._doubtful_scans = 0
         self._score_level: float | None = None
+        self._usual_score = 0.0  # level, or score of the scan before, if lower: turning lowers it gradually
         self._contradiction_level = 0.0
 
     @property
@@ -201,12 +202,12 @@ class IntegrityMonitor:
             recovered: only the wide search has matched it.
         """
         self.contradiction = contradicted
-        level = score if self._score_level is None else self._score_level
+        usual = score if self._score_level is None else self._usual_score
         excess = min(max(contradicted - self._contradiction_level, 0.0) / FULL_CONTRADICTION, 1.0)
-        drop = min(max(level - score, 0.0) / FULL_DROP, 1.0)
+        drop = min(max(usual - score, 0.0) / FULL_DROP, 1.0)
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
-        long_drop = min(max(level - score, 0.0) / LONG_DROP, 1.0)
+        long_drop = min(max(usual - score, 0.0) / LONG_DROP, 1.0)
         share = max(math.sqrt(excess * drop), LONG_DROP_SHARE * long_drop)
         evidence = EVIDENCE * (2.0 * share - 1.0)
         if recovered:
@@ -214,7 +215,9 @@ class IntegrityMonitor:
         else:
             self._weigh(evidence, elapsed_s)
         if self._score_level is None or not self.doubts:
+            level = score if self._score_level is None else self._score_level
             self._score_level = level + LEVEL_SHARE * (score - level)
+            self._usual_score = min(self._score_level, score)
             self._contradiction_level += LEVEL_SHARE * (contradicted - self._contradiction_level)
 
     def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:

@@ -16,7 +16,7 @@ _STATUSES = {
     SlamStatus.TRACKED: (Level.OK, "tracking"),
     SlamStatus.RECOVERED: (Level.WARN, "odometry was far off; the scan was found again by the wide search"),
     SlamStatus.LOST: (Level.ERROR, "the scan fits nowhere near; going on by odometry"),
-    SlamStatus.RESTARTED: (Level.ERROR, "lost for long; a new local map begins where odometry says"),
+    SlamStatus.RESTARTED: (Level.ERROR, "the robot is lost; it maps apart from its map until its place is recognized"),
     SlamStatus.NO_POINTS: (Level.WARN, "the scan has too few points; going on by odometry"),
     SlamStatus.TIME_BACKWARDS: (Level.WARN, "the scan is not newer than the one before and is ignored"),
 }
@@ -42,6 +42,15 @@ def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel
     sigma_m = float(np.sqrt(max(np.diag(result.covariance)[:2])))
     figures = {"score": round(result.score, 3), "sigma_xy_m": round(sigma_m, 4), **slam.figures()}
     yield Diagnosis("slam", *_STATUSES[result.status], figures)
+    trust = result.integrity
+    figures = {
+        "lost_probability": round(trust.lost_probability, 4),
+        "position_bound_m": round(trust.position_bound_m, 3),
+        "heading_bound_rad": round(trust.heading_bound_rad, 4),
+        "contradiction": round(slam.monitor.contradiction, 3),
+    }
+    text = "the pose is trusted" if trust.trusted else "the robot is probably not where the pose says"
+    yield Diagnosis("integrity", Level.OK if trust.trusted else Level.ERROR, text, figures)
     if not result.localized:
         text = "the robot's place in the saved map is not known yet: drive on, or set it (/initialpose)"
         yield Diagnosis("place", Level.WARN, text)
