@@ -2,7 +2,7 @@
 
 A wrong pose may still fit the local map by its score. What gives it away is the scan's rays: they pass through walls of
 the map, or end in space that the map shows as free. Neither happens where the robot only sees something new. The
-contradiction counts together with a drop of the match score, both against their recent level: a map that has drifted
+contradiction counts together with a drop of the match score, both against the scans before: a map that has drifted
 contradicts new scans too, but gradually, and at a good score.
 
 `IntegrityMonitor` is a Bayes filter on one bit, lost or not. The log-likelihood ratio of a scan was chosen on the Intel
@@ -174,7 +174,9 @@ class IntegrityMonitor:
         self._unseen_s = 0.0
         self._doubtful_scans = 0
         self._score_level: float | None = None
-        self._usual_score = 0.0  # level, or score of the scan before, if lower: turning lowers it gradually
+        # Level, or value of the scan before, if worse: what changes gradually, as in a turn or in a map that has
+        # drifted, is no sign of another place.
+        self._usual_score = self._usual_contradiction = 0.0
         self._contradiction_level = 0.0
 
     @property
@@ -203,7 +205,7 @@ class IntegrityMonitor:
         """
         self.contradiction = contradicted
         usual = score if self._score_level is None else self._usual_score
-        excess = min(max(contradicted - self._contradiction_level, 0.0) / FULL_CONTRADICTION, 1.0)
+        excess = min(max(contradicted - self._usual_contradiction, 0.0) / FULL_CONTRADICTION, 1.0)
         drop = min(max(usual - score, 0.0) / FULL_DROP, 1.0)
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
@@ -219,6 +221,7 @@ class IntegrityMonitor:
             self._score_level = level + LEVEL_SHARE * (score - level)
             self._usual_score = min(self._score_level, score)
             self._contradiction_level += LEVEL_SHARE * (contradicted - self._contradiction_level)
+            self._usual_contradiction = max(self._contradiction_level, contradicted)
 
     def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:
         """Take in a scan without a match: one that fits nowhere near, or one without points."""

@@ -1,0 +1,157 @@
+"""Integrity of the pose: rays against the map, the monitor's odds, and robots carried off in the simulator."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from instant_ic.experiments.slam_faults import evaluate_faults
+from instant_ic.experiments.slam_sim import round_trip
+from instant_ic.sim.worlds import make_world
+from instant_ic.slam.integrity import (
+    BOUND_SIGMAS,
+    LOST_SIGMA_M,
+    UNTRUSTED,
+    IntegrityMonitor,
+    contradiction,
+    mixture,
+)
+from instant_ic.slam.logs import LogEntry
+from instant_ic.slam.scan import ScanPoints
+
+KNOWN_FREE, WALL = -3.0, 3.0
+
+
+def wall_map() -> tuple[np.ndarray, np.ndarray]:
+    """8 m × 4 m of 5 cm cells from (0, 0): free, a wall along x = 4 m, and unknown from x = 5 m on."""
+    cells = np.full((80, 160), KNOWN_FREE, dtype=np.float32)
+    cells[:, 80] = WALL
+    seen = np.ones((80, 160), dtype=np.int32)
+    seen[:, 100:] = 0
+    return cells, seen
+
+
+def hits(*points: tuple[float, float]) -> ScanPoints:
+    """Thirty equal hits each, so that the least number of rays is reached."""
+    repeated = np.repeat(np.array(points, dtype=np.float64), 30, axis=0)
+    return ScanPoints(repeated, np.zeros(len(repeated), dtype=np.bool_), np.zeros(2), np.zeros((0, 2)))
+
+
+@pytest.mark.parametrize(
+    ("points", "share"),
+    [
+        (((3.0, 0.0),), 0.0),  # from x = 1 m: on the wall
+        (((3.2, 0.0),), 0.0),  # within the slack of it
+        (((1.5, 0.0),), 1.0),  # in free space
+        (((5.5, 0.0),), 1.0),  # through the wall
+        (((3.0, 0.0), (1.5, 0.0)), 0.5),
+        (((-3.0, 0.0),), 0.0),  # off the map: something new
+    ],
+)
+def test_share_of_rays_that_contradict_the_map(points: tuple[tuple[float, float], ...], share: float) -> None:
+    cells, seen = wall_map()
+    assert contradiction(cells, seen, np.zeros(2), 0.05, np.array([1.0, 2.0, 0.0]), hits(*points)) == share
+
+
+def steady(scans: int = 30) -> IntegrityMonitor:
+    monitor = IntegrityMonitor()
+    for _ in range(scans):
+        monitor.matched(0.02, 0.9, 0.1)
+    return monitor
+
+
+def test_four_contradicted_scans_take_the_trust_and_six_confirm() -> None:
+    # Full evidence is 2 a scan at 10 Hz, from -6: at 0 after three scans, at 2 after four, at 4 after five.
+    monitor = steady()
+    trusted = []
+    for _ in range(5):
+        monitor.matched(0.5, 0.4, 0.1)
+        assert monitor.doubts
+        trusted.append(monitor.lost_probability < UNTRUSTED)
+    assert trusted == [True, True, False, False, False]
+    assert monitor.lost
+    assert monitor.lost_probability == pytest.approx(1 / (1 + math.exp(-4.0)))
+
+
+def test_evidence_counts_by_time() -> None:
+    # At 40 Hz a scan has a quarter of the evidence: 20 scans instead of 5.
+    monitor = steady()
+    scans = 0
+    while not monitor.lost:
+        monitor.matched(0.5, 0.4, 0.025)
+        scans += 1
+    assert scans == 20
+
+
+@pytest.mark.parametrize(("contradicted", "score"), [(0.5, 0.9), (0.02, 0.7)])
+def test_neither_alone_takes_the_trust(contradicted: float, score: float) -> None:
+    # A map that has drifted contradicts at a good score; a new place lowers the score without contradiction.
+    monitor = steady()
+    for _ in range(50):
+        monitor.matched(contradicted, score, 0.1)
+    assert monitor.lost_probability < 0.01
+
+
+def test_a_doubt_ends_with_scans_that_fit() -> None:
+    monitor = steady()
+    monitor.matched(0.5, 0.4, 0.1)
+    monitor.matched(0.02, 0.9, 0.1)
+    assert not monitor.doubts
+
+
+def test_a_scan_that_only_the_wide_search_finds_stays_out_of_the_map() -> None:
+    monitor = steady()
+    monitor.matched(0.02, 0.9, 0.1, recovered=True)
+    assert monitor.doubts
+    monitor.matched(0.02, 0.9, 0.1)
+    assert not monitor.doubts
+
+
+def test_time_without_scans_raises_the_probability_up_to_a_limit() -> None:
+    # -6 + 0.6 · (6 s - 1 s) = -3; the limit is -1.
+    monitor = steady()
+    monitor.unmatched(False, 6.0)
+    assert monitor.lost_probability == pytest.approx(1 / (1 + math.exp(3.0)))
+    monitor.unmatched(False, 600.0)
+    assert monitor.lost_probability == pytest.approx(1 / (1 + math.exp(1.0)))
+
+
+def test_covariance_and_bounds_follow_the_probability() -> None:
+    own = np.diag([0.01, 0.0004, 0.0001])
+    np.testing.assert_allclose(mixture(own, 0.0), own)
+    np.testing.assert_allclose(mixture(own, 1.0), np.diag([LOST_SIGMA_M**2, LOST_SIGMA_M**2, math.pi**2 / 3]))
+    trusted = steady().integrity(own, localized=True)
+    assert trusted.trusted and trusted.position_bound_m == pytest.approx(BOUND_SIGMAS * 0.1)
+    lost = steady().integrity(own, localized=False)
+    assert not lost.trusted and lost.lost_probability == 1.0
+    assert lost.position_bound_m == pytest.approx(BOUND_SIGMAS * LOST_SIGMA_M)
+    assert lost.heading_bound_rad == math.pi
+
+
+@pytest.fixture(scope="module")
+def log() -> list[LogEntry]:
+    return round_trip(make_world("corridor"), 0.2, seed=11, rounds=1).entries[:700]
+
+
+def test_a_robot_carried_off_is_noticed_and_found_again(log: list[LogEntry]) -> None:
+    report = evaluate_faults(log, places=2, seed=2, faults=("kidnapped_mapping", "kidnapped_localized"))
+    assert report["clean"]["false_alarms"] == 0
+    for fault in ("kidnapped_mapping", "kidnapped_localized"):
+        figures = report[fault]
+        assert figures["went_wrong"] == figures["detected"] == figures["places"] == 2
+        assert figures["trusted_wrong_scans_max"] <= 10
+        assert figures["recovered"] == 2, figures
+        assert figures["end_error_m_max"] < 0.1
+
+
+def test_a_heading_that_jumps_leaves_no_turned_map(log: list[LogEntry]) -> None:
+    report = evaluate_faults(log, places=2, seed=1, faults=("heading_jump_85deg",))
+    assert report["heading_jump_85deg"]["trusted_wrong_scans_max"] <= 10
+    assert report["heading_jump_85deg"]["right_at_end"] == 2
+
+
+def test_an_unknown_fault_is_named(log: list[LogEntry]) -> None:
+    with pytest.raises(ValueError, match="unknown fault 'flood'"):
+        evaluate_faults(log, faults=("flood",))
