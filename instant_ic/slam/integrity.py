@@ -43,8 +43,9 @@ LEVEL_SHARE = 0.1
 """Weight of a new scan in the levels."""
 FLOOR = -6.0
 """Least log-odds of being lost. Higher makes false alarms, lower delays detection."""
-DOUBT = -5.5
-"""Log-odds above which scans are kept out of the map: a quarter of a scan's evidence is enough."""
+DOUBT, SUSPICIOUS = -5.5, 0.5
+"""Log-odds, or evidence of the last scan, above which scans are kept out of the map: a quarter of a scan's evidence is
+enough, also at a high rate."""
 LOST = 4.0
 """Log-odds above which the doubt is confirmed."""
 UNSEEN_S, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 0.6, -1.0
@@ -171,6 +172,7 @@ class IntegrityMonitor:
     def __init__(self) -> None:
         self.contradiction = 0.0
         self._log_odds = FLOOR
+        self._suspicious = False  # the last scan, whatever the time since the one before
         self._unseen_s = 0.0
         self._doubtful_scans = 0
         self._score_level: float | None = None
@@ -182,7 +184,7 @@ class IntegrityMonitor:
     @property
     def doubts(self) -> bool:
         """Whether scans must stay out of the map."""
-        return self._log_odds > DOUBT
+        return self._suspicious or self._log_odds > DOUBT
 
     @property
     def lost(self) -> bool:
@@ -250,11 +252,12 @@ class IntegrityMonitor:
         return Integrity(lost, BOUND_SIGMAS * sigma_m, min(heading, math.pi))
 
     def _weigh(self, evidence: float, elapsed_s: float) -> None:
+        self._suspicious = evidence >= SUSPICIOUS
         self._log_odds += evidence * min(1.0, max(elapsed_s, 0.0) / EVIDENCE_S)
         self._log_odds = min(max(self._log_odds, FLOOR), LOST + EVIDENCE)
         self._doubtful_scans = self._doubtful_scans + 1 if self.doubts else 0
         if self._doubtful_scans > LONGEST_DOUBT and self._log_odds < 0.0:
-            self._log_odds, self._doubtful_scans = FLOOR, 0
+            self._log_odds, self._doubtful_scans, self._suspicious = FLOOR, 0, False
 
 
 def mixture(covariance: FloatArray, lost_probability: float) -> FloatArray:

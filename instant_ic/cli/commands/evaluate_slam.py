@@ -53,6 +53,19 @@ def add_kind(kinds: Any) -> None:
     parser.add_argument(
         "--perturb-odometry", type=int, metavar="SEED", help="degrade the odometry: 5 %% noise, 2 %% scale"
     )
+    parser.add_argument(
+        "--faults",
+        nargs="?",
+        const="all",
+        metavar="NAME,...",
+        help="put faults into the log instead (all, or the named ones): detection, recovery and false alarms by fault",
+    )
+    parser.add_argument(
+        "--places", type=int, default=5, metavar="N", help="of --faults: places for each (default: %(default)d)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, metavar="N", help="of --faults: chooses the places (default: %(default)d)"
+    )
     parser.set_defaults(func=evaluate_slam)
 
 
@@ -71,12 +84,17 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         write_trajectory,
     )
     from instant_ic.experiments.slam_bag import is_bag, read_bag
+    from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
     from instant_ic.slam.logs import BadLines, LogError, read_log
 
     if args.stamps and not args.relations:
         raise UserError("--stamps selects relations: give --relations too", 2)
     if not args.tolerance > 0:
         raise UserError(f"--tolerance must be > 0 (got {args.tolerance:g})", 2)
+    if args.faults and args.backend != "graph":
+        raise UserError("--faults needs --backend graph", 2)
+    if args.places < 1:
+        raise UserError(f"--places must be at least 1 (got {args.places})", 2)
     if args.particles < 1:
         raise UserError(f"--particles must be at least 1 (got {args.particles})", 2)
     overrides = [f"grid_slam.{override}" for override in args.param]
@@ -106,6 +124,13 @@ def evaluate_slam(args: argparse.Namespace) -> int:
             read = read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log, bad)
             entries: list[LogEntry] = list(read)
             progress.update(task, description=args.log.name, total=len(entries))
+            if args.faults:
+                faults = FAULTS if args.faults == "all" else tuple(args.faults.split(","))
+                report = evaluate_faults(
+                    entries, config, places=args.places, seed=args.seed, faults=faults,
+                    on_step=lambda name: progress.update(task, description=name),
+                )  # fmt: skip
+                return _write_faults(folder, {"log": args.log.name, "seed": args.seed, **report}, args.json)
             source = entries if args.perturb_odometry is None else perturb_odometry(entries, args.perturb_odometry)
             report, run = evaluate_log(
                 source, relations, config, particles=particles, use_wheel_odom=not args.no_odometry,
@@ -130,6 +155,19 @@ def evaluate_slam(args: argparse.Namespace) -> int:
             if file is not None:
                 _plot(file, run)
         for file in (folder / "figures.json", args.json):
+            if file is not None:
+                file.write_text(text)
+    except OSError as error:
+        raise UserError(f"evaluate slam: {error}") from None
+    sys.stdout.write(text)
+    return 0
+
+
+def _write_faults(folder: Path, report: dict[str, object], json_file: Path | None) -> int:
+    text = json.dumps({**report, "output": str(folder)}, indent=2) + "\n"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for file in (folder / "faults.json", json_file):
             if file is not None:
                 file.write_text(text)
     except OSError as error:
