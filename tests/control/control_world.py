@@ -163,6 +163,7 @@ class Loop:
         self.navigator = Navigator(HybridPlanner(PlannerConfig()), PathFollower(FollowerConfig(), limits))
         self.vbot = VirtualRobot(VbotConfig(), limits)
         self.base = Base(np.array(start))
+        self.pose_lost = 0.0
         self.vspace = Vspace(ready=True, position=np.zeros(2), ready_radius_m=100.0)
         self.k = 0
         self.frames: list[Frame] = []
@@ -200,6 +201,7 @@ class Loop:
         picture, view = self.pictures()
         inputs = ArbiterInputs(
             robot_pose=robot,
+            pose_lost_probability=self.pose_lost,
             robot_velocity=(self.base.v, self.base.w),
             operator_command=operator,
             estop=self.estop,

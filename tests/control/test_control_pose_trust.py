@@ -1,0 +1,70 @@
+"""What the robot may do while the SLAM doubts its pose: slow, stop, then slow driving until its place is recognized."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from control_world import Loop, World, corridor, draw_map, rectangle
+
+from instant_ic.control.arbiter_config import PoseTrustConfig
+from instant_ic.control.states import Mode, Reason
+
+FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)
+
+
+def loop() -> Loop:
+    walls = corridor(16.0)
+    world = World(np.concatenate([walls, rectangle(7.0, -0.25, 7.5, 0.25)]))
+    made = Loop(world, draw_map(walls, (-2, -1.2, 14.0, 1.2)))
+    made.start()
+    return made
+
+
+def drive(made: Loop, seconds: float, command: tuple[float, float]) -> None:
+    for _ in range(round(seconds * 20)):
+        made.step(command)
+
+
+def test_a_doubt_slows_the_robot_and_a_lost_pose_stops_it() -> None:
+    made = loop()
+    drive(made, 2.0, FORWARD)
+    assert made.frames[-1].command == pytest.approx(FORWARD)
+    made.pose_lost = 0.2
+    drive(made, 0.5, FORWARD)
+    assert made.frames[-1].command[0] == pytest.approx(PoseTrustConfig().speed_m_s)
+    made.pose_lost = 0.9
+    drive(made, 0.1, FORWARD)
+    stopped = made.frames[-1]
+    assert stopped.decision.mode == Mode.STOPPED and stopped.command == NOTHING
+    assert stopped.decision.reason == "let go of the controls to continue (stopped: the robot has lost its place)"
+
+
+def test_once_the_operator_has_let_go_the_robot_drives_slowly_until_its_place_is_recognized() -> None:
+    made = loop()
+    made.pose_lost = 0.9
+    drive(made, 1.5, NOTHING)
+    drive(made, 1.0, FORWARD)
+    slow = made.frames[-1]
+    assert slow.decision.mode == Mode.REAL
+    assert slow.command[0] == pytest.approx(PoseTrustConfig().speed_m_s)
+    assert "not sure of its place" in slow.decision.reason
+    made.pose_lost = 0.0
+    drive(made, 1.0, FORWARD)
+    assert made.frames[-1].command == pytest.approx(FORWARD)
+    made.pose_lost = 0.9  # lost a second time: stopped a second time
+    drive(made, 0.1, FORWARD)
+    assert made.frames[-1].decision.mode == Mode.STOPPED
+
+
+def test_no_switch_with_a_pose_in_doubt() -> None:
+    made = loop()
+    made.pose_lost = 0.2
+    drive(made, 45.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL"]
+    assert made.frames[-1].decision.reason_code == Reason.POSE_DOUBTFUL
+    assert made.frames[-1].command == NOTHING
+
+
+def test_the_thresholds_are_in_order() -> None:
+    with pytest.raises(ValueError, match="stop must be >= slow"):
+        PoseTrustConfig(slow=0.6, stop=0.5)
