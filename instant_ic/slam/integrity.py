@@ -1,4 +1,4 @@
-"""Integrity of the pose: tells a right pose from a plausible one, and bounds the error.
+"""Integrity of the pose: distinguishes a right pose from a plausible one, and bounds the error.
 
 A wrong pose may still fit the local map by its score. What gives it away is the scan's rays: they pass through walls of
 the map, or end in space that the map shows as free. Neither happens where the robot only sees something new. The
@@ -240,7 +240,7 @@ class IntegrityMonitor:
             self._log_odds = min(self._log_odds + grown, UNSEEN_MOST)
 
     def restart(self) -> None:
-        """Begin anew in another map: nothing is known against the pose."""
+        """Restart in another map: nothing is known against the pose."""
         self.__init__()  # type: ignore[misc]
 
     def integrity(self, covariance: FloatArray, localized: bool) -> Integrity:
