@@ -204,6 +204,9 @@ def solid_columns(key, odds, sums, last, now, keep, cell, ground, top, index):  
                 end = levels
             elif end >= top and ends > 2 * open_above:
                 end = tops[at, 0]
+            elif end < top:
+                # It ends somewhere between the highest point and the lowest beam above.
+                end = (tops[at, 0] + end) // 2
             codes[at, tops[at, 0] : end] = UP
     _bridge(key, index, faces, cell)
     return codes, faces
@@ -333,6 +336,16 @@ def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, hig
             x, y = faces[at, 0], faces[at, 1]
             dx, dy = x - origin[0], y - origin[1]
             length = math.sqrt(dx * dx + dy * dy)
+            inner = True  # behind its outermost columns a thing would become wider than it is
+            for side in (-1, 1):
+                found = False
+                for far in (1, 2):
+                    ix = math.floor((x - side * far * cell * dy / length) / cell)
+                    iy = math.floor((y + side * far * cell * dx / length) / cell)
+                    found = found or index[ix & (n - 1), iy & (n - 1)] >= 0
+                inner = inner and found
+            if not inner:
+                continue
             for k in range(1, int(behind / cell * 2) + 1):
                 ix = math.floor((x + dx / length * 0.5 * k * cell) / cell)
                 iy = math.floor((y + dy / length * 0.5 * k * cell) / cell)

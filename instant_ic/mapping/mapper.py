@@ -78,7 +78,7 @@ class LocalMapper:
         self._held: tuple[str, int, NDArray[np.floating], Callable[[], NDArray[np.floating]]] | None = None
         self._taken_ns: int | None = None
         self._taken_at: Matrix | None = None
-        self._map_from_odom: Matrix | None = None
+        self._reference: tuple[int, Matrix] | None = None  # stamp and correction of the last look-up
         self._model_from_map = np.eye(4)
 
     def revolution(
@@ -120,7 +120,7 @@ class LocalMapper:
             waited_s = (stamp_ns - self._taken_ns) / 1e9
             if moved_m < self.config.every_m and 0 <= waited_s < self.config.every_s:
                 return False
-        model_from_map = self._model_from_map_at(middle_ns, odom_from_lidar)
+        model_from_map = self._model_from_map_at(frame, middle_ns)
         points = xyz()
         if len(points) != len(time_s):
             raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is left out")
@@ -151,20 +151,29 @@ class LocalMapper:
         try:
             return correction(self.transforms, self.map_frame, self.odom_frame, stamp_ns)
         except TransformError:
-            return np.eye(4) if self._map_from_odom is None else self._map_from_odom
+            return np.eye(4) if self._reference is None else self._reference[1]
 
-    def _model_from_map_at(self, stamp_ns: int, odom_from_sensor: Matrix) -> Matrix:
-        """Pose of the map in the model; a jump of the map since the last call moves the model with the robot."""
+    def _model_from_map_at(self, frame: str, stamp_ns: int) -> Matrix:
+        """Pose of the map in the model; a jump of the map since the last call moves the model with the robot.
+
+        Images and revolutions come in any order of their stamps, so correction and motion are compared over the same
+        time: a turn on slipping tracks changes the correction by degrees between them and is no jump.
+        """
         map_from_odom = self._correction(stamp_ns)
-        if self._map_from_odom is not None and self._taken_at is not None:
-            before = self._map_from_odom
-            moved_m = float(np.linalg.norm(odom_from_sensor[:3, 3] - self._taken_at[:3, 3]))
+        if self._reference is not None:
+            reference_ns, before = self._reference
+            odom_from_sensor = self.transforms.lookup(self.odom_frame, frame, stamp_ns)
+            try:
+                start = self.transforms.lookup(self.odom_frame, frame, reference_ns)
+            except TransformError:  # too long ago
+                start = odom_from_sensor
+            moved_m = float(np.linalg.norm(odom_from_sensor[:3, 3] - start[:3, 3]))
             shift = (map_from_odom - before) @ np.append(odom_from_sensor[:3, 3], 1.0)
             if float(np.linalg.norm(shift[:3])) > _JUMP_M + _DRIFT * moved_m or (
-                _angle(before, map_from_odom) > _JUMP_RAD + _DRIFT * _angle(self._taken_at, odom_from_sensor)
+                _angle(before, map_from_odom) > _JUMP_RAD + _DRIFT * _angle(start, odom_from_sensor)
             ):
                 self._model_from_map = self._model_from_map @ before @ inverse(map_from_odom)
-        self._map_from_odom = map_from_odom
+        self._reference = stamp_ns, map_from_odom
         return self._model_from_map
 
     def model_from_camera(self, camera: str, stamp_ns: int) -> Matrix:
@@ -173,8 +182,7 @@ class LocalMapper:
         Raises:
             TransformError: the pose is not known.
         """
-        odom_from_camera = self.transforms.lookup(self.odom_frame, camera, stamp_ns)
-        return self._model_from_map_at(stamp_ns, odom_from_camera) @ self._map_from(camera, stamp_ns)
+        return self._model_from_map_at(camera, stamp_ns) @ self._map_from(camera, stamp_ns)
 
     def cloud(self) -> NDArray[np.float32]:
         """(N, 3) points of the model in the map frame; (0, 3) before the first revolution."""

@@ -198,7 +198,7 @@ def test_odometry_that_slips_in_a_turn_does_not_turn_the_model() -> None:
     transforms = TransformBuffer()
     transforms.set("base_link", "velodyne", 0, pose_matrix(0, 0, 0.6), static=True)
     transforms.set("base_link", "camera", 0, pose_matrix(0, 0, 1.2), static=True)
-    mapper = LocalMapper(transforms)
+    mapper = LocalMapper(transforms, MapperConfig(every_s=0.1))
     points, origin = measured(0.0, (), 0)
     for k in range(31):  # 0.8 rad/s, of which odometry sees nine tenths; SLAM knows better ten times a second
         true, seen = 0.08 * k, 0.072 * k
@@ -208,6 +208,12 @@ def test_odometry_that_slips_in_a_turn_does_not_turn_the_model() -> None:
         mapper.revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=turned: p)
     pose = mapper.model_from_camera("camera", 2 * S)  # an image one second old
     np.testing.assert_allclose(pose, pose_matrix(0, 0, 1.2, yaw=1.6), atol=1e-9)
+    # The next revolution is 1.1 s newer than that image: its correction is another by 5 degrees, and nothing jumped.
+    transforms.set("odom", "base_link", 31 * S // 10, pose_matrix(yaw=2.232))
+    transforms.set("map", "odom", 31 * S // 10, pose_matrix(yaw=0.248))
+    for k in (31, 32):
+        mapper.revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=points - origin: p)
+    np.testing.assert_allclose(mapper.model_from_camera("camera", 2 * S), pose, atol=1e-9)
     depth = MetricDepth(
         DepthSource(),
         transforms,
