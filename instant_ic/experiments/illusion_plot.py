@@ -11,14 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.illusion import Film
-from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, TRUE_FILL, TRUE_VIEW
+from instant_ic.experiments.illusion_stack import (
+    LIVE,
+    SOURCES,
+    TRUE_DEPTH,
+    TRUE_FILL,
+    TRUE_VIEW,
+    WEBGL,
+    WEBGL_TRUE_DEPTH,
+)
 from instant_ic.experiments.pictures import new_figure, save_figure
 
 _TILE = (400, 225)
 _LABEL_PX, _HEAD_PX = 64, 24
-_COLUMNS = {LIVE: "shown", "truth": "true", TRUE_DEPTH: "with true depth", TRUE_FILL: "with true depth and fill"}
-_NAMES = {**_COLUMNS, TRUE_VIEW: "true view (the page alone)"}
-_COLOURS = {LIVE: "tab:red", TRUE_DEPTH: "tab:blue", TRUE_FILL: "tab:green", TRUE_VIEW: "0.4"}
+_COLUMNS = {
+    LIVE: "shown",
+    WEBGL: "shown in WebGL",
+    "truth": "true",
+    TRUE_DEPTH: "with true depth",
+    TRUE_FILL: "with true depth and fill",
+}
+_NAMES = {**_COLUMNS, TRUE_VIEW: "true view (the page alone)", WEBGL_TRUE_DEPTH: "in WebGL, true depth"}
+_COLOURS = {
+    LIVE: "tab:red",
+    TRUE_DEPTH: "tab:blue",
+    TRUE_FILL: "tab:green",
+    TRUE_VIEW: "0.4",
+    WEBGL: "tab:orange",
+    WEBGL_TRUE_DEPTH: "tab:cyan",
+}
 
 
 def save_strip(path: Path, films: Sequence[Film]) -> None:

@@ -34,7 +34,10 @@ FloatArray: TypeAlias = NDArray[np.float64]
 LIVE, TRUE_DEPTH, TRUE_FILL = "live", "with_true_depth", "with_true_depth_and_fill"
 TRUE_VIEW = "with_true_view"
 """The simulator's image and depth instead of the rendered view: what the page itself loses."""
-SOURCES = (LIVE, TRUE_DEPTH, TRUE_FILL, TRUE_VIEW)
+WEBGL, WEBGL_TRUE_DEPTH = "webgl", "webgl_with_true_depth"
+"""What a page with WebGL shows: it renders the layers itself, at the shown pose, with the screen's pixels and without
+the dissolve between keyframes. Not modelled: its paler guesses, and the tolerance of its triangles."""
+SOURCES = (LIVE, TRUE_DEPTH, TRUE_FILL, TRUE_VIEW, WEBGL, WEBGL_TRUE_DEPTH)
 FRAME_S = 0.3
 """Simulated seconds between two compared frames: every third view. The page shows up to 60 frames a second."""
 VIEW_AGE_S = 0.15
@@ -105,6 +108,7 @@ class FilmedStack(SimulatedStack):
         self.screen = Screen()
         self._course, self._episode, self._emit = course, episode, on_frame
         self._truth_space: VirtualSpace | None = None
+        self._page_space: VirtualSpace | None = None
         self._world_from_map = np.eye(4)
         self._taken: _Taken | None = None
         self._next_frame_s = 0.0
@@ -213,6 +217,10 @@ class FilmedStack(SimulatedStack):
         covered = self._blend == 1 and all(bool((inside == 1).all()) for _, inside in placed.values())
         camera = None if covered else self._camera_image(map_from_shown)
         images = {name: compose(*each, camera, self._blend) for name, each in placed.items()}
+        by_page = self._webgl(map_from_shown)
+        whole = np.ones((screen.height, screen.width), np.float32)
+        for name, view in by_page.items():
+            images[name] = compose(view.rgb / np.float32(255), whole, camera, self._blend)
         renderer, distance_m, with_obstacle = self._truth_at(world_from_shown)
         truths = {with_obstacle: self._true(renderer, world_from_shown)}
         if distance_m is not None:
@@ -230,10 +238,23 @@ class FilmedStack(SimulatedStack):
             score(images[LIVE], truths[False], world_from_shown, screen.fov_rad, with_ssim=False).psnr_db
             if False in truths
             else None,
-            taken.unseen,
+            {**taken.unseen, **{name: view.unseen_share for name, view in by_page.items()}},
             taken.expected_psnr_db,
         )
         self._emit(frame, images, truth.rgb)
+
+    def _webgl(self, map_from_shown: FloatArray) -> dict[str, View]:
+        """The views that a page renders from the layers."""
+        live, screen = self.nodes["nerf"].work.space.shown, self.screen
+        assert live is not None and self._truth_space is not None
+        if self._page_space is None:
+            self._page_space = VirtualSpace(self.nodes["nerf"].config.space)
+        self._page_space.show(live)
+        spaces = {WEBGL: self._page_space, WEBGL_TRUE_DEPTH: self._truth_space}
+        return {
+            name: space.render(map_from_shown, screen.width, screen.height, screen.fov_rad)
+            for name, space in spaces.items()
+        }
 
     def _vbot_in_map(self) -> FloatArray:
         x, y, yaw = self.page.state.get("vbot") or self.page.state["robot"]

@@ -19,6 +19,11 @@ Painted = tuple[NDArray[np.uint8], Floats, Floats]
 """A finished image: (H, W, 3) uint8, depth (P,) and confidence (P,)."""
 
 
+_ALIKE, _APART, _AROUND = 0.03, 0.06, 5
+"""Images agree where the mean difference (0..1) over so many pixels a side is below the first, not at all from the
+second on."""
+
+
 @dataclass(frozen=True)
 class Picture:
     """A rendered view (P, …); ``guessed``: share of the background's guess in the image, 0 in what has been seen."""
@@ -83,6 +88,19 @@ def continued(picture: Picture, shape: tuple[int, int], wraps: bool) -> Floats:
     image = continue_unseen(drawn, depth, confidence, wraps)
     share = np.where(confidence > 0, 0, picture.guessed.reshape(shape))[..., None]
     return image + share * (drawn - image)
+
+
+def passed(before: Floats, after: Floats, share: float) -> Floats:
+    """An image (H, W, 3) on its way from ``before`` to ``after``, of which it has ``share`` where both agree.
+
+    Where they do not, the same thing would stand in two places: those parts change at once.
+    """
+    import cv2
+
+    change = after - before
+    apart = cv2.blur(np.abs(change).max(axis=2), (_AROUND, _AROUND))
+    kept = (1 - share) * np.clip((_APART - apart) / (_APART - _ALIKE), 0, 1)
+    return np.asarray(after - kept[..., None] * change, np.float32)
 
 
 def painted(picture: Picture, image: Floats) -> Painted:

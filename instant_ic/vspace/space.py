@@ -153,6 +153,11 @@ class VirtualSpace(Drawn):
         self._train_seconds = 0.0
 
     @property
+    def shown(self) -> KeyframeSet | None:
+        """The keyframes that views show, prepared for rendering; another space may ``show`` them too."""
+        return self._shown
+
+    @property
     def keyframe(self) -> PanoramaPrior | None:
         """The newest keyframe that views show."""
         return None if self._shown is None else self._shown.keyframes[0].prior
@@ -425,7 +430,7 @@ class VirtualSpace(Drawn):
         if self._before is not None:
             before = self._drawn(device, rays, self._before, warps, layers)
             share = (self._pictures + 1) / self.config.picture.refresh_pictures
-            image = share * image + (1 - share) * canvas.continued(before, rays.shape, around)
+            image = canvas.passed(canvas.continued(before, rays.shape, around), image, share)
         return canvas.painted(picture, image)
 
     def _drawn(

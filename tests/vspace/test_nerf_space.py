@@ -19,6 +19,7 @@ from instant_ic.vspace import (
     TrainConfig,
     VirtualSpace,
     VirtualSpaceConfig,
+    canvas,
 )
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
@@ -174,12 +175,22 @@ def test_what_is_shown_passes_into_a_new_keyframe():
     shown = [space.render(CAMERA, 64, 36, 1.5).rgb.astype(float) for _ in range(6)]
     assert np.array_equal(shown[3], shown[5])
     for number, picture in enumerate(shown[:4], 1):
-        assert picture == pytest.approx(first + number / 4 * (shown[5] - first), abs=1)
+        expected = 255 * canvas.passed(*(np.float32(image / 255) for image in (first, shown[5])), number / 4)
+        assert picture == pytest.approx(expected, abs=2)
     # The field has not learnt it yet, and can at any time.
     assert len(space._scene.priors) == 1 and np.array_equal(space._scene.prior.map_from_camera, CAMERA)
     space.learn(space.scene_of(prepared))
     assert space.train(iterations=2).iterations == 2
     assert np.array_equal(space._scene.prior.map_from_camera, NEXT)
+
+
+def test_parts_that_disagree_change_at_once_and_the_others_pass():
+    before = np.full((20, 40, 3), 0.5, np.float32)
+    after = before + np.float32(0.02)
+    after[:, 20:] = 0.9  # a door elsewhere
+    image = canvas.passed(before, after, 0.25)
+    assert image[:, :16] == pytest.approx(0.505)  # a quarter of the way
+    assert image[:, 24:] == pytest.approx(0.9)
 
 
 def test_a_keyframe_that_replaces_one_that_is_not_fit_is_shown_at_once():
