@@ -23,7 +23,7 @@ from instant_ic.vspace.warp import pinhole
 
 REACH_RAD = 0.35
 """How far behind an edge the background is continued, as seen from the keyframe."""
-_NEARER = 0.12  # a surface is in front of another where its inverse depth is greater by this share
+_NEARER = 0.4  # a surface is in front of another where its inverse depth is greater by this share; less is noise
 _ON_LEVEL = 0.1  # inverse depths within this share of the floor's or the ceiling's are on it
 _BEHIND = 1.05  # a guess lies farther than what hides it by this factor
 _STEEP, _ALIKE, _LEVEL_SHARE = 0.6, 0.04, 0.6  # beyond this sine of the elevation so many heights agree so far
