@@ -220,7 +220,7 @@ class FilmedStack(SimulatedStack):
         by_page = self._webgl(map_from_shown)
         whole = np.ones((screen.height, screen.width), np.float32)
         for name, view in by_page.items():
-            images[name] = compose(view.rgb.astype(np.float32) / 255, whole, camera, self._blend)
+            images[name] = compose(view.rgb * np.float32(1 / 255), whole, camera, self._blend)
         renderer, distance_m, with_obstacle = self._truth_at(world_from_shown)
         truths = {with_obstacle: self._true(renderer, world_from_shown)}
         if distance_m is not None:
