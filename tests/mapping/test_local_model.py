@@ -97,6 +97,20 @@ def test_the_ceiling_is_measured_and_a_wall_is_none(approach: LocalModel) -> Non
     assert near.ceiling_m(np.array([0.0, 0.0, 1.2])) in (None, pytest.approx(2.7, abs=0.03))
 
 
+def test_a_thing_ends_half_way_between_its_highest_point_and_the_lowest_beam_above() -> None:
+    model, origin = LocalModel(LocalModelConfig(behind_m=0.0)), np.array([0.0, 0.0, 0.6])
+    y = np.arange(-0.5, 0.5, 0.02)
+    on = np.stack(np.meshgrid([2.0], y, np.arange(0.02, 0.6, 0.02)), -1).reshape(-1, 3)  # measured up to 0.6 m
+    above = np.stack(np.meshgrid([4.0], 2 * y, np.arange(1.4, 2.0, 0.02)), -1).reshape(-1, 3)  # over it at 1 m and more
+    for _ in range(4):
+        model.add(np.vstack([on, above]), origin, stride=1)
+    pose = pose_matrix(0.0, 0.0, 1.2)
+    depth = model.render(pose, (512, 1024)).depth_m[:, 512]
+    elevation = np.pi / 2 - (np.arange(512) + 0.5) * np.pi / 512
+    of_thing = np.abs(depth * np.cos(elevation) - 2.0) < 0.05
+    assert 1.2 + 2.0 * np.tan(elevation[of_thing].max()) == pytest.approx(0.8, abs=0.06)  # a voxel is 0.05 m
+
+
 def test_what_has_gone_vanishes() -> None:
     """Somebody stands 2 m ahead for a second, then leaves; the robot stands."""
     person = (np.array([2.0, -0.2, 0.0]), np.array([2.3, 0.2, 1.7]))
