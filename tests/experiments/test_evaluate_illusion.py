@@ -250,6 +250,7 @@ def test_a_short_film(corridor: teleop_worlds.Course, tmp_path: Path) -> None:
     # The page alone loses least; with true depth nothing is lost to depth.
     assert told[TRUE_VIEW]["psnr_mean_db"] > told["with_true_depth_and_fill"]["psnr_mean_db"] > 20
     assert told["with_true_depth_and_fill"]["psnr_mean_db"] > told["psnr_mean_db"] > 12
+    assert told["webgl_with_true_depth"]["psnr_mean_db"] > told["webgl"]["psnr_mean_db"] > 12
     assert told[TRUE_VIEW]["floor_fog_share"] < 0.01 and 0 < told["unseen_share_mean"] < 0.5
     for each in told["each"]:
         assert each["with_obstacle"] == (each["distance_m"] < 0)
@@ -259,7 +260,7 @@ def test_a_short_film(corridor: teleop_worlds.Course, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "film.json").read_text()) == told
     save_strip(tmp_path / "strip.png", [first])
     strip = cv2.imread(str(tmp_path / "strip.png"))
-    assert strip.shape == (24 + 225 * len(rows), 64 + 4 * 400, 3) and strip.std() > 20
+    assert strip.shape == (24 + 225 * len(rows), 64 + 5 * 400, 3) and strip.std() > 20
     save_plot(tmp_path / "plot.png", told)
     assert cv2.imread(str(tmp_path / "plot.png")).std() > 10
     with pytest.raises(ValueError, match="no obstacle was passed"):
