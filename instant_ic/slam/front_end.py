@@ -13,6 +13,7 @@ from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.keyframes import Keyframe, Trajectory, grown_drift, turned
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
+from instant_ic.slam.loop_search import find_place
 from instant_ic.slam.matcher import Match, Window, match_scan
 from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
@@ -20,6 +21,15 @@ RECOVERY_MARGIN = 0.1
 """Minimum score gain of the wide search over the first search."""
 START_KEYFRAMES = 4
 """Maximum number of keyframes taken at the start pose before the robot moves."""
+WIDE_GAIN = 0.35
+"""Share of the residual that a pose found over all headings must explain, of the local match's and of the second best
+place's."""
+SCORE_MEMORY, SCORE_DROP = 0.05, 0.15
+"""Weight of a scan in the usual score; a score this much below the usual one is in doubt."""
+DOUBTFUL_TURN_RAD = 0.15
+"""σ of a heading by odometry, that of a turn of 40° in one scan, above which the match is in doubt at any score."""
+WIDE_SIGMAS, WIDE_REACH_M = 3.0, 6.0
+"""Reach of the search over all headings: standard deviations of the guess since the last match, and its limit."""
 WINDOW_PER_M, WINDOW_PER_RAD, TURN_WINDOW_PER_M = 0.4, 0.4, 0.2
 """Growth of the search window with the odometry step: translation per metre, rotation per radian and per metre; twice
 the default σ of the odometry."""
@@ -61,11 +71,13 @@ class Guess:
         pose: (3,).
         sigma: (3,) along, across, rotation.
         window: search window around the pose.
+        doubtful: whether odometry reports a turn so large that its tracks may have slipped.
     """
 
     pose: FloatArray
     sigma: FloatArray
     window: Window
+    doubtful: bool = False
 
 
 @dataclass(frozen=True)
@@ -86,6 +98,8 @@ class FrontEnd:
         self.config = config
         self.trajectory = Trajectory()
         self._field = LikelihoodField(config.field, config.match.recovery_translation_m + 0.5)
+        self._lost_variance = 0.0
+        self._usual_score = 0.0
         self._covariance = np.zeros((3, 3))
         self._known: FloatArray | None = None
         self._built_at = np.zeros(2)
@@ -110,7 +124,8 @@ class FrontEnd:
             match.search_translation_m + WINDOW_PER_M * distance,
             match.search_rotation_rad + WINDOW_PER_RAD * turn + TURN_WINDOW_PER_M * distance,
         )
-        return Guess(pose, np.array([translation, translation, rotation]), self._within_recovery(window))
+        sigma = np.array([translation, translation, rotation])
+        return Guess(pose, sigma, self._within_recovery(window), rotation > DOUBTFUL_TURN_RAD)
 
     def guess_from_velocity(self, pose: FloatArray, elapsed_s: float) -> Guess:
         """Guess at ``pose`` without odometry: the window covers any motion possible in the elapsed time."""
@@ -120,6 +135,18 @@ class FrontEnd:
         window = Window(match.search_translation_m + translation, match.search_rotation_rad + rotation)
         sigma = np.array([translation, translation, rotation])
         return Guess(pose, sigma, self._within_recovery(window))
+
+    def constant_velocity(self, pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:
+        """Pose after another ``elapsed_s`` at the velocity of the last ``step`` (3,), which took ``step_s`` seconds.
+
+        The velocity is at most ``match.free_motion_*``: stamps of a few milliseconds would make it arbitrarily large.
+        """
+        match = self.config.match
+        part = elapsed_s / step_s if step_s > 0 else 0.0
+        way, turn = math.hypot(step[0], step[1]), abs(wrap_angle(float(step[2])))
+        part_m = min(part, match.free_motion_speed_mps * elapsed_s / way) if way > 0 else 0.0
+        part_rad = min(part, match.free_motion_yaw_rate_radps * elapsed_s / turn) if turn > 0 else 0.0
+        return compose2(pose, np.array([part_m * step[0], part_m * step[1], part_rad * wrap_angle(float(step[2]))]))
 
     def _within_recovery(self, window: Window) -> Window:
         match = self.config.match
@@ -159,10 +186,17 @@ class FrontEnd:
             margin = 0.0 if match.at_border else RECOVERY_MARGIN
             if recovered.score >= config.min_score and recovered.score > match.score + margin:
                 match, status = recovered, SlamStatus.RECOVERED
+        if self._doubtful(match, guess):
+            wide = self._search_all_headings(points, guess, match.score)
+            if wide is not None:
+                match, status = wide, SlamStatus.RECOVERED
         if match.score < config.min_score:
+            self._lost_variance += float(guess.sigma[0] ** 2)
             return Track(guess.pose, self._grown_covariance(guess), match.score, SlamStatus.LOST, None)
 
         accepted = accept is None or accept(match.pose, match.score, status is SlamStatus.RECOVERED)
+        self._lost_variance = 0.0
+        self._usual_score += SCORE_MEMORY * (match.score - self._usual_score)
         self._covariance = match.covariance
         added: Keyframe | None = None
         if self.in_known_map:
@@ -176,6 +210,7 @@ class FrontEnd:
         """Start a new local map and trajectory with a scan, at the predicted pose."""
         self._known = None
         self.trajectory = Trajectory()
+        self._lost_variance = 0.0
         covariance = self._grown_covariance(guess)
         keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
         return Track(guess.pose, covariance, 0.0, SlamStatus.RESTARTED, keyframe)
@@ -192,6 +227,23 @@ class FrontEnd:
         config = self.config.match
         window = Window(config.recovery_translation_m, config.recovery_rotation_rad)
         return match_scan(self._field, points, guess.pose, guess.sigma, window)
+
+    def _doubtful(self, match: Match, guess: Guess) -> bool:
+        """Whether the scan may fit better at a heading that the local search does not reach."""
+        usual = max(self.config.match.recovery_score, self._usual_score - SCORE_DROP)
+        return match.at_border or match.score < usual or guess.doubtful
+
+    def _search_all_headings(self, points: FloatArray, guess: Guess, score: float) -> Match | None:
+        """Best pose over all headings near the guess; None unless it is unique and clearly better than ``score``."""
+        sigma = math.sqrt(float(guess.sigma[0] ** 2) + self._lost_variance)
+        reach_m = min(self.config.match.recovery_translation_m + WIDE_SIGMAS * sigma, WIDE_REACH_M)
+        found = find_place(self._field, points, guess.pose, reach_m, math.pi)
+        if found is None or found.score < self.config.match.recovery_score:
+            return None
+        other = max(score, found.runner_up)
+        if found.score - other < WIDE_GAIN * (1.0 - other):
+            return None
+        return Match(found.pose, found.covariance, found.score, False)
 
     def _grown_covariance(self, guess: Guess) -> FloatArray:
         self._covariance = self._covariance + turned(np.diag(guess.sigma**2), float(guess.pose[2]))
@@ -244,9 +296,3 @@ class FrontEnd:
         self._built_at = np.array(centre[:2])
         alone = np.zeros(len(self._known), dtype=np.bool_)
         self._field.rebuild(self._built_at, [Surface(np.zeros(3), self._known, alone)])
-
-
-def constant_velocity(pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:
-    """Pose after another ``elapsed_s`` at the velocity of the last ``step`` (3,), which took ``step_s`` seconds."""
-    part = elapsed_s / step_s if step_s > 0 else 0.0
-    return compose2(pose, np.array([part * step[0], part * step[1], wrap_angle(part * step[2])]))

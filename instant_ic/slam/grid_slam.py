@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from instant_ic.geometry.poses import compose2, inverse2, relative2
 from instant_ic.jit import leave_out_blas
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.front_end import FrontEnd, Guess, SlamStatus, Track, constant_velocity
+from instant_ic.slam.front_end import FrontEnd, Guess, SlamStatus, Track
 from instant_ic.slam.integrity import Integrity, IntegrityMonitor, mixture
 from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.localization import Place, SavedMap
@@ -105,13 +105,14 @@ class GridSlam:
         self.monitor = IntegrityMonitor()
         self._framed = saved is None
         self._apart = False  # a session began after the robot was lost in the map being made
-        self._found_before: tuple[Keyframe, FloatArray] | None = None
+        self._found_before: tuple[FloatArray, FloatArray] | None = None
         self._saved_cells: tuple[SavedMap, OccupancyMap] | None = None  # a saved map, to compare scans with
         self.map_from_base: FloatArray = np.zeros(3)
         self.odom_from_base: FloatArray = np.zeros(3)
         self.map_from_odom: FloatArray = np.zeros(3)
         self._covariance: FloatArray = np.zeros((3, 3))
         self._stamp_ns: int | None = None
+        self._points: ScanPoints | None = None
         self._step: FloatArray = np.zeros(3)
         self._step_s = 0.0
         # Odometry and map pose at the last scan that came with odometry.
@@ -143,6 +144,7 @@ class GridSlam:
             raise ValueError(f"odometry at {scan.stamp_ns} ns is not finite: {odometry}")
         mount = np.asarray(base_from_laser, dtype=np.float64)
         points = scan_points(scan, mount, self.config.map.no_return_clear_m)
+        self._points = points
         guess = self._guess(odometry, scan.stamp_ns)
         if len(points.points) >= self.config.match.min_points:
             track = self._track(points, guess, scan.stamp_ns)
@@ -234,7 +236,8 @@ class GridSlam:
             return None
         job: Callable[[], Place | Outcome] | None = None
         if self.saved is not None and not self.saved.located:
-            job = self.saved.search_job(self.front_end.trajectory.recent(QUERY_KEYFRAMES))
+            recent = self.front_end.trajectory.recent(QUERY_KEYFRAMES)
+            job = None if self._points is None else self.saved.search_job(recent, self.map_from_base, self._points)
         elif self.config.loop.enabled and not self._broken and not self.front_end.in_known_map:
             new = self.front_end.trajectory.keyframes[self._handed_over :]
             self._handed_over += len(new)
@@ -258,8 +261,8 @@ class GridSlam:
         elif isinstance(outcome, Outcome):
             self._take_over_loops(outcome)
         elif outcome.found is not None and self.saved is not None and not self.saved.located:
-            moved = correction(outcome.keyframe.map_from_base, outcome.found.pose)
-            if self._recognized(self.saved, moved, outcome.keyframe):
+            moved = correction(outcome.pose, outcome.found.pose)
+            if self._recognized(self.saved, moved, outcome.pose):
                 self._join(self.saved, moved, outcome.found.covariance, outcome.map)
 
     def finish(self) -> None:
@@ -363,8 +366,8 @@ class GridSlam:
         self.monitor.restart()
         return self.front_end.restart(points, guess, stamp_ns)
 
-    def _recognized(self, saved: SavedMap, moved: FloatArray, keyframe: Keyframe) -> bool:
-        """Whether the place that ``moved`` (3,) moves the recent keyframes to may be taken for theirs.
+    def _recognized(self, saved: SavedMap, moved: FloatArray, here: FloatArray) -> bool:
+        """Whether the place that ``moved`` (3,) moves the recent keyframes, and a scan at ``here`` (3,), to is theirs.
 
         They must not contradict the map there. The map of a session before is not complete: the true place may be
         missing in it, and another one look like it. A place far from where odometry says must therefore be found
@@ -374,17 +377,16 @@ class GridSlam:
         shares = [self._cells_of(saved).contradiction(compose2(moved, k.map_from_base), k.scan) for k in recent]
         if float(np.mean(shares)) > MOST_JOIN_CONTRADICTION:
             return False
-        here = keyframe.map_from_base
         step = relative2(here, compose2(moved, here))
         if not self._apart or (math.hypot(step[0], step[1]) < NEAR_M and abs(step[2]) < NEAR_RAD):
             return True
-        before, self._found_before = self._found_before, (keyframe, moved)
+        before, self._found_before = self._found_before, (here, moved)
         if before is None:
             return False
         apart = relative2(compose2(before[1], here), compose2(moved, here))
         if math.hypot(apart[0], apart[1]) > AGREE_M or abs(apart[2]) > AGREE_RAD:
             return False
-        way = relative2(before[0].map_from_base, here)
+        way = relative2(before[0], here)
         if math.hypot(way[0], way[1]) + abs(way[2]) >= CONFIRM_AFTER:
             return True
         self._found_before = before
@@ -401,7 +403,7 @@ class GridSlam:
         if odometry is not None and gap_s <= max(MAX_ODOMETRY_GAP_S, 2 * elapsed_s):
             step = relative2(self._odometry_pose, odometry)
             return self.front_end.guess_from_odometry(compose2(self._pose_at_odometry, step), step)
-        pose = constant_velocity(self.map_from_base, self._step, self._step_s, elapsed_s)
+        pose = self.front_end.constant_velocity(self.map_from_base, self._step, self._step_s, elapsed_s)
         return self.front_end.guess_from_velocity(pose, elapsed_s)
 
     def _follow(self, track: Track, odometry: FloatArray | None, stamp_ns: int) -> None:

@@ -9,67 +9,82 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from instant_ic.geometry.poses import relative2
+from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.loop_closure import LoopClosure, gather
-from instant_ic.slam.loop_search import POOL, Found, apart, find_place, pool
+from instant_ic.slam.loop_search import POOL, ROTATION_STEP_RAD, Found, apart, pool, refined
 from instant_ic.slam.map_files import occupied_points
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.pose_graph import Edge
-from instant_ic.slam.scan import FloatArray
+from instant_ic.slam.scan import FloatArray, ScanPoints
 
-ROTATIONS = 90
-COARSE_POINTS = 80
-STARTS = 24
+POINTS = 120
+"""Number of query points in the search; the refinement uses all."""
+LEVELS = 4
+"""Pooled fields, each with cells twice as wide as the one before; the first has cells of `POOL` field cells."""
+FIRST_FLOOR, FLOOR_STEP = 0.9, 0.1
+"""Score above which all poses are examined first, and its step down: a good place makes those below needless."""
 MIN_GAIN = 0.2
+"""Share of the residual of every other place that the found place must explain."""
+MAX_STARTS, MAX_NODES = 150, 1_000_000
+"""Maximum numbers of refined poses and of bounds of a search. A search that needs more has not shown that its place is
+the only one, so that place is ambiguous."""
+SAME_M, SAME_RAD = 0.3, 0.1
+"""Largest difference between the places of two scans that confirm each other."""
 UNKNOWN_STEP = np.diag([100.0, 100.0, 10.0])
 """Covariance of the motion from the last saved keyframe to the first new one."""
 
 
 @njit(cache=True)
-def score_places(field, origin, resolution, points, places, rotations):  # type: ignore[no-untyped-def]
-    """Best mean field value of the points at each place, over all headings.
+def bound_nodes(field, origin, resolution, points, nodes, floor, rotation_step):  # type: ignore[no-untyped-def]
+    """Upper bound of the score of the points over each node: a cell of translations at one heading.
 
     Args:
-        field: float32 (H, W).
-        origin: (2,) centre of cell (0, 0).
-        resolution: metres per cell.
+        field: float32 (H, W), pooled: a cell holds the best value within it and its next neighbours.
+        origin: (2,) centre of the first cell of the field that was pooled.
+        resolution: metres per pooled cell.
         points: (n, 2) in the base frame, n > 0.
-        places: (k, 2) metres.
-        rotations: number of headings tried at each place, evenly spaced around the circle.
+        nodes: int32 (k, 3): rotation, row, column; a node is the translations of a pooled cell.
+        floor: a bound below it is not computed to its end.
+        rotation_step: radians.
 
     Returns:
-        value (k,) float32 and heading (k,).
+        float32 (k,); 0 where it is below ``floor``.
     """
     height, width = field.shape
     n = points.shape[0]
-    best = np.zeros(places.shape[0], dtype=np.float32)
-    heading = np.zeros(places.shape[0])
-    for r in range(rotations):
-        yaw = -math.pi + 2 * math.pi * r / rotations
-        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-        dx = (cos_yaw * points[:, 0] - sin_yaw * points[:, 1] - origin[0]) / resolution + 0.5
-        dy = (sin_yaw * points[:, 0] + cos_yaw * points[:, 1] - origin[1]) / resolution + 0.5
-        for k in range(places.shape[0]):
-            px, py = places[k, 0] / resolution, places[k, 1] / resolution
-            total = np.float32(0.0)
+    bounds = np.zeros(nodes.shape[0], dtype=np.float32)
+    x, y = np.empty(n), np.empty(n)
+    rotation = -1
+    for k in range(nodes.shape[0]):
+        if nodes[k, 0] != rotation:
+            rotation = nodes[k, 0]
+            cos_yaw, sin_yaw = math.cos(rotation * rotation_step), math.sin(rotation * rotation_step)
             for i in range(n):
-                # Stop once the remaining points cannot reach the best value.
-                if total + (n - i) <= best[k] * n:
-                    break
-                ix, iy = int(px + dx[i]), int(py + dy[i])
-                if 0 <= ix < width and 0 <= iy < height:
-                    total += field[iy, ix]
-            if total > best[k] * n:
-                best[k] = total / n
-                heading[k] = yaw
-    return best, heading
+                x[i] = (cos_yaw * points[i, 0] - sin_yaw * points[i, 1]) / resolution + 1000.0
+                y[i] = (sin_yaw * points[i, 0] + cos_yaw * points[i, 1]) / resolution + 1000.0
+        # A pooled cell holds the values around its lower corner; those above it are in the next one.
+        row, column = nodes[k, 1] - 999, nodes[k, 2] - 999
+        total = np.float32(0.0)
+        for i in range(n):
+            ix, iy = int(x[i]) + column, int(y[i]) + row
+            if 0 <= ix < width and 0 <= iy < height:
+                total += field[iy, ix]
+            if total + (n - 1 - i) < floor * n:
+                break
+        else:
+            bounds[k] = total / n
+    return bounds
 
 
 class Localizer:
-    """Finds scans in a saved map.
+    """Finds scans in a saved map, by branch and bound over all positions and headings.
+
+    A pooled field bounds the score of every pose of a cell of translations (Hess et al., Real-time loop closure in 2D
+    LIDAR SLAM, ICRA 2016). All cells that may hold a pose above a score are visited, so a place that is reported as
+    the only one is so by search, not by a limit on the number of candidates.
 
     Attributes:
         points: the map's occupied cells (n, 2).
@@ -86,46 +101,107 @@ class Localizer:
         free = grid.origin + grid.resolution * (np.column_stack([free_columns, free_rows]) + 0.5)
         low = np.minimum(self.points.min(axis=0), free.min(axis=0))
         high = np.maximum(self.points.max(axis=0), free.max(axis=0))
-        self._centre = (low + high) / 2
+        centre = (low + high) / 2
         field = replace(config.field, max_range_m=float((high - low).max() / 2 + 1.0))
         self._field = LikelihoodField(field, 0.5)
         self._field.rebuild(
-            np.array([*self._centre, 0.0]),
+            np.array([*centre, 0.0]),
             [Surface(np.zeros(3), self.points, np.zeros(len(self.points), dtype=np.bool_))],
         )
-        coarse = POOL * self._field.resolution
-        self._places = np.unique(np.round(free / coarse).astype(np.int64), axis=0) * coarse
-        self._pooled = pool(self._field.values, POOL)
+        self._pooled = [pool(self._field.values, POOL << level) for level in range(LEVELS)]
+        cells = np.floor((free - self._field.origin) / (POOL * self._field.resolution)).astype(np.int64)
+        self._free = [np.zeros(pooled.shape, dtype=np.bool_) for pooled in self._pooled]
+        for level, mask in enumerate(self._free):
+            mask[tuple((cells[:, ::-1] >> level).T)] = True
+        self._rotations = math.ceil(2 * math.pi / ROTATION_STEP_RAD)
         self._min_score = config.loop.min_score
 
-    def find(self, points: FloatArray) -> Found | None:
-        """Return the only pose where the points (n, 2), in the base frame, fit; None if none or several fit."""
+    def find(self, points: FloatArray) -> tuple[Found | None, bool]:
+        """Return the only pose where the points (n, 2), in the base frame, fit, and whether several places fit."""
         if len(points) < 10:
-            return None
-        few = points[(np.arange(min(len(points), COARSE_POINTS)) * len(points)) // min(len(points), COARSE_POINTS)]
-        coarse = POOL * self._field.resolution
-        value, heading = score_places(self._pooled, self._field.origin, coarse, few, self._places, ROTATIONS)
-        found: list[Found] = []
-        taken: list[FloatArray] = []
-        for k in np.argsort(-value, kind="stable"):
-            if len(found) >= STARTS or value[k] < self._min_score:
+            return None, False
+        # In an order without a pattern the sums of the bounds reach their end, or their floor, soonest.
+        few = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
+        floor = FIRST_FLOOR
+        while True:
+            starts = self._starts(few, floor)
+            if starts is None or len(starts) > MAX_STARTS:
+                return None, True
+            found = self._refined(points, starts)
+            # Every pose with a score of the floor or more is examined. Those below may matter while the best is poor.
+            rival = self._rival(found[0].score) if found else 0.0
+            if rival >= floor or floor <= self._min_score:
                 break
-            place = self._places[k]
-            if any(math.hypot(*(place - other)) < 2 * coarse for other in taken):
-                continue
-            taken.append(place)
-            start = np.array([*place, heading[k]])
-            near = find_place(self._field, points, start, 2 * coarse, 2 * math.pi / ROTATIONS)
-            if near is not None:
-                found.append(near)
-        if not found:
-            return None
-        found.sort(key=lambda one: -one.score)
+            floor = max(self._min_score, floor - FLOOR_STEP, rival)
+        if not found or found[0].score < self._min_score:
+            return None, False
         best = found[0]
-        others = [one.score for one in found[1:] if apart(one.pose, best.pose)]
-        best = replace(best, runner_up=max(others, default=0.0))
-        gain = (best.score - best.runner_up) / max(1.0 - best.runner_up, 1e-6)
-        return best if best.score >= self._min_score and gain >= MIN_GAIN else None
+        runner_up = max((one.score for one in found[1:] if apart(one.pose, best.pose)), default=0.0)
+        if runner_up > self._rival(best.score):
+            return None, True
+        return replace(best, runner_up=runner_up), False
+
+    @staticmethod
+    def _rival(score: float) -> float:
+        """Score of another place from which on a place with ``score`` is ambiguous."""
+        return (score - MIN_GAIN) / (1.0 - MIN_GAIN)
+
+    def _starts(self, points: FloatArray, floor: float) -> FloatArray | None:
+        """Poses (k, 3), best bound first, around which every score of ``floor`` or more lies; None if too many."""
+        step = 2 * math.pi / self._rotations
+        nodes = np.argwhere(self._free[-1])
+        nodes = np.column_stack(
+            [np.repeat(np.arange(self._rotations), len(nodes)), np.tile(nodes, (self._rotations, 1))]
+        ).astype(np.int32)
+        visited = 0
+        bounds = np.zeros(0, dtype=np.float32)
+        for level in range(LEVELS - 1, -1, -1):
+            resolution = self._field.resolution * (POOL << level)
+            visited += len(nodes)
+            if visited > MAX_NODES:
+                return None
+            bounds = bound_nodes(self._pooled[level], self._field.origin, resolution, points, nodes, floor, step)
+            nodes, bounds = nodes[bounds >= floor], bounds[bounds >= floor]
+            if level > 0:
+                corners = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]], dtype=np.int32)
+                nodes = (nodes[:, None] * np.array([1, 2, 2], dtype=np.int32) + corners).reshape(-1, 3)
+                rows, columns = self._free[level - 1].shape
+                inside = (nodes[:, 1] < rows) & (nodes[:, 2] < columns)
+                nodes = nodes[inside]
+                nodes = nodes[self._free[level - 1][nodes[:, 1], nodes[:, 2]]]
+        order = np.argsort(-bounds, kind="stable")
+        taken = [nodes[k] for k in order[keep_peaks(nodes[order], self._rotations, MAX_STARTS + 1)]]
+        kept = np.array(taken, dtype=np.float64).reshape(-1, 3)
+        coarse = POOL * self._field.resolution
+        places = self._field.origin + coarse * (kept[:, [2, 1]] + 0.5)
+        return np.column_stack([places, kept[:, 0] * step])
+
+    def _refined(self, points: FloatArray, starts: FloatArray) -> list[Found]:
+        """Best poses near ``starts`` (k, 3), best first."""
+        found = [refined(self._field, points, start) for start in starts]
+        return sorted((one for one in found if one is not None), key=lambda one: -one.score)
+
+
+@njit(cache=True)
+def keep_peaks(nodes, rotations, count):  # type: ignore[no-untyped-def]
+    """Indices of at most ``count`` nodes (k, 3), none next to one before it in translation and rotation."""
+    kept = np.zeros(count, dtype=np.int64)
+    taken = 0
+    for k in range(nodes.shape[0]):
+        near = False
+        for j in range(taken):
+            other = nodes[kept[j]]
+            turn = abs(nodes[k, 0] - other[0])
+            turn = min(turn, rotations - turn)
+            if turn <= 1 and abs(nodes[k, 1] - other[1]) <= 1 and abs(nodes[k, 2] - other[2]) <= 1:
+                near = True
+                break
+        if not near:
+            kept[taken] = k
+            taken += 1
+            if taken == count:
+                break
+    return kept[:taken]
 
 
 @dataclass(frozen=True)
@@ -133,12 +209,12 @@ class Place:
     """Result of a search in the saved map.
 
     Attributes:
-        keyframe: the keyframe that was searched for.
-        found: its pose; None if not found.
+        pose: of the scan that was searched for, in the frame of its own map (3,).
+        found: its pose in the saved map; None if not found or not confirmed by a second scan yet.
         map: built from the saved keyframes if the map is to be extended; otherwise None.
     """
 
-    keyframe: Keyframe
+    pose: FloatArray
     found: Found | None
     map: OccupancyMap | None
 
@@ -157,6 +233,7 @@ class SavedMap:
         keyframes: saved keyframes; empty if the map stays unchanged.
         edges: edges between them.
         located: whether the robot is located in the map.
+        ambiguous: whether the last search found several places that fit.
     """
 
     def __init__(
@@ -166,8 +243,10 @@ class SavedMap:
         self.localizer = Localizer(grid, config)
         self.keyframes, self.edges = graph or ([], [])
         self.located = False
+        self.ambiguous = False
         self._config = config
         self._searched: Keyframe | None = None
+        self._unconfirmed: FloatArray | None = None
 
     @property
     def extends(self) -> bool:
@@ -179,18 +258,36 @@ class SavedMap:
         """Whether the map is still as it was read."""
         return not (self.extends and self.located)
 
-    def search_job(self, recent: Sequence[Keyframe]) -> Callable[[], Place] | None:
-        """Return a job that searches the map for the recent keyframes; None if the newest was searched for already."""
-        if not recent or recent[-1] is self._searched:
+    def search_job(self, recent: Sequence[Keyframe], pose: FloatArray, scan: ScanPoints) -> Callable[[], Place] | None:
+        """Return a job that searches the map for the recent keyframes and the newest scan, whose pose is ``pose`` (3,).
+
+        None if the newest keyframe was searched for already and no place waits for its confirmation.
+        """
+        if not recent or (recent[-1] is self._searched and self._unconfirmed is None):
             return None
-        last = self._searched = recent[-1]
-        query = gather([k.map_from_base for k in recent], [k.scan for k in recent])
+        self._searched = recent[-1]
+        query = gather([*(k.map_from_base for k in recent), pose], [*(k.scan for k in recent), scan])
 
         def search() -> Place:
-            found = self.localizer.find(query)
-            return Place(last, found, self.build_map() if found is not None and self.extends else None)
+            found, self.ambiguous = self.localizer.find(query)
+            if not self._confirmed(found, pose):
+                found = None
+            return Place(pose, found, self.build_map() if found is not None and self.extends else None)
 
         return search
+
+    def _confirmed(self, found: Found | None, pose: FloatArray) -> bool:
+        """Whether the place agrees with that of the scan before; it then waits no longer."""
+        before = self._unconfirmed
+        # The saved map's pose of the other map's origin is the same for every scan.
+        self._unconfirmed = None if found is None else compose2(found.pose, relative2(pose, np.zeros(3)))
+        if found is None or before is None:
+            return False
+        rest = relative2(compose2(before, pose), found.pose)
+        if math.hypot(rest[0], rest[1]) > SAME_M or abs(wrap_angle(float(rest[2]))) > SAME_RAD:
+            return False
+        self._unconfirmed = None
+        return True
 
     def build_map(self) -> OccupancyMap:
         """Build the occupancy map from the saved keyframes."""

@@ -8,7 +8,7 @@ second best place shows whether the result is unique.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -155,26 +155,35 @@ def find_place(
         pool(field.values, POOL), field.origin, coarse, few, centre, cells, rotations, ROTATION_STEP_RAD
     )
     tops = peaks(volume, CANDIDATES, 1, 1)
-    none = np.zeros(3)
-    close: list[tuple[float, FloatArray, FloatArray, float]] = []
+    close: list[Found] = []
     for r, j, i in tops:
         start = centre + np.array([(i - cells) * coarse, (j - cells) * coarse, (r - rotations) * ROTATION_STEP_RAD])
-        if close and volume[r, j, i] < close[0][0] - 0.1:
+        if close and volume[r, j, i] < close[0].score - 0.1:
             break  # a pooled score is close to an upper bound: no later candidate can be near the best
-        x, y, yaw, _ = correlate(
-            field.values, field.origin, resolution, points, start, POOL, 4, ROTATION_STEP_RAD / 4, start,
-            none, 1.0, 1.0,
-        )  # fmt: skip
-        start = np.array([x, y, yaw])
-        pose, hessian, score, squares = refine(
-            field.values, field.origin, resolution, points, start, start, none, 1.0, 12, 0.15, 0.04
-        )
-        close.append((float(score), pose, hessian.copy(), float(squares)))
-        close.sort(key=lambda entry: -entry[0])
+        one = refined(field, points, start)
+        if one is not None:
+            close.append(one)
+            close.sort(key=lambda entry: -entry.score)
     if not close:
         return None
-    score, pose, hessian, squares = close[0]
-    others = [entry[0] for entry in close[1:] if apart(entry[1], pose)]
+    best = close[0]
+    return replace(best, runner_up=max((one.score for one in close[1:] if apart(one.pose, best.pose)), default=0.0))
+
+
+def refined(field: LikelihoodField, points: FloatArray, start: FloatArray) -> Found | None:
+    """Best pose of ``points`` (n, 2) within a pooled cell and a heading step of ``start`` (3,), without a runner-up.
+
+    None if the points give no information.
+    """
+    none = np.zeros(3)
+    x, y, yaw, _ = correlate(
+        field.values, field.origin, field.resolution, points, start, POOL, 4, ROTATION_STEP_RAD / 4, start,
+        none, 1.0, 1.0,
+    )  # fmt: skip
+    start = np.array([x, y, yaw])
+    pose, hessian, score, squares = refine(
+        field.values, field.origin, field.resolution, points, start, start, none, 1.0, 12, 0.15, 0.04
+    )
     try:
         covariance = max(squares / max(len(points) - 3, 1), 1e-3) * np.linalg.inv(hessian)
         # Information on translation with unknown heading: the Schur complement.
@@ -184,7 +193,7 @@ def find_place(
         return None
     shape = float(max(low, 0.0) / high) if high > 0 else 0.0
     pose = np.array([pose[0], pose[1], wrap_angle(float(pose[2]))])
-    return Found(pose, 0.5 * (covariance + covariance.T), score, shape, max(others, default=0.0))
+    return Found(pose, 0.5 * (covariance + covariance.T), float(score), shape, 0.0)
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:

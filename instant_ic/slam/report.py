@@ -52,7 +52,8 @@ def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel
     text = "the pose is trusted" if trust.trusted else "the robot is probably not where the pose says"
     yield Diagnosis("integrity", Level.OK if trust.trusted else Level.ERROR, text, figures)
     if not result.localized:
-        text = "the robot's place in the saved map is not known yet: drive on, or set it (/initialpose)"
+        why = "ambiguous: several places look alike" if slam.saved and slam.saved.ambiguous else "not known yet"
+        text = f"the robot's place in the saved map is {why}: drive on, or set it (/initialpose)"
         yield Diagnosis("place", Level.WARN, text)
     elif slam.saved is not None:
         yield Diagnosis("place", Level.OK, "found in the saved map")

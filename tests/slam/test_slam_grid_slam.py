@@ -195,6 +195,45 @@ def test_odometry_that_jumps_is_found_out() -> None:
     assert drive.errors[-1][0] < 0.02 and drive.errors[-1][1] < 0.01
 
 
+@pytest.mark.parametrize("turn_deg", [85.0, -85.0, 170.0])
+def test_a_heading_that_jumps_in_one_scan_turns_nothing(turn_deg: float) -> None:
+    drive = Drive(l_corridor())
+    drive.go(0.5, 0.0, 10)
+    drive.odometry = compose2(drive.odometry, [0.0, 0.0, math.radians(turn_deg)])
+    assert drive.look(drive.odometry).status is SlamStatus.RECOVERED
+    drive.go(0.5, 0.0, 10)
+    assert max(error[1] for error in drive.errors[10:]) < 0.02
+    assert max(error[0] for error in drive.errors[10:]) < 0.1
+
+
+def test_stamps_a_millisecond_apart_make_no_speed() -> None:
+    # Without odometry: a step of 5 cm that took 1 ms by its stamp does not go on at 50 m/s.
+    drive = Drive(box_room())
+    drive.go(0.0, 0.0, 1, odometry=False)
+    drive.go(0.5, 0.0, 5, odometry=False)
+    drive.stamp_ns -= STEP_NS - 1_000_000
+    drive.go(0.5, 0.0, 1, odometry=False)
+    drive.stamp_ns += STEP_NS - 1_000_000
+    drive.go(0.5, 0.0, 5, odometry=False)
+    assert all(result.status is not SlamStatus.LOST for result in drive.results)
+    assert max(error[0] for error in drive.errors) < 0.03
+
+
+@pytest.mark.parametrize("lost_after", [(25_000_000, 40), (700_000_000, 3)])
+def test_a_lost_robot_starts_anew_after_a_second_at_any_scan_rate(lost_after: tuple[int, int]) -> None:
+    step_ns, scans = lost_after
+    drive = Drive(box_room())
+    drive.go(0.4, 0.0, 10)
+    corners = [(-9.0, -5.0), (14.0, -7.0), (1.0, 16.0)]
+    drive.world = PlanarWorld([(*corners[k], *corners[(k + 1) % 3]) for k in range(3)])
+    drive.true = np.zeros(3)
+    statuses = []
+    for _ in range(scans):
+        drive.stamp_ns += step_ns - STEP_NS
+        statuses.append(drive.look(drive.odometry).status)
+    assert statuses == [SlamStatus.LOST] * (scans - 1) + [SlamStatus.RESTARTED]
+
+
 def test_a_robot_put_elsewhere_is_lost_then_starts_anew() -> None:
     drive = Drive(box_room())
     drive.go(0.4, 0.0, 10)
