@@ -1,7 +1,8 @@
 """Collision monitor: the last step before ``/cmd_vel`` (after nav2_collision_monitor).
 
-It checks the newest scan and 3D points against the true footprint. The caller adds the costmap's memory
-(``blind_radius_m``, ``memory_range_m``) of things that are too near or too low to be seen.
+It checks the newest scan and 3D points against the true footprint, on the path that the robot takes from its present
+speed to the commanded one. The caller adds the costmap's memory (``blind_radius_m``, ``memory_range_m``) of things that
+are too near or too low to be seen, and people with their velocity (``moving.py``).
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 
 from instant_ic.config.ranges import NotNegative, Positive, PositiveInt, Range, check_ranges
 from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.moving import MOST_SPEED_M_S, NOTHING_MOVES, MovingPoints
 
 ActionType = Literal["stop", "slowdown", "limit", "approach"]
 
@@ -36,6 +39,8 @@ class PolygonConfig:
         angular_limit: limit: largest angular speed, in rad/s.
         time_before_collision: approach: seconds to contact below which the command is slowed in proportion.
         stop_time_s: approach: seconds to contact at which the command becomes zero.
+        moving_stop_time_s: approach: the same for contact with a person or another moving thing: the robot stands by
+            then.
         simulation_time_step: approach, stop: seconds between the simulated poses.
     """
 
@@ -49,12 +54,14 @@ class PolygonConfig:
     angular_limit: Positive = 0.5
     time_before_collision: Positive = 1.2
     stop_time_s: NotNegative = 0.1
+    moving_stop_time_s: NotNegative = 0.6
     simulation_time_step: Positive = 0.05
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if not self.stop_time_s < self.time_before_collision:
-            raise ValueError(f"stop_time_s must be below time_before_collision (got {self.stop_time_s})")
+        for name in ("stop_time_s", "moving_stop_time_s"):
+            if not getattr(self, name) < self.time_before_collision:
+                raise ValueError(f"{name} must be below time_before_collision (got {getattr(self, name)})")
         if self.points:
             parse_polygon(self.points)
 
@@ -148,15 +155,23 @@ class CollisionMonitor:
     move so that the contact gets smaller: ``stop`` and ``approach`` block only motion that goes deeper.
     """
 
-    def __init__(self, config: CollisionMonitorConfig, footprint: Footprint) -> None:
+    def __init__(
+        self, config: CollisionMonitorConfig, footprint: Footprint, limits: MotionLimits | None = None
+    ) -> None:
         self.config = config
         self.footprint = footprint
+        self.limits = limits or MotionLimits()
         self._polygons = [_polygon(name, polygon, footprint) for name, polygon in config.polygons().items()]
         self.most_points_needed = max((p.config.min_points for p in self._polygons), default=1)
         """A cell of memory must count as that many points for every polygon to notice it."""
 
     def limit(
-        self, command: tuple[float, float], points: NDArray[np.float64], source_age_s: float = 0.0
+        self,
+        command: tuple[float, float],
+        points: NDArray[np.float64],
+        source_age_s: float = 0.0,
+        velocity: tuple[float, float] | None = None,
+        moving: MovingPoints = NOTHING_MOVES,
     ) -> MonitoredCommand:
         """The part of the command (m/s, rad/s) that may be sent.
 
@@ -164,6 +179,8 @@ class CollisionMonitor:
             command: the requested command.
             points: (N, 2) points seen, in ``base_link`` at present.
             source_age_s: age of the oldest required source of the points.
+            velocity: present twist of the robot; None: it moves as commanded already.
+            moving: points of people and other moving things, in ``base_link`` at present.
         """
         linear, angular = command
         if not (math.isfinite(linear) and math.isfinite(angular)):
@@ -172,30 +189,34 @@ class CollisionMonitor:
             return MonitoredCommand(command, "free", math.inf)
         if not source_age_s <= self.config.source_timeout:
             return MonitoredCommand((0.0, 0.0), "stop", 0.0, "source_timeout")
-        squares = (points**2).sum(axis=1)
+        velocity = command if velocity is None else velocity
+        standing = MovingPoints(points, np.zeros_like(points))
         factor, action, decided, soonest = 1.0, "free", "", math.inf
         for polygon in self._polygons:
-            share, time_s = self._allowed(polygon, linear, angular, points, squares)
-            soonest = min(soonest, time_s)
-            if share < factor:
-                factor, decided = share, polygon.name
-                action = "stop" if share == 0.0 else polygon.config.action_type
+            for seen in (standing, moving):
+                share, time_s = self._allowed(polygon, command, velocity, seen, seen is moving)
+                soonest = min(soonest, time_s)
+                if share < factor:
+                    factor, decided = share, polygon.name
+                    action = "stop" if share == 0.0 else polygon.config.action_type
         return MonitoredCommand((linear * factor, angular * factor), action, soonest, decided)
 
     def _allowed(
         self,
         polygon: _Polygon,
-        linear: float,
-        angular: float,
-        points: NDArray[np.float64],
-        squares: NDArray[np.float64],
+        command: tuple[float, float],
+        velocity: tuple[float, float],
+        seen: MovingPoints,
+        moving: bool,
     ) -> tuple[float, float]:
         """Share of the command that one polygon allows, and the time to collision; inf where not computed."""
         config = polygon.config
         looks_ahead = config.action_type in ("approach", "stop")
         horizon = config.time_before_collision if config.action_type == "approach" else 3 * config.simulation_time_step
-        reach = polygon.reach + 0.05 + (abs(linear) * horizon if looks_ahead else 0.0)
-        near = np.ascontiguousarray(points[squares < reach**2], dtype=np.float64)
+        speed = max(abs(command[0]), abs(velocity[0])) + (MOST_SPEED_M_S if moving else 0.0)
+        reach = polygon.reach + 0.05 + (speed * horizon if looks_ahead else 0.0)
+        close = (seen.points**2).sum(axis=1) < reach**2
+        near = np.ascontiguousarray(seen.points[close], dtype=np.float64)
         if len(near) < config.min_points:
             return 1.0, math.inf
         if not looks_ahead or config.action_type == "stop":
@@ -205,13 +226,14 @@ class CollisionMonitor:
         if config.action_type == "slowdown":
             return config.slowdown_ratio, math.inf
         if config.action_type == "limit":
-            share = min(config.linear_limit / max(abs(linear), 1e-9), config.angular_limit / max(abs(angular), 1e-9))
-            return min(1.0, share), math.inf
+            linear, angular = abs(command[0]), abs(command[1])
+            return min(1.0, config.linear_limit / max(linear, 1e-9), config.angular_limit / max(angular, 1e-9)), math.inf
         time_s = float(
             _time_to_collision(
                 near,
-                linear,
-                angular,
+                np.ascontiguousarray(seen.velocities[close], dtype=np.float64),
+                np.array([velocity, command], dtype=np.float64),
+                np.array([self.limits.max_linear_accel_m_s2, self.limits.max_angular_accel_rad_s2]),
                 polygon.normals,
                 polygon.offsets,
                 config.simulation_time_step,
@@ -221,7 +243,8 @@ class CollisionMonitor:
         )
         if math.isinf(time_s):
             return 1.0, time_s
-        if config.action_type == "stop" or time_s <= config.stop_time_s:
+        stop_s = config.moving_stop_time_s if moving else config.stop_time_s
+        if config.action_type == "stop" or time_s <= stop_s:
             return 0.0, time_s
         return time_s / config.time_before_collision, time_s
 
@@ -245,29 +268,35 @@ def _depth(x: float, y: float, normals: NDArray[np.float64], offsets: NDArray[np
 @njit(cache=True)
 def _time_to_collision(
     points: NDArray[np.float64],
-    linear: float,
-    angular: float,
+    velocities: NDArray[np.float64],
+    twists: NDArray[np.float64],
+    accelerations: NDArray[np.float64],
     normals: NDArray[np.float64],
     offsets: NDArray[np.float64],
     step: float,
     horizon: float,
     min_points: int,
 ) -> float:
-    """Start of the first step in which at least ``min_points`` points enter the polygon (or go deeper)."""
+    """Start of the first step in which at least ``min_points`` points enter the polygon (or go deeper).
+
+    The robot accelerates from ``twists[0]`` to ``twists[1]``, the points (N, 2) move at ``velocities``.
+    """
     depth = np.empty(points.shape[0])
     for j in range(points.shape[0]):
         depth[j] = _depth(points[j, 0], points[j, 1], normals, offsets)
+    x, y, yaw = 0.0, 0.0, 0.0
+    now = twists[0].copy()
     for k in range(1, math.ceil(horizon / step) + 1):
-        turn = angular * step * k
-        if abs(turn) > 1e-9:
-            radius = linear / angular
-            x, y = radius * math.sin(turn), radius * (1.0 - math.cos(turn))
-        else:
-            x, y = linear * step * k, 0.0
-        c, s = math.cos(turn), math.sin(turn)
+        for i in range(2):
+            most = accelerations[i] * step
+            now[i] += min(max(twists[1, i] - now[i], -most), most)
+        half = 0.5 * now[1] * step
+        chord = now[0] * step * (math.sin(half) / half if half != 0.0 else 1.0)
+        x, y, yaw = x + chord * math.cos(yaw + half), y + chord * math.sin(yaw + half), yaw + 2.0 * half
+        c, s = math.cos(yaw), math.sin(yaw)
         inside = 0
         for j in range(points.shape[0]):
-            dx, dy = points[j, 0] - x, points[j, 1] - y
+            dx, dy = points[j, 0] + velocities[j, 0] * step * k - x, points[j, 1] + velocities[j, 1] * step * k - y
             new_depth = _depth(c * dx + s * dy, c * dy - s * dx, normals, offsets)
             if new_depth > 0.0 and new_depth > depth[j] + 1e-3:
                 inside += 1

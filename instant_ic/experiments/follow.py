@@ -13,22 +13,24 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.base.config import LimitsConfig, SkidSteerConfig
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, scan_points, scan_rays
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import sort_points
 from instant_ic.control.kinematics import MotionLimits, accelerate
+from instant_ic.control.moving import MovingPoints, MovingThings
 from instant_ic.control.navigator import Navigator
 from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, Predictor
-from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
+from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, MonitoredCommand
 from instant_ic.control.static_map import StaticMap
 from instant_ic.control.subgoal import SubgoalConfig, choose_subgoal
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
@@ -120,7 +122,7 @@ class _Drive:
         start: tuple[float, float, float] = tuple(float(v) for v in self.room.start)  # type: ignore[assignment]
         self.robot = TrackedRobot(RobotConfig(slip=0.05, turn_slip=0.08), self.mask, start, seed=1000 * seed + index)
         self.distance = self.mask.distance_m()
-        self.late: deque[tuple[float, float]] = deque([(0.0, 0.0)] * int(self.rng.integers(1, 4)))
+        self.late: deque[MonitoredCommand] = deque([MonitoredCommand((0.0, 0.0), "free", 0.0)] * int(self.rng.integers(1, 4)))
         self.velocity = (0.0, 0.0)
         self.pose_error = np.zeros(3)
         self.touching: set[int] = set()
@@ -130,6 +132,7 @@ class _Drive:
         self.static = self._map()
         self.walls = WallMap(self.static)
         self.costmaps = RollingCostmap(self.config, footprint)
+        self.moving = MovingThings()
         self.costmap: Costmap | None = None
         self.published: Costmap | None = None
         self.planner = _TimedPlanner()
@@ -196,7 +199,7 @@ class _Drive:
         self.pose_error = 0.95 * self.pose_error + self.rng.normal(0.0, [0.005, 0.005, 0.002])
         estimate = self.robot.pose + self.pose_error
         if k % 2 == 0:
-            self._see(estimate, publish=k % 4 == 0)
+            self._see(estimate, k * DT_S, publish=k % 4 == 0)
         assert self.costmap is not None and self.published is not None
         command = self._operator()
         self.vbot.step(command, estimate, DT_S)  # its route avoids the walls
@@ -216,8 +219,12 @@ class _Drive:
         else:
             self.plan_reason = "no free place near the v-bot"
         self.nav = wanted
-        sent = self.monitor.limit(wanted, self._close_points(estimate)).command
-        self._move(sent)
+        velocity = (float(self.robot.twist[0]), float(self.robot.twist[2]))
+        self._move(
+            self.monitor.limit(
+                wanted, self._close_points(estimate), velocity=velocity, moving=self._moving_points(estimate, k * DT_S)
+            )
+        )
 
     def _operator(self) -> tuple[float, float]:
         """Steer the v-bot along its route: turn towards a point 0.4 m ahead and drive; release at the goal."""
@@ -232,7 +239,7 @@ class _Drive:
         bearing = math.atan2(float(y), float(x))
         return (0.0 if abs(bearing) > 0.6 else OPERATOR_M_S), min(max(1.5 * bearing, -0.8), 0.8)
 
-    def _see(self, estimate: FloatArray, publish: bool) -> None:
+    def _see(self, estimate: FloatArray, time_s: float, publish: bool) -> None:
         points = worlds.look(self.room, self.people, self.robot.pose, self.rng)
         ranges = worlds.flat_ranges(points)
         beam = 2 * math.pi / worlds.BEAMS
@@ -243,6 +250,7 @@ class _Drive:
         began = time.thread_time()
         sweep = sort_points(cloud, np.zeros(len(cloud), np.float32), map_from_lidar[None], 0.0, self.config.points)
         rays = scan_rays(*scan, map_from_lidar, self.config)
+        self.moving.update(sweep, time_s)
         self.costmap = self.costmaps.update(estimate, self.static, rays, sweep)
         self.episode.costmap_ms.append(1e3 * (time.thread_time() - began))
         if publish:
@@ -261,12 +269,22 @@ class _Drive:
         memory = self.costmap.memory_near(estimate, config.blind_radius_m, config.memory_range_m)
         return np.concatenate([seen, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
 
-    def _move(self, command: tuple[float, float]) -> None:
+    def _moving_points(self, estimate: FloatArray, time_s: float) -> MovingPoints:
+        c, s = math.cos(estimate[2]), math.sin(estimate[2])
+        turn, found = np.array([[c, -s], [s, c]]), self.moving.moving(time_s)
+        return MovingPoints((found.points - estimate[:2]) @ turn, found.velocities @ turn)
+
+    def _move(self, command: MonitoredCommand) -> None:
         self.late.append(command)
         asked = self.late.popleft()
+        limits = MotionLimits()
+        if asked.action == "stop":  # the arbiter marks it as a hard stop, which the base obeys with its own ramp
+            hard = LimitsConfig().hard_decel_m_s2
+            turning = 2.0 * hard / SkidSteerConfig().effective_width
+            limits = replace(limits, max_linear_accel_m_s2=hard, max_angular_accel_rad_s2=turning)
         steering, before = self.robot.kinematics, self.robot.pose.copy()
         for _ in range(3):
-            self.velocity = accelerate(self.velocity, asked, MotionLimits(), DT_S / 3)
+            self.velocity = accelerate(self.velocity, asked.command, limits, DT_S / 3)
             self.robot.step(steering.motors_from_tracks(steering.tracks_from_twist(*self.velocity)), DT_S / 3)
         for i, person in enumerate(self.people):
             gap, _ = worlds.gap_to_robot(person.place, self.robot.pose)

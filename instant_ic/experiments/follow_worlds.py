@@ -33,8 +33,8 @@ WALL_M = 0.10
 PERSON_M = 0.22
 """Radius of a person."""
 KINDS = ("wall", "box", "low", "hanging")
-BLIND_M = LIDAR_HEIGHT_M / math.tan(math.radians(15.0))
-"""Within this distance the lowest beam of a standing VLP-16 does not reach the floor."""
+STEEPEST = math.tan(math.radians(15.0))
+"""Slope of the lowest and the highest ring."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +118,11 @@ def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> R
         # Remove objects at the start and the goal.
         start = np.array([*rng.uniform([0.8, 0.8], size - 0.8), rng.uniform(-math.pi, math.pi)])
         goal = rng.uniform([0.8, 0.8], size - 0.8)
-        # A robot that drove to its start has seen the low objects around it. A robot placed there has not: no beam
-        # reaches them, so no planner could avoid them.
+        # A robot that drove to its start has seen the low and hanging objects around it. A robot placed there has not:
+        # no beam reaches them, so no planner could avoid them.
         clear = np.array(
             [
-                k == 0 or (_away(s, start[:2]) > (BLIND_M if KINDS[k] == "low" else 0.6) and _away(s, goal) > 0.6)
+                k == 0 or (_away(s, start[:2]) > max(0.6, _blind_m(s, KINDS[k])) and _away(s, goal) > 0.6)
                 for s, k in zip(every, kinds, strict=True)
             ]
         )
@@ -168,6 +168,13 @@ def _thing(rng: np.random.Generator, size: FloatArray, kind: int) -> Sequence[fl
     if kind == 2:
         half_x, half_y = max(half_x, 0.1), max(half_y, 0.1)
     return (x, y, half_x, half_y, rng.uniform(-math.pi, math.pi), low, high)
+
+
+def _blind_m(shape: Sequence[float] | FloatArray, kind: str) -> float:
+    """Distance within which a standing VLP-16 may not hit a low or a hanging object, metres; 0 for others."""
+    if kind == "hanging":
+        return (float(shape[5]) - LIDAR_HEIGHT_M) / STEEPEST
+    return LIDAR_HEIGHT_M / STEEPEST if kind == "low" else 0.0
 
 
 def _away(shape: Sequence[float] | FloatArray, point: FloatArray) -> float:
