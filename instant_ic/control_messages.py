@@ -119,6 +119,7 @@ class ArbiterInbox:
             estop_button=latch.button,
             estop_why=latch.why,
             scan_points=np.zeros((0, 2)) if near is None else near,
+            moving=surroundings.moving_points(now_ns),
             costmap=surroundings.costmap,
             walls=walls,
             vspace=Vspace() if status is None else _vspace(status),

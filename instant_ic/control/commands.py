@@ -36,7 +36,7 @@ class CommandRules:
 
     def __init__(self, config: ArbiterConfig) -> None:
         self.config = config
-        self.monitor = CollisionMonitor(config.collision_monitor, config.footprint)
+        self.monitor = CollisionMonitor(config.collision_monitor, config.footprint, config.limits)
         self.sources = SourceMonitor(config)
 
     def command(self, s: Snapshot, stopped_by: Notice) -> DriveCommand:
@@ -112,7 +112,8 @@ class CommandRules:
             config = self.config.collision_monitor
             memory = inputs.costmap.memory_near(inputs.robot_pose, config.blind_radius_m, config.memory_range_m)
             points = np.concatenate([points, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
-        return self.monitor.limit(command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
+        age_s = max(inputs.age("scan"), inputs.ages.get("points", 0.0))
+        return self.monitor.limit(command, points, age_s, inputs.robot_velocity, inputs.moving)
 
     def _slowed(self, command: Twist2, distance_m: float, reach_m: float) -> Twist2:
         """The command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""

@@ -152,7 +152,7 @@ def _look(sweep: SortedPoints, time_s: float) -> _Look:
     column = np.floor((np.arctan2(away[:, 1], away[:, 0]) + math.pi) * (AZIMUTHS / (2 * math.pi))).astype(np.int64)
     ranges = np.full(AZIMUTHS, np.inf)
     np.minimum.at(ranges, column % AZIMUTHS, np.linalg.norm(away, axis=1))
-    tall = (np.abs(sweep.ends - ranges) < _MARGIN_M).sum(axis=0) >= _TALL_ROWS
+    tall = ((sweep.ends > ranges - _MARGIN_M) & (sweep.ends < ranges + _MARGIN_M)).sum(axis=0) >= _TALL_ROWS
     return _Look(time_s, origin, ranges, tall)
 
 

@@ -7,6 +7,7 @@ are too near or too low to be seen, and people with their velocity (``moving.py`
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from dataclasses import dataclass, field
@@ -189,12 +190,13 @@ class CollisionMonitor:
             return MonitoredCommand(command, "free", math.inf)
         if not source_age_s <= self.config.source_timeout:
             return MonitoredCommand((0.0, 0.0), "stop", 0.0, "source_timeout")
-        velocity = command if velocity is None else velocity
+        # Both as if it moved as commanded already, and as it moves: a command to slow down or to turn away takes time.
+        starts = {command, command if velocity is None else velocity}
         standing = MovingPoints(points, np.zeros_like(points))
         factor, action, decided, soonest = 1.0, "free", "", math.inf
         for polygon in self._polygons:
-            for seen in (standing, moving):
-                share, time_s = self._allowed(polygon, command, velocity, seen, seen is moving)
+            for start, seen in itertools.product(starts, (standing, moving)):
+                share, time_s = self._allowed(polygon, command, start, seen, seen is moving)
                 soonest = min(soonest, time_s)
                 if share < factor:
                     factor, decided = share, polygon.name
@@ -205,15 +207,16 @@ class CollisionMonitor:
         self,
         polygon: _Polygon,
         command: tuple[float, float],
-        velocity: tuple[float, float],
+        start: tuple[float, float],
         seen: MovingPoints,
         moving: bool,
     ) -> tuple[float, float]:
-        """Share of the command that one polygon allows, and the time to collision; inf where not computed."""
+        """Share of the command that one polygon allows from the twist ``start`` on, and the time to collision; inf where
+        not computed."""
         config = polygon.config
         looks_ahead = config.action_type in ("approach", "stop")
         horizon = config.time_before_collision if config.action_type == "approach" else 3 * config.simulation_time_step
-        speed = max(abs(command[0]), abs(velocity[0])) + (MOST_SPEED_M_S if moving else 0.0)
+        speed = max(abs(command[0]), abs(start[0])) + (MOST_SPEED_M_S if moving else 0.0)
         reach = polygon.reach + 0.05 + (speed * horizon if looks_ahead else 0.0)
         close = (seen.points**2).sum(axis=1) < reach**2
         near = np.ascontiguousarray(seen.points[close], dtype=np.float64)
@@ -232,7 +235,7 @@ class CollisionMonitor:
             _time_to_collision(
                 near,
                 np.ascontiguousarray(seen.velocities[close], dtype=np.float64),
-                np.array([velocity, command], dtype=np.float64),
+                np.array([start, command], dtype=np.float64),
                 np.array([self.limits.max_linear_accel_m_s2, self.limits.max_angular_accel_rad_s2]),
                 polygon.normals,
                 polygon.offsets,

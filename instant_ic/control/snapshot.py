@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import Costmap
+from instant_ic.control.moving import NOTHING_MOVES, MovingPoints
 from instant_ic.control.prediction import Prediction, Predictor
 from instant_ic.control.reasons import Notice, Stale
 from instant_ic.control.states import Mode
@@ -55,6 +56,8 @@ class ArbiterInputs:
     """Text for the operator of a stop that nobody pressed in this run; empty: the usual text."""
     scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) hits of the newest scan and 3D points in ``base_link``, at the robot's present pose."""
+    moving: MovingPoints = NOTHING_MOVES
+    """People and other moving things, in ``base_link`` at the robot's present pose."""
     costmap: Costmap | None = None
     walls: WallMap | None = None
     vspace: Vspace = field(default_factory=Vspace)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, scan_points, scan_rays
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import SortedPoints, sort_points
+from instant_ic.control.moving import NOTHING_MOVES, MovingPoints, MovingThings
 from instant_ic.control.static_map import StaticMap
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
@@ -89,6 +90,7 @@ class Surroundings:
         self._map_from_odom: Matrix | None = None
         self._scan_hits: NDArray[np.float64] | None = None  # (N, 2) of the newest scan with a transform, in odom
         self._sweep: SortedPoints | None = None  # newest 3D points, in odom
+        self._moving = MovingThings()
         self._used: dict[str, tuple[int, int]] = {}  # last scan and points with a transform: stamp, arrival
         self._published_ns: int | None = None
         self._in_costmap: tuple[int, int] = (-1, -1)  # stamps of the scan and the points in the costmap
@@ -123,6 +125,18 @@ class Surroundings:
             self._find("scan", False, f"scan cannot be placed: {error}")
             return None
         return np.asarray(near @ base_from_odom[:2, :2].T + base_from_odom[:2, 3])
+
+    def moving_points(self, now_ns: int) -> MovingPoints:
+        """Points and velocities of people and other moving things, in ``base_link`` now; needs 3D points."""
+        found = self._moving.moving(now_ns / 1e9)
+        if len(found.points) == 0:
+            return NOTHING_MOVES
+        try:
+            base_from_odom = self._tf.lookup("base_link", "odom")
+        except TransformError:
+            return NOTHING_MOVES  # near_points has reported it
+        turn = base_from_odom[:2, :2].T
+        return MovingPoints(found.points @ turn + base_from_odom[:2, 3], found.velocities @ turn)
 
     def used_age_s(self, key: str, now_ns: int, steady_ns: int) -> float:
         """Age of the last ``scan`` or ``points`` with a transform, since its arrival or its stamp, whichever is longer.
@@ -203,6 +217,7 @@ class Surroundings:
             return -1
         try:
             self._sweep = self._sorted(cloud)
+            self._moving.update(self._sweep, cloud.stamp_ns / 1e9)
         except TransformError as error:
             self._find("points", False, f"3D points cannot be used: {error}")
             return -1
