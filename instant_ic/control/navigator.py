@@ -13,6 +13,7 @@ from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerCommand, PathFollower
 from instant_ic.control.kinematics import move
 from instant_ic.control.planner import HybridPlanner, Plan, no_plan
+from instant_ic.control.progress import Progress
 from instant_ic.geometry.poses import relative2
 
 
@@ -26,6 +27,8 @@ class RecoveryConfig:
         speed_m_s: m/s; backwards, the next time forwards.
         moved_m: m from which on the robot counts as moving.
         turned_rad: rad from which on it counts as moving.
+        give_up_after_s: s in which the way to a standing goal has not become shorter, after which the robot stands and
+            says that there is no way.
         keep_plan_s: s for which a path to the goal that is still free is kept when no new one is found.
     """
 
@@ -34,6 +37,7 @@ class RecoveryConfig:
     speed_m_s: Positive = 0.15
     moved_m: Positive = 0.03
     turned_rad: Positive = 0.05
+    give_up_after_s: Positive = 8.0
     keep_plan_s: NotNegative = 3.0
 
     def __post_init__(self) -> None:
@@ -60,7 +64,8 @@ class Navigator:
     and plans again; the next time it moves forwards. The collision monitor also checks these commands.
 
     In a passage hardly wider than the robot, noise opens and closes the way from one plan to the next. When no new path
-    is found, a path to the goal that is still free is therefore kept for ``recovery.keep_plan_s``.
+    is found, a path to the goal that is still free is therefore kept for ``recovery.keep_plan_s``. A robot that shuttles
+    between ways which turn out to be closed stops, and tries again when a way stays open.
     """
 
     def __init__(
@@ -74,12 +79,16 @@ class Navigator:
         self.follower = follower
         self.replan_period_s = replan_period_s
         self.recovery = recovery or RecoveryConfig()
+        self._progress = Progress(self.recovery.give_up_after_s)
+        self._lost = False
         self._body = planner.footprint.points(0.045)
         self.reset()
 
     def reset(self) -> None:
         """Forget the plan and the follower's state."""
         self.follower.reset()
+        self._progress.reset()
+        self._lost = False
         self._plan = _NO_PLAN
         self._planned_ns: int | None = None
         self._found_ns: int | None = None  # when a path all the way to the goal was last planned
@@ -102,7 +111,14 @@ class Navigator:
         if due:
             self._plan = self._planned(costmap, pose, subgoal, now_ns)
             self._planned_ns = now_ns
+            self._lost = self._progress.lost(self._plan, pose, subgoal, now_ns)
         plan = _with_end(self._plan, subgoal)
+        if self._lost:
+            self._recovering_ns, self._moved_ns = None, now_ns
+            self.follower.reset()
+            why = self._plan.reason or "a way opens and closes"
+            reason = f"no way found in {self.recovery.give_up_after_s:.0f} s: {why}"
+            return NavigatorStep((0.0, 0.0), "no_way", replace(plan, reached=False, reason=reason), due)
         if self._recovering(pose, now_ns):
             return NavigatorStep((self._direction * self.recovery.speed_m_s, 0.0), "recover", plan, due)
         step: FollowerCommand = self.follower.step(pose, speed_m_s, plan, subgoal_velocity, costmap)

@@ -107,13 +107,13 @@ class TestPeople:
         x, y, yaw = drive.robot.pose
         inside = np.array([x + 0.45 * math.cos(yaw), y + 0.45 * math.sin(yaw)])  # 0.15 m before the nose
         drive.people = [Person(inside, inside, 0.0, True)]
-        drive._move((0.0, 0.0))
-        drive._move((0.0, 0.0))
+        drive._move(MonitoredCommand((0.0, 0.0), "free", 0.0))
+        drive._move(MonitoredCommand((0.0, 0.0), "free", 0.0))
         assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 0)
         drive.touching.clear()
         drive.velocity, drive.robot.tracks[:] = (0.4, 0.0), 0.4
         drive.late[0] = (0.4, 0.0)
-        drive._move((0.4, 0.0))
+        drive._move(MonitoredCommand((0.4, 0.0), "free", 0.0))
         assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 1)
 
 
