@@ -211,8 +211,10 @@ class CollisionMonitor:
         seen: MovingPoints,
         moving: bool,
     ) -> tuple[float, float]:
-        """Share of the command that one polygon allows from the twist ``start`` on, and the time to collision; inf where
-        not computed."""
+        """Share of the command that one polygon allows from the twist ``start`` on, and the time to collision.
+
+        The time is inf where it is not computed.
+        """
         config = polygon.config
         looks_ahead = config.action_type in ("approach", "stop")
         horizon = config.time_before_collision if config.action_type == "approach" else 3 * config.simulation_time_step
@@ -230,7 +232,9 @@ class CollisionMonitor:
             return config.slowdown_ratio, math.inf
         if config.action_type == "limit":
             linear, angular = abs(command[0]), abs(command[1])
-            return min(1.0, config.linear_limit / max(linear, 1e-9), config.angular_limit / max(angular, 1e-9)), math.inf
+            return min(
+                1.0, config.linear_limit / max(linear, 1e-9), config.angular_limit / max(angular, 1e-9)
+            ), math.inf
         time_s = float(
             _time_to_collision(
                 near,

@@ -122,7 +122,9 @@ class _Drive:
         start: tuple[float, float, float] = tuple(float(v) for v in self.room.start)  # type: ignore[assignment]
         self.robot = TrackedRobot(RobotConfig(slip=0.05, turn_slip=0.08), self.mask, start, seed=1000 * seed + index)
         self.distance = self.mask.distance_m()
-        self.late: deque[MonitoredCommand] = deque([MonitoredCommand((0.0, 0.0), "free", 0.0)] * int(self.rng.integers(1, 4)))
+        self.late: deque[MonitoredCommand] = deque(
+            [MonitoredCommand((0.0, 0.0), "free", 0.0)] * int(self.rng.integers(1, 4))
+        )
         self.velocity = (0.0, 0.0)
         self.pose_error = np.zeros(3)
         self.touching: set[int] = set()

@@ -12,6 +12,7 @@ from instant_ic.control.commands import CommandRules
 from instant_ic.control.costmap import CostmapConfig, RollingCostmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import sort_points
+from instant_ic.control.moving import MovingPoints
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig, parse_polygon
 from instant_ic.control.snapshot import ArbiterInputs
 
@@ -133,3 +134,27 @@ def test_the_arbiter_holds_before_a_low_thing_that_only_its_memory_knows() -> No
     assert rules.monitored((-0.4, 0.0), inputs).action == "free"
     old = ArbiterInputs(**{**vars(inputs), "ages": {**inputs.ages, "points": 0.6}})
     assert rules.monitored((-0.4, 0.0), old).polygon == "source_timeout"
+
+
+def test_a_robot_that_is_faster_than_its_command_needs_its_braking_distance() -> None:
+    wall = np.array([[0.44, y] for y in (-0.1, 0.0, 0.1)])
+    approach = CollisionMonitor(CollisionMonitorConfig(), Footprint())
+    # 0.10 m before the padded nose at 0.34 m. At 0.1 m/s the point enters in the step that starts at 1.0 s.
+    assert approach.limit((0.1, 0.0), wall).time_to_collision_s == pytest.approx(1.0, abs=0.051)
+    # From 0.5 m/s down by 0.8 m/s2 in steps of 0.05 s: 0.023, 0.044, 0.063, 0.080, 0.095, 0.108 m.
+    found = approach.limit((0.1, 0.0), wall, velocity=(0.5, 0.0))
+    assert found.time_to_collision_s == pytest.approx(0.25)
+    assert found.command[0] == pytest.approx(0.1 * 0.25 / 1.2)
+
+
+@pytest.mark.parametrize(("place_m", "time_s", "speed"), [(1.14, 0.65, 0.2 * 0.65 / 1.2), (1.04, 0.55, 0.0)])
+def test_the_robot_stands_when_a_person_arrives(place_m: float, time_s: float, speed: float) -> None:
+    # 0.80 m (0.70 m) before the padded nose, closing at 1.0 + 0.2 m/s: in the step from 0.65 s (0.55 s) on.
+    person = np.array([[place_m, y] for y in (-0.05, 0.0, 0.05)])
+    moving = MovingPoints(person, np.tile([-1.0, 0.0], (3, 1)))
+    watched = CollisionMonitor(CollisionMonitorConfig(), Footprint())
+    found = watched.limit((0.2, 0.0), person, moving=moving)
+    assert found.time_to_collision_s == pytest.approx(time_s)
+    assert found.command[0] == pytest.approx(speed)
+    assert watched.limit((0.2, 0.0), person).action == "free"
+    assert watched.limit((0.2, 0.0), person, moving=MovingPoints(person, -moving.velocities)).action == "free"

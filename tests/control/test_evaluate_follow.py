@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from instant_ic.cli.main import main
+from instant_ic.control.safety import MonitoredCommand
 from instant_ic.experiments import follow
 from instant_ic.experiments import follow_worlds as worlds
 from instant_ic.experiments.follow_worlds import Person, Room
@@ -101,20 +102,30 @@ class TestPeople:
         assert gaps[-1] == pytest.approx(nearest, abs=0.051)
 
     def test_a_contact_is_of_who_made_it(self) -> None:
+        def sent(speed: float) -> MonitoredCommand:
+            return MonitoredCommand((speed, 0.0), "free", math.inf)
+
         drive = follow._Drive(0, 0)
         drive.late.clear()
-        drive.late.append((0.0, 0.0))
+        drive.late.append(sent(0.0))
         x, y, yaw = drive.robot.pose
         inside = np.array([x + 0.45 * math.cos(yaw), y + 0.45 * math.sin(yaw)])  # 0.15 m before the nose
         drive.people = [Person(inside, inside, 0.0, True)]
-        drive._move(MonitoredCommand((0.0, 0.0), "free", 0.0))
-        drive._move(MonitoredCommand((0.0, 0.0), "free", 0.0))
+        drive._move(sent(0.0))
+        drive._move(sent(0.0))
         assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 0)
         drive.touching.clear()
         drive.velocity, drive.robot.tracks[:] = (0.4, 0.0), 0.4
-        drive.late[0] = (0.4, 0.0)
-        drive._move(MonitoredCommand((0.4, 0.0), "free", 0.0))
+        drive.late[0] = sent(0.4)
+        drive._move(sent(0.4))
         assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 1)
+
+
+def test_a_hanging_thing_that_no_ring_reaches_from_the_start_counts_as_blind() -> None:
+    # Its lower edge is 0.375 m above the LiDAR; a ring of 15 degrees is that high at 0.375 / 0.268 = 1.40 m.
+    hanging = (0.0, 0.0, 0.05, 0.05, 0.0, 0.975, 2.0)
+    assert worlds._blind_m(hanging, "hanging") == pytest.approx(1.40, abs=0.005)
+    assert worlds._blind_m(hanging, "box") == 0.0
 
 
 class TestShortestWay:
