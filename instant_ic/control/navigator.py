@@ -64,8 +64,9 @@ class Navigator:
     and plans again; the next time it moves forwards. The collision monitor also checks these commands.
 
     In a passage hardly wider than the robot, noise opens and closes the way from one plan to the next. When no new path
-    is found, a path to the goal that is still free is therefore kept for ``recovery.keep_plan_s``. A robot that shuttles
-    between ways which turn out to be closed stops, and tries again when a way stays open.
+    is found, a path to the goal that is still free is therefore kept for ``recovery.keep_plan_s``.
+
+    A robot that shuttles between ways which turn out to be closed stops, and tries again when a way stays open.
     """
 
     def __init__(

@@ -30,6 +30,7 @@ class Progress:
     def reset(self) -> None:
         """Forget the goal, as when it was reached."""
         self._goal: NDArray[np.float64] | None = None
+        self._best_m, self._nearer_ns, self._ways = math.inf, 0, 0
         self._free_since_ns: int | None = None
         self._given_up = 0
 
