@@ -31,7 +31,7 @@ OCCUPIED_LOG_ODDS = 1.0
 """A cell above is a wall: two hits more than rays through it."""
 LEAST_KNOWN = 20
 """Fewer comparable rays count as so many: five of five are little evidence."""
-FULL_CONTRADICTION, FULL_DROP = 0.12, 0.2
+FULL_CONTRADICTION, FULL_DROP = 0.25, 0.2
 """Share of contradicted rays, and drop of the score, above their levels, which are full evidence together."""
 LONG_DROP, LONG_DROP_SHARE = 0.4, 0.6
 """A drop of the score this large is neutral to weak evidence without a contradiction: the place may be new."""
