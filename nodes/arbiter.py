@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from instant_ic import msg
@@ -98,7 +99,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         points = self.latest("/lidar/points", msg.PointCloud2, 10.0) if c.costmap.points.enabled else None
         shown = self.latest("/view/shown", msg.ShownPictures, 1.0, callback=self.on_shown)
         vspace = self.latest("/vspace/status", msg.VspaceStatus, 60.0, qos=LATCHED)
-        integrity = self.latest("/slam/integrity", msg.PoseIntegrity, 1.0)
+        # A doubt holds until the next report: silence is no trust. A SLAM that is gone is noticed by the age of /pose.
+        integrity = self.latest("/slam/integrity", msg.PoseIntegrity, math.inf)
         self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace, integrity)
         self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=msg.Bool)

@@ -98,7 +98,9 @@ class Ros1Source:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         store = get_typestore(Stores.EMPTY)
-        store.register(dict(typestore().fielddefs))
+        # Registered types are compiled; those of our store already are.
+        store.fielddefs.update(typestore().fielddefs)
+        store.types.update(typestore().types)
         for source in self._bag.connections:
             name = _ros2_name(source.msgtype)
             if name not in store.fielddefs:

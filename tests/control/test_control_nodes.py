@@ -25,6 +25,7 @@ from instant_ic.msg import (
     Bool,
     CompressedImage,
     ControlState,
+    PoseIntegrity,
     PoseWithCovariance,
     PoseWithCovarianceStamped,
     ShownPictures,
@@ -237,6 +238,25 @@ def test_each_loss_sends_zero_within_0_3_s_of_the_next_message(topic: str, reaso
     states = stack.drive(2.0, (0.4, 0.0))
     expected = ControlState.REAL if topic == "/operator/cmd_vel" else ControlState.STOPPED
     assert states[-1].mode == expected
+
+
+def test_a_doubt_about_the_pose_holds_until_the_next_report() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(2.5, None)
+
+    def report(lost_probability: float) -> None:
+        stack.send(
+            "/slam/integrity",
+            PoseIntegrity(header("map", stack.now), lost_probability, 0.1, 0.1, localized=True, status="tracked"),
+        )
+
+    def speed_m_s(seconds: float) -> float:
+        return twist_values(stack.drive(seconds, (0.4, 0.0))[-1].applied_command)[0]
+
+    report(0.2)
+    assert speed_m_s(4.0) == pytest.approx(ArbiterNodeConfig().pose_trust.speed_m_s)  # poses go on, reports do not
+    report(0.0)
+    assert speed_m_s(1.0) == pytest.approx(0.4)
 
 
 def test_a_camera_at_5_hz_is_late_by_its_own_rhythm() -> None:
