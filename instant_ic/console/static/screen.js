@@ -196,8 +196,7 @@ export class Screen {
   _renderView(scene) {
     const { viewer, images, look } = this;
     const resized = fit(viewer.canvas, viewer.slow ? slowPixels(scene) : 1);
-    const viewpoint = scene.camera?.position ?? scene.moved;
-    const key = rounded([scene.blend], 4) + (scene.blend > 0 ? rounded(viewpoint, 3) : "");
+    const key = rounded([scene.blend], 4) + rounded(scene.blend > 0 ? scene.camera?.position : scene.glide?.to, 3);
     const direction = [...scene.mapFromLook, look.vfov];
     // A standing robot's pose is never still: SLAM turns it by parts of a milliradian with every scan.
     const halfPixel = this._tanHalf()[0] / viewer.canvas.width;
@@ -263,7 +262,8 @@ export class Screen {
 }
 
 /** Share of the window's pixels per axis when the CPU renders: few for a scene that costs much, or has few itself. @param {Scene} scene */
-function slowPixels({ blend, camera }) {
+function slowPixels({ blend, camera, glide }) {
+  if (glide) return SLOW_LAYER_PIXELS;
   if (blend < 1) return SLOW_PIXELS;
   return camera ? SLOW_LAYER_PIXELS : SLOW_VIEW_PIXELS;
 }

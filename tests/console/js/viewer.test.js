@@ -5,7 +5,7 @@ import { test } from "node:test";
 import "./page.js";
 
 const math = await import("../../../instant_ic/console/static/math.js");
-const { cells, covers, SAMPLE, SAMPLE_FINE } = await import("../../../instant_ic/console/static/viewer.js");
+const { cells, SAMPLE, SAMPLE_FINE } = await import("../../../instant_ic/console/static/viewer.js");
 const { extended, tiles } = await import("../../../instant_ic/console/static/guide.js");
 const { Motion } = await import("../../../instant_ic/console/static/motion.js");
 const { ServerClock } = await import("../../../instant_ic/console/static/clock.js");
@@ -88,19 +88,6 @@ test("the server's clock follows the fastest answer, and the quality the slow on
   assert.equal(clock.quality, "poor");
   clock.reset();
   assert.equal(clock.at(0), null);
-});
-
-test("the view fills the window with its margin, less the motion of its nearest surface", () => {
-  // Straight ahead the corners are at 1 / 1.25 = 0.8 of the view's half size; it fades out from 0.94.
-  const scene = { viewFromLook: math.identity, tanHalf: [1, 0.6], viewTanHalf: [1.25, 0.75], moved: null };
-  assert.ok(covers(scene, 0));
-  assert.ok(!covers({ ...scene, tanHalf: [1.2, 0.6] }, 0)); // 0.96
-  assert.ok(!covers({ ...scene, viewFromLook: math.lookRotation(Math.PI, 0) }, 0)); // behind
-  // 0.1 m to the left at 1 m: 0.1 / 1.25 = 0.08 more, at 0.5 m 0.16 more.
-  assert.ok(covers({ ...scene, moved: [0, 0.1, 0] }, 1));
-  assert.ok(!covers({ ...scene, moved: [0, 0.1, 0] }, 2));
-  assert.ok(covers({ ...scene, moved: [0.3, 0, 0] }, 1.5)); // forward: the edges move out of the window
-  assert.ok(!covers({ ...scene, moved: [-0.3, 0, 0] }, 1.5));
 });
 
 test("the trajectory's canvas covers whole tiles around it, within the window", () => {
