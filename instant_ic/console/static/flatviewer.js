@@ -1,15 +1,16 @@
 // @ts-check
-// The view without WebGL: a crop of the panorama (a cylinder instead of a plane, so lines bend slightly), and the
-// rendered view. The direction is exact at the centre.
+// The view without WebGL: the panorama, pixel by pixel in the same projection as with it, and the rendered view, whose
+// direction is exact at the centre.
 
 /** @import { Colour } from "./colour.js" */
 /** @import { Scene } from "./images.js" */
 /** @import { Samples } from "./viewer.js" */
 /** @typedef {CanvasRenderingContext2D | OffscreenCanvasRenderingContext2D} Context */
 /** @typedef {{bitmap: ImageBitmap, finished: OffscreenCanvas | null, colour: Colour}} Layer */
+
+const TURN = 2 * Math.PI;
 import { plain } from "./colour.js";
 import { context2d, offscreen } from "./dom.js";
-import { panoramaPlace, rotate } from "./math.js";
 import { cells, SAMPLE, SAMPLE_FINE } from "./viewer.js";
 
 export class FlatViewer {
@@ -22,7 +23,7 @@ export class FlatViewer {
     this.busy = false; // renders synchronously
     this.restUntil = 0;
     this.lost = false;
-    /** @type {Layer | null} */
+    /** @type {ImageData | null} */
     this._panorama = null;
     /** @type {Layer | null} */
     this._view = null;
@@ -32,7 +33,10 @@ export class FlatViewer {
 
   /** @param {ImageBitmap} bitmap */
   setPanorama(bitmap) {
-    this._panorama = renewed(this._panorama, bitmap);
+    const { width, height } = bitmap, context = offscreen(width, height);
+    context.drawImage(bitmap, 0, 0);
+    bitmap.close();
+    this._panorama = context.getImageData(0, 0, width, height);
   }
 
   /** @param {ImageBitmap} bitmap */
@@ -75,17 +79,25 @@ export class FlatViewer {
     }
   }
 
-  /** @param {Context} context @param {number} width @param {number} height @param {Scene} scene @param {Layer} panorama */
-  _renderPanorama(context, width, height, scene, panorama) {
-    const image = finished(panorama, scene.panoramaColour);
-    const [centreU, centreV] = panoramaPlace(rotate(scene.panoramaFromLook, [1, 0, 0]));
-    const spanU = Math.atan(scene.tanHalf[0]) / Math.PI;
-    const spanV = (2 * Math.atan(scene.tanHalf[1])) / Math.PI;
-    // The full panorama, repeated on both sides, so that the seam needs no special case.
-    const turn = width / spanU, sheet = height / spanV;
-    const top = height / 2 - centreV * sheet;
-    for (const shift of [-1, 0, 1])
-      context.drawImage(image, width / 2 - (centreU + shift) * turn, top, turn, sheet);
+  /** @param {Context} context @param {number} width @param {number} height @param {Scene} scene @param {ImageData} panorama */
+  _renderPanorama(context, width, height, { panoramaFromLook: m, tanHalf, panoramaColour }, panorama) {
+    const [red, green, blue] = levels(panoramaColour), { data, width: columns, height: rows } = panorama;
+    const image = context.createImageData(width, height), out = image.data;
+    for (let y = 0, to = 0; y < height; y++) {
+      const up = (1 - (2 * y + 1) / height) * tanHalf[1];
+      for (let x = 0; x < width; x++, to += 4) {
+        const left = (1 - (2 * x + 1) / width) * tanHalf[0];
+        const ahead = m[0] + m[1] * left + m[2] * up, aside = m[3] + m[4] * left + m[5] * up, high = m[6] + m[7] * left + m[8] * up;
+        const column = Math.floor((0.5 - Math.atan2(aside, ahead) / TURN) * columns) % columns;
+        const row = Math.floor((0.5 - Math.atan2(high, Math.sqrt(ahead * ahead + aside * aside)) / Math.PI) * rows);
+        const from = 4 * (Math.min(row, rows - 1) * columns + column);
+        out[to] = red[data[from]];
+        out[to + 1] = green[data[from + 1]];
+        out[to + 2] = blue[data[from + 2]];
+        out[to + 3] = 255;
+      }
+    }
+    context.putImageData(image, 0, 0);
   }
 
   /** @param {Context} context @param {number} width @param {number} height @param {Scene} scene */
@@ -101,6 +113,10 @@ export class FlatViewer {
     context.drawImage(finished(this._view, scene.viewColour), x - viewWidth / 2, y - viewHeight / 2, viewWidth, viewHeight);
   }
 }
+
+/** Levels 0 to 255 of each channel in a colour. @param {Colour} colour */
+const levels = ({ gain, offset }) =>
+  gain.map((value, channel) => Uint8ClampedArray.from({ length: 256 }, (_, level) => value * level + 255 * offset[channel]));
 
 /** @param {Layer | null} old @param {ImageBitmap} bitmap @returns {Layer} */
 function renewed(old, bitmap) {

@@ -1,4 +1,4 @@
-// Geometry of the view: directions, columns of the panorama, sample cells, motion and the trajectory's extension.
+// Geometry of the view: directions, sample cells, motion and the trajectory's extension.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -24,13 +24,6 @@ test("a quaternion about z is the rotation about z", () => {
   const half = 0.35;
   close(math.fromQuaternion([0, 0, Math.sin(half), Math.cos(half)]), math.rotationZ(0.7));
   close(math.multiply(math.rotationZ(0.7), math.transpose(math.rotationZ(0.7))), math.identity);
-});
-
-test("columns of the panorama: forward in the centre, left a quarter to the left, up at the top", () => {
-  close(math.panoramaPlace([1, 0, 0]), [0.5, 0.5]);
-  close(math.panoramaPlace([0, 1, 0]), [0.25, 0.5]);
-  close(math.panoramaPlace([0, -1, 0]), [0.75, 0.5]);
-  close(math.panoramaPlace([0, 0, 1.0000001]), [0.5, 0]); // a rounding error beyond the unit sphere
 });
 
 test("angles wrap into a half turn to either side", () => {
