@@ -187,9 +187,6 @@ class NerfNode(Node[NerfConfig]):
                 confidence=float(encoded.view.confidence.mean()),
                 render_ms=self.schedule.figures(now).render_ms,
                 image=image,
-                confidence_png=np.frombuffer(encoded.mask_png, np.uint8),
-                depth_near_m=encoded.depth_near_m,
-                depth_png=np.frombuffer(encoded.depth_png, np.uint8),
             )
         )
         self.image_out.publish(image)

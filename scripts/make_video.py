@@ -61,8 +61,8 @@ class Page(_Page):
         self.mode = message.get("mode", self.mode)
         self.server.publish(kind, message)
 
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
-        super().send_frame(kind, header, payload, client)
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
+        super().send_frame(kind, header, payload)
         self.server.send_frame(kind, header, self.photo() if kind.name == "PANORAMA" else payload)
 
     def send_layers(self, layers: Any) -> None:
@@ -128,8 +128,7 @@ def film(args: argparse.Namespace) -> list[bytes]:
     with SimulatedStack(course.world, config) as stack:
         operator = Operator(stack)
         patient = DriveConfig(watchdog_s=60.0, lease_timeout_s=600.0, max_command_age_s=60.0, beat_timeout_s=60.0)
-        lead_max_m = stack.nodes["console"].config.lead.max_m
-        page_values = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M], "lead_max_m": lead_max_m}
+        page_values = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
         server = ConsoleServer(operator, ServerConfig(port=0, drive=patient), page_values)
         stack.page = stack.nodes["console"].feed.server = page_in = Page(stack, server)
         stack.nodes["console"].feed_layers(True)

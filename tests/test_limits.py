@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from instant_ic.depth.files import DepthFileError, load_depth, load_picture
-from instant_ic.geometry.depth_picture import decode_depth
 from instant_ic.jpeg import JpegError
 from instant_ic.limits import MOST_ARRAY_BYTES, check_arrays, decode_image, decode_rgb, load_image
 from instant_ic.slam.logs import LogError, read_log
@@ -48,8 +47,6 @@ def test_image_of_a_message_is_refused_by_its_declared_size(data: bytes) -> None
     assert decode_image(data, cv2.IMREAD_COLOR) is None
     with pytest.raises(JpegError, match="at most"):
         decode_rgb(data, 64, 32)
-    with pytest.raises(ValueError, match="depth image"):
-        decode_depth(data, 0.3)
 
 
 def test_image_file_is_refused_by_its_declared_size(tmp_path: Path) -> None:

@@ -18,7 +18,8 @@ _INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 3
 def upgrade_of(schema: Schema) -> Callable[[bytes], bytes] | None:
     """Function that converts a payload of ``schema`` to the present definition of its type; None where none can.
 
-    A type may have grown by fields of plain numbers, booleans and strings at its end; they get 0, False or "".
+    A type may have grown by fields of plain numbers, booleans and strings at its end; they get 0, False or "". It may
+    have lost fields at its end.
     Any other difference could change the meaning of a field.
     """
     own = schema_or_unknown(schema.name)
@@ -31,15 +32,16 @@ def upgrade_of(schema: Schema) -> Callable[[bytes], bytes] | None:
         return None
     added = {name: _default(kind) for name, kind in now[len(before) :]}
     nested = (name for name in store.fielddefs if name != schema.name)
-    unchanged = before == now[: len(before)] and all(_same(store, name) for name in nested)
+    kept = min(len(before), len(now))
+    unchanged = before[:kept] == now[:kept] and all(_same(store, name) for name in nested)
     if not unchanged or None in added.values():
         return None
     message_class = message_type(schema.name)
 
     def upgrade(payload: bytes) -> bytes:
         message = store.deserialize_cdr(payload, schema.name)
-        kept = {name: getattr(message, name) for name, _ in before}
-        return bytes(serialize(message_class(**kept, **added)))
+        fields = {name: getattr(message, name) for name, _ in before[:kept]}
+        return bytes(serialize(message_class(**fields, **added)))
 
     return upgrade
 

@@ -8,7 +8,7 @@ from instant_ic.console.client import ConsoleClient
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
 from instant_ic.console.protocol import Frame, FrameKind, ProtocolError, decode_frame, encode_frame
 from instant_ic.console.server import Backend, ConsoleError, ConsoleServer, ServerConfig
-from instant_ic.console.view import Lead, LeadConfig, Look, ViewConfig, ViewScheduler
+from instant_ic.console.view import Look, ViewConfig, ViewScheduler
 
 __all__ = [
     "Backend",
@@ -19,8 +19,6 @@ __all__ = [
     "DriveGate",
     "Frame",
     "FrameKind",
-    "Lead",
-    "LeadConfig",
     "Look",
     "ProtocolError",
     "ServerConfig",

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, MotionLimits, Mount, Rectangle
 from instant_ic.console.server import ServerConfig
-from instant_ic.console.view import LeadConfig, ViewConfig
+from instant_ic.console.view import ViewConfig
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,6 @@ class ConsoleConfig:
     """Parameters.
 
     Attributes:
-        lead: rendered views are moved to the v-bot's present position by their depth.
         state_rate_hz: rate at which mode, poses and commands are sent to the page.
         map_rate_hz: highest rate at which a changed map or costmap is sent to the page.
         dissolve_ms: duration of the dissolve between camera and rendered view; 0 = cut.
@@ -29,7 +28,6 @@ class ConsoleConfig:
 
     server: ServerConfig = field(default_factory=ServerConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
-    lead: LeadConfig = field(default_factory=LeadConfig)
     state_rate_hz: Positive = 20.0
     map_rate_hz: Positive = 2.0
     dissolve_ms: Annotated[float, Range(0, 5000)] = 250.0
@@ -49,7 +47,6 @@ class ConsoleConfig:
             "dissolve_ms": self.dissolve_ms,
             "ease_ms": self.ease_ms,
             "colour_release_s": self.colour_release_s,
-            "lead_max_m": self.lead.max_m,
             "max_accel": [self.limits.max_linear_accel_m_s2, self.limits.max_angular_accel_rad_s2],
             "footprint": [self.footprint.length_m, self.footprint.width_m],
             "camera": [0.0, 0.0, self.camera_mount.xyz[2]],

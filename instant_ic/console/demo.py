@@ -7,7 +7,6 @@ method, enough to try the page; instant_ic.control implements it.
 from __future__ import annotations
 
 import argparse
-import base64
 import logging
 import math
 import threading
@@ -23,8 +22,7 @@ from instant_ic.console.gridimage import GridImage, grey_png, grid_image
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer, ServerConfig
-from instant_ic.console.view import Lead, LeadConfig, Look, ViewConfig, ViewScheduler, view_shape
-from instant_ic.geometry.depth_picture import encode_depth
+from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, ViewScheduler, view_shape
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix, quaternion_from_matrix, wrap_angle
 from instant_ic.geometry.projections import equirect_directions, perspective_directions
 
@@ -84,7 +82,7 @@ class Demo:
         page_values: dict[str, float] | None = None,
     ) -> None:
         self.config = config or DemoConfig()
-        page = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M], "lead_max_m": LeadConfig().max_m}
+        page = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
         self.server = ConsoleServer(self, server_config, page | (page_values or {}))
         self.commands: list[tuple[float, float]] = []
         self.look = Look()
@@ -95,9 +93,7 @@ class Demo:
         self.pace = ""
         self.nodes = [{"name": "nerf", "cpu_percent": 12.0, "budget_percent": 17.0}]
         self.images = True
-        self.depth: bytes | None = None  # sent instead of the views' own depth
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
-        self.keyframe: Pose | None = None  # trained pose of the virtual space; what it did not see is noise
         self._layers_at: Pose | None = None  # keyframe of the layers that were sent
         self._version = 0
         self.mode = "real"
@@ -109,10 +105,8 @@ class Demo:
         self._command = (0.0, 0.0)
         self._placing = threading.Lock()
         self._transitions = 0
-        self.lead = Lead(LeadConfig())
         self._views = ViewScheduler(self.config.view)
         self._slow_due = 0.0
-        self._noise = np.random.default_rng(0)
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
         self._panorama, self._panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
         self.recorder = DemoRecorder()
@@ -195,7 +189,8 @@ class Demo:
                 far = self._layers_at is None or math.hypot(*(self.robot - self._layers_at)[:2]) > KEYFRAME_M
                 if far:
                     self.send_layers(self.robot)
-            if self.images and self.server.needs_views() and self._views.due(now, virtual=self.mode == "virtual"):
+            rate_hz = self.config.view.virtual_rate_hz if self.mode == "virtual" else PROBE_HZ
+            if self.images and self.server.needs_views() and self._views.due(now, rate_hz):
                 self._send_view(self._views.asked(now))
 
     def send_layers(self, keyframe: Pose) -> None:
@@ -283,7 +278,6 @@ class Demo:
                 "at_ms": self.server.now_ms(),
                 "mode": self.mode,
                 "shown": "virtual" if self.mode == "virtual" else "real",
-                "lead": self.lead.step(now, self.mode == "virtual"),
                 "reason": self.reason,
                 "estop": self.estop or self.button,
                 "blocked": False,
@@ -314,7 +308,7 @@ class Demo:
         if not np.array_equal(self._panorama_camera, camera):  # a standing robot sees the same image
             self._panorama = _jpeg(demo_world.shade(_position(camera), _turned(self._directions, camera)))
             self._panorama_camera = camera
-        header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist()}
+        header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist(), "p": camera[:3, 3].tolist()}
         self.server.send_frame(FrameKind.PANORAMA, header, self._panorama)
 
     def _send_view(self, request_id: int) -> None:
@@ -323,23 +317,14 @@ class Demo:
         shape = view_shape(look, self.config.view)
         camera = _camera(self.vbot if self.mode == "virtual" else self.robot) @ look.rotation()
         directions = _turned(perspective_directions(shape.width, shape.height, shape.fov_rad), camera)
-        image, mask = demo_world.shade(_position(camera), directions), b""
-        if self.keyframe is not None:
-            seen = demo_world.seen(_position(_camera(self.keyframe)), _position(camera), directions)
-            image = np.where(seen[..., None] > 0, image, self._noise.integers(0, 256, image.shape)).astype(np.uint8)
-            mask = _mask(seen)
+        image = demo_world.shade(_position(camera), directions)
         image = np.clip(image * np.array(self.tint), 0, 255).astype(np.uint8)
-        depth, near_m = encode_depth(demo_world.distances(_position(camera), directions), shape.fov_rad)
         header = {
             "captured_ms": captured_ms,
             "q": quaternion_from_matrix(camera).tolist(),
             "p": camera[:3, 3].tolist(),
-            "mount": [0.0, 0.0, CAMERA_HEIGHT_M],
             "fov": shape.fov_rad,
             "confidence": 0.9,
-            "mask": base64.b64encode(mask).decode("ascii"),
-            "depth": base64.b64encode(depth if self.depth is None else self.depth).decode("ascii"),
-            "depth_near_m": near_m,
             "render_ms": 20.0,
             "request_id": request_id,
         }
@@ -369,14 +354,6 @@ def _jpeg(image: NDArray[np.uint8]) -> bytes:
     if not ok:
         raise ValueError(f"JPEG encoder failed on an image of shape {image.shape}")
     return bytes(data.tobytes())
-
-
-def _mask(seen: NDArray[np.float32]) -> bytes:
-    import cv2
-
-    height, width = seen.shape
-    small = cv2.resize(seen, (64, max(1, round(64 * height / width))), interpolation=cv2.INTER_AREA)
-    return grey_png(np.rint(255 * small).astype(np.uint8))
 
 
 def _moved(pose: Pose, v: float, w: float, seconds: float) -> Pose:

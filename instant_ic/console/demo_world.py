@@ -45,16 +45,6 @@ def shade(origin: tuple[float, float, float], directions: Array) -> NDArray[np.u
     return np.clip(255 * colour * fog, 0, 255).astype(np.uint8).reshape(*shape, 3)
 
 
-def seen(keyframe: tuple[float, float, float], origin: tuple[float, float, float], directions: Array) -> Array:
-    """Return 1 where the surface along ``directions`` (..., 3) from ``origin`` is visible from ``keyframe``, else 0."""
-    eye, other = np.asarray(origin, np.float32), np.asarray(keyframe, np.float32)
-    rays = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=1, keepdims=True)
-    way = eye + rays * _cast(eye, rays)[0][:, None] - other
-    distance = np.linalg.norm(way, axis=1)
-    reached = _cast(other, way / distance[:, None])[0] > distance - 0.02
-    return reached.astype(np.float32).reshape(directions.shape[:-1])
-
-
 def distances(origin: tuple[float, float, float], directions: Array) -> Array:
     """Return the distances (m) from ``origin`` along ``directions`` (..., 3) to the nearest surface."""
     rays = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=1, keepdims=True)

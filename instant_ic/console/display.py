@@ -1,4 +1,4 @@
-"""What the page shows: the mode, the newest camera image and rendered view, and where that view is displayed."""
+"""What the page shows: the mode, the newest camera image and rendered view."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import numpy as np
 
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.scene import Scene
-from instant_ic.console.view import Lead, LeadConfig
-from instant_ic.geometry.poses import Matrix
 from instant_ic.msg import ControlState, Pose, ShownPictures, header, pose_message, to_time
 from instant_ic.pace import current
 
@@ -28,19 +26,16 @@ class Display:
     Attributes:
         mode: name of the control mode; ``none`` without an arbiter.
         shown: ``real`` (camera image), ``virtual`` (rendered view) or ``none``.
-        lead: share of the way at which the view is displayed.
         image_stamp_ns: stamp of the newest camera image; 0 without one.
     """
 
-    def __init__(self, lead: LeadConfig, scene: Scene) -> None:
-        self.lead = Lead(lead)
+    def __init__(self, scene: Scene) -> None:
         self.mode = self.shown = "none"
         self._scene = scene
         self._image_ns: int | None = None  # arrival of the newest camera image, steady clock
         self.image_stamp_ns = 0
         self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
-        self._rendered: tuple[Matrix, bool] | None = None  # its camera pose, and whether it carries depth
-        self._displayed = pose_message(np.eye(4))  # pose from which the page shows it
+        self._view_pose = pose_message(np.eye(4))  # map_from_camera of that
         self._drawn_ms: float | None = None  # newest state that the driver's page has rendered by itself
         self._drawn_ns = self._drawn_id = 0  # its time, steady clock; counts such states
         self._lost_ns: int | None = None  # when the driver was last lost, steady clock
@@ -61,25 +56,21 @@ class Display:
         """Whether a new state of the arbiter changes the mode that the page shows."""
         return self.mode not in ("none", MODES.get(int(control.mode)))
 
-    def step(self, control: ControlState | None, now_ns: int) -> None:
+    def step(self, control: ControlState | None) -> None:
         """Follow the arbiter's newest state; None: there is none."""
         if control is None:
             self.mode = self.shown = "none"
         else:
             self.mode = MODES.get(int(control.mode), "none")
             self.shown = "virtual" if int(control.shown) == ControlState.SHOWN_VIRTUAL else "real"
-        self.lead.step(now_ns / 1e9, self.mode == "virtual")
-        self._displayed = self._view_pose()
 
     def take_image(self, stamp_ns: int, now_ns: int) -> None:
         """Note a camera image."""
         self._image_ns, self.image_stamp_ns = now_ns, stamp_ns
 
-    def take_view(self, request_id: int, delay_s: float, camera: Matrix, has_depth: bool, now_ns: int) -> None:
+    def take_view(self, request_id: int, delay_s: float, camera: Pose, now_ns: int) -> None:
         """Note a view rendered for the driver at the pose ``camera``."""
-        self._view = request_id, now_ns, delay_s
-        self._rendered = camera, has_depth
-        self._displayed = self._view_pose()
+        self._view, self._view_pose = (request_id, now_ns, delay_s), camera
 
     def take_drawn(self, drawn_ms: float | None, server_ms: float, now_ns: int) -> None:
         """Note what the driver's page renders by itself.
@@ -106,7 +97,7 @@ class Display:
         """Return the available images, their age and the loss of the driver. Any thread may call it."""
         lost_ns = self._lost_ns
         view_id, came_ns, delay_s = self._view
-        pose = self._displayed
+        pose = self._view_pose
         if self._drawn_ms is not None:  # the page renders the v-bot's present pose, as of this state
             view_id, came_ns, delay_s, pose = self._drawn_id, self._drawn_ns, 0.0, self._vbot_camera(pose)
         return ShownPictures(
@@ -125,14 +116,3 @@ class Display:
         """Pose of the v-bot's camera."""
         vbot = self._scene.vbot_pose()
         return unknown if vbot is None else pose_message(vbot @ self._scene.camera_mount())
-
-    def _view_pose(self) -> Pose:
-        """Pose from which the page shows the newest view, moved towards the v-bot's present pose."""
-        if self._rendered is None:
-            return self._displayed
-        camera, has_depth = self._rendered
-        shown, vbot = camera.copy(), self._scene.vbot_pose()
-        if has_depth and vbot is not None and self.lead.share > 0:
-            now = (vbot @ self._scene.camera_mount())[:2, 3]
-            shown[:2, 3] = self.lead.displayed(camera[:2, 3], now)
-        return pose_message(shown)

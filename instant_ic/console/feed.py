@@ -30,7 +30,6 @@ from instant_ic.msg import (
     ViewRequest,
     VspaceLayers,
     VspaceStatus,
-    matrix_from_pose,
     stamp_ns,
 )
 from instant_ic.pace import current
@@ -105,7 +104,7 @@ class PageFeed:
         self._meshes = LayerMeshes()
         self._mount = config.camera_mount.xyz
         self.scene = Scene(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
-        self.display = Display(config.lead, self.scene)
+        self.display = Display(self.scene)
         self.requests = ViewRequests(config.view, self.scene, self.display)
         self.grids, self.faults = GridLayers(), FaultList()
         self._state_period_ns = 1e9 / config.state_rate_hz
@@ -127,16 +126,13 @@ class PageFeed:
         if not (0 < message.fov_rad < math.pi):
             self._diagnose("view", ERROR, f"rendered view dropped: its field of view is {message.fov_rad:.3g} rad")
             return
-        depth, near_m = page.has_depth(message), message.depth_near_m
-        fault = f"depth images with an invalid range of {near_m:.3g} m: views stay at their rendered position"
-        self._check("depth", depth or not len(message.depth_png), fault)
         request_id, now_ns = int(message.request_id), self._clock.steady_ns()
-        client, delay_s = self.requests.answered(request_id, now_ns)
-        if client is None:
-            self.display.take_view(request_id, delay_s, matrix_from_pose(message.pose), depth, now_ns)
+        delay_s = self.requests.answered(request_id, now_ns)
+        if delay_s is not None:
+            self.display.take_view(request_id, delay_s, message.pose, now_ns)
             self.report_shown()
-        header = page.view_header(self._captured_ms(stamp_ns(message)), message, self.scene.camera_mount())
-        self.server.send_frame(FrameKind.VIEW, header, bytes(message.image.data), client=client)
+            header = page.view_header(self._captured_ms(stamp_ns(message)), message)
+            self.server.send_frame(FrameKind.VIEW, header, bytes(message.image.data))
         self._request_view()
 
     def layers_of(self, message: VspaceLayers) -> PageLayers | str:
@@ -195,7 +191,7 @@ class PageFeed:
             return
         self._state_sent_ns = self._clock.steady_ns()
         control, vbot = self._inputs.control.message, self._inputs.vbot.message
-        self.display.step(control, self._state_sent_ns)
+        self.display.step(control)
         self.server.show(*self.display.foreground)
         self.server.publish("state", page.state_message(self.server.now_ms(), self.display, self.scene, control, vbot))
         self.report_shown()
@@ -234,12 +230,9 @@ class PageFeed:
     def _request_view(self) -> None:
         if not self.watched:
             return
-        # In REAL too: the arbiter switches by the expected PSNR, which VspaceStatus has of the newest view.
-        if self.display.with_vbot and not self.server.needs_views():
-            return
         status = self._inputs.vspace.message
         renders = status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
-        request = self.requests.next(renders, self.server.watching, self._clock.now_ns(), self._clock.steady_ns())
+        request = self.requests.next(renders, self.server.needs_views(), self._clock.now_ns(), self._clock.steady_ns())
         if request is not None:
             self._outputs.request_view(request)
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from typing import Any
-
-import numpy as np
 
 from instant_ic.console.display import Display
 from instant_ic.console.scene import Scene, planar
@@ -40,7 +37,6 @@ def state_message(
         "at_ms": at_ms,
         "mode": display.mode,
         "shown": display.shown,
-        "lead": round(display.lead.share, 3),
         "robot": planar(scene.robot_pose()),
         "vbot": planar(scene.vbot_pose()) if display.with_vbot else None,
         "twist": [0.0, 0.0] if moving is None else [finite(value) or 0.0 for value in twist_values(moving)],
@@ -107,28 +103,21 @@ def _battery(battery: BatteryState | None) -> dict[str, Any] | None:
 
 def panorama_header(captured_ms: float, map_from_camera: Matrix | None) -> dict[str, Any]:
     """Return the header of a panorama's frame."""
-    rotation = None if map_from_camera is None else quaternion_from_matrix(map_from_camera).tolist()
-    return {"captured_ms": captured_ms, "q": rotation}
+    if map_from_camera is None:
+        return {"captured_ms": captured_ms, "q": None, "p": None}
+    rotation, position = quaternion_from_matrix(map_from_camera), map_from_camera[:3, 3]
+    return {"captured_ms": captured_ms, "q": rotation.tolist(), "p": position.tolist()}
 
 
-def has_depth(view: RenderedView) -> bool:
-    """Whether a view carries depth of a valid range."""
-    return bool(len(view.depth_png)) and math.isfinite(view.depth_near_m) and view.depth_near_m > 0
-
-
-def view_header(captured_ms: float, view: RenderedView, mount: Matrix) -> dict[str, Any]:
-    """Return the header of a rendered view's frame; ``mount``: base_from_camera."""
-    camera, depth = matrix_from_pose(view.pose), has_depth(view)
+def view_header(captured_ms: float, view: RenderedView) -> dict[str, Any]:
+    """Return the header of a rendered view's frame."""
+    camera = matrix_from_pose(view.pose)
     return {
         "captured_ms": captured_ms,
         "q": quaternion_from_matrix(camera).tolist(),
         "p": camera[:3, 3].tolist(),
         "fov": float(view.fov_rad),
         "confidence": finite(view.confidence),
-        "mask": _base64(view.confidence_png),
-        "depth": _base64(view.depth_png) if depth else "",
-        "depth_near_m": float(view.depth_near_m) if depth else 0.0,
-        "mount": mount[:3, 3].tolist(),
         "render_ms": finite(view.render_ms),
         "request_id": int(view.request_id),
     }
@@ -138,7 +127,3 @@ def finite(value: Any) -> float | None:
     """Return a number for JSON; None for infinity and NaN."""
     number = float(value)
     return number if math.isfinite(number) else None
-
-
-def _base64(data: np.ndarray[Any, Any]) -> str:
-    return base64.b64encode(bytes(data)).decode("ascii")

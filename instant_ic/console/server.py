@@ -58,7 +58,6 @@ BURST_SOCKETS = 20.0
 RESERVED_FOR_DRIVERS = 2  # share of max_clients that pages that may only watch cannot take
 MAX_BOOKMARK = 60  # characters
 SILENT_CLIENT_S = 15.0
-OWN_S = 1.5
 SUPERSEDED_S = 5.0  # time for a page to load new layers; what it still renders from older ones does not count as a view
 START_TIMEOUT_S = 10.0
 SECURITY_HEADERS = {
@@ -173,8 +172,6 @@ class ConsoleServer:
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame | PendingLayers] = {}
         self._versions: dict[int, float] = {}  # of layers -> when the next one superseded it; inf: not yet
-        self._looks: dict[int, Look] = {}
-        self._own: dict[tuple[int, FrameKind], float] = {}  # (client, kind) -> time of its last own frame
         self._foreground = frozenset({FrameKind.PANORAMA})
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
@@ -246,16 +243,15 @@ class ConsoleServer:
         text = json.dumps({"type": kind, **message}, separators=(",", ":"), allow_nan=False)
         self._call(self._publish, kind, text)
 
-    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
         """Send an image or map to every client; it replaces a pending one of this kind.
 
         Args:
             kind: content of the frame.
             header: JSON header of the frame.
             payload: JPEG or PNG.
-            client: only recipient; for ``OWN_S`` it gets no frames of this kind that are meant for all.
         """
-        self._call(self._send_frame, kind, PendingFrame(header, payload), client)
+        self._call(self._send_frame, kind, PendingFrame(header, payload))
 
     def send_layers(self, layers: PageLayers) -> None:
         """Send a version of the virtual space to every client; it replaces a pending one.
@@ -279,19 +275,6 @@ class ConsoleServer:
     def needs_views(self) -> bool:
         """Whether a page does not render the virtual space by itself."""
         return any(session.drawn is None for session in self._sessions.copy().values())
-
-    def watching(self) -> dict[int, Look]:
-        """Looks of the clients that do not drive, by client; empty while nobody drives."""
-        driver = self.gate.driver
-        return (
-            {}
-            if driver is None
-            else {
-                number: look
-                for number, look in self._looks.copy().items()
-                if number != driver and (page := self._sessions.get(number)) is not None and page.drawn is None
-            }
-        )
 
     def show(self, *kinds: FrameKind) -> None:
         """Set which of PANORAMA and VIEW the page shows or soon will; the other is sent at a low rate."""
@@ -534,8 +517,6 @@ class ConsoleServer:
         if self._sessions.pop(session.number, None) is None:
             return
         self.gate.forget(session.number, current().steady_s())
-        self._looks.pop(session.number, None)
-        self._own = {key: at for key, at in self._own.items() if key[0] != session.number}
         self._emit_due()
         self._send_session()
         if not self._sessions:
@@ -726,8 +707,7 @@ class ConsoleServer:
             hfov=number(message, "hfov", 0.01, MAX_FOV_RAD),
             vfov=number(message, "vfov", 0.01, MAX_FOV_RAD),
         )
-        self._looks[session.number] = look
-        # The main view follows the driver, or any page while nobody drives; watchers get views in spare time.
+        # Views follow the driver, or any page while nobody drives.
         if self.gate.driver in (session.number, None):
             self.backend.on_look(look)
 
@@ -822,18 +802,10 @@ class ConsoleServer:
         for session in self._sessions.values():
             session.put_text(kind, text)
 
-    def _send_frame(self, kind: FrameKind, frame: PendingFrame, client: int | None = None) -> None:
-        now = time.monotonic()
-        if client is not None:
-            if client in self._sessions:
-                self._own[client, kind] = now
-                self._sessions[client].put_frame(kind, frame)
-            return
+    def _send_frame(self, kind: FrameKind, frame: PendingFrame) -> None:
         self._frames[kind] = frame
         for session in self._sessions.values():
-            if kind is FrameKind.VIEW and session.drawn is not None:
-                continue
-            if now - self._own.get((session.number, kind), -OWN_S) >= OWN_S:
+            if kind is not FrameKind.VIEW or session.drawn is None:
                 session.put_frame(kind, frame)
 
     def _send_layers(self, layers: PageLayers) -> None:

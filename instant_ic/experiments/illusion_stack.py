@@ -42,8 +42,6 @@ FRAME_S = 0.3
 """Simulated seconds between two compared frames: every third view. The page shows up to 60 frames a second."""
 VIEW_AGE_S = 0.15
 """Age of the shown view's pose: rendering and transport take about 0.1 s, and views come ten times a second."""
-ELSEWHERE_M = 1.0
-"""A view rendered farther away is not moved to the v-bot, as on the page."""
 TRUE_SIGMA = 0.01
 """Relative sigma of the true depth: it is sampled once per pixel."""
 
@@ -112,7 +110,7 @@ class FilmedStack(SimulatedStack):
         self._world_from_map = np.eye(4)
         self._taken: _Taken | None = None
         self._next_frame_s = 0.0
-        self._blend = self._lead = 0.0
+        self._blend = 0.0
         self._passage: Passage | None = None
         self._mode = ""
         self._renderers: dict[Obstacle, EquirectRenderer] = {}
@@ -192,27 +190,18 @@ class FilmedStack(SimulatedStack):
         dissolve_s = console.dissolve_ms / 1e3
         change = passed / dissolve_s if dissolve_s > 0 else 1.0
         self._blend = min(max(self._blend + (change if self.page.virtual else -change), 0.0), 1.0)
-        self._lead = float(state.get("lead", 0.0))
         taken = self._taken
         if taken is not None and self.time_s >= taken.due_s - 1e-9:
             self._taken = None
             if self._blend > 0:
-                self._compare(taken, console.lead.max_m)
+                self._compare(taken)
 
-    def _compare(self, taken: _Taken, lead_max_m: float) -> None:
+    def _compare(self, taken: _Taken) -> None:
         screen = self.screen
         map_from_vbot = self._vbot_in_map()
-        rendered = taken.views[LIVE].map_from_camera
-        way = (map_from_vbot @ self._base_from_camera)[:3, 3] - rendered[:3, 3]
-        way[2] = 0.0
-        far = float(np.linalg.norm(way))
-        share = 0.0 if far > ELSEWHERE_M or far == 0 else min(self._lead, lead_max_m / far)
         map_from_shown = map_from_vbot.copy()
-        map_from_shown[:3, 3] = rendered[:3, 3] + share * way
-        placed = {
-            name: place_on_screen(view, screen, map_from_shown[:3, :3], share * way)
-            for name, view in taken.views.items()
-        }
+        map_from_shown[:3, 3] = taken.views[LIVE].map_from_camera[:3, 3]
+        placed = {name: place_on_screen(view, screen, map_from_shown[:3, :3]) for name, view in taken.views.items()}
         world_from_shown = taken.world_from_map @ map_from_shown
         covered = self._blend == 1 and all(bool((inside == 1).all()) for _, inside in placed.values())
         camera = None if covered else self._camera_image(map_from_shown)

@@ -23,8 +23,7 @@ _SETUP = """async ([width, height, full]) => {
         ["viewer", "images", "messages", "colour"].map((name) => import(`/${name}.js`)));
     const canvas = document.querySelector("canvas");
     [canvas.width, canvas.height] = [width, height];
-    const viewer = new GlViewer(canvas);
-    if (full) viewer.slow = false;
+    const viewer = new GlViewer(canvas, full);
     const loaded = [], link = {acknowledge: (frame, fine = true) => loaded.push(fine), serverNow: () => 0};
     const images = new Images(viewer, link);
     window.load = async () => {

@@ -168,7 +168,7 @@ class SilentPage:
     def publish(self, kind: str, message: dict[str, Any]) -> None:
         pass
 
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
         pass
 
     def send_layers(self, layers: Any) -> None:
@@ -182,9 +182,6 @@ class SilentPage:
 
     def show(self, *kinds: Any) -> None:
         pass
-
-    def watching(self) -> dict[int, Any]:
-        return {}
 
     def stop(self) -> None:
         pass
@@ -210,7 +207,7 @@ class _Page(SilentPage):
             self.virtual = virtual
             self._stack.on_show()
 
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
         if kind.name in ("VIEW", "PANORAMA"):  # but not the map
             self._stack.on_frame(kind.name == "VIEW", header, payload)
 

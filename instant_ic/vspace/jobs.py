@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.depth_picture import encode_depth
 from instant_ic.limits import decode_image, load_image
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_device_fault
@@ -114,9 +113,6 @@ class EncodedView:
     render_ms: float
     view: View
     jpeg: bytes
-    mask_png: bytes
-    depth_png: bytes
-    depth_near_m: float
 
 
 @dataclass(frozen=True)
@@ -229,9 +225,8 @@ class SpaceWorker:
 def _render(space: Space, order: ViewOrder) -> EncodedView:
     start = time.perf_counter()
     view = space.render(order.pose(), order.width, order.height, order.fov_rad)
-    _, jpeg = cv2.imencode(".jpg", view.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, order.jpeg_quality])
-    encoded = jpeg.tobytes(), view.mask_png(), *encode_depth(view.depth_m, order.fov_rad)
-    return EncodedView(order, (time.perf_counter() - start) * 1e3, view, *encoded)
+    _, jpeg = cv2.imencode(".jpg", view.softened()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, order.jpeg_quality])
+    return EncodedView(order, (time.perf_counter() - start) * 1e3, view, jpeg.tobytes())
 
 
 def decode_panorama(data: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -16,6 +16,9 @@ from instant_ic.vspace.prior import fill_holes
 
 MIN_VIEW, MAX_VIEW = 16, 4096
 """Pixels a side."""
+_SOFT, _SOFT_EDGE = 16, 7
+"""Pixels: those averaged for a guess, and the width of its edge."""
+_GREY = np.array([0.30, 0.59, 0.11], np.float32)
 _STRIDE_RAD = 0.025
 """In an equirect image the inverse depth of a plane is linear between pixels no further apart than about this."""
 
@@ -58,20 +61,20 @@ class View:
         weight = np.sin((np.arange(height) + 0.5) * (math.pi / height))
         return float(self.confidence.mean(axis=1) @ weight / weight.sum())
 
-    def mask_png(self, width: int = 64) -> bytes:
-        """Confidence of a flat image as a small grey PNG, 0 unseen to 255 seen; empty where all of it was seen."""
+    def softened(self) -> NDArray[np.uint8]:
+        """The flat image as it is shown to people, (H, W, 3): blurred and paler where it is a guess."""
         import cv2
 
         if (self.confidence >= 1).all():
-            return b""
-        rows, columns = self.confidence.shape
-        width = min(width, columns)
-        size = (width, max(1, round(rows * width / columns)))
-        small = cv2.resize(np.asarray(self.confidence, np.float32), size, interpolation=cv2.INTER_AREA)
-        ok, png = cv2.imencode(".png", np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
-        if not ok:
-            raise ValueError(f"PNG encoder refused a mask of shape {small.shape}")
-        return bytes(png.tobytes())
+            return self.rgb
+        height, width = self.confidence.shape
+        edge = np.ones((_SOFT_EDGE, _SOFT_EDGE))
+        seen = cv2.blur(cv2.erode(np.asarray(self.confidence, np.float32), edge), edge.shape)[..., None]
+        rgb = self.rgb.astype(np.float32)
+        small = cv2.resize(rgb, (max(width // _SOFT, 1), max(height // _SOFT, 1)), interpolation=cv2.INTER_AREA)
+        soft = cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
+        pale = 0.5 * (soft + (soft @ _GREY)[..., None])
+        return np.asarray(np.rint(pale + seen * (rgb - pale)), np.uint8)
 
 
 def check_size(width: int, height: int) -> None:

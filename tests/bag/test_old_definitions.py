@@ -104,6 +104,18 @@ def test_an_older_message_is_replayed_through_a_node(bag: Path, tmp_path: Path) 
     assert found == [0.0, 1.0, 2.0]
 
 
+def test_fields_that_a_type_has_lost_at_its_end_are_dropped() -> None:
+    own = own_schema("std_msgs/msg/ColorRGBA")
+    grown = with_hash(Schema(own.name, "ros2msg", own.text + "\nfloat32 depth_near_m\nuint8[] depth_png\n", ""))
+    upgrade = upgrade_of(grown)
+    assert upgrade is not None
+    store = store_of(grown)
+    kind = store.types[own.name]
+    before = kind(r=0.1, g=0.2, b=0.3, a=0.4, depth_near_m=7.0, depth_png=np.arange(3, dtype=np.uint8))
+    after = deserialize(upgrade(bytes(store.serialize_cdr(before, own.name))), own.name)
+    assert (after.r, after.g, after.b, after.a) == pytest.approx((0.1, 0.2, 0.3, 0.4))
+
+
 @pytest.mark.parametrize(
     "text",
     [

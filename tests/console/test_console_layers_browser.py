@@ -119,6 +119,56 @@ def test_a_page_without_webgl_gets_rendered_views(open_page, room):
     assert likeness_of(picture_of(page), room_seen(tuple(KEYFRAME), 0.0, demo.look.pitch)) > 0.9
 
 
+def test_the_cameras_image_is_shown_from_where_the_robot_is_now_until_a_key_switches_it_off(open_page, room):
+    demo = room
+    demo.forced_mode, demo.images = "real", True
+    there = (1.9, 0.2, 0.3)
+    try:
+        demo.place(*KEYFRAME)
+        page = open_layers(open_page, demo, "?quality=full")  # on the CPU it is off at first
+        wait_until(lambda: not demo.server.needs_views(), page, "the layers")
+        expect_body(page, "image", "live")
+        page.wait_for_timeout(600)  # an image of the keyframe's place
+        demo.images = False
+        page.wait_for_timeout(400)
+        room_there = room_seen(there, 0.0, demo.look.pitch)
+        demo.place(*there)
+        wait_until(lambda: psnr_db(picture_of(page), room_there) > 30, page, "the image by its depth")
+        page.keyboard.press("v")
+        wait_until(lambda: psnr_db(picture_of(page), room_there) < 25, page, "the image as it was taken")
+        at_keyframe = room_seen(tuple(KEYFRAME), 0.0, demo.look.pitch)
+        assert psnr_db(picture_of(page), at_keyframe) > 30
+    finally:
+        demo.forced_mode, demo.images = "virtual", True
+
+
+# The robot drives at 0.3 m/s. Images come each 0.2 s, 0.1 s old; from 1 s on it is in ENTERING, from 2 s on in VIRTUAL.
+GLIDE = """async () => {
+    const {Images} = await import("/static/images.js");
+    let now = 0;
+    const viewer = {name: "webgl", slow: false, lost: false, sample() {}};
+    const images = new Images(viewer, {serverNow: () => now, roundTripMs: 10, connected: true, acknowledge() {}});
+    images.layers = {version: 1, mount: [0.1, 0, 1.2]};
+    images.colourReleaseMs = 0;
+    const places = [], at = (ms) => 0.0003 * ms, q = [0, 0, 0, 1];
+    for (; now < 2500; now += 10) {
+        if (now % 200 === 0) images.panorama = {q, p: [0.1 + at(now - 100), 0, 1.2], captured_ms: now - 100};
+        const mode = now < 1000 ? "real" : now < 2000 ? "entering" : "virtual", shown = now < 2000 ? "real" : "virtual";
+        const pose = [at(now), 0, 0], state = {at_ms: now, mode, shown, robot: pose, vbot: pose, twist: [0.3, 0]};
+        const {glide} = images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
+        places.push(glide && glide.to[0]);
+    }
+    return places;
+}"""
+
+
+def test_the_shown_place_goes_steadily_and_is_the_images_own_before_a_switch(open_page, room):
+    places = open_layers(open_page, room).evaluate(GLIDE)
+    steady = np.array(places[40:100])
+    assert steady == pytest.approx(0.1 + 0.003 * np.arange(40, 100), abs=0.001)  # 10 ms at 0.3 m/s, no steps of 6 cm
+    assert places[135:] == [None] * len(places[135:])  # 0.3 s after the change of mode: as it was taken
+
+
 # A v-bot at rest; the last state is 20 ms old when the operator's key goes down, and no other one comes.
 KEY = """async () => {
     const {Images} = await import("/static/images.js");
@@ -128,7 +178,7 @@ KEY = """async () => {
     images.layers = {version: 1, mount: [0.1, 0, 1.2]};
     images.prediction.maxAccel = [0.8, 2];
     const pose = [1, 2, 0], twist = [0, 0];
-    const state = {at_ms: 1000, mode: "virtual", shown: "virtual", robot: pose, vbot: pose, twist, lead: 1};
+    const state = {at_ms: 1000, mode: "virtual", shown: "virtual", robot: pose, vbot: pose, twist};
     const seen = () => images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
     const places = [];
     for (; now < 1600; now += 10) {
@@ -164,7 +214,7 @@ BACK = """async () => {
         const back = now >= 1500, robot = [0.0003 * now + 0.07, 0, 0], vbot = [0.0003 * now, 0, 0];
         const [mode, shown] = back ? ["real", "real"] : ["returning", "virtual"];
         images.panorama.captured_ms = now;
-        const state = {at_ms: now, mode, shown, robot, vbot, twist: [0.3, 0], lead: 0};
+        const state = {at_ms: now, mode, shown, robot, vbot, twist: [0.3, 0]};
         const {camera, blend} = images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
         places.push([camera.position[0], blend]);
     }

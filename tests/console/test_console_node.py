@@ -1,6 +1,5 @@
 """The console node in lockstep: what goes to the page, and what comes from it to the bus."""
 
-import base64
 import dataclasses
 import math
 
@@ -48,7 +47,6 @@ class FakeServer:
     def __init__(self, clock):
         self.clock = clock
         self.texts, self.frames, self.shown = {}, [], None
-        self.clients, self.watchers = [], {}
         self.drawn, self.layers = None, []
 
     def now_ms(self):
@@ -57,9 +55,8 @@ class FakeServer:
     def publish(self, kind, message):
         self.texts[kind] = message
 
-    def send_frame(self, kind, header, payload, client=None):
+    def send_frame(self, kind, header, payload):
         self.frames.append((kind, header, payload))
-        self.clients.append(client)
 
     def send_layers(self, layers):
         layers.check()
@@ -71,9 +68,6 @@ class FakeServer:
     def needs_views(self):
         return self.drawn is None
 
-    def watching(self):
-        return self.watchers
-
     def show(self, *kinds):
         self.shown = kinds
 
@@ -84,7 +78,7 @@ class FakeServer:
 @pytest.fixture
 def setup():
     with LockstepBus(START) as bus:
-        node = bus.add(ConsoleNode, ConsoleConfig(view=ViewConfig(virtual_rate_hz=10, real_rate_hz=1)))
+        node = bus.add(ConsoleNode, ConsoleConfig(view=ViewConfig(virtual_rate_hz=10)))
         node.feed.server = FakeServer(bus.clock)
         yield bus, node, node.feed.server
 
@@ -140,7 +134,7 @@ def vspace_status(state):
     )  # fmt: skip
 
 
-def view_message(bus, request_id, fov=1.8, near_m=0.7):
+def view_message(bus, request_id, fov=1.8):
     return RenderedView(
         header=header("map", bus.clock.now_ns()),
         request_id=request_id,
@@ -152,9 +146,6 @@ def view_message(bus, request_id, fov=1.8, near_m=0.7):
         confidence=0.9,
         render_ms=math.nan,
         image=compressed_image_message(b"VIEW", "map", bus.clock.now_ns()),
-        confidence_png=np.frombuffer(b"MASK", np.uint8),
-        depth_near_m=near_m,
-        depth_png=np.frombuffer(b"DEPTH", np.uint8),
     )
 
 
@@ -256,7 +247,6 @@ def test_only_one_request_is_outstanding_and_the_rate_follows_the_answers(setup)
 
     assert ask(1.0, answer=False) in (2, 3)  # one each 0.5 s, by the time-out
     ask(0.6, answer=True)
-    assert ask(1.0, answer=True) in (4, 5, 6)  # nothing moves
     assert ask(1.0, answer=True, speed=0.3) in (9, 10, 11)
     _, frame_header, payload = next(f for f in server.frames if f[0] is FrameKind.VIEW)
     assert payload == b"VIEW"
@@ -269,46 +259,14 @@ def virtual_state(bus, **values):
     return control(bus, ControlState.VIRTUAL, **({"shown": ControlState.SHOWN_VIRTUAL} | values))
 
 
-def test_a_step_of_the_vbot_is_shown_and_its_view_asked_for_at_once(setup):
+def test_a_step_of_the_vbot_is_shown_at_once(setup):
     bus, _, server = setup
     publish_tree(bus)
-    for _ in range(6):  # it stands; every request is answered
-        bus.publish("/ic/state", virtual_state(bus), latched=True)
-        bus.publish("/vbot/odom", odometry_message(pose_matrix(), 0.0, 0.0, "map", "vbot", bus.clock.now_ns()))
-        bus.advance(0.05)
-        if bus.messages("/view/request"):
-            bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
-    bus.advance(0.01)  # between two timers
-    asked = len(bus.messages("/view/request"))
+    bus.publish("/ic/state", virtual_state(bus), latched=True)
+    bus.advance(0.06)  # between two timers
     bus.publish("/vbot/odom", odometry_message(pose_matrix(x=0.01), 0.2, 0.1, "map", "vbot", bus.clock.now_ns()))
-    assert len(bus.messages("/view/request")) == asked + 1
-    assert matrix_from_pose(bus.last("/view/request").pose)[0, 3] == pytest.approx(0.01)
     assert server.texts["state"]["vbot"][0] == pytest.approx(0.01)
     assert server.texts["state"]["twist"] == pytest.approx([0.2, 0.1])
-
-
-def test_a_watchers_view_goes_to_him_alone_and_is_not_told_to_the_arbiter(setup):
-    bus, _, server = setup
-    publish_tree(bus)
-    server.watchers = {7: Look(yaw=1.5), 8: Look(yaw=0.1)}
-    answered = 0
-    for _ in range(40):
-        bus.publish("/ic/state", virtual_state(bus), latched=True)
-        bus.publish("/vbot/odom", odometry_message(pose_matrix(), 0.0, 0.0, "map", "vbot", bus.clock.now_ns()))
-        bus.advance(0.05)
-        if len(bus.messages("/view/request")) > answered:
-            answered += 1
-            bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
-    views = [
-        client for (kind, _, _), client in zip(server.frames, server.clients, strict=True) if kind is FrameKind.VIEW
-    ]
-    assert views.count(7) in (3, 4, 5)  # 2 Hz for 2 s
-    assert views.count(8) == 0  # has enough of the driver's
-    assert views.count(None) >= 8
-    mine = [r for r in bus.messages("/view/request") if matrix_from_pose(r.pose)[1, 0] > 0.9]  # looks left
-    assert len(mine) in (views.count(7), views.count(7) + 1)
-    told = {int(message.view_id) for message in bus.messages("/view/shown")}
-    assert not told & {int(request.id) for request in mine}
 
 
 def test_the_loss_of_the_driver_is_told_with_its_time_at_once(setup):
@@ -327,57 +285,14 @@ def test_the_loss_of_the_driver_is_told_with_its_time_at_once(setup):
     assert stamp_ns(bus.last("/view/shown")) > lost_ns
 
 
-def test_the_mask_of_a_view_goes_to_the_page(setup):
-    bus, _, server = setup
+def test_the_arbiter_hears_of_the_newest_view_where_it_was_rendered(setup):
+    bus, _, _ = setup
+    publish_tree(bus)
+    bus.publish("/ic/state", virtual_state(bus), latched=True)
+    bus.publish("/vbot/odom", odometry_message(pose_matrix(x=1.1, y=2.0), 0.2, 0.0, "map", "vbot", 0))
     bus.publish("/vspace/view", view_message(bus, 1))
-    _, frame_header, _ = next(f for f in server.frames if f[0] is FrameKind.VIEW)
-    assert base64.b64decode(frame_header["mask"]) == b"MASK"
-
-
-@pytest.mark.parametrize(("near_m", "sent"), [(0.7, b"DEPTH"), (0.0, b""), (math.nan, b""), (-1.0, b"")])
-def test_the_depth_of_a_view_goes_to_the_page_where_it_can_be_used(setup, near_m, sent):
-    bus, node, server = setup
-    publish_tree(bus)
-    bus.publish("/vspace/view", view_message(bus, 1, near_m=near_m))
-    _, frame_header, payload = next(f for f in server.frames if f[0] is FrameKind.VIEW)
-    assert base64.b64decode(frame_header["depth"]) == sent
-    assert frame_header["depth_near_m"] == pytest.approx(near_m if sent else 0.0)
-    assert frame_header["mount"] == pytest.approx([0, 0, 1.5])
-    assert payload == b"VIEW"
-    level, words = node.diagnoses()["depth"][:2]
-    assert (level > 0) == (not sent)
-    assert ("invalid range" in words) == (not sent)
-
-
-def test_the_page_leads_with_the_vbot_and_the_arbiter_hears_what_is_displayed(setup):
-    """A view drawn 10 cm behind the v-bot: shown there at a switch, and with the v-bot from 0.8 s after it on."""
-    bus, _, server = setup
-    publish_tree(bus)
-    vbot = odometry_message(pose_matrix(x=1.1, y=2.0), 0.2, 0.0, "map", "vbot", 0)
-
-    def drive(mode, seconds, near_m=0.7):
-        for _ in range(round(seconds / 0.05)):
-            bus.publish("/ic/state", control(bus, mode, shown=int(mode != ControlState.REAL)), latched=True)
-            bus.publish("/vbot/odom", vbot)
-            bus.publish("/vspace/view", view_message(bus, 1, near_m=near_m))  # from x = 1, y = 2
-            bus.advance(0.05)
-        shown = matrix_from_pose(bus.last("/view/shown").view_pose)
-        assert shown[:3, 0] == pytest.approx([math.cos(0.3), math.sin(0.3), 0])  # it is turned by the page alone
-        assert shown[1:3, 3] == pytest.approx([2, 1.5])
-        return server.texts["state"]["lead"], shown[0, 3] - 1.0
-
-    assert drive(ControlState.REAL, 0.5) == (0.0, pytest.approx(0.0))
-    assert drive(ControlState.ENTERING, 0.5) == (0.0, pytest.approx(0.0))
-    lead, ahead = drive(ControlState.VIRTUAL, 0.4)
-    assert lead == pytest.approx(0.5, abs=0.15)
-    assert ahead == pytest.approx(0.1 * lead, abs=1e-4)
-    assert drive(ControlState.VIRTUAL, 1.0) == (1.0, pytest.approx(0.1))
-    # Without depth the page cannot move it; with depth again it does.
-    assert drive(ControlState.VIRTUAL, 0.1, near_m=0.0) == (1.0, pytest.approx(0.0))
-    lead, ahead = drive(ControlState.RETURNING, 0.4)
-    assert lead == pytest.approx(0.5, abs=0.15)
-    assert ahead == pytest.approx(0.1 * lead, abs=1e-4)
-    assert drive(ControlState.RETURNING, 0.6) == (0.0, pytest.approx(0.0))
+    bus.advance(0.05)
+    assert matrix_from_pose(bus.last("/view/shown").view_pose)[:3, 3] == pytest.approx([1, 2, 1.5])
 
 
 def test_a_page_that_renders_by_itself_needs_no_views_and_the_arbiter_hears_how_old_its_state_is(setup):
@@ -397,8 +312,10 @@ def test_a_page_that_renders_by_itself_needs_no_views_and_the_arbiter_hears_how_
 
     requests, shown = drive(0.5, None)
     assert (requests > 0, shown.view_id) == (True, 1)
-    requests, shown = drive(0.5, 30.0)
-    assert requests == 0
+    drive(0.5, 30.0)
+    requests, shown = drive(2.0, 30.0)
+    assert requests in (1, 2, 3)  # small ones, once a second: the expected PSNR there is for the arbiter
+    assert (bus.last("/view/request").width, bus.last("/view/request").height) == (64, 32)
     # 30 ms when the page said so; the reports come at each step of the v-bot and at 20 Hz.
     assert 0.03 <= shown.view_age_s <= 0.085
     assert shown.view_delay_s == 0.0
@@ -417,7 +334,7 @@ def test_a_page_that_renders_by_itself_needs_no_views_and_the_arbiter_hears_how_
     assert (shown.view_id, shown.view_age_s < 0.1) == (1, True)
 
 
-def test_in_real_views_tell_the_expected_psnr_although_the_page_renders_by_itself(setup):
+def test_views_that_are_only_judged_are_small_and_go_to_no_page(setup):
     bus, _, server = setup
     publish_tree(bus)
     for _ in range(60):
@@ -428,6 +345,9 @@ def test_in_real_views_tell_the_expected_psnr_although_the_page_renders_by_itsel
         if bus.messages("/view/request"):
             bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
     assert len(bus.messages("/view/request")) in (3, 4)  # one a second
+    assert max(int(request.width) for request in bus.messages("/view/request")) <= 96
+    assert not [f for f in server.frames if f[0] is FrameKind.VIEW]
+    assert bus.last("/view/shown").view_id != bus.last("/view/request").id
 
 
 def test_layers_are_taken_while_a_page_can_render_them(setup):

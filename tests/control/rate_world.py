@@ -269,9 +269,6 @@ class RateWorld:
             confidence=1.0,
             render_ms=1000 * takes_s,
             image=compressed_image_message(b"", "map", self.now),
-            confidence_png=np.zeros(0, np.uint8),
-            depth_near_m=0.0,
-            depth_png=np.zeros(0, np.uint8),
         )
 
         def send() -> None:

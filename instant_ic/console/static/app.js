@@ -35,7 +35,7 @@ const wake = () => screen.wake();
 function makeViewer() {
   if (options.get("viewer") !== "canvas") {
     try {
-      return new GlViewer(canvas);
+      return new GlViewer(canvas, options.get("quality") === "full");
     } catch (error) {
       console.info(`${error}: falling back to the 2D canvas`);
     }
@@ -149,6 +149,11 @@ function help() {
   else helpDialog.showModal();
 }
 
+function glide() {
+  images.glides = !images.glides;
+  hud.toast(`Smooth motion of the camera's image: ${images.glides ? "on" : "off"}`);
+}
+
 const slower = () => setScale(+scale.value - 10), faster = () => setScale(+scale.value + 10);
 /** @type {Record<string, () => void>} */
 const SHORTCUTS = {
@@ -158,6 +163,7 @@ const SHORTCUTS = {
   KeyP: () => screen.save(),
   KeyF: fullScreen,
   KeyH: help,
+  KeyV: glide,
   Minus: slower, NumpadSubtract: slower,
   Equal: faster, NumpadAdd: faster,
 };
@@ -230,7 +236,6 @@ for (const [target, name] of /** @type {const} */ ([[link, "open"], [link, "lost
   target.addEventListener(name, wake);
 }
 
-if (options.get("quality") === "full") viewer.slow = false;
 mark("viewer", viewer.name);
 mark("quality", viewer.slow ? "plain" : "full");
 setScale(70);

@@ -1,18 +1,17 @@
 // @ts-check
-// The view without WebGL: a crop of the panorama (a cylinder instead of a plane, so lines bend slightly), and the
-// rendered view, shifted and scaled as a whole when the camera has moved. The direction is exact at the centre.
+// The view without WebGL: the panorama, pixel by pixel in the same projection as with it, and the rendered view, whose
+// direction is exact at the centre.
 
 /** @import { Colour } from "./colour.js" */
 /** @import { Scene } from "./images.js" */
-/** @import { Depth, Samples } from "./viewer.js" */
+/** @import { Samples } from "./viewer.js" */
 /** @typedef {CanvasRenderingContext2D | OffscreenCanvasRenderingContext2D} Context */
-/** @typedef {{bitmap: ImageBitmap, mask: OffscreenCanvas | null, finished: OffscreenCanvas | null, colour: Colour}} Layer */
+/** @typedef {{bitmap: ImageBitmap, finished: OffscreenCanvas | null, colour: Colour}} Layer */
+
+const TURN = 2 * Math.PI;
 import { plain } from "./colour.js";
 import { context2d, offscreen } from "./dom.js";
-import { panoramaPlace, rotate } from "./math.js";
-import { cells, MOST_PARALLAX, SAMPLE, SAMPLE_FINE } from "./viewer.js";
-
-const SOFT_PIXELS = 16; // of the view per pixel of its blurred copy
+import { cells, SAMPLE, SAMPLE_FINE } from "./viewer.js";
 
 export class FlatViewer {
   /** @param {HTMLCanvasElement} canvas */
@@ -24,27 +23,25 @@ export class FlatViewer {
     this.busy = false; // renders synchronously
     this.restUntil = 0;
     this.lost = false;
-    /** @type {Layer | null} */
+    /** @type {ImageData | null} */
     this._panorama = null;
     /** @type {Layer | null} */
     this._view = null;
     /** @type {OffscreenCanvasRenderingContext2D | null} */
     this._samples = null;
-    this._inverse = 0; // mean inverse depth of the view, 1/m; 0: unknown
   }
 
   /** @param {ImageBitmap} bitmap */
   setPanorama(bitmap) {
-    this._panorama = renewed(this._panorama, bitmap, null);
+    const { width, height } = bitmap, context = offscreen(width, height);
+    context.drawImage(bitmap, 0, 0);
+    bitmap.close();
+    this._panorama = context.getImageData(0, 0, width, height);
   }
 
-  /**
-   * See GlViewer.setView; only the mean of the depth image is used.
-   * @param {ImageBitmap} bitmap @param {OffscreenCanvas | null} mask @param {Depth | null} depth
-   */
-  setView(bitmap, mask, depth) {
-    this._view = renewed(this._view, bitmap, mask);
-    this._inverse = depth ? meanLevel(depth.image) / depth.near_m : 0;
+  /** @param {ImageBitmap} bitmap */
+  setView(bitmap) {
+    this._view = renewed(this._view, bitmap);
   }
 
   /** @param {Scene} scene */
@@ -82,17 +79,25 @@ export class FlatViewer {
     }
   }
 
-  /** @param {Context} context @param {number} width @param {number} height @param {Scene} scene @param {Layer} panorama */
-  _renderPanorama(context, width, height, scene, panorama) {
-    const image = finished(panorama, scene.panoramaColour);
-    const [centreU, centreV] = panoramaPlace(rotate(scene.panoramaFromLook, [1, 0, 0]));
-    const spanU = Math.atan(scene.tanHalf[0]) / Math.PI;
-    const spanV = (2 * Math.atan(scene.tanHalf[1])) / Math.PI;
-    // The full panorama, repeated on both sides, so that the seam needs no special case.
-    const turn = width / spanU, sheet = height / spanV;
-    const top = height / 2 - centreV * sheet;
-    for (const shift of [-1, 0, 1])
-      context.drawImage(image, width / 2 - (centreU + shift) * turn, top, turn, sheet);
+  /** @param {Context} context @param {number} width @param {number} height @param {Scene} scene @param {ImageData} panorama */
+  _renderPanorama(context, width, height, { panoramaFromLook: m, tanHalf, panoramaColour }, panorama) {
+    const [red, green, blue] = levels(panoramaColour), { data, width: columns, height: rows } = panorama;
+    const image = context.createImageData(width, height), out = image.data;
+    for (let y = 0, to = 0; y < height; y++) {
+      const up = (1 - (2 * y + 1) / height) * tanHalf[1];
+      for (let x = 0; x < width; x++, to += 4) {
+        const left = (1 - (2 * x + 1) / width) * tanHalf[0];
+        const ahead = m[0] + m[1] * left + m[2] * up, aside = m[3] + m[4] * left + m[5] * up, high = m[6] + m[7] * left + m[8] * up;
+        const column = Math.floor((0.5 - Math.atan2(aside, ahead) / TURN) * columns) % columns;
+        const row = Math.floor((0.5 - Math.atan2(high, Math.sqrt(ahead * ahead + aside * aside)) / Math.PI) * rows);
+        const from = 4 * (Math.min(row, rows - 1) * columns + column);
+        out[to] = red[data[from]];
+        out[to + 1] = green[data[from + 1]];
+        out[to + 2] = blue[data[from + 2]];
+        out[to + 3] = 255;
+      }
+    }
+    context.putImageData(image, 0, 0);
   }
 
   /** @param {Context} context @param {number} width @param {number} height @param {Scene} scene */
@@ -101,49 +106,32 @@ export class FlatViewer {
     // Axis of the rendered view in the look frame (first row of viewFromLook).
     const axis = scene.viewFromLook.slice(0, 3);
     if (axis[0] <= 0.1) return;
-    const [forward, left, up] = scene.moved ?? [0, 0, 0];
-    const inverse = Math.min(this._inverse, MOST_PARALLAX / Math.max(Math.hypot(forward, left, up), 1e-9));
-    const nearer = 1 / (1 - forward * inverse);
-    const viewWidth = (nearer * width * scene.viewTanHalf[0]) / scene.tanHalf[0];
-    const viewHeight = (nearer * height * scene.viewTanHalf[1]) / scene.tanHalf[1];
-    /** @param {number} value @param {number} moved */
-    const aside = (value, moved) => value / axis[0] - moved * inverse * nearer;
-    const x = width / 2 - (aside(axis[1], left) * width) / 2 / scene.tanHalf[0];
-    const y = height / 2 - (aside(axis[2], up) * height) / 2 / scene.tanHalf[1];
+    const viewWidth = (width * scene.viewTanHalf[0]) / scene.tanHalf[0];
+    const viewHeight = (height * scene.viewTanHalf[1]) / scene.tanHalf[1];
+    const x = width / 2 - (axis[1] / axis[0] * width) / 2 / scene.tanHalf[0];
+    const y = height / 2 - (axis[2] / axis[0] * height) / 2 / scene.tanHalf[1];
     context.drawImage(finished(this._view, scene.viewColour), x - viewWidth / 2, y - viewHeight / 2, viewWidth, viewHeight);
   }
 }
 
-/** Mean level of a grey image, 0..1. @param {ImageBitmap} image */
-function meanLevel(image) {
-  const context = offscreen(image.width, image.height);
-  context.drawImage(image, 0, 0);
-  const { data } = context.getImageData(0, 0, image.width, image.height);
-  let total = 0;
-  for (let i = 0; i < data.length; i += 4) total += data[i];
-  return total / (255 * data.length / 4);
-}
+/** Levels 0 to 255 of each channel in a colour. @param {Colour} colour */
+const levels = ({ gain, offset }) =>
+  gain.map((value, channel) => Uint8ClampedArray.from({ length: 256 }, (_, level) => value * level + 255 * offset[channel]));
 
-/** @param {Layer | null} old @param {ImageBitmap} bitmap @param {OffscreenCanvas | null} mask @returns {Layer} */
-function renewed(old, bitmap, mask) {
+/** @param {Layer | null} old @param {ImageBitmap} bitmap @returns {Layer} */
+function renewed(old, bitmap) {
   old?.bitmap.close();
-  return { bitmap, mask, finished: null, colour: plain };
+  return { bitmap, finished: null, colour: plain };
 }
 
-/** Returns the image in its colour, blurred where the mask marks unseen places; cached. @param {Layer} layer @param {Colour} colour */
+/** Returns the image in its colour; cached. @param {Layer} layer @param {Colour} colour */
 function finished(layer, colour) {
-  if (!layer.mask && colour === plain) return layer.bitmap;
+  if (colour === plain) return layer.bitmap;
   if (layer.finished && sameColour(layer.colour, colour)) return layer.finished;
   const { width, height } = layer.bitmap;
   const context = offscreen(width, height);
-  context.imageSmoothingQuality = "high";
-  /** @param {CanvasImageSource} image */
-  const pixels = (image) => {
-    context.drawImage(image, 0, 0, width, height);
-    return context.getImageData(0, 0, width, height);
-  };
-  const image = pixels(layer.bitmap), data = image.data;
-  if (layer.mask) soften(data, pixels(blurred(layer.bitmap)).data, pixels(layer.mask).data);
+  context.drawImage(layer.bitmap, 0, 0);
+  const image = context.getImageData(0, 0, width, height), data = image.data;
   for (let i = 0; i < data.length; i += 4)
     for (let channel = 0; channel < 3; channel++)
       data[i + channel] = data[i + channel] * colour.gain[channel] + 255 * colour.offset[channel]; // Uint8ClampedArray clamps
@@ -157,25 +145,3 @@ function finished(layer, colour) {
 const sameColour = (a, b) =>
   a.gain.every((gain, i) => Math.abs(gain - b.gain[i]) < 0.004) &&
   a.offset.every((offset, i) => Math.abs(offset - b.offset[i]) < 0.002);
-
-/** @param {ImageBitmap} bitmap */
-function blurred(bitmap) {
-  const context = offscreen(Math.ceil(bitmap.width / SOFT_PIXELS), Math.ceil(bitmap.height / SOFT_PIXELS));
-  context.imageSmoothingQuality = "high";
-  context.drawImage(bitmap, 0, 0, context.canvas.width, context.canvas.height);
-  return context.canvas;
-}
-
-/**
- * Blends in the blurred, paler image where the mask is dark.
- * @param {Uint8ClampedArray} data @param {Uint8ClampedArray} soft @param {Uint8ClampedArray} mask
- */
-function soften(data, soft, mask) {
-  for (let i = 0; i < data.length; i += 4) {
-    const seen = mask[i] / 255;
-    if (seen > 0.996) continue;
-    const grey = 0.3 * soft[i] + 0.59 * soft[i + 1] + 0.11 * soft[i + 2];
-    for (let channel = 0; channel < 3; channel++)
-      data[i + channel] = seen * data[i + channel] + (1 - seen) * (soft[i + channel] + grey) / 2;
-  }
-}

@@ -6,20 +6,20 @@
 /** @import { Link } from "./link.js" */
 /** @import { Look } from "./look.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
-/** @import { Camera, Layer, Surface } from "./layers.js" */
+/** @import { Camera, Layer, Photo, Surface } from "./layers.js" */
 /** @import { LayerData, LayersFrame, LayersHeader, Mesh, PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
 /** @import { Settings } from "./settings.js" */
-/** @import { Depth, GlViewer } from "./viewer.js" */
+/** @import { GlViewer } from "./viewer.js" */
 import { coloured, fitColour, plain, Releasing } from "./colour.js";
-import { offscreen } from "./dom.js";
-import { fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, transpose } from "./math.js";
+import { clamp, fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, transpose } from "./math.js";
 import { PANORAMA, VIEW } from "./messages.js";
-import { Motion, SMOOTHING_MS } from "./motion.js";
+import { Motion } from "./motion.js";
 import { Prediction } from "./prediction.js";
 
 /** @typedef {GlViewer | FlatViewer} Viewer */
 /** @typedef {1 | 2} Kind PANORAMA or VIEW. */
-/** @typedef {Omit<ViewHeader, "mask" | "depth"> & {aspect: number, hasDepth: boolean}} View */
+/** @typedef {ViewHeader & {aspect: number}} View */
+/** @typedef {{from: Omit<Photo, "image">, to: Vec3}} Glide Where the camera's image was taken, and the place from which it is shown, m. */
 /**
  * @typedef {object} Scene
  * @property {[number, number]} tanHalf of the shown field of view: horizontal, vertical
@@ -27,7 +27,7 @@ import { Prediction } from "./prediction.js";
  * @property {Mat3} panoramaFromLook
  * @property {Mat3} viewFromLook
  * @property {[number, number]} viewTanHalf of the rendered view
- * @property {Vec3 | null} moved motion of the camera since the view was rendered: forward, left, up in its frame, m
+ * @property {Glide | null} glide the camera's image from another place; null: as it was taken
  * @property {Camera | null} camera of the layers, which then take the place of the rendered view; null: there are none
  * @property {number} blend 0 panorama, 1 view
  * @property {Colour} panoramaColour
@@ -38,9 +38,10 @@ const STALE_MS = 2000;
 // Longest wait for an image made after the change of mode; afterwards the best available is shown.
 const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
 const RELEASE_STEP_MS = 100; // the matched colour fades in steps too small to be seen
-const LEAST_M = 0.0005; // smallest motion of a view that is rendered
 const LAYERS_MS = 5000; // longest wait for the layers of a new link
-const ELSEWHERE_M = 1; // a view rendered farther away shows another place
+const ELSEWHERE_M = 0.5; // a camera image taken farther away is shown as it was taken
+const GLIDE_MS = 300; // time in which the camera's image comes to the robot's present place, and goes back
+const LEAD_MS = 800; // time after a switch in which the way of a command to the robot comes to be predicted
 
 export class Images {
   /** @param {Viewer} viewer @param {Link} link */
@@ -71,14 +72,15 @@ export class Images {
     this._rendered = null;
     this.shownMs = 0; // time of the newest state that is shown, server's clock
     this.moves = false; // the v-bot moves, as far as this page knows
-    this.leadMaxM = 0; // largest distance by which a view is moved from its rendered position; 0: never moved
+    this.glides = viewer.name === "webgl" && !viewer.slow; // the camera's image is shown from the robot's present place
     /** @type {[number, number] | null} Position in the map frame from which the view is shown. */
     this.place = null;
     /** @type {[number, number] | null} Position of the v-bot's camera. */
     this._now = null;
     /** @type {[number, number] | null} Position of the real robot's camera in the last scene, if it was shown. */
     this._followed = null;
-    this._lead = 0; // 0: rendered position, 1: present position of the v-bot
+    this._lead = 0; // share of the time that a command takes to the robot which is predicted
+    this._glide = 0; // 0: the place where the camera's image was taken, 1: the robot's present place
     this._virtual = false;
     // Time since which images of each kind are made at the shown robot; server's clock.
     this._since = { [PANORAMA]: 0, [VIEW]: 0 };
@@ -96,7 +98,6 @@ export class Images {
   configure(settings) {
     this.dissolveMs = settings.dissolveMs;
     this.motion.easeMs = settings.easeMs;
-    this.leadMaxM = settings.leadMaxM;
     this.prediction.maxAccel = settings.maxAccel;
     this.colourReleaseMs = settings.colourReleaseMs;
   }
@@ -180,12 +181,9 @@ export class Images {
 
   /** @param {ViewFrame} frame */
   async _takeView(frame) {
-    const { mask: maskText, depth: depthText, ...header } = frame.header;
-    const [bitmap, mask, depth] = await Promise.all([
-      decoded(frame.payload), decodedMask(maskText), decodedDepth(depthText, header.depth_near_m)]);
-    this.viewer.setView(bitmap, mask, depth);
-    this.view = { ...header, aspect: bitmap.width / bitmap.height, hasDepth: depth !== null };
-    depth?.image.close();
+    const bitmap = await decoded(frame.payload);
+    this.viewer.setView(bitmap);
+    this.view = { ...frame.header, aspect: bitmap.width / bitmap.height };
     return bitmap;
   }
 
@@ -238,7 +236,9 @@ export class Images {
   scene(state, look, tanHalf, elapsedMs) {
     const now = performance.now();
     const starts = this._step(state, elapsedMs);
+    this._lead = ramp(this._lead, state?.mode === "virtual", elapsedMs / LEAD_MS);
     this._follow(state, elapsedMs);
+    this.place = this.view && [this.view.p[0], this.view.p[1]];
     const lookTurn = lookRotation(look.yaw, look.pitch);
     const mapFromLook = multiply(rotationZ(this.motion.yaw ?? 0), lookTurn);
     /** @param {[number, number, number, number]} q */
@@ -252,7 +252,7 @@ export class Images {
       panoramaFromLook: q ? relative(q) : lookTurn,
       viewFromLook: this.view ? relative(this.view.q) : identity,
       viewTanHalf: [viewTan, viewTan / (this.view?.aspect ?? 1)],
-      moved: this.view ? this._moved(this.view, state, elapsedMs) : null,
+      glide: this._glided(state, elapsedMs),
       camera: this.layers && this.rendersLayers ? this._camera(this.layers, mapFromLook, tanHalf) : null,
       blend: this.blend * this.blend * (3 - 2 * this.blend),
       panoramaColour: plain,
@@ -266,24 +266,20 @@ export class Images {
   }
 
   /**
-   * Motion of the camera since the view was rendered, in the view's frame; null: too small to be seen. `state.lead` is the
-   * share of the way to the v-bot's present position; at a switch it is 0, so that each image is where it was made.
-   * @param {View} view @param {State | null} state @param {number} elapsedMs @returns {Vec3 | null}
+   * Where the camera's image is shown from: from the robot's present place, by the depth of the layers, so that few images
+   * a second look smooth. Near a switch, and while two images dissolve, each is where it was made.
+   * @param {State | null} state @param {number} elapsedMs @returns {Glide | null}
    */
-  _moved({ p, q, mount, hasDepth }, state, elapsedMs) {
-    const own = this.motion.own;
-    this._lead += ((state?.lead ?? 0) - this._lead) * (1 - Math.exp(-elapsedMs / SMOOTHING_MS));
-    if (own && this._virtual) {
-      const [x, y] = rotate(rotationZ(own[2]), mount);
-      this._now = [own[0] + x, own[1] + y];
-    }
-    this.place = [p[0], p[1]];
-    if (!hasDepth || !this._now || this.leadMaxM <= 0) return null;
-    const way = [this._now[0] - p[0], this._now[1] - p[1]], far = Math.hypot(...way);
-    const share = far > ELSEWHERE_M ? 0 : Math.min(this._lead, this.leadMaxM / far);
-    if (share * far < LEAST_M) return null;
-    this.place = [p[0] + share * way[0], p[1] + share * way[1]];
-    return rotate(transpose(fromQuaternion(q)), [share * way[0], share * way[1], 0]);
+  _glided(state, elapsedMs) {
+    const { panorama, layers } = this, { own } = this.motion;
+    const wanted = this.glides && state?.mode === "real" && this.blend === 0;
+    this._glide = this.blend > 0 ? 0 : ramp(this._glide, wanted, elapsedMs / GLIDE_MS);
+    if (this._glide === 0 || !panorama?.q || !panorama.p || !own || !layers || !this.rendersLayers) return null;
+    const [x, y] = rotate(rotationZ(own[2]), layers.mount), [px, py, pz] = panorama.p;
+    const way = [own[0] + x - px, own[1] + y - py];
+    if (Math.hypot(...way) > ELSEWHERE_M) return null;
+    const from = { mapFromCamera: fromQuaternion(panorama.q), position: panorama.p };
+    return { from, to: [px + this._glide * way[0], py + this._glide * way[1], pz] };
   }
 
   /**
@@ -366,7 +362,7 @@ export class Images {
     const now = this.link.serverNow() ?? state?.at_ms ?? 0, age = state ? now - state.at_ms : 0;
     const twist = state?.twist ?? [0, 0];
     if (state && pose && state.mode === "virtual" && robot === "virtual" && this.rendersLayers) {
-      const delay = (state.lead * (this.link.roundTripMs ?? 0)) / 2;
+      const delay = (this._lead * (this.link.roundTripMs ?? 0)) / 2;
       const present = this.prediction.from(pose, twist, state.at_ms, now, delay);
       this.motion.follow(robot, present.pose, present.twist, 0, elapsedMs);
       this.moves = present.twist[0] !== 0 || present.twist[1] !== 0;
@@ -380,6 +376,9 @@ export class Images {
 /** Which robot the operator sees and drives. @param {State | null} state @returns {"real" | "virtual"} */
 export const shows = (state) => (state?.shown === "virtual" ? "virtual" : "real");
 
+/** @param {number} share @param {boolean} up @param {number} step @returns {number} */
+const ramp = (share, up, step) => clamp(share + (up ? step : -step), 0, 1);
+
 /** @param {Blob} blob */
 const decoded = (blob) => createImageBitmap(blob, { colorSpaceConversion: "none" });
 
@@ -387,45 +386,4 @@ const decoded = (blob) => createImageBitmap(blob, { colorSpaceConversion: "none"
 async function decodedSurface({ image, confidence, ...numbers }) {
   const [colours, seen] = await Promise.all([decoded(image), confidence && decoded(confidence)]);
   return { ...numbers, image: colours, confidence: seen };
-}
-
-/** @param {string} text base64 */
-const decodedPng = (text) =>
-  decoded(new Blob([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], { type: "image/png" }));
-
-/**
- * Decodes the depth image of a view (base64 PNG); null if it is missing or unusable.
- * @param {string} text @param {number} near_m @returns {Promise<Depth | null>}
- */
-async function decodedDepth(text, near_m) {
-  if (!text || !(near_m > 0)) return null;
-  try {
-    return { image: await decodedPng(text), near_m };
-  } catch (error) {
-    console.warn(`the depth of a view cannot be decoded; the view stays at its rendered position: ${error}`);
-    return null;
-  }
-}
-
-/**
- * Decodes the mask of a view (base64 PNG); null if all of it was seen. The mask is much coarser than the view, so each
- * pixel takes the minimum of its neighbourhood: then no unseen place shows at the edges.
- * @param {string} text
- */
-async function decodedMask(text) {
-  if (!text) return null;
-  const bitmap = await decodedPng(text);
-  const { width, height } = bitmap, context = offscreen(width, height);
-  context.drawImage(bitmap, 0, 0);
-  bitmap.close();
-  const image = context.getImageData(0, 0, width, height), seen = image.data.filter((_, i) => i % 4 === 0);
-  for (let y = 0; y < height; y++)
-    for (let x = 0; x < width; x++) {
-      let least = 255;
-      for (let v = Math.max(y - 1, 0); v <= Math.min(y + 1, height - 1); v++)
-        for (let u = Math.max(x - 1, 0); u <= Math.min(x + 1, width - 1); u++) least = Math.min(least, seen[v * width + u]);
-      image.data.fill(least, 4 * (y * width + x), 4 * (y * width + x) + 3);
-    }
-  context.putImageData(image, 0, 0);
-  return context.canvas;
 }

@@ -1,10 +1,12 @@
 // @ts-check
-// The virtual space in WebGL 2: layers of triangles round a keyframe, rendered from any place (Python: vspace/layers.py).
+// What the page shows in WebGL 2: layers of triangles round a keyframe, rendered from any place (Python: vspace/layers.py),
+// with their own colours or with the camera's image; and the camera's image as it was taken, which has no depth.
 
 /** @import { Colour } from "./colour.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
-import { multiply, rotate, transpose } from "./math.js";
-import { link } from "./program.js";
+import { identity, multiply, rotate, transpose } from "./math.js";
+import { plain } from "./colour.js";
+import { link, Program } from "./program.js";
 
 /**
  * Triangles with an image. The vertices are corners of the panorama's pixels; `size` is height and width of that lattice.
@@ -30,6 +32,13 @@ import { link } from "./program.js";
  * @property {Vec3} position of the view in the map frame, m
  * @property {[number, number]} tanHalf tangents of half the field of view
  */
+/**
+ * The camera's image in the place of the layers' own colours.
+ * @typedef {object} Photo
+ * @property {WebGLTexture} image equirectangular
+ * @property {Mat3} mapFromCamera rotation of the camera
+ * @property {Vec3} position of the camera in the map frame, m
+ */
 /** @typedef {{vertices: WebGLVertexArrayObject, count: number, image: WebGLTexture, confidence: WebGLTexture, surface: Surface, buffers: WebGLBuffer[]}} Loaded */
 
 const NEAR_M = 0.02;
@@ -41,23 +50,19 @@ const VERTEX = `#version 300 es
 in vec2 corner;
 in float inverse;
 uniform vec2 size;
-uniform mat3 lookFromPanorama;
-uniform vec3 position;
+uniform mat3 lookFromPanorama, imageFromPanorama;
+uniform vec3 position, imagePosition; // of the view and of the image's camera, in the keyframe's frame
 uniform vec2 tanHalf;
-out vec3 direction; // in the keyframe's frame; its length varies as the interpolation needs it
+out vec3 direction; // in the image's frame; its length varies as the interpolation needs it
 void main() {
   float azimuth = ${Math.PI} * (1.0 - 2.0 * corner.x / size.y), elevation = ${Math.PI} * (0.5 - corner.y / size.x);
-  direction = vec3(cos(elevation) * vec2(cos(azimuth), sin(azimuth)), sin(elevation));
-  vec3 place = lookFromPanorama * (direction - position * inverse);
+  vec3 ray = vec3(cos(elevation) * vec2(cos(azimuth), sin(azimuth)), sin(elevation));
+  direction = imageFromPanorama * (ray - imagePosition * inverse);
+  vec3 place = lookFromPanorama * (ray - position * inverse);
   gl_Position = vec4(-place.y / tanHalf.x, place.z / tanHalf.y, place.x - 2.0 * ${NEAR_M} * inverse, place.x);
 }`;
 
-const FRAGMENT = `
-in vec3 direction;
-out vec4 colour;
-uniform sampler2D image, confidence;
-uniform vec3 gain, offset;
-uniform bool soft; // what nobody has seen is blurred and paler
+const ANGLES = `
 const vec3 GREY = vec3(0.30, 0.59, 0.11);
 const float PI = ${Math.PI};
 
@@ -72,7 +77,14 @@ vec2 angles(vec3 d) {
   azimuth = d.x < 0.0 ? PI - azimuth : azimuth;
   float down = sqrt(max(1.0 - z, 0.0)) * (1.5707288 + z * (-0.2121144 + z * (0.0742610 - z * 0.0187293)));
   return vec2(d.y < 0.0 ? -azimuth : azimuth, d.z < 0.0 ? PI - down : down);
-}
+}`;
+
+const FRAGMENT = `
+in vec3 direction;
+out vec4 colour;
+uniform sampler2D image, confidence;
+uniform vec3 gain, offset;
+uniform bool soft; // what nobody has seen is blurred and paler
 
 void main() {
   vec2 angle = angles(normalize(direction)), uv = vec2(0.5 - angle.x / (2.0 * PI), angle.y / PI);
@@ -93,41 +105,35 @@ void main() {
   colour.rgb = colour.rgb * gain + offset;
 }`;
 
-// Where no layer has a surface: the colours of the direction, blurred.
-const BEYOND = `
-precision highp float;
+// By direction alone: an image as it was taken; where no layer has a surface its colours, blurred.
+const FAR = `
 in vec2 screen;
 out vec4 colour;
 uniform sampler2D image;
 uniform mat3 panoramaFromLook;
 uniform vec2 tanHalf;
 uniform vec3 gain, offset;
+uniform float level, dim; // mipmap level; share of grey
 void main() {
-  vec3 d = panoramaFromLook * normalize(vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y));
-  vec2 uv = vec2(0.5 - atan(d.y, d.x) / ${2 * Math.PI}, acos(clamp(d.z, -1.0, 1.0)) / ${Math.PI});
-  colour = vec4(gain * textureLod(image, uv, ${BEYOND_LEVEL}.0).rgb + offset, 0.0);
-}`;
-const FULL = `#version 300 es
-out vec2 screen;
-void main() {
-  screen = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2) * 2.0 - 1.0;
-  gl_Position = vec4(screen, 0.0, 1.0);
+  vec2 angle = angles(panoramaFromLook * normalize(vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y)));
+  vec3 rgb = gain * textureLod(image, vec2(0.5 - angle.x / (2.0 * PI), angle.y / PI), level).rgb + offset;
+  colour = vec4(mix(rgb, vec3(0.023, 0.028, 0.036) + 0.35 * dot(rgb, GREY), dim), 0.0);
 }`;
 
-/** Renders layers into the bound framebuffer, which needs depth and stencil. */
+/** Renders into the bound framebuffer, which needs depth and stencil. */
 export class LayerRenderer {
   /** @param {WebGL2RenderingContext} gl @param {boolean} slow software rendering: plain look-ups */
   constructor(gl, slow) {
     this._gl = gl;
-    const sharp = `#version 300 es\nprecision highp float;\nconst bool SHARP = ${!slow};\nconst float SHARPNESS = 0.7;\n`;
-    this._program = link(gl, VERTEX, sharp + FRAGMENT);
-    this._beyond = link(gl, FULL, `#version 300 es\n${BEYOND}`);
+    const sharp = `precision highp float;\nconst bool SHARP = ${!slow};\nconst float SHARPNESS = 0.7;\n${ANGLES}`;
+    this._program = link(gl, VERTEX, `#version 300 es\n${sharp}${FRAGMENT}`);
+    this._far = new Program(gl, sharp + FAR);
     this._minification = slow ? gl.LINEAR_MIPMAP_NEAREST : gl.LINEAR_MIPMAP_LINEAR; // the CPU would read two levels
     this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
     /** @type {(Loaded & {layer: Layer})[]} Each is shown where the ones before show nothing. */
     this._layers = [];
     this._empty = this._texture(null);
-    /** @type {Map<WebGLProgram, Map<string, WebGLUniformLocation | null>>} */
+    /** @type {Map<string, WebGLUniformLocation | null>} */
     this._places = new Map();
   }
 
@@ -153,9 +159,10 @@ export class LayerRenderer {
    * The alpha of what is rendered is 1 where the place was seen.
    * @param {Camera} camera @param {number} width @param {number} height
    * @param {Colour} tint gain and offset of the colours
+   * @param {Photo | null} photo takes the place of the layers' own colours, and of guesses
    */
-  render(camera, width, height, tint) {
-    const gl = this._gl, program = this._program, at = this._place(program);
+  render(camera, width, height, tint, photo = null) {
+    const gl = this._gl, program = this._program, at = this._at;
     gl.viewport(0, 0, width, height);
     gl.useProgram(program);
     gl.uniform2fv(at("tanHalf"), camera.tanHalf);
@@ -169,6 +176,7 @@ export class LayerRenderer {
     gl.clear(gl.STENCIL_BUFFER_BIT);
     // Stencil bit k: layer k shows a surface here. A surface seen from behind hides, but shows the layers below.
     this._layers.forEach(({ vertices, count, image, confidence, surface, layer }, k) => {
+      if (photo && surface.confidence) return; // a guess
       const panoramaFromMap = transpose(layer.mapFromCamera), [x, y, z] = camera.position, [px, py, pz] = layer.position;
       // Transposed: row-major read by columns.
       gl.uniformMatrix3fv(at("lookFromPanorama"), false, multiply(panoramaFromMap, camera.mapFromLook));
@@ -181,47 +189,51 @@ export class LayerRenderer {
       gl.activeTexture(gl.TEXTURE0 + CONFIDENCE);
       gl.bindTexture(gl.TEXTURE_2D, confidence);
       gl.activeTexture(gl.TEXTURE0 + IMAGE);
-      gl.bindTexture(gl.TEXTURE_2D, image);
+      gl.bindTexture(gl.TEXTURE_2D, photo?.image ?? image);
       gl.uniform2fv(at("size"), surface.size);
-      gl.uniform3fv(at("gain"), times(layer.gain, tint.gain));
+      gl.uniform3fv(at("gain"), photo ? tint.gain : times(layer.gain, tint.gain));
+      const { mapFromCamera, position: [cx, cy, cz] } = photo ?? layer;
+      gl.uniformMatrix3fv(at("imageFromPanorama"), true, photo ? multiply(transpose(mapFromCamera), layer.mapFromCamera) : identity);
+      gl.uniform3fv(at("imagePosition"), rotate(panoramaFromMap, [cx - px, cy - py, cz - pz]));
       gl.uniform1i(at("soft"), Number(surface.confidence !== null));
       gl.bindVertexArray(vertices);
       gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
     });
     gl.bindVertexArray(null);
     gl.disable(gl.DEPTH_TEST);
-    this._renderBeyond(camera, tint);
+    gl.stencilFunc(gl.EQUAL, 0, 0xff);
+    gl.stencilOp(gl.KEEP, gl.KEEP, gl.KEEP);
+    const last = this._layers[this._layers.length - 1], { image, mapFromCamera } = photo ?? { ...last, ...last.layer };
+    const beyond = photo ? tint : { ...tint, gain: times(last.layer.gain, tint.gain) };
+    this.renderFar(image, multiply(transpose(mapFromCamera), camera.mapFromLook), camera.tanHalf, beyond, photo ? 0 : BEYOND_LEVEL);
     gl.disable(gl.STENCIL_TEST);
   }
 
-  /** @param {Camera} camera @param {Colour} tint */
-  _renderBeyond(camera, tint) {
-    const gl = this._gl, program = this._beyond, at = this._place(program), last = this._layers[this._layers.length - 1];
-    if (!last) return;
-    gl.useProgram(program);
-    gl.stencilFunc(gl.EQUAL, 0, 0xff);
-    gl.stencilOp(gl.KEEP, gl.KEEP, gl.KEEP);
-    gl.bindTexture(gl.TEXTURE_2D, last.image);
+  /**
+   * Renders a panorama by direction alone; its alpha is 0.
+   * @param {WebGLTexture} image @param {Mat3} panoramaFromLook @param {[number, number]} tanHalf @param {Colour} tint
+   * @param {number} level mipmap level @param {number} dim 1: dim and grey
+   */
+  renderFar(image, panoramaFromLook, tanHalf, tint = plain, level = 0, dim = 0) {
+    const gl = this._gl, at = this._far.use();
+    gl.activeTexture(gl.TEXTURE0 + IMAGE);
+    gl.bindTexture(gl.TEXTURE_2D, image);
     gl.uniform1i(at("image"), IMAGE);
-    gl.uniformMatrix3fv(at("panoramaFromLook"), true, multiply(transpose(last.layer.mapFromCamera), camera.mapFromLook));
-    gl.uniform2fv(at("tanHalf"), camera.tanHalf);
-    gl.uniform3fv(at("gain"), times(last.layer.gain, tint.gain));
+    gl.uniformMatrix3fv(at("panoramaFromLook"), true, panoramaFromLook); // our matrices are row-major
+    gl.uniform2fv(at("tanHalf"), tanHalf);
+    gl.uniform3fv(at("gain"), tint.gain);
     gl.uniform3fv(at("offset"), tint.offset);
+    gl.uniform1f(at("level"), level);
+    gl.uniform1f(at("dim"), dim);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** Places of a program's uniforms, looked up once. @param {WebGLProgram} program */
-  _place(program) {
-    let places = this._places.get(program);
-    if (!places) this._places.set(program, places = new Map());
-    const known = places;
-    /** @param {string} name @returns {WebGLUniformLocation | null} */
-    return (name) => {
-      let place = known.get(name);
-      if (place === undefined) known.set(name, place = this._gl.getUniformLocation(program, name));
-      return place;
-    };
-  }
+  /** Place of a uniform of the layers' program, looked up once. @param {string} name */
+  _at = (name) => {
+    let place = this._places.get(name);
+    if (place === undefined) this._places.set(name, place = this._gl.getUniformLocation(this._program, name));
+    return place;
+  };
 
   /** @param {Surface} surface @returns {Loaded} */
   _upload(surface) {

@@ -60,15 +60,6 @@ export function clamp(value, low, high) {
   return Math.min(Math.max(value, low), high);
 }
 
-/**
- * Place of a direction in a panorama, 0..1: from the left, from the top. The centre looks forward, columns run clockwise.
- * @param {Vec3} direction unit vector
- * @returns {[number, number]}
- */
-export function panoramaPlace([x, y, z]) {
-  return [0.5 - Math.atan2(y, x) / (2 * Math.PI), 0.5 - Math.asin(clamp(z, -1, 1)) / Math.PI];
-}
-
 /** @param {number} radians */
 export const degrees = (radians) => (radians * 180) / Math.PI;
 /** @param {number} angle degrees */

@@ -62,7 +62,6 @@ const page = object({
   dissolve_ms: optional(number),
   ease_ms: optional(number),
   colour_release_s: optional(number),
-  lead_max_m: optional(number),
   max_accel: optional(pair),
   footprint: optional(pair),
   camera: optional(triple),
@@ -81,7 +80,6 @@ const state = object({
   at_ms: number,
   mode: oneOf("real", "entering", "virtual", "returning", "stopped", "none"),
   shown: oneOf("real", "virtual", "none"),
-  lead: number,
   robot: optional(triple),
   vbot: optional(triple),
   twist: pair,
@@ -170,10 +168,8 @@ const KINDS = /** @type {const} */ ([PANORAMA, VIEW, MAP, COSTMAP, LAYERS, PART]
 const PREFIX_BYTES = 12;
 const VERSION = 1;
 
-const panoramaHeader = object({ captured_ms: number, q: optional(quaternion) });
-const viewHeader = object({
-  captured_ms: number, q: quaternion, p: triple, fov: number, mask: text, depth: text, depth_near_m: number, mount: triple,
-});
+const panoramaHeader = object({ captured_ms: number, q: optional(quaternion), p: optional(triple) });
+const viewHeader = object({ captured_ms: number, q: quaternion, p: triple, fov: number });
 const gridHeader = object({ resolution: number, width: number, height: number, x: number, y: number });
 const partHeader = object({ start: number, size: number });
 const MOST_LAYERS = 8; // bits of the stencil buffer

@@ -17,8 +17,6 @@ export class Program {
     this._program = link(gl, VERTEX, `#version 300 es\n${fragment}`);
     /** @type {Map<string, WebGLUniformLocation | null>} */
     this._places = new Map();
-    gl.useProgram(this._program);
-    ["panorama", "view", "mask", "depth"].forEach((name, unit) => gl.uniform1i(this._at(name), unit));
   }
 
   /** Uses it; returns its uniforms by name. */

@@ -25,6 +25,7 @@ const LATENCY_MS = 250;
 const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
 const SLOW_PIXELS = 0.5, SLOW_VIEW_PIXELS = 0.36, SLOW_LAYER_PIXELS = 0.42; // share of the window's pixels per axis
 const SLOW_MAP_MS = 200;
+const STILL_PIXELS = 0.5, LEAST_PIXELS = 0.3; // smallest shown turn while the robot stands, and while the v-bot is driven
 const REPORT_MS = 500; // longest interval between two reports of the shown state while the camera is shown
 const IDLE_MS = 200; // longest interval between two frames while messages arrive
 const COLOURS = { real: "#45c4b0", entering: "#45c4b0", virtual: "#f0ac45", returning: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
@@ -189,19 +190,18 @@ export class Screen {
   }
 
   /**
-   * Renders if a new image arrived, the direction changed by half a pixel, or the window size changed. Returns whether
+   * Renders if a new image arrived, the direction changed visibly, or the window size changed. Returns whether
    * the shown place or the blend has changed, so that the next frame is likely to differ too.
    * @param {Scene} scene
    */
   _renderView(scene) {
     const { viewer, images, look } = this;
     const resized = fit(viewer.canvas, viewer.slow ? slowPixels(scene) : 1);
-    const viewpoint = scene.camera?.position ?? scene.moved;
-    const key = rounded([scene.blend], 4) + (scene.blend > 0 ? rounded(viewpoint, 3) : "");
+    const key = rounded([scene.blend], 4) + rounded(scene.blend > 0 ? scene.camera?.position : scene.glide?.to, 3);
     const direction = [...scene.mapFromLook, look.vfov];
-    // A standing robot's pose is never still: SLAM turns it by parts of a milliradian with every scan.
-    const halfPixel = this._tanHalf()[0] / viewer.canvas.width;
-    const turned = this._direction.some((value, index) => Math.abs(value - direction[index]) > halfPixel);
+    // A standing robot's pose is never still: SLAM turns it by parts of a milliradian with every scan. The v-bot's is.
+    const least = (images.moves ? LEAST_PIXELS : STILL_PIXELS) * 2 * this._tanHalf()[0] / viewer.canvas.width;
+    const turned = this._direction.some((value, index) => Math.abs(value - direction[index]) > least);
     const moves = turned || key !== this._viewKey;
     if (viewer.lost || !(resized || images.changed || moves)) return false;
     this._viewKey = key;
@@ -263,7 +263,8 @@ export class Screen {
 }
 
 /** Share of the window's pixels per axis when the CPU renders: few for a scene that costs much, or has few itself. @param {Scene} scene */
-function slowPixels({ blend, camera }) {
+function slowPixels({ blend, camera, glide }) {
+  if (glide) return SLOW_LAYER_PIXELS;
   if (blend < 1) return SLOW_PIXELS;
   return camera ? SLOW_LAYER_PIXELS : SLOW_VIEW_PIXELS;
 }

@@ -13,7 +13,6 @@ export const DEFAULTS = {
   dissolveMs: 250,
   easeMs: 400,
   colourReleaseMs: 6000,
-  leadMaxM: 0,
   /** @type {[number, number]} */
   maxAccel: [0.8, 2], // m/s², rad/s²
 };
@@ -32,6 +31,5 @@ export function settingsOf(hello, reducedMotion) {
     easeMs: reducedMotion ? 0 : page.ease_ms ?? DEFAULTS.easeMs,
     colourReleaseMs: page.colour_release_s === null ? DEFAULTS.colourReleaseMs : 1000 * page.colour_release_s,
     maxAccel: page.max_accel ?? DEFAULTS.maxAccel,
-    leadMaxM: page.lead_max_m ?? DEFAULTS.leadMaxM,
   };
 }

@@ -7,7 +7,7 @@ const { decodeFrame, frameNumber, MessageError, parseMessage } = await import(".
 const { settingsOf } = await import("../../../instant_ic/console/static/settings.js");
 
 const STATE = {
-  type: "state", at_ms: 5, mode: "virtual", shown: "virtual", lead: 0.5, robot: [1, 2, 0.1], vbot: null, twist: [0.2, 0],
+  type: "state", at_ms: 5, mode: "virtual", shown: "virtual", robot: [1, 2, 0.1], vbot: null, twist: [0.2, 0],
 };
 const HELLO = { type: "hello", max_linear: 0.4, max_angular: 0.8, may_drive: true, page: {} };
 
@@ -20,7 +20,7 @@ test("fields without a value are null, and unknown fields are dropped", () => {
 for (const [what, change, text] of [
   ["a mode that does not exist", { mode: "flying" }, /state\.mode must be one of real, .* \(got "flying"\)/],
   ["a pose with two numbers", { robot: [1, 2] }, /state\.robot must be 3 numbers/],
-  ["a text for a number", { lead: "0" }, /state\.lead must be a finite number \(got "0"\)/],
+  ["a text for a number", { at_ms: "0" }, /state\.at_ms must be a finite number \(got "0"\)/],
   ["a list with a hole", { twist: [0.1, null] }, /state\.twist\[1\] must be a finite number/],
   ["a missing field", { at_ms: undefined }, /state\.at_ms must be/],
 ]) {
@@ -49,8 +49,8 @@ function frame(kind, header, { version = 1, length } = {}) {
 }
 
 test("a frame's parts are those of the layout in protocol.py", async () => {
-  const decoded = decodeFrame(frame(1, { captured_ms: 3, q: [0, 0, 0, 1] }));
-  assert.deepEqual([decoded.kind, decoded.sequence, decoded.header], [1, 7, { captured_ms: 3, q: [0, 0, 0, 1] }]);
+  const decoded = decodeFrame(frame(1, { captured_ms: 3, q: [0, 0, 0, 1], p: [1, 2, 3] }));
+  assert.deepEqual([decoded.kind, decoded.sequence, decoded.header], [1, 7, { captured_ms: 3, q: [0, 0, 0, 1], p: [1, 2, 3] }]);
   assert.deepEqual([...new Uint8Array(await decoded.payload.arrayBuffer())], [0xff, 0xd8]);
 });
 
@@ -123,11 +123,11 @@ test("layers that cannot be rendered are refused by the name of what is wrong", 
 
 test("settings: the server's values, else the defaults; no motion for those who asked for none", () => {
   const plain = settingsOf(parseMessage(JSON.stringify(HELLO)), false);
-  assert.deepEqual([plain.dissolveMs, plain.easeMs, plain.colourReleaseMs, plain.leadMaxM], [250, 400, 6000, 0]);
+  assert.deepEqual([plain.dissolveMs, plain.easeMs, plain.colourReleaseMs], [250, 400, 6000]);
   assert.deepEqual(plain.limits, { linear: 0.4, angular: 0.8 });
-  const page = { dissolve_ms: 100, ease_ms: 0, colour_release_s: 0, lead_max_m: 0.3, footprint: [1, 2] };
+  const page = { dissolve_ms: 100, ease_ms: 0, colour_release_s: 0, footprint: [1, 2] };
   const given = settingsOf(parseMessage(JSON.stringify({ ...HELLO, page })), false);
-  assert.deepEqual([given.dissolveMs, given.easeMs, given.colourReleaseMs, given.leadMaxM], [100, 0, 0, 0.3]);
+  assert.deepEqual([given.dissolveMs, given.easeMs, given.colourReleaseMs], [100, 0, 0]);
   assert.deepEqual(given.footprint, [1, 2]);
   const reduced = settingsOf(parseMessage(JSON.stringify({ ...HELLO, page })), true);
   assert.deepEqual([reduced.dissolveMs, reduced.easeMs], [0, 0]);

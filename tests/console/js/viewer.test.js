@@ -1,11 +1,11 @@
-// Geometry of the view: directions, columns of the panorama, sample cells, motion and the trajectory's extension.
+// Geometry of the view: directions, sample cells, motion and the trajectory's extension.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import "./page.js";
 
 const math = await import("../../../instant_ic/console/static/math.js");
-const { cells, covers, SAMPLE, SAMPLE_FINE } = await import("../../../instant_ic/console/static/viewer.js");
+const { cells, SAMPLE, SAMPLE_FINE } = await import("../../../instant_ic/console/static/viewer.js");
 const { extended, tiles } = await import("../../../instant_ic/console/static/guide.js");
 const { Motion } = await import("../../../instant_ic/console/static/motion.js");
 const { ServerClock } = await import("../../../instant_ic/console/static/clock.js");
@@ -24,13 +24,6 @@ test("a quaternion about z is the rotation about z", () => {
   const half = 0.35;
   close(math.fromQuaternion([0, 0, Math.sin(half), Math.cos(half)]), math.rotationZ(0.7));
   close(math.multiply(math.rotationZ(0.7), math.transpose(math.rotationZ(0.7))), math.identity);
-});
-
-test("columns of the panorama: forward in the centre, left a quarter to the left, up at the top", () => {
-  close(math.panoramaPlace([1, 0, 0]), [0.5, 0.5]);
-  close(math.panoramaPlace([0, 1, 0]), [0.25, 0.5]);
-  close(math.panoramaPlace([0, -1, 0]), [0.75, 0.5]);
-  close(math.panoramaPlace([0, 0, 1.0000001]), [0.5, 0]); // a rounding error beyond the unit sphere
 });
 
 test("angles wrap into a half turn to either side", () => {
@@ -88,19 +81,6 @@ test("the server's clock follows the fastest answer, and the quality the slow on
   assert.equal(clock.quality, "poor");
   clock.reset();
   assert.equal(clock.at(0), null);
-});
-
-test("the view fills the window with its margin, less the motion of its nearest surface", () => {
-  // Straight ahead the corners are at 1 / 1.25 = 0.8 of the view's half size; it fades out from 0.94.
-  const scene = { viewFromLook: math.identity, tanHalf: [1, 0.6], viewTanHalf: [1.25, 0.75], moved: null };
-  assert.ok(covers(scene, 0));
-  assert.ok(!covers({ ...scene, tanHalf: [1.2, 0.6] }, 0)); // 0.96
-  assert.ok(!covers({ ...scene, viewFromLook: math.lookRotation(Math.PI, 0) }, 0)); // behind
-  // 0.1 m to the left at 1 m: 0.1 / 1.25 = 0.08 more, at 0.5 m 0.16 more.
-  assert.ok(covers({ ...scene, moved: [0, 0.1, 0] }, 1));
-  assert.ok(!covers({ ...scene, moved: [0, 0.1, 0] }, 2));
-  assert.ok(covers({ ...scene, moved: [0.3, 0, 0] }, 1.5)); // forward: the edges move out of the window
-  assert.ok(!covers({ ...scene, moved: [-0.3, 0, 0] }, 1.5));
 });
 
 test("the trajectory's canvas covers whole tiles around it, within the window", () => {
