@@ -87,10 +87,10 @@ class Setup:
     worlds: Sequence[str] = ("corridor", "random:11", "random:12")  # nothing was tuned on these two
     repeats: int = 15
     steps: int = 50
-    clock: Callable[[], float] = time.perf_counter
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
+    clock: Callable[[], float] = time.perf_counter
 
     @classmethod
     def tiny(cls, out: Path) -> Setup:
