@@ -1,32 +1,38 @@
 """Measures on an NVIDIA GPU what a CPU cannot answer for the virtual space, in steps that run apart; writes JSON.
 
-    python benchmarks/gpu.py [--step kernels,train,views,field-or-warp] [--out runs/gpu] [--dry-run]
+    python benchmarks/gpu.py [--step kernels,train,views,field-or-warp,depth] [--out runs/gpu] [--dry-run | --cpu]
 
 - kernels: values and gradients of the Triton kernels against plain torch on the same samples, and the time of both.
 - train: time until views of the field are within 1 dB of its last. The paper needs 3 to 4 s; goal: at most 1 s.
 - views: views a second, alone and while training. The paper has 10; goal: at least 60 at 1280 × 720.
-- field-or-warp: PSNR and SSIM of the field against the warped panoramas, with one and with several keyframes, on views
-  of the places of keyframes that were left out, in the corridor and in generated worlds.
+- field-or-warp: PSNR and SSIM of fields against the warp of the same keyframes, with one and with several, true and
+  wrong depth, on views of places that were left out. Fields: the default, one that also learns a panorama of the warp
+  from ahead (taught), and the paper's (density, with losses on depth, opacity and distortion). Runs on a CPU too:
+  ``--cpu``.
+- depth: ``ic depth train`` with the arguments ``DEPTH_TRAINING``, 6 minutes: panoramas a second and held-out errors.
 
-Each step takes less than 10 minutes (``--seconds`` limits a training) and writes OUT/STEP.json, train and field-or-warp
-OUT/STEP.png as well. Wall time; every call ends with a copy to the CPU, so nothing is still running. ``--dry-run`` does
-the same at tiny sizes on the CPU: its figures say only that the script works. Otherwise an NVIDIA GPU, torch's CUDA
-build and `pip install 'instant-ic[triton]'` are needed.
+Each step takes less than 10 minutes (``--seconds`` limits a training of a field) and writes OUT/STEP.json, train and
+field-or-warp OUT/STEP.png as well. Wall time; every call ends with a copy to the CPU, so nothing is still running.
+``--dry-run`` does the same at tiny sizes on the CPU: its figures say only that the script works. Otherwise an NVIDIA
+GPU, torch's CUDA build and `pip install 'instant-ic[triton]'` are needed.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import dataclasses
 import importlib.util
+import itertools
 import json
 import math
 import os
 import platform
 import statistics
+import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +43,7 @@ import torch
 
 from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.projections import CUBE_FACES, equirect_directions
 from instant_ic.vspace import FieldConfig, GeometryConfig, PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.nerf import reference
 from instant_ic.vspace.nerf.field import Device, Lattice, Scene, sample_weights
@@ -46,15 +53,22 @@ from instant_ic.vspace.prior import prepare
 from instant_ic.vspace.view import perspective_rays
 
 FOV = math.pi / 2
-FIELD_ONLY = PictureConfig(panorama_until_db=0.0, field_from_db=0.0)
+FIELD_ONLY = PictureConfig(field_alone=True)
 TARGETS = {
     "kernels": {"gradient_error": "at most 0.01 of the largest", "same_depth": "at least 0.96"},
     "train": {"within_1_db_s": "at most 1 (paper: 3 to 4)"},
     "views": {"fps_1280x720": "at least 60 (paper: 10)", "fps_training_1280x720": "at least 30", "first_view_s": "0.3"},
+    "depth": {"panoramas_per_s": "no target yet"},
     "field-or-warp": {"gain_db": "field over warp, above 0 with three keyframes"},
 }
 KEYFRAMES = {"one": (0.0,), "three": (-1.5, -0.75, 0.0), "three, one ahead": (-1.5, 3.0, 0.0)}
 """Places of the keyframes along x in metres, in order of arrival."""
+DEPTH_TRAINING = ("--network", "resnet50:512", "--batch-size", "16", "--minutes", "6", "--device", "cuda")
+"""Of ``ic depth train`` on a GPU; the preset for GPUs, once there is one."""
+DEPTH_ERRORS = (0.0, 0.04)
+"""Standard deviation of the keyframes' depth, as a share of it."""
+TAUGHT_AT = 1.2
+"""Place along x of the panorama that the warp teaches the field, m."""
 LEFT_OUT = {0.5: (0.5, 0.0, 0.0), 1.0: (1.0, -0.2, 0.3), 1.5: (1.5, 0.2, -0.4), 2.0: (2.0, 0.0, 0.0)}
 """Places of the judged views by distance from the newest keyframe: x, y in metres, yaw."""
 
@@ -70,12 +84,13 @@ class Setup:
     panorama: int = 1024
     sizes: tuple[tuple[int, int], ...] = ((320, 180), (640, 360), (1280, 720))
     view: tuple[int, int] = (640, 360)
-    worlds: tuple[str, ...] = ("corridor", "random:11", "random:12")  # nothing was tuned on these two
+    worlds: Sequence[str] = ("corridor", "random:11", "random:12")  # nothing was tuned on these two
     repeats: int = 15
     steps: int = 50
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
+    clock: Callable[[], float] = time.perf_counter
 
     @classmethod
     def tiny(cls, out: Path) -> Setup:
@@ -107,11 +122,14 @@ class Place:
         ways = np.minimum(free_m, np.roll(free_m, 32) + 1.5)  # ahead, and half as far behind
         self.start = pose_matrix(x, y, 1.2, yaw=math.pi - (int(np.argmax(ways)) + 0.5) * (2 * math.pi / 64))
 
-    def keyframe(self, x: float) -> tuple[Any, ...]:
-        """Arguments of ``VirtualSpace.set_keyframe``."""
+    def keyframe(self, x: float, wrong: float = 0.0) -> tuple[Any, ...]:
+        """Arguments of ``VirtualSpace.set_keyframe``; the depth has smooth errors of so large a share (1 sigma)."""
         pose, width = self.start @ pose_matrix(x), self._setup.panorama
         picture = self._renderer.render(pose, width, width // 2, supersample=2)
-        return picture.rgb, picture.depth_m, pose, 0.02
+        coarse = np.random.default_rng(round(100 * x) + 1000).normal(size=(9, 16)).astype(np.float32)
+        smooth = cv2.resize(coarse, (width, width // 2), interpolation=cv2.INTER_CUBIC)
+        depth_m = picture.depth_m * (1 + wrong * smooth / smooth.std())
+        return picture.rgb, depth_m, pose, max(wrong, 0.02)
 
     def truth(self, pose: Any) -> Any:
         """The world from a pose, (H, W, 3) uint8."""
@@ -300,43 +318,92 @@ def views(setup: Setup) -> dict[str, Any]:
 
 
 def field_or_warp(setup: Setup) -> dict[str, Any]:
-    """Left-out views of the warp, of the field alone and as shown after the training, by world and keyframes."""
+    """Left-out views of the warp of all keyframes and of fields trained on them, by world, depth and keyframes."""
     result: dict[str, Any] = {}
     rows = []
     device = setup.devices[0]
+    density = dataclasses.replace(setup.field, geometry="density")
+    alone = setup.config(device, keyframes=4, picture=FIELD_ONLY)
     sources = {
-        "warp": setup.config(device, source="warp", keyframes=3),
-        "field": setup.config(device, keyframes=3, picture=FIELD_ONLY),
-        "as shown": setup.config(device, keyframes=3),
+        "warp": dataclasses.replace(alone, source="warp"),
+        "field": alone,
+        "taught": alone,
+        "density": dataclasses.replace(alone, field=density),
     }
     for world in setup.worlds:
         place = Place(world, setup)
         poses = {distance: pose_matrix(x, y, yaw=yaw) for distance, (x, y, yaw) in LEFT_OUT.items()}
         truth = {distance: place.truth(pose) for distance, pose in poses.items()}
-        for name, places in KEYFRAMES.items():
-            taken, found, images = [place.keyframe(x) for x in places], {}, []
+        for wrong, (name, places) in itertools.product(DEPTH_ERRORS, KEYFRAMES.items()):
+            taken, found, images = [place.keyframe(x, wrong) for x in places], {}, []
             for source, config in sources.items():
+                if source in ("taught", "density") and name != "three, one ahead":
+                    continue
                 space = VirtualSpace(config)
+                if source == "taught":
+                    space.set_keyframe(*_warped_keyframe(taken, place.start @ pose_matrix(TAUGHT_AT), sources["warp"]))
                 for keyframe in taken:
                     space.set_keyframe(*keyframe)
-                start = time.perf_counter()
-                while source != "warp" and not space.status.converged and time.perf_counter() - start < setup.seconds:
+                start = setup.clock()
+                while source != "warp" and not space.status.converged and setup.clock() - start < setup.seconds:
                     space.train(iterations=10)
-                seconds = time.perf_counter() - start
+                seconds = setup.clock() - start
                 shown = {distance: place.shown(space, pose) for distance, pose in poses.items()}
                 images.append(np.hstack(list(shown.values())))
                 found[source] = {
                     "psnr_db": {f"{d:g} m": round(psnr_db(view, truth[d]), 2) for d, view in shown.items()},
                     "ssim": {f"{d:g} m": round(ssim(view, truth[d]), 4) for d, view in shown.items()},
                     "seconds": round(seconds, 2),
+                    "iterations": space.status.iterations,
                 }
             means = {source: statistics.mean(values["psnr_db"].values()) for source, values in found.items()}
-            gain = {"gain_db": round(means["field"] - means["warp"], 2)}
-            result.setdefault(world, {})[name] = found | gain
-            if name == "three":
+            gains = {source: round(mean - means["warp"], 2) for source, mean in means.items() if source != "warp"}
+            result.setdefault(world, {}).setdefault(f"depth {wrong:.0%} off", {})[name] = found | {"gain_db": gains}
+            print(f"{world}, depth {wrong:.0%} off, {name}: {means}", file=sys.stderr, flush=True)
+            if name == "three, one ahead":
                 rows += [np.hstack(list(truth.values())), *images]
     write_image(setup.out / "field-or-warp.png", np.vstack(rows))
     return result
+
+
+def _warped_keyframe(taken: list[tuple[Any, ...]], pose: Any, config: VirtualSpaceConfig) -> tuple[Any, ...]:
+    """Arguments of ``set_keyframe``: the warp's panorama from a pose, what no keyframe has seen included."""
+    space = VirtualSpace(config)
+    for keyframe in taken:
+        space.set_keyframe(*keyframe)
+    height, width = taken[0][0].shape[:2]
+    cube = space.render_cube(pose, width // 4)
+    directions = equirect_directions(width, height)
+    rgb, depth = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
+    for rotation, colours, depths in zip(CUBE_FACES.values(), cube.rgb, cube.depth_m, strict=True):
+        x, y, z = np.moveaxis(directions @ rotation.astype(np.float32), -1, 0)
+        inside = (x >= np.abs(y)) & (x >= np.abs(z))
+        half = width // 8
+        column, row = ((half * (1 - t[inside] / x[inside])).astype(int).clip(0, 2 * half - 1) for t in (y, z))
+        rgb[inside], depth[inside] = colours[row, column], depths[row, column]
+    return rgb, depth, pose, 0.05
+
+
+def depth(setup: Setup) -> dict[str, Any]:
+    """Speed and held-out errors of a training of the depth network; in a dry run of a tiny one on six images."""
+    words, checkpoint = list(DEPTH_TRAINING), setup.out / "depth.pt"
+    if setup.dry:
+        folder = setup.out / "panoramas"
+        for name in ("rgb", "depth"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        for index in range(6):
+            cv2.imwrite(str(folder / "rgb" / f"{index}.png"), np.full((64, 128, 3), 40 * index, np.uint8))
+            np.save(folder / "depth" / f"{index}.npy", np.full((64, 128), 1.0 + index, np.float32))
+        words = ["--data", f"plain:{folder}", "--network", "resnet18:64", "--epochs", "1", "--batch-size", "2"]
+        words += ["--device", "cpu", "--workers", "1"]
+    command = [sys.executable, "-m", "instant_ic.cli.main", "depth", "train", *words, "--checkpoint", str(checkpoint)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=580, check=False)
+    if done.returncode:
+        raise RuntimeError(f"ic depth train: {done.stderr[-2000:]}")
+    with checkpoint.with_suffix(".csv").open() as file:
+        speeds = [float(row["panoramas_per_s"]) for row in csv.DictReader(file) if row["panoramas_per_s"]]
+    held_out = json.loads(done.stdout.splitlines()[-1])
+    return {"arguments": words, "panoramas_per_s": speeds[-1], "held_out": held_out}
 
 
 def write_image(path: Path, rgb: Any) -> None:
@@ -347,7 +414,7 @@ def write_image(path: Path, rgb: Any) -> None:
     cv2.imwrite(str(path), rgb)
 
 
-STEPS = {"kernels": kernels, "train": train, "views": views, "field-or-warp": field_or_warp}
+STEPS = {"kernels": kernels, "train": train, "views": views, "field-or-warp": field_or_warp, "depth": depth}
 
 
 def main() -> int:
@@ -356,11 +423,15 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/gpu"), help="folder of the results (default runs/gpu)")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each training at most (default 10)")
     parser.add_argument("--dry-run", action="store_true", help="tiny sizes on the CPU")
+    parser.add_argument("--cpu", action="store_true", help="field-or-warp on the CPU; --seconds are CPU seconds")
+    parser.add_argument("--worlds", default="corridor,random:11,random:12", help="worlds, by commas")
     arguments = parser.parse_args()
     steps = arguments.step.split(",")
     if unknown := sorted(set(steps) - set(STEPS)):
         parser.error(f"--step: no such step: {', '.join(unknown)}; there are {', '.join(STEPS)}")
-    if not arguments.dry_run and not torch.cuda.is_available():
+    if arguments.cpu and steps != ["field-or-warp"]:
+        parser.error("--cpu: only --step field-or-warp is of use on a CPU")
+    if not (arguments.dry_run or arguments.cpu or torch.cuda.is_available()):
         parser.error("torch finds no CUDA device; --dry-run checks the script without one")
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.dry_run:
@@ -368,14 +439,23 @@ def main() -> int:
         torch.set_num_threads(1)  # of tiny work threads wait for each other
         setup = Setup.tiny(arguments.out)
     else:
-        setup = Setup(False, arguments.out, ("triton", "torch-cuda"), arguments.seconds)
-    machine = "dry run on the CPU" if setup.dry else torch.cuda.get_device_name()
+        setup = Setup(
+            False, arguments.out, ("triton", "torch-cuda"), arguments.seconds, worlds=arguments.worlds.split(",")
+        )
+    if arguments.cpu:
+        small = {"view": (320, 180), "clock": time.process_time, "train": TrainConfig(iterations=1000)}
+        setup = dataclasses.replace(setup, devices=("cpu",), **small)
+    machine = "dry run on the CPU" if setup.dry else "CPU" if arguments.cpu else torch.cuda.get_device_name()
     failed = False
     for step in steps:
         start = time.perf_counter()
         try:
             found: dict[str, Any] = STEPS[step](setup)
-        except (RuntimeError, ImportError) as error:  # one step's failure must not hide the others' figures
+        except (
+            RuntimeError,
+            ImportError,
+            subprocess.TimeoutExpired,
+        ) as error:  # one step's failure must not hide the others' figures
             found, failed = {"error": f"{type(error).__name__}: {error}"}, True
         about = {"step": step, "machine": machine, "python": platform.python_version(), "torch": torch.__version__}
         result = about | {"targets": TARGETS[step], "took_s": round(time.perf_counter() - start, 1), "result": found}

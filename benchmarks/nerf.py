@@ -164,7 +164,7 @@ def scene(world: str) -> tuple[Any, Any, list[Any], list[Any]]:
 
 def shown(source: str) -> VirtualSpaceConfig:
     """``field``: the field alone; ``shown``: the default; ``density``: the field alone, as density."""
-    alone = PictureConfig(panorama_until_db=30.0, field_from_db=30.0)
+    alone = PictureConfig(field_alone=True)
     if source == "shown":
         return VirtualSpaceConfig()
     geometry = "density" if source == "density" else "distance"

@@ -187,7 +187,7 @@ def make_space(shots: list[Shot], depth: str, settings: VspaceSettings, config: 
 
 def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
     """The same configuration, but rendering the field however little it is trained."""
-    return replace(config, picture=replace(config.picture, field_from_db=config.picture.panorama_until_db))
+    return replace(config, picture=replace(config.picture, field_alone=True))
 
 
 def make_source(

@@ -11,7 +11,6 @@ from instant_ic.vspace.compose import Layer, compose
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.store import Keyframe, KeyframeSet
 from instant_ic.vspace.view import continue_unseen
-from instant_ic.vspace.warp import dissolve
 
 Drawing = tuple[Floats, Floats, Floats]
 """Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,)."""
@@ -37,24 +36,20 @@ class Picture:
 def draw(
     rays: Rays,
     shown: KeyframeSet | None,
-    panorama_share: float,
     field: Drawing | None,
     layers: dict[int, Drawing],
 ) -> Picture:
-    """Compose a view: warped panoramas blended with the field, and the background in unseen places.
+    """Compose a view: warped panoramas or the field, and the background in unseen places.
 
     Args:
         rays: of a perspective view; of any where ``shown`` is None.
         shown: the keyframes; None: the field alone, nothing is warped. Warping needs numba.
-        panorama_share: of the warped panoramas, 0..1.
-        field: the view as the field has it, as ``field.Device.draw`` gives it; None: the panoramas alone.
+        field: the view as the field has it, as ``field.Device.draw`` gives it; None: the panoramas.
         layers: in and out, the warps of keyframes that have been rendered for this view.
     """
     if field is None:
         assert shown is not None, "neither keyframes nor a field to render"
         picture = _warped(rays, shown, layers)
-    elif shown is not None and panorama_share > 0:
-        picture = dissolve(_warped(rays, shown, layers), field, panorama_share)
     else:
         picture = field
     colour, depth, confidence = picture

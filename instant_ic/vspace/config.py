@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
@@ -147,36 +146,23 @@ class ReadinessConfig:
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """Content of a view: the keyframe's panorama, warped by its depth, then the field as it becomes better.
-
-    The share of the panorama falls linearly in the PSNR of the training rays.
+    """Content of a view: the keyframe's panorama warped by its depth, or the field where it is measured to be better.
 
     Attributes:
-        panorama_until_db: the panorama alone up to this PSNR of the training rays.
-        field_from_db: the field alone from this PSNR on, mixed in between; set to panorama_until_db: field only.
+        field_gain_db: dB by which the field must render older keyframes better than the warp to be shown; it then stays
+            until it is worse.
+        field_alone: the field from its first step on, never the warp, unmeasured: for experiments.
         refresh_pictures: number of views over which a new keyframe is blended in; 1: at once.
-        least_depth_share: of the keyframe's depth in where surfaces lie, at least; else the panorama's share.
+        least_depth_share: of the keyframe's depth in where the field's surfaces lie.
     """
 
-    panorama_until_db: Annotated[float, Range(-100, 200)] = 40.0
-    field_from_db: Annotated[float, Range(-100, 200)] = 44.0
-
+    field_gain_db: Annotated[float, Range(0, 20)] = 0.5
+    field_alone: bool = False
     refresh_pictures: Annotated[int, Range(1, 60)] = 6
     least_depth_share: Share = 0.5
 
     def __post_init__(self) -> None:
         check_ranges(self)
-
-    def depth_share(self, psnr_db: float) -> float:
-        """Share of the keyframe's depth in the signed distance, 0..1."""
-        return max(self.panorama_share(psnr_db), self.least_depth_share)
-
-    def panorama_share(self, psnr_db: float) -> float:
-        """Share of the panorama's colour, 0..1; 1 where nothing is known yet (NaN)."""
-        span = self.field_from_db - self.panorama_until_db
-        if span <= 0:
-            return 0.0
-        return 1.0 if math.isnan(psnr_db) else min(max((self.field_from_db - psnr_db) / span, 0.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -184,8 +170,8 @@ class VirtualSpaceConfig:
     """Everything about the virtual space but the bus.
 
     Attributes:
-        source: field: the panorama warped by its depth until the field is better; warp: that alone, no training; auto:
-            field on a GPU, else warp, because no field trained on a CPU becomes better in time; mesh.
+        source: field: the panorama warped by its depth until the field is measured to be better; warp: that alone, no
+            training; auto: field on a GPU, else warp, because no field trained on a CPU becomes better in time; mesh.
         mesh: file of a place scanned beforehand (GLB, glTF, PLY, OBJ), with source: mesh.
         mesh_pose: where the mesh lies in the map: x, y, z (m), yaw (degrees, counter-clockwise).
         mesh_max_triangles: larger meshes are refused.
@@ -196,7 +182,7 @@ class VirtualSpaceConfig:
         keyframes: newest keyframes that are kept and shown together, 1..8; the time per view grows with it.
         older: older keyframes, from up to 3 m away, whose pixels show what is hidden from the newest; costs nothing per
             view.
-        picture: the keyframe's panorama, warped by its depth, then the field.
+        picture: the keyframe's panorama warped by its depth, or the field.
     """
 
     source: str = "field"

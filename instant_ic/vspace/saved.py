@@ -19,9 +19,7 @@ from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import FieldParameters, Floats, Lattice
 from instant_ic.vspace.prior import PanoramaPrior
 
-FORMAT, VERSION = "instant_ic virtual space", 2
-_IN_FILE = {"depth_edge": "torn"}
-"""Names of fields in files of this version, where they differ."""
+FORMAT, VERSION = "instant_ic virtual space", 3
 FILE_NAME = "space.npz"
 """Name of the file in a folder."""
 
@@ -40,6 +38,7 @@ class Progress:
     ready_iterations: int
     train_seconds: float
     ready: bool
+    shows_field: bool
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
     groups: dict[str, Any] = {f"prior.{number}": prior for number, prior in enumerate(saved.priors)}
     for group, part in (groups | {"lattice": saved.lattice, "parameters": saved.parameters}).items():
         for field in dataclasses.fields(part):
-            arrays[f"{group}.{_IN_FILE.get(field.name, field.name)}"] = np.asarray(getattr(part, field.name))
+            arrays[f"{group}.{field.name}"] = np.asarray(getattr(part, field.name))
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
@@ -159,7 +158,7 @@ def _checksum(arrays: dict[str, NDArray[Any]]) -> bytes:
 def _group(kind: type[Any], group: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """A dataclass of arrays and numbers."""
     names = [field.name for field in dataclasses.fields(kind)]
-    values = {name: arrays[f"{group}.{_IN_FILE.get(name, name)}"] for name in names}
+    values = {name: arrays[f"{group}.{name}"] for name in names}
     return kind(**{name: value.item() if value.ndim == 0 else value for name, value in values.items()})
 
 

@@ -266,8 +266,10 @@ class JobSchedule:
             text = f"training, {status.psnr_db:.1f} dB" if status.iterations else "training"
         if status.refreshing:
             text += f"; learning keyframe {self.keyframe.id}"
-        share = self.config.picture.panorama_share(status.psnr_db)
-        return f"{text}; shown: {share:.0%} warped panorama" if share > 0 else text
+        text += f"; shown: the {'field' if status.shows_field else 'warped panorama'}"
+        if not math.isnan(status.gain_db):
+            text += f" (older keyframes by the field: {status.gain_db:+.1f} dB against the warp)"
+        return text
 
     def findings(self, outcome: Outcome) -> list[Finding]:
         """Diagnoses that follow from a job's outcome, after it was taken."""

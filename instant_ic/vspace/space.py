@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.vspace import canvas
 from instant_ic.vspace.canvas import Drawing, Painted, Picture
+from instant_ic.vspace.choice import Choice, Trial, gain_db, trials
 from instant_ic.vspace.compose import exposure_gains, moved
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_out_of_memory, make_device
@@ -83,6 +84,9 @@ class Status:
     device: str
     warning: str = ""
     """Problem of the device; empty when there is none."""
+    shows_field: bool = False
+    gain_db: float = math.nan
+    """PSNR of the field above the warp's on older keyframes; NaN where it was not measured."""
 
 
 class NotReadyError(RuntimeError):
@@ -91,10 +95,11 @@ class NotReadyError(RuntimeError):
 
 @dataclass(frozen=True)
 class Prepared:
-    """A scene to train on, and its keyframes."""
+    """A scene to train on, its keyframes, and the older ones that field and warp are compared by."""
 
     scene: Scene
     keyframes: KeyframeSet
+    trials: tuple[Trial, ...] = ()
 
 
 class VirtualSpace(Drawn):
@@ -138,6 +143,8 @@ class VirtualSpace(Drawn):
         self._pictures = 0  # rendered since then
         self._scene: Scene | None = None  # what the field learns
         self._held: tuple[Keyframe, ...] = ()  # whose arrays the scene looks at
+        self._trials: tuple[Trial, ...] = ()
+        self._choice = Choice(self.config.picture.field_gain_db)
         self._texture: tuple[PanoramaPrior, Texture] | None = None
         self._ready = False
         self._colour_error = math.nan
@@ -178,8 +185,8 @@ class VirtualSpace(Drawn):
 
     @property
     def _done(self) -> bool:
-        """Whether nothing is left to train."""
-        return self._schedule.finished or self.config.source == "warp"
+        """Whether nothing is left to train, or it would not help."""
+        return self._schedule.finished or self._choice.hopeless or self.config.source == "warp"
 
     def set_keyframe(
         self,
@@ -273,7 +280,8 @@ class VirtualSpace(Drawn):
         lattice, scene = Lattice.for_prior(priors[0], config.field), self._scene
         if scene is not None and scene.lattice.suits(lattice):
             lattice = scene.lattice
-        return Prepared(Scene(priors, lattice, build_occupancy(priors, config.geometry), prepared.gains), prepared)
+        scene = Scene(priors, lattice, build_occupancy(priors, config.geometry), prepared.gains)
+        return Prepared(scene, prepared, () if config.picture.field_alone else trials(prepared))
 
     def learn(self, prepared: Prepared) -> None:
         """Train on these keyframes from now on, starting from the present parameters.
@@ -287,8 +295,11 @@ class VirtualSpace(Drawn):
         else:
             self._start_anew(scene, old)
         self._scene, self._held = scene, prepared.keyframes.keyframes
-        self._ready = self._ready and (refresh or self.config.picture.panorama_share(math.nan) == 1)
+        self._ready = self._ready and (refresh or not self.config.picture.field_alone)
         self._reset_run(refresh)
+        self._trials = prepared.trials
+        self._choice.gain_db = math.nan  # on other images
+        self._choose()
 
     def _start_anew(self, scene: Scene, old: Scene) -> None:
         learnt = self._device.parameters()
@@ -324,12 +335,21 @@ class VirtualSpace(Drawn):
             self._schedule.iteration += 1
             done += 1
             distance_error = math.sqrt(distance)
+            if self._schedule.finished or self._schedule.iteration % self.config.readiness.plateau_iterations == 0:
+                self._choose()
             self._note(colour)
             if (time.perf_counter() - start) * 1e3 >= budget_ms:
                 break
         elapsed = time.perf_counter() - start
         self._train_seconds += elapsed
         return TrainStats(done, self._psnr_db, distance_error, elapsed * 1e3, self._done)
+
+    def _choose(self) -> None:
+        """Show the field or the warp, whichever renders the older keyframes better."""
+        share, train = self.config.picture.least_depth_share, self.config.train
+        drawings = [self._on_device(functools.partial(_field_alone, trial.rays, share)) for trial in self._trials]
+        left = (train.iterations - self._schedule.iteration) / self.config.readiness.plateau_iterations
+        self._choice.take(gain_db(self._trials, drawings), left)
 
     def _note(self, colour_error: float) -> None:
         first = math.isnan(self._colour_error)
@@ -339,7 +359,7 @@ class VirtualSpace(Drawn):
         full = len(self._history) == rule.plateau_iterations + 1
         plateau = full and self._history[-1] - self._history[0] < rule.plateau_db
         good = self._psnr_db >= rule.psnr_db and self._schedule.iteration >= 5
-        if not self._ready_iterations and (good or plateau or self._schedule.finished):
+        if not self._ready_iterations and (good or plateau or self._done):
             self._ready_iterations, self._ready = self._schedule.iteration, True
 
     @property
@@ -363,6 +383,8 @@ class VirtualSpace(Drawn):
             source=self.config.source,
             device=self._device.name,
             warning=self._warning,
+            shows_field=self._panorama_share == 0,
+            gain_db=self._choice.gain_db,
         )
 
     def _ready_radius_m(self) -> float:
@@ -436,16 +458,18 @@ class VirtualSpace(Drawn):
     def _drawn(
         self, device: Device, rays: Rays, shown: KeyframeSet, warps: bool, layers: dict[int, Drawing]
     ) -> Picture:
-        """Render keyframes: their panoramas warped (``warps``), blended with the field as it improves."""
-        share, depth_share = self._panorama_share, self.config.picture.depth_share(self._psnr_db)
-        field = None
-        if share < 1 or not warps:
-            field = device.draw(rays, 0.0 if warps else share, depth_share)
-        return canvas.draw(rays, shown if warps else None, share, field, layers)
+        """Render keyframes: their panoramas warped (``warps``), or the field."""
+        share, field = self._panorama_share, None
+        if share == 0 or not warps:
+            field = device.draw(rays, share, max(share, self.config.picture.least_depth_share))
+        return canvas.draw(rays, shown if warps else None, field, layers)
 
     @property
     def _panorama_share(self) -> float:
-        return 1.0 if self.config.source == "warp" else self.config.picture.panorama_share(self._psnr_db)
+        """1 while the panorama is shown, 0 while the field is."""
+        if self.config.source == "warp":
+            return 1.0
+        return 0.0 if self.config.picture.field_alone or self._choice.field else 1.0
 
     def _on_device(self, call: Callable[[Device], T]) -> T:
         """Call with the backend; with ``device: auto``, a GPU that runs out of memory is replaced by the CPU."""
@@ -472,6 +496,7 @@ class VirtualSpace(Drawn):
         return Progress(
             *(self._psnr_db, schedule.iteration, schedule.refresh),
             *(self._ready_iterations, self._train_seconds, self._ready),
+            shows_field=self._choice.field,
         )
 
     def save(self, path: str | Path) -> Path:
@@ -519,6 +544,7 @@ class VirtualSpace(Drawn):
         space._colour_error = 10 ** (-progress.psnr_db / 10)
         space._train_seconds, space._ready_iterations = progress.train_seconds, progress.ready_iterations
         space._ready = progress.ready
+        space._choice.field = progress.shows_field
         # Rays that were not sampled before, the same at each loading.
         space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
         return space
@@ -529,6 +555,10 @@ def _renewed(keyframe: Keyframe, prior: PanoramaPrior) -> Keyframe:
     if prior is keyframe.prior:
         return keyframe
     return ready(keyframe.place, prior, None if keyframe.warp is None else keyframe.warp.pyramid)
+
+
+def _field_alone(rays: Rays, depth_share: float, device: Device) -> Drawing:
+    return device.draw(rays, 0.0, depth_share)
 
 
 def _step(uniform: Floats, rates: tuple[float, float], device: Device) -> tuple[float, float]:

@@ -24,8 +24,6 @@ def warm_up(config: VirtualSpaceConfig) -> None:
         config,
         field=dataclasses.replace(config.field, log2_table=10),
         train=dataclasses.replace(config.train, ray_columns=16, ray_rows=16),
-        # Images of both the warp and the field.
-        picture=dataclasses.replace(config.picture, panorama_until_db=-100.0, field_from_db=200.0),
     )
     space = VirtualSpace(small)
     rgb = np.zeros((32, 64, 3), np.uint8)
@@ -37,7 +35,10 @@ def warm_up(config: VirtualSpaceConfig) -> None:
     aside[1, 3] = 1.0
     for pose in (np.eye(4), aside)[: config.keyframes]:
         space.set_keyframe(rgb, depth, pose, 0.05)
+    pose = aside if config.keyframes == 1 else np.eye(4)
+    space.render(pose, 32, 16, math.pi / 2)
     if space.config.source == "field":
         space.train(iterations=1)
         space.render_equirect(np.eye(4), 64)
-    space.render(aside if config.keyframes == 1 else np.eye(4), 32, 16, math.pi / 2)
+        space.config = dataclasses.replace(space.config, picture=dataclasses.replace(config.picture, field_alone=True))
+        space.render(pose, 32, 16, math.pi / 2)

@@ -186,20 +186,6 @@ class PanoramaWarp:
         return colour, depth, confidence
 
 
-def dissolve(
-    warped: tuple[Floats, Floats, Floats], field: tuple[Floats, Floats, Floats], share: float
-) -> tuple[Floats, Floats, Floats]:
-    """Blend two renderings of one view: ``share`` of the first; where one has nothing, the other.
-
-    Depth and confidence are those of the larger share.
-    """
-    weights = [share * (warped[2] > 0), (1 - share) * (field[2] > 0)]
-    total = np.maximum(weights[0] + weights[1], np.float32(1e-9))
-    colour = (warped[0] * (weights[0] / total)[:, None] + field[0] * (weights[1] / total)[:, None]).astype(np.float32)
-    first = weights[0] >= weights[1]
-    return colour, np.where(first, warped[1], field[1]), np.where(first, warped[2], field[2])
-
-
 def pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
     """Pose (4, 4) of a perspective view, and the tangent of half its horizontal field of view, from its rays."""
     height, width = rays.shape

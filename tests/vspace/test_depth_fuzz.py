@@ -1,5 +1,6 @@
 """Any depth image is refused with a reason or goes through the whole chain: keyframe, occupancy, training, views."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -29,7 +30,6 @@ CONFIG = VirtualSpaceConfig(
     field=FieldConfig(levels=2, log2_table=10, hidden=8),
     train=TrainConfig(ray_columns=8, ray_rows=8),
     geometry=GeometryConfig(cell_m=0.2, max_cells=200_000),
-    picture=PictureConfig(-100.0, 200.0),  # panorama and field, mixed
 )
 
 
@@ -80,7 +80,9 @@ def test_any_depth_is_refused_or_shown(depths, sigma, step_m, robot):
     if space.keyframe is None:
         return
     pose = space.keyframe.map_from_camera @ pose_matrix(0.4, 0.1, 0.0, yaw=0.2)
-    for view in (space.render(pose, 24, 16, 1.5), space.render_equirect(pose, 32)):
+    views = [space.render(pose, 24, 16, 1.5), space.render_equirect(pose, 32)]
+    space.config = dataclasses.replace(CONFIG, picture=PictureConfig(field_alone=True))
+    for view in (*views, space.render(pose, 24, 16, 1.5)):
         assert view.rgb.shape[2] == 3
         assert np.isfinite(view.depth_m).all() and view.depth_m.min() >= 0
         assert view.confidence.min() >= 0 and view.confidence.max() <= 1

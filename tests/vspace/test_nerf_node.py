@@ -118,7 +118,7 @@ def test_the_first_view_comes_before_any_training(bus):
     assert psnr_db(picture, true.rgb) > 20
     status = bus.last("/vspace/status")
     assert (status.state, status.iterations) == (TRAINING, 0)
-    assert "100% warped panorama" in status.message
+    assert "shown: the warped panorama" in status.message
 
 
 def test_the_warp_as_the_source_is_ready_with_the_keyframe():

@@ -145,7 +145,7 @@ WRONG = {
     "foreign": "not a saved virtual space",
     "text": "not a saved virtual space",
     "empty": "not a saved virtual space",
-    "newer": "version 3, this program reads up to 2",
+    "newer": "version 4, this program reads up to 3",
     "key": "colour",
     "value": "levels",
     "array": "parameters.w1",
@@ -173,7 +173,7 @@ def test_a_failing_write_leaves_the_old_file(space, tmp_path, monkeypatch):
 
 def test_every_setting_survives(space, tmp_path):
     config = dataclasses.replace(
-        CONFIG, panorama_width=512, picture=dataclasses.replace(CONFIG.picture, field_from_db=31)
+        CONFIG, panorama_width=512, picture=dataclasses.replace(CONFIG.picture, field_gain_db=2)
     )
     other = VirtualSpace(config)
     keyframe(other, CAMERA)

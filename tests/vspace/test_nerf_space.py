@@ -32,7 +32,7 @@ CONFIG = VirtualSpaceConfig(
     field=FieldConfig(log2_table=14),
     train=TrainConfig(ray_columns=64, ray_rows=32, iterations=120),
 )
-FIELD_ONLY = dataclasses.replace(CONFIG, picture=PictureConfig(field_from_db=30))
+FIELD_ONLY = dataclasses.replace(CONFIG, picture=PictureConfig(field_alone=True))
 CAMERA = pose_matrix(x=0.4, y=0.1, z=0.05, yaw=-0.5)
 
 
@@ -199,12 +199,7 @@ def test_a_keyframe_that_replaces_one_that_is_not_fit_is_shown_at_once():
     assert np.array_equal(space.keyframe.map_from_camera, NEXT)
 
 
-def test_the_panorama_gives_way_to_the_field():
-    rule = PictureConfig(panorama_until_db=30, field_from_db=36)
-    shares = [rule.panorama_share(db) for db in (math.nan, 20.0, 30.0, 33.0, 36.0, 40.0)]
-    assert shares == [1, 1, 1, 0.5, 0, 0]
-    assert PictureConfig(panorama_until_db=30, field_from_db=30).panorama_share(math.nan) == 0
-    # A picture from the panorama through the field's geometry is nearer to the truth than the young field's own.
+def test_the_panorama_is_nearer_to_the_truth_than_a_young_field():
     pose = pose_matrix(x=0.7, y=-0.1, yaw=-0.4)
     truth = box_room.perspective(pose, 160, 90, 1.5).rgb
     mixed, field_only = (psnr_db(trained(40, c).render(pose, 160, 90, 1.5).rgb, truth) for c in (CONFIG, FIELD_ONLY))

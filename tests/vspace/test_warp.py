@@ -12,7 +12,6 @@ from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.vspace import (
     FieldConfig,
     KeyframeError,
-    PictureConfig,
     State,
     TrainConfig,
     VirtualSpace,
@@ -22,7 +21,7 @@ from instant_ic.vspace import (
 )
 from instant_ic.vspace.prior import _fill
 from instant_ic.vspace.view import perspective_rays
-from instant_ic.vspace.warp import PanoramaWarp, Pyramid, dissolve
+from instant_ic.vspace.warp import PanoramaWarp, Pyramid
 
 FOV = math.pi / 2
 
@@ -184,32 +183,6 @@ def test_the_warp_as_the_source_is_ready_at_once_and_trains_nothing(room):
     assert not space.status.refreshing
     with pytest.raises(ValueError, match="source"):
         VirtualSpaceConfig(source="mesh")
-
-
-def test_warp_and_field_are_dissolved_into_each_other(room):
-    camera, picture = room
-    pose = camera @ pose_matrix(0.4)
-    pictures = []
-    for until, end in ((50.0, 60.0), (-20.0, 60.0), (-20.0, -20.0)):  # warp alone, both, field alone
-        config = VirtualSpaceConfig(
-            device="cpu", field=SMALL.field, train=SMALL.train, picture=PictureConfig(until, end)
-        )
-        space = VirtualSpace(config)
-        space.set_keyframe(picture.rgb, picture.depth_m, camera, 0.02)
-        space.train(iterations=20)
-        pictures.append(space.render(pose, 96, 54, FOV))
-    assert psnr_db(pictures[1].rgb, pictures[0].rgb) > psnr_db(pictures[2].rgb, pictures[0].rgb) + 1
-
-
-def test_a_dissolve_by_hand():
-    """0.75 of the first where both have a surface; where one has none, the other alone."""
-    one = np.ones((3, 3), np.float32)
-    first = one * 0.8, np.array([2, 2, 0], np.float32), np.array([1, 1, 0], np.float32)
-    second = one * 0.4, np.array([3, 0, 3], np.float32), np.array([1, 0, 1], np.float32)
-    colour, depth, confidence = dissolve(first, second, 0.75)
-    assert colour[:, 0] == pytest.approx([0.7, 0.8, 0.4])
-    assert depth.tolist() == [2, 2, 3]
-    assert confidence.tolist() == [1, 1, 1]
 
 
 def test_a_views_pose_follows_from_its_rays(warp):

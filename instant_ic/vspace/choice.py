@@ -1,0 +1,96 @@
+"""Warp or field, by measurement: an older keyframe is a true image from a displaced place, which both must render."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace.canvas import Drawing, draw
+from instant_ic.vspace.compose import exposure_gains
+from instant_ic.vspace.nerf.field import Floats, Rays
+from instant_ic.vspace.store import KeyframeSet, spread
+from instant_ic.vspace.view import perspective_rays
+
+TRIALS = 2
+"""Older keyframes that are rendered, at most."""
+_SIZE, _FOV = (256, 144), math.pi / 2
+"""Of a trial's view in pixels: as fine as a panorama of 1024 columns, so that neither side is blurred."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A view of an older keyframe as it was, and how well the warp renders it.
+
+    Attributes:
+        rays: P rays from that keyframe's place along the newest one's heading.
+        truth: (P, 3), 0..1, in the newest keyframe's exposure.
+        warp_error: (P,) mean squared error of the warp's colour, NaN where nothing is judged.
+    """
+
+    rays: Rays
+    truth: Floats
+    warp_error: Floats
+
+    @classmethod
+    def of(cls, rays: Rays, truth: Floats, judged: NDArray[np.bool_], warped: Floats) -> Trial:
+        """Of the warp's colours (P, 3); ``judged`` (P,): both sides have seen the place."""
+        return cls(rays, truth, np.where(judged, _error(warped, truth), np.float32(np.nan)))
+
+
+def trials(shown: KeyframeSet) -> tuple[Trial, ...]:
+    """The older keyframes that are kept but neither shown nor learnt, rendered by the warp of those that are.
+
+    Places hidden from the shown keyframes are left out: the warp has them from the very images that it is judged by.
+    """
+    newest, found = shown.keyframes[0], []
+    for older in spread((newest, *shown.kept), TRIALS):
+        assert older.warp is not None, "keyframes are kept for warping only"
+        pose = newest.prior.map_from_camera.copy()
+        pose[:3, 3] = older.prior.map_from_camera[:3, 3]
+        rays = perspective_rays(pose, *_SIZE, _FOV)
+        colour, _, known = older.warp.draw(rays)
+        warped = draw(rays, shown, None, {})
+        truth = np.clip(colour * exposure_gains([newest.prior, older.prior])[1], 0, 1).astype(np.float32)
+        found.append(Trial.of(rays, truth, (known > 0) & (warped.confidence > 0), warped.colour))
+    return tuple(found)
+
+
+def gain_db(trials: Sequence[Trial], drawings: Sequence[Drawing]) -> float:
+    """PSNR of the field's drawings above the warp's over all judged pixels that both render; NaN without any."""
+    warp = field = 0.0
+    for trial, (colour, _, confidence) in zip(trials, drawings, strict=True):
+        both = np.isfinite(trial.warp_error) & (confidence > 0)
+        warp += float(trial.warp_error[both].sum())
+        field += float(_error(colour, trial.truth)[both].sum())
+    return 10 * math.log10(warp / field) if warp > 0 and field > 0 else math.nan
+
+
+def _error(colour: Floats, truth: Floats) -> Floats:
+    return np.asarray(((colour - truth) ** 2).mean(axis=1), np.float32)
+
+
+class Choice:
+    """Which of the two is shown; with hysteresis, so that it does not change to and fro.
+
+    Args:
+        least_db: gain from which the field is shown; it stays until it is worse than the warp.
+
+    Attributes:
+        field: the field is shown.
+        gain_db: as last measured; NaN: not measured.
+        hopeless: at the rate of its last gain, the field would still lose at the end of its training.
+    """
+
+    def __init__(self, least_db: float, field: bool = False) -> None:
+        self.field, self.gain_db, self.hopeless = field, math.nan, False
+        self._least_db = least_db
+
+    def take(self, gain_db: float, spans_left: float = math.inf) -> None:
+        """Take a measurement; ``spans_left``: training left, in units of that since the measurement before."""
+        grown, self.gain_db = gain_db - self.gain_db, gain_db
+        self.field = gain_db >= (0 if self.field else self._least_db)
+        self.hopeless = not self.field and gain_db + max(grown, 0) * spans_left < 0
