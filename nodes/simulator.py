@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
+from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.capture import CaptureError
-from instant_ic.msg import Bool, Float32, Odometry, odometry_message
+from instant_ic.msg import Bool, Float32, Odometry, PoseStamped, matrix_from_pose, odometry_message
 from instant_ic.pace import current
 from instant_ic.paths import run_dir
 from instant_ic.sim.capture_replay import CaptureReplay
@@ -52,6 +53,7 @@ class SimulatorNode(Node[SimulatorConfig]):
 
         self._loop = RealTimeLoop(self.simulation, self._devices.scanner, report)
         self.late = self.publisher("/simulation/late", Float32, qos=SENSOR)
+        self.subscribe("/simulation/put_down", PoseStamped, self._put_down, qos=RELIABLE)
         self.timer(_TRUTH_S, self._publish_truth)
         self.timer(_LATE_S, self._publish_late)
         self.timer(1.0, self._check)
@@ -63,6 +65,14 @@ class SimulatorNode(Node[SimulatorConfig]):
             self._loop.stop()
         if self._devices is not None:
             self._devices.close()
+
+    def _put_down(self, message: PoseStamped) -> None:
+        """Lift the robot and put it down elsewhere in the world."""
+        try:
+            x, y, yaw = (float(v) for v in pose2_from_matrix(matrix_from_pose(message)))
+            self.simulation.put_down((x, y, yaw))
+        except ValueError as error:
+            self.log.warning("/simulation/put_down is not used: %s", error)
 
     def _publish_truth(self) -> None:
         simulation, robot = self.simulation, self.simulation.robot

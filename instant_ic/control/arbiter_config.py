@@ -87,11 +87,16 @@ class PoseTrustConfig:
         slow: probability of being lost from which the r-bot drives slowly and does not switch.
         stop: probability of being lost from which the r-bot stops, until the operator lets go of the controls.
         speed_m_s: speed limit in m/s from the first of the two on.
+        jump_m: m; a jump of the pose by more than this stops the r-bot as a lost pose does: it was carried off, or its
+            pose was wrong.
+        jump_deg: degrees; as jump_m, for the heading.
     """
 
     slow: _Probability = 0.1
     stop: _Probability = 0.5
     speed_m_s: Positive = 0.15
+    jump_m: Positive = 0.4
+    jump_deg: Positive = 25.0
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -23,7 +23,7 @@ def source_lost(s: Snapshot) -> bool:
 
 
 def pose_lost(s: Snapshot) -> bool:
-    return s.pose_lost
+    return s.pose_lost or s.pose_jumped
 
 
 def vspace_lost(s: Snapshot) -> bool:
@@ -206,6 +206,8 @@ def stop_notice(s: Snapshot) -> Notice:
         return stale_notice(s.lost)
     if s.pose_lost:
         return Notice(Reason.POSE_LOST, "the robot has lost its place")
+    if s.pose_jumped:
+        return Notice(Reason.POSE_LOST, "the robot's place on the map has jumped; check where it stands")
     if s.inputs.vspace.failed:
         return Notice(Reason.VSPACE_FAILED, f"the virtual space failed: {s.inputs.vspace.message}")
     return Notice(Reason.VSPACE_LOST, "the virtual space is silent")

@@ -25,6 +25,8 @@ AZIMUTHS = 720
 """Number of azimuth bins."""
 FAST = {"contract", "arcp", "afn"}
 """Fast-math flags that keep nan and inf."""
+SCATTER_M = 0.01
+"""Metres by which the heights of points on one surface differ: noise of the ranges, pitch of the robot."""
 INSTANTS = 65
 """Sensor poses per sweep: accurate to 1 mrad at 1 rad/s."""
 
@@ -297,9 +299,12 @@ def _clear_and_mark(
                 continue
             azimuth = _angle(cos * dy - sin * dx, cos * dx + sin * dy)
             column = min(int((azimuth + math.pi) * azimuths / (2.0 * math.pi)), azimuths - 1)
-            # Half a cell more on each side: the points of a surface scatter by that much.
+            # A beam above a low thing or below a hanging one proves nothing, and from near no beam ever sees it again.
+            # So a mark ends only with a beam well between its heights; a beam that ends there, or nearly so, keeps it.
             first = (_angle(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
             last = (_angle(high[r, c] + 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
+            least = (_angle(low[r, c] + SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / per_row
+            most = (_angle(high[r, c] - SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / per_row
             passed, stands = False, False
             for row in range(max(0, int(first)), min(rows - 1, int(last)) + 1):
                 end = ends[row, column]
@@ -307,7 +312,7 @@ def _clear_and_mark(
                     continue
                 if abs(end - distance) <= margin:
                     stands = True
-                elif end > distance and first <= row + 0.5 <= last:
+                elif end > distance and least <= row + 0.5 <= most:
                     passed = True
             if passed and not stands:
                 hits[r, c] = 0

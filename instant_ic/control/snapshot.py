@@ -137,6 +137,8 @@ class Snapshot:
     """Seconds for which the v-bot has driven slower than commanded."""
     pose_lost: bool = False
     """The SLAM is lost, and the robot has not been stopped for it yet."""
+    pose_jumped: bool = False
+    """The r-bot's pose has jumped since the previous step."""
     no_view_fits: bool = False
     """An entry was abandoned, and neither has a view fitted since nor has the operator let go."""
     leading_back: bool = False

@@ -167,8 +167,9 @@ GUARDS: dict[str, str] = {
     "estop_pressed": "the emergency stop is latched",
     "source_lost": "a source that this state needs has been silent for stop_after_s (camera, views: for twice their "
     "time-out, if that is longer)",
-    "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more; once the operator has let go, the "
-    "r-bot may drive slowly until its place is recognized",
+    "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more, or the pose has jumped by "
+    "pose_trust.jump_m or jump_deg; once the operator has let go, the r-bot may drive, slowly until its place is "
+    "recognized",
     "vspace_lost": "the virtual space has failed, or its node is silent",
     "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, the r-bot has a way "
     "round; after an abandoned entry, also: a view fits, or the operator let go",

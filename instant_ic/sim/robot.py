@@ -112,6 +112,16 @@ class TrackedRobot:
         points = self._outline @ np.asarray([[c, s], [-s, c]]) + (x, y)
         return bool(self._mask.at(points).any())
 
+    def put_down(self, pose: tuple[float, float, float]) -> None:
+        """Place the robot at another pose (x, y, yaw).
+
+        Raises:
+            ValueError: the pose is not finite, or something stands there.
+        """
+        if not np.isfinite(pose).all() or self.touches(pose):
+            raise ValueError(f"the pose x={pose[0]:.2f}, y={pose[1]:.2f} collides with the world")
+        self.pose, self.contact = np.asarray(pose, float), False
+
     def step(self, setpoint_pps: npt.ArrayLike, dt_s: float) -> None:
         """Advance the robot by ``dt_s`` (at most about 20 ms) with motor set points (2,) in pulses/s."""
         config = self.config

@@ -142,6 +142,15 @@ class Simulation:
             self.controller.target_speed_pps[:] = pulses
             self.controller.acceleration_pps2 = 0.0
 
+    def put_down(self, pose: tuple[float, float, float]) -> None:
+        """Lift the robot and put it down at another pose (x, y, yaw); tracks and encoders do not notice.
+
+        Raises:
+            ValueError: something stands there.
+        """
+        with self.lock:
+            self.robot.put_down(pose)
+
     def poses_at(self, times_s: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Interpolated x, y, yaw (N, 3) of base_link in the world at simulated times (N,), clamped at the ends."""
         times = np.asarray(times_s, float)

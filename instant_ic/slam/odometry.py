@@ -79,11 +79,16 @@ def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
     return np.array([c * vx - d * vy, d * vx + c * vy, angle])
 
 
+JUMP_M, JUMP_RAD = 0.5, 0.5
+"""A larger correction is broadcast at once."""
+
+
 class CorrectionLimiter:
     """Makes map_from_odom follow its estimate at a limited speed.
 
     A recovered track or a closed loop may correct the pose by decimetres at once; the limiter keeps the robot's pose in
-    the map continuous. Ordinary corrections of a few centimetres per scan pass unchanged.
+    the map continuous. Ordinary corrections of a few centimetres per scan pass unchanged. So does a correction by more
+    than ``JUMP_M`` or ``JUMP_RAD``: the old pose is wrong, and the longer it is broadcast, the longer it misleads.
 
     Args:
         speed_mps: limit for the base's position in the map, m/s.
@@ -112,9 +117,10 @@ class CorrectionLimiter:
             turn = wrap_angle(float(wanted[2] - shown[2]))
             distance = math.hypot(way[0], way[1])
             part = 1.0
-            if distance > 0:
+            jumps = distance > JUMP_M or abs(turn) > JUMP_RAD
+            if distance > 0 and not jumps:
                 part = min(part, self.speed_mps * elapsed_s / distance)
-            if turn != 0:
+            if turn != 0 and not jumps:
                 part = min(part, self.yaw_rate_radps * elapsed_s / abs(turn))
             if part >= 1.0:
                 limited = map_from_odom.copy()

@@ -56,6 +56,20 @@ def test_once_the_operator_has_let_go_the_robot_drives_slowly_until_its_place_is
     assert made.frames[-1].decision.mode == Mode.STOPPED
 
 
+@pytest.mark.parametrize("jump", [(0.0, 0.5, 0.0), (0.0, 0.0, 0.5)])
+def test_a_pose_that_jumps_stops_the_robot_until_the_operator_lets_go(jump: tuple[float, float, float]) -> None:
+    made = loop()
+    drive(made, 2.0, FORWARD)
+    made.base.pose = made.base.pose + np.array(jump)
+    drive(made, 0.1, FORWARD)
+    stopped = made.frames[-1]
+    assert stopped.decision.mode == Mode.STOPPED and stopped.command == NOTHING
+    assert "stopped: the robot's place on the map has jumped; check where it stands" in stopped.decision.reason
+    drive(made, 1.5, NOTHING)
+    drive(made, 0.5, FORWARD)
+    assert made.frames[-1].decision.mode == Mode.REAL
+
+
 def test_no_switch_with_a_pose_in_doubt() -> None:
     made = loop()
     made.pose_lost = 0.2

@@ -188,7 +188,7 @@ def test_a_drive_reaches_its_goal_without_contact_and_is_told_in_full(drive: tup
     assert each["driven_m"] > 0.9 * each["optimum_m"] > 4.0
     for name in ("planner", "controller", "costmap"):
         assert 0 < figures[f"{name}_ms_p50"] <= figures[f"{name}_ms_p99"]
-    assert set(figures["targets"]) >= {"contacts == 0", "reached_share >= 0.95", "path_ratio_mean <= 1.2"}
+    assert set(figures["targets"]) >= {"contacts == 0", "reached_share >= 0.97", "path_ratio_mean <= 1.2"}
     assert (out / "f.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -216,10 +216,11 @@ def test_figures_of_episodes_by_hand() -> None:
     assert figures["people_walked_into_robot"] == 1
     assert figures["path_ratio_mean"] == pytest.approx((1.1 + 1.2) / 2)
     assert figures["path_ratio_mean_without_people"] == pytest.approx(1.1)
+    assert figures["time_ratio_max"] == pytest.approx(30.0 * 0.4 / 5.0)
     assert figures["yaw_rate_changes_per_m"] == pytest.approx(6 / 20.0)
     assert figures["planner_ms_p50"] == 3.0
     assert not figures["targets"]["contacts == 0"]
-    assert not figures["targets"]["reached_share >= 0.95"]
+    assert not figures["targets"]["reached_share >= 0.97"]
     assert figures["targets"]["path_ratio_mean <= 1.2"]
     rows = follow.report([good, long, lost, none], 0)["each"]
     assert rows[3]["optimum_m"] is None and rows[2]["path_ratio"] is None  # JSON knows no infinity

@@ -124,11 +124,26 @@ class TestLayer:
 
     def test_a_beam_at_its_own_height_that_goes_on_clears_it(self) -> None:
         layer = self.layer()
-        self.seen(layer, (2.17, 0.01, 0.10), (2.18, 0.01, 0.10))
+        self.seen(layer, (2.17, 0.01, 0.085), (2.18, 0.01, 0.115))
         assert self.marked(layer) == [(2.175, 0.025)]
         # The ring at -13° is 0.098 m high there (0.6 - 2.175 tan 13°), and meets the ground at 2.599 m.
         self.seen(layer, (2.599, 0.0299, 0.0))
         assert self.marked(layer) == []
+
+    def test_a_beam_just_over_a_low_thing_does_not_clear_it(self) -> None:
+        layer = self.layer()
+        # The top of a thing 0.13 m high. From 1.675 m away the lowest ring (-15°) passes 2 cm over it: 0.151 m there
+        # (0.6 - 1.675 tan 15°); it meets the ground at 2.239 m. No ring ever reaches the thing from nearer.
+        self.seen(layer, (1.66, 0.01, 0.09), (1.68, 0.01, 0.13))
+        self.seen(layer, (2.239, 0.0299, 0.0))
+        assert self.marked(layer) == [(1.675, 0.025)]
+
+    def test_a_beam_just_under_a_hanging_thing_does_not_clear_it(self) -> None:
+        layer = self.layer()
+        # Its lower edge is 1.06 m high. From 1.675 m away the highest ring (15°) passes under it: 1.049 m there.
+        self.seen(layer, (1.66, 0.01, 1.06), (1.68, 0.01, 1.20))
+        self.seen(layer, (2.2, 0.0294, 0.6 + 2.2 * math.tan(math.radians(15))))
+        assert self.marked(layer) == [(1.675, 0.025)]
 
     def test_a_person_who_goes_away_is_cleared(self) -> None:
         layer = self.layer()

@@ -150,11 +150,18 @@ def test_small_corrections_pass_and_large_ones_arrive_at_the_given_speed() -> No
     assert np.allclose(places, [0.13, 0.23, 0.33, 0.43, 0.43])
 
 
+def test_a_robot_that_was_carried_off_is_where_it_is_at_once() -> None:
+    for moved in ([0.6, 0.0, 0.0], [0.0, 0.0, 0.6]):
+        limiter = CorrectionLimiter(speed_mps=1.0, yaw_rate_radps=1.0)
+        limiter.follow(np.zeros(3), np.zeros(3), 0)
+        assert np.allclose(limiter.follow(np.array(moved), np.zeros(3), 100_000_000), moved)
+
+
 def test_the_limit_of_a_turn_holds_at_the_robot_not_at_the_origin() -> None:
-    # 0.01 rad about the origin moves a robot 100 m away by 1 m.
+    # 0.004 rad about the origin moves a robot 100 m away by 0.4 m.
     limiter = CorrectionLimiter(speed_mps=1.0, yaw_rate_radps=10.0)
     base = np.array([100.0, 0.0, 0.0])
     limiter.follow(np.zeros(3), base, 0)
-    limited = limiter.follow(np.array([0.0, 0.0, 0.01]), base, 100_000_000)
+    limited = limiter.follow(np.array([0.0, 0.0, 0.004]), base, 100_000_000)
     moved = compose2(limited, base)
     assert math.hypot(moved[0] - 100.0, moved[1]) == pytest.approx(0.1, rel=1e-3)
