@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from instant_ic.training.weights import fold_norms, load_start
 
 from instant_ic.training.dataset import Sample, Subset
 from instant_ic.training.feeds import FileFeed
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.slicenet import CheckpointError, SliceNet, SliceNetConfig, load_checkpoint
 from instant_ic.training.trainer import Team, Trainer, TrainingConfig, evaluate, schedule, to_tensors, update_average
-from instant_ic.training.weights import fold_norms, load_start
 
 TINY = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, decoder_floor=8)
 
