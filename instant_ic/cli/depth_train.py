@@ -34,8 +34,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "completion": {"minutes": 120.0, "batch_size": 6, "learning_rate": 1e-3, "pool": 192},
     "gpu": {"minutes": 20.0, "batch_size": 64, "learning_rate": 2e-3, "pool": 2048, "reuse": 6.0},
 }
-"""``completion``: one CPU core for some hours, in as many pieces as one likes. ``gpu``: one large GPU; all CPU cores but
-one render (``--workers``)."""
+"""``completion``: one CPU core for some hours, in pieces. ``gpu``: one large GPU; all CPU cores but one render."""
 _EPILOG = """examples:
   ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures
   ic depth train --preset completion --textures runs/textures --export models/mine.onnx
@@ -50,8 +49,8 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "train",
         help="train depth completion on generated worlds and on folders of panoramas",
-        description="Train the completion network on worlds rendered during the training, on folders of panoramas with\n"
-        "depth, or on both, and export it. Ctrl-C ends the training early: the last weights are evaluated, saved\n"
+        description="Train the completion network on worlds rendered during the training, on folders of panoramas\n"
+        "with depth, or on both, and export it. Ctrl-C ends the training early: the last weights are evaluated, saved\n"
         "and exported. A CSV of the progress and, where the package is installed, a TensorBoard folder are\n"
         "written beside the checkpoint.",
         epilog=_EPILOG,
@@ -171,14 +170,15 @@ def _start(args: argparse.Namespace, network: CompletionConfig) -> tuple[Complet
     import torch
 
     from instant_ic.training.completion import CompletionNet, load_completion, load_encoder
-    from instant_ic.training.slicenet import CheckpointError
+    from instant_ic.training.slicenet import CheckpointError, read_checkpoint
 
     torch.manual_seed(args.seed)
     if args.init:
         model = load_completion(args.init)
         if model.config != network:
             raise CheckpointError(f"{args.init}: contains {model.config}, but the training uses {network}")
-        return model, {"file": args.init.name, "sha256": hashlib.sha256(args.init.read_bytes()).hexdigest()}
+        digest = hashlib.sha256(args.init.read_bytes()).hexdigest()
+        return model, {"file": args.init.name, "sha256": digest, "record": read_checkpoint(args.init).get("record")}
     model = CompletionNet(network)
     path = args.encoder
     if path is None:
@@ -231,6 +231,10 @@ def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, repor
     if folders and size - own < len(folders):
         raise ValueError(f"a batch of {size} is too small for {len(folders)} folders: increase --batch-size")
     textures = str(args.textures.resolve()) if args.textures else ""
+    if textures:
+        from instant_ic.training.photographs import load
+
+        load(textures)  # an error here, not in a rendering process
     worlds = args.worlds or (400 if args.cache else 100_000)
     feeds: list[Feed] = []
     held_out: list[Subset] = []

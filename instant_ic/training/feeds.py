@@ -265,6 +265,7 @@ class Renderers:
                 target=_render, args=(recipe, self._cache.name, os.getpid(), asked, given), daemon=True
             )
             process.start()
+            given._writer.close()  # else the end of a process in the middle of a message would never be noticed
             self._processes.append(process)
             self._asked.append(asked)
             self._given.append(given)
@@ -292,7 +293,9 @@ class Renderers:
             try:
                 samples, error = self._given[which].get(timeout=1.0)
                 break
-            except queue.Empty:
+            except (queue.Empty, EOFError) as none:
+                if isinstance(none, EOFError):
+                    self._processes[which].join(10)
                 if not self._processes[which].is_alive():
                     code = self._processes[which].exitcode
                     raise FeedError(f"a rendering process exited with {code} at world {self.seed_of(place)}") from None

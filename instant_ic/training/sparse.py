@@ -97,6 +97,8 @@ def _prior(
 ) -> NDArray[np.float32]:
     source, (height, width) = _source(), size
     built = source.estimate(None, points, up, camera_m, (height, width), local)
+    if not built.ok:
+        return nothing(size, up, camera_m)
     return prior_channels(built.depth_m, built.sigma, source.structure.ranges(points, (height, width)), up, camera_m)
 
 
