@@ -116,7 +116,7 @@ class DepthModel:
         """
         if self.manifest.prior_input:
             nothing = np.zeros((self.manifest.input_height, self.manifest.input_width), np.float32)
-            return self.complete(rgb, prior_channels(nothing, nothing, nothing, (0.0, 0.0, 1.0), None))[0]
+            return self.complete(rgb, prior_channels(nothing, nothing, nothing, np.array([0.0, 0.0, 1.0]), None))[0]
         return self._finish(*self._run({self._input: self.prepare(rgb)}))
 
     def complete(

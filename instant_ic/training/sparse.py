@@ -126,7 +126,8 @@ def drive(renderer: EquirectRenderer, map_from_camera: Floats, lidar_m: float, r
         at = end + place * back
         pose = pose_matrix(at[0], at[1], lidar_m, yaw=heading)
         points = measure_world(renderer, pose, lidar_m, lidar_m, Errors(0.02, 0.0, int(rng.integers(1 << 31))))
-        drift = pose_matrix(*(at[:2] + rng.normal(0, 0.008, 2)), lidar_m, yaw=heading + rng.normal(0, 0.002))
+        x, y = at[:2] + rng.normal(0, 0.008, 2)
+        drift = pose_matrix(x, y, lidar_m, yaw=heading + rng.normal(0, 0.002))
         model.add(points @ drift[:3, :3].T + drift[:3, 3], drift[:3, 3], max(length, 0.0) / count)
     return model
 
