@@ -265,7 +265,8 @@ class Renderers:
                 target=_render, args=(recipe, self._cache.name, os.getpid(), asked, given), daemon=True
             )
             process.start()
-            given._writer.close()  # type: ignore[attr-defined]  # else the end of a process in the middle of a message would never be noticed
+            # Else the end of a process in the middle of a message would never be noticed.
+            given._writer.close()  # type: ignore[attr-defined]
             self._processes.append(process)
             self._asked.append(asked)
             self._given.append(given)

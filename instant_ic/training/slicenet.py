@@ -90,17 +90,6 @@ class SliceNetConfig:
         return asdict(self)
 
 
-# The model that the project trains and ships.
-SMALL = SliceNetConfig(
-    backbone="resnet18",
-    height=256,
-    width_multiplier=0.5,
-    lstm_hidden=160,
-    column_stride=2,
-    decoder_floor=24,
-)
-
-
 class CircularPad(nn.Module):
     """Pads the width with columns from the opposite edge: the panorama has no left and right border."""
 
