@@ -27,7 +27,7 @@ from instant_ic.experiments.depth_pictures import Sheets
 from instant_ic.experiments.depth_worlds import KINDS, LIDAR_HEIGHT_M, Scene, scenes
 from instant_ic.paths import shipped_file
 
-SOURCES = ("as estimated", "network", "lidar", "fused")
+SOURCES = ("as estimated", "network", "lidar", "fused", "completed")
 TARGET_MRE, TARGET_DELTA1, TARGET_SCALE_MEDIAN, TARGET_SCALE_P95 = 0.08, 0.93, 0.03, 0.10
 
 
@@ -41,6 +41,13 @@ class Remembered:
         self.cpu_s: list[float] = []
         self.wall_s: list[float] = []
 
+    def complete(self, rgb: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        cpu, wall = time.process_time(), time.perf_counter()
+        found = self._model.complete(rgb, prior)
+        self.cpu_s.append(time.process_time() - cpu)
+        self.wall_s.append(time.perf_counter() - wall)
+        return found
+
     def estimate(self, rgb: np.ndarray) -> np.ndarray:
         if self._last is None or self._last[0] != id(rgb):
             cpu, wall = time.process_time(), time.perf_counter()
@@ -50,13 +57,17 @@ class Remembered:
         return self._last[1].copy()
 
 
-def evaluators(model: Remembered, share: float, method: str) -> dict[str, Evaluator]:
+def evaluators(
+    model: Remembered, share: float, method: str, completion: Remembered | None = None
+) -> dict[str, Evaluator]:
     """One evaluator per source; the unscaled source uses no LiDAR and therefore has no outliers."""
     lidar = LidarSettings(outliers=share, height_m=LIDAR_HEIGHT_M)
     made = {
         source: Evaluator(DepthSettings(source, lidar, method=method if source != "lidar" else ""), model)
-        for source in SOURCES[1:]
+        for source in SOURCES[1:4]
     }
+    if completion is not None:
+        made[SOURCES[4]] = Evaluator(DepthSettings(SOURCES[4], lidar), completion)
     return made if share else {SOURCES[0]: Evaluator(DepthSettings("network"), model), **made}
 
 
@@ -65,7 +76,10 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         return round(float(np.mean([row[part][key] for row in rows])), 4)
 
     scale = [row["scale_error_median"] for row in rows]
-    inside = [row["within_one_sigma"] for row in rows if row["within_one_sigma"] is not None]
+    inside = {
+        name: [row[name] for row in rows if row[name] is not None]
+        for name in ("within_one_sigma", "within_two_sigma", "within_three_sigma")
+    }
     keys = ("mre", "mae_m", "rmse_m", "delta1", "delta2", "delta3")
     return {
         "panoramas": len(rows),
@@ -74,7 +88,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "worst_mre": round(max(row["mre"] for row in rows), 4),
         "scale_error_median": round(float(np.median(scale)), 4),
         "scale_error_p95": round(float(np.quantile(scale, 0.95)), 4),
-        "within_one_sigma": round(float(np.mean(inside)), 3) if inside else None,
+        **{name: round(float(np.mean(values)), 3) if values else None for name, values in inside.items()},
         "fits_ok": sum(bool(row["fit"]["ok"]) for row in rows) if rows[0]["fit"] else None,
         "cpu_source_s": round(float(np.median([row["cpu_source_s"] for row in rows])), 4),
     }
@@ -135,6 +149,9 @@ def main() -> int:
     parser.add_argument("--kinds", default=",".join(KINDS), help="of worlds (default: %(default)s)")
     parser.add_argument("--mesh", type=Path, help="mesh file for the kind mesh; without one it is left out")
     parser.add_argument("--model", type=Path, help="ONNX file (default: the shipped one)")
+    parser.add_argument(
+        "--completion", type=Path, help="ONNX file of ic depth train: also measure the source completed"
+    )
     parser.add_argument("--method", default="", help="of scaling (default: the scaler's)")
     parser.add_argument("--threads", type=int, default=2, help="of the model (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
@@ -145,6 +162,7 @@ def main() -> int:
     if args.sheets:
         args.sheets.mkdir(parents=True, exist_ok=True)
     model = Remembered(DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads))
+    completion = Remembered(DepthModel.load(args.completion, threads=args.threads)) if args.completion else None
     results: dict[str, Any] = {}
     for kind in args.kinds.split(","):
         if kind == "mesh" and args.mesh is None:
@@ -152,7 +170,7 @@ def main() -> int:
             continue
         rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
         sheets = [Sheets(args.sheets / f"{kind}{end}.png", bool(end)) for end in ("", "-side")] if args.sheets else []
-        made = {share: evaluators(model, share, args.method) for share in (0.0, 0.05)}
+        made = {share: evaluators(model, share, args.method, completion) for share in (0.0, 0.05)}
         for number, scene in enumerate(scenes(kind, args.count, args.mesh if kind == "mesh" else None)):
             for share, each in made.items():
                 for name, row in score(scene, number, each, share, sheets):
@@ -166,6 +184,10 @@ def main() -> int:
         "machine": platform.processor() or platform.machine(), "threads": args.threads,
         "model_cpu_s": round(float(np.median(model.cpu_s)), 4),
         "model_wall_s": round(float(np.median(model.wall_s)), 4),
+        "completion": {
+            "model": completion.manifest.name, "sha256": completion.manifest.sha256,
+            "model_cpu_s": round(float(np.median(completion.cpu_s)), 4),
+        } if completion else None,
         "targets_met": targets(results), "results": results,
     }  # fmt: skip
     text = json.dumps(figures, indent=2)

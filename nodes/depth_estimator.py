@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,12 @@ from numpy.typing import NDArray
 
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.config.ranges import Positive, PositiveInt, check_ranges
-from instant_ic.depth.manifest import ManifestError
-from instant_ic.depth.model import DEFAULT_MODEL, DepthModel, InferenceError
+from instant_ic.depth.manifest import InferenceError, ManifestError
+from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.providers import CHOICES
 from instant_ic.jpeg import JpegError
 from instant_ic.limits import decode_rgb
 from instant_ic.msg import CompressedImage, DepthModelInfo, Header, Image, header, image_message, stamp_ns
-from instant_ic.paths import shipped_file
 
 _WATCH_S = 0.5
 _GIVE_UP_S = 10.0  # an inference still running this long after its cancellation hangs in a driver
@@ -77,9 +75,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
     def load(self, provider: str) -> None:
         """Load the model; report its provider and why a faster one is not used."""
         try:
-            bare = Path(self.config.model).name == self.config.model
-            path = shipped_file("models", self.config.model) if bare else Path(self.config.model)
-            self.model = DepthModel.load(path, self.config.threads, provider)
+            self.model = DepthModel.find(self.config.model, self.config.threads, provider)
         except (ManifestError, FileNotFoundError) as error:
             raise NodeError(str(error)) from error
         manifest = self.model.manifest

@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
+from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, Revolution, RevolutionTrigger
 from instant_ic.depth.keyframes import KeyframeSelector, encode_sigma
-from instant_ic.depth.metric_depth import MetricDepth
+from instant_ic.depth.manifest import ManifestError
+from instant_ic.depth.metric_depth import MetricDepth, MetricDepthConfig
+from instant_ic.depth.model import DepthModel
 from instant_ic.depth.node_config import DepthScalerConfig
 from instant_ic.depth.sources import DepthResult, DepthSource
 from instant_ic.geometry.transforms import TransformError
+from instant_ic.limits import decode_rgb
 from instant_ic.mapping.local_model import warm_up
 from instant_ic.mapping.mapper import CloudError, LocalMapper
 from instant_ic.msg import (
@@ -52,6 +55,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         if self.config.source != "network":
             warm_up()
         self.source = DepthSource(self.config.depth_source)
+        self.completion = self.load_completion()
         self.selector = KeyframeSelector(self.config.keyframes)
         self.inputs, self.trigger, self.requests = RecentInputs(), RevolutionTrigger(), DepthRequests()
         self.model: Any = None
@@ -62,7 +66,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
         self.warn_of_method()
-        self.metric = MetricDepth(self.source, self.tf, self.inputs, self.config.metric, self.new_mapper())
+        self.metric = MetricDepth(self.source, self.tf, self.inputs, self.metric_config, self.new_mapper())
         self.local_map = self.publisher("/map/local", PointCloud2, qos=SENSOR)
         self.timer(_LOCAL_MAP_S, self.on_local_map)
         self.subscribe("/depth/model", DepthModelInfo, self.on_model, qos=LATCHED)
@@ -73,7 +77,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     def reconfigure(self, config: DepthScalerConfig) -> None:
         super().reconfigure(config)
         self.source.config, self.selector.config = config.depth_source, config.keyframes
-        self.metric.config = config.metric
+        self.metric.config = self.metric_config
         if self.metric.mapper.config != config.mapping or self.metric.mapper.frames != (
             config.map_frame, config.odom_frame,
         ):  # fmt: skip
@@ -83,11 +87,27 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             self.on_model(self.model)
         self.warn_of_method()
 
+    def load_completion(self) -> DepthModel | None:
+        if self.config.source != "completed":
+            return None
+        try:
+            model = DepthModel.find(self.config.completion, self.config.threads, self.config.provider)
+        except (ManifestError, FileNotFoundError) as error:
+            raise NodeError(str(error)) from error
+        self.log.info("depth completed by %s on %s", model.manifest.name, model.provider)
+        return model
+
+    @property
+    def metric_config(self) -> MetricDepthConfig:
+        if self.completion is None:
+            return self.config.metric
+        return replace(self.config.metric, rows=self.completion.manifest.input_height)
+
     def new_mapper(self) -> LocalMapper:
         return LocalMapper(self.tf, self.config.mapping, self.config.map_frame, self.config.odom_frame)
 
     def warn_of_method(self) -> None:
-        if self.config.scaler.method == "as_estimated" and self.config.source != "lidar":
+        if self.config.scaler.method == "as_estimated" and not self.config.of_lidar:
             self.log.warning("depth is used as estimated, without the LiDAR: for recordings, not for driving")
 
     def on_model(self, message: Any) -> None:
@@ -116,7 +136,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.diagnose("pose", OK, "the camera's pose is known")
         if not due:
             return
-        if self.config.source == "lidar":
+        if self.config.of_lidar:
             image = HeldImage(camera, stamp)
             late = self.trigger.image(image, self.last_ns, self.config.max_rate_hz, self.config.max_cloud_age_s)
             if late is not None:
@@ -157,14 +177,21 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             self.local_map.publish(cloud)
 
     def on_depth(self, message: Any) -> None:
-        if self.config.source != "lidar":
+        if not self.config.of_lidar:
             self.requests.answered()
             self.handle(image_array(message), message.header.frame_id, stamp_ns(message))
 
     def handle(self, raw: NDArray[np.float32] | None, camera: str, stamp: int) -> None:
         """Compute, report and publish the depth of the image taken at ``stamp``."""
         self.last_ns = stamp
-        result = self.metric.estimate(raw, camera, stamp)
+        image, model = self.inputs.images.get(stamp), self.completion
+
+        def complete(prior: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            assert image is not None and model is not None
+            size = 2 * model.manifest.input_width, 2 * model.manifest.input_height
+            return model.complete(decode_rgb(image.data, *size), prior)
+
+        result = self.metric.estimate(raw, camera, stamp, complete if image is not None and model is not None else None)
         self.diagnose("scale", OK if result.ok else WARN, result.message, **result.figures())
         if result.ok:
             self.scaled.publish(image_message(result.depth_m, "32FC1", camera, stamp))

@@ -33,6 +33,10 @@ class ManifestError(ValueError):
     """The manifest of a depth model is missing, malformed or does not fit its model."""
 
 
+class InferenceError(RuntimeError):
+    """The inference did not finish; the text says why."""
+
+
 @dataclass(frozen=True)
 class ModelManifest:
     """Interface of a depth model.
@@ -59,6 +63,9 @@ class ModelManifest:
         max_range_m: metric depth above it is cut to it.
         geometry: ``radial`` (distance from the camera) or ``planar`` (along the axis of the cube face that the
             pixel lies on); planar output is turned into radial.
+        prior_input: name of the input that takes incomplete depth, (1, 5, height, width) float32
+            (``depth.completion.prior_channels``); empty for a model that takes the image alone.
+        sigma_output: name of the output with the relative standard deviation; required with ``prior_input``.
         mask_output: name of an output that marks where depth is valid; empty for none.
         mask_means: ``valid``, or ``invalid`` (sky) of the pixels where the mask is above the threshold.
         mask_threshold: of the mask's numbers; 0.5 for probabilities, 0 for logits.
@@ -86,6 +93,8 @@ class ModelManifest:
     min_range_m: float = 0.1
     max_range_m: float = 16.0
     geometry: str = "radial"
+    prior_input: str = ""
+    sigma_output: str = ""
     mask_output: str = ""
     mask_means: str = "valid"
     mask_threshold: float = 0.5
@@ -130,6 +139,10 @@ class ModelManifest:
                              f"(got {self.output_kind}): a shift must not be unknown")  # fmt: skip
         if self.output_form == "points" and self.geometry == "planar":
             raise ValueError("geometry must be radial with output_form points: their length is the distance")
+        if bool(self.prior_input) != bool(self.sigma_output):
+            raise ValueError("prior_input and sigma_output belong together: give both names, or neither")
+        if self.prior_input and (self.mask_output or self.output_kind != "metric" or self.output_form != "depth"):
+            raise ValueError("prior_input needs output_kind metric, output_form depth and no mask_output")
         if self.mask_output and self.mask_output == self.depth_output:
             raise ValueError(f"mask_output and depth_output are the same ({self.mask_output!r})")
         if self.sha256 and not re.fullmatch(r"[0-9a-f]{64}", self.sha256):

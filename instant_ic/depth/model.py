@@ -10,18 +10,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.manifest import ManifestError, ModelManifest, load_manifest, manifest_path
+from instant_ic.depth.completion import PRIOR_CHANNELS, prior_channels
+from instant_ic.depth.manifest import InferenceError, ManifestError, ModelManifest, load_manifest, manifest_path
 from instant_ic.depth.providers import OpenSession, open_session
 from instant_ic.geometry.projections import equirect_directions
+from instant_ic.paths import shipped_file
 
 DEFAULT_MODEL = "slicenet_small.onnx"
 MAX_GAIN = 2.5
 """An image's brightness is changed by this factor at most, up or down."""
 INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
-
-
-class InferenceError(RuntimeError):
-    """The inference did not finish; the text says why."""
 
 
 class DepthModel:
@@ -81,6 +79,16 @@ class DepthModel:
             raise ManifestError(f"{model_file}: onnxruntime cannot load it: {error}") from error
         return cls(opened, manifest, model_file)
 
+    @classmethod
+    def find(cls, name: str, threads: int = 2, provider: str = "auto") -> DepthModel:
+        """:meth:`load` of a file; a bare name is searched for in ``models/``.
+
+        Raises:
+            FileNotFoundError: there is no model of this name.
+        """
+        bare = Path(name).name == name
+        return cls.load(shipped_file("models", name) if bare else name, threads, provider)
+
     @property
     def inputs(self) -> list[tuple[str, str, list[Any]]]:
         """Name, type and shape of the network's inputs."""
@@ -106,17 +114,47 @@ class DepthModel:
             ManifestError: the outputs are not what the manifest says.
             InferenceError: the network failed, or :meth:`cancel` ended it.
         """
+        if self.manifest.prior_input:
+            nothing = np.zeros((self.manifest.input_height, self.manifest.input_width), np.float32)
+            return self.complete(rgb, prior_channels(nothing, nothing, nothing, np.array([0.0, 0.0, 1.0]), None))[0]
+        return self._finish(*self._run({self._input: self.prepare(rgb)}))
+
+    def complete(
+        self, rgb: NDArray[np.uint8], prior: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Dense depth and its relative standard deviation, (h, 2h) float32 each, from an image and incomplete depth.
+
+        Args:
+            rgb: as for :meth:`estimate`.
+            prior: (5, h, 2h), see ``depth.completion.prior_channels``.
+
+        Raises:
+            ValueError: the model takes no prior, or another shape than this one's.
+            ManifestError, InferenceError: as for :meth:`estimate`.
+        """
+        manifest = self.manifest
+        size = (PRIOR_CHANNELS, manifest.input_height, manifest.input_width)
+        if not manifest.prior_input:
+            raise ValueError(f"{manifest.name} takes the image alone; a model of ic depth train is needed")
+        if prior.shape != size:
+            raise ValueError(f"the prior must be {size} (got {prior.shape})")
+        feeds = {self._input: self.prepare(rgb), manifest.prior_input: prior[None].astype(np.float32)}
+        depth, sigma = self._run(feeds)
+        doubt = self._plane(sigma, manifest.sigma_output)
+        doubt[~(doubt > 0)] = np.inf  # also where it is not a number
+        return self._finish(depth), doubt
+
+    def _run(self, feeds: dict[str, NDArray[Any]]) -> list[Any]:
         import onnxruntime
 
-        feeds = {self._input: self.prepare(rgb)}
         self._run_options = options = onnxruntime.RunOptions()
         try:
-            outputs = self._session.run(self._outputs, feeds, options)
+            outputs: list[Any] = self._session.run(self._outputs, feeds, options)
         except Exception as error:  # onnxruntime's exceptions share no public base
             raise InferenceError(f"{self.manifest.name} on {self.provider}: {error}") from error
         finally:
             self._run_options = None
-        return self._finish(*outputs)
+        return outputs
 
     def cancel(self) -> None:
         """Cancel an inference that runs in another thread, at its next layer."""
@@ -201,9 +239,16 @@ class DepthModel:
 
     def _check_input(self) -> tuple[str, type]:
         manifest, inputs = self.manifest, self.inputs
+        names = ", ".join(a[0] for a in inputs)
+        if manifest.prior_input:
+            found = [shape for name, _, shape in inputs if name == manifest.prior_input]
+            if not found or not _fits(found[0], [1, PRIOR_CHANNELS, manifest.input_height, manifest.input_width]):
+                raise ManifestError(f"{self._where}: no input {manifest.prior_input!r} of {PRIOR_CHANNELS} channels in "
+                                    f"the image's size (has: {names})")  # fmt: skip
+            inputs = [one for one in inputs if one[0] != manifest.prior_input]
         if len(inputs) != 1:
-            names = ", ".join(a[0] for a in inputs)
-            raise ManifestError(f"{self._where}: takes {len(inputs)} inputs ({names}); only the image can be given")
+            raise ManifestError(f"{self._where}: takes {len(self.inputs)} inputs ({names}); only the image, and with "
+                                "prior_input incomplete depth, can be given")  # fmt: skip
         name, kind, shape = inputs[0]
         if kind not in INPUT_TYPES:
             raise ManifestError(f"{self._where}: input {name!r} is {kind}; one of {', '.join(INPUT_TYPES)} is needed")
@@ -221,14 +266,16 @@ class DepthModel:
     def _check_outputs(self) -> list[str]:
         manifest = self.manifest
         names = [name for name, _, _ in self.outputs]
-        for key in ("depth_output", "mask_output"):
+        for key in ("depth_output", "mask_output", "sigma_output"):
             name, purpose = getattr(manifest, key), key.split("_")[0]
             if name and name not in names:
                 raise ManifestError(f"{self._where}: no output {name!r} for the {purpose} (has: {', '.join(names)})")
-        depth = manifest.depth_output or next((name for name in names if name != manifest.mask_output), "")
+        depth = manifest.depth_output or next(
+            (name for name in names if name not in (manifest.mask_output, manifest.sigma_output)), ""
+        )
         if not depth:
             raise ManifestError(f"{self._where}: no output besides the mask")
-        chosen = [depth, manifest.mask_output] if manifest.mask_output else [depth]
+        chosen = [depth, *(name for name in (manifest.mask_output, manifest.sigma_output) if name)]
         for name, _, shape in self.outputs:
             if name in chosen and all(isinstance(length, int) and length > 0 for length in shape):
                 self._plane(

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.config.ranges import check_ranges
+from instant_ic.depth.completion import prior_channels
 from instant_ic.depth.fusion import Corrected, FusionConfig, ceiling_height, correct, likely_ceiling
 from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, Origin, rays
+from instant_ic.depth.manifest import InferenceError
 from instant_ic.depth.scaler import DepthScaler, ScaleFit, ScalerConfig
 from instant_ic.depth.visibility import nearest_points
 from instant_ic.mapping.mapper import LocalView
 
 Floats = NDArray[np.floating]
-SOURCES = ("network", "lidar", "fused")
+Complete = Callable[[NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
+"""Prior (5, H, W) (``depth.completion``) -> depth (H, W) in metres and relative sigma (H, W), of one image."""
+SOURCES = ("network", "lidar", "fused", "completed")
 # Of the floor under the robot: a camera's height is known to centimetres.
 _FLOOR_SIGMA = 0.02
 # A point nearer than the local model by this share is of something that has come since.
@@ -29,7 +34,8 @@ class SourceConfig:
     """Source of depth and its parameters.
 
     Attributes:
-        source: ``network``: the network's depth, scaled; ``lidar``: LiDAR and structure, no network; ``fused``: both.
+        source: ``network``: the network's depth, scaled; ``lidar``: LiDAR and structure, no network; ``fused``: both;
+            ``completed``: a network completes the LiDAR's depth, and per pixel the smaller uncertainty is taken.
         scaler: how the network's depth is scaled.
         lidar: how depth is made from points alone.
         fusion: how both are brought together.
@@ -129,6 +135,7 @@ class DepthSource:
         camera_height_m: float | None,
         size: tuple[int, int] = (256, 512),
         local: LocalView | None = None,
+        complete: Complete | None = None,
     ) -> DepthResult:
         """Depth of one image.
 
@@ -142,13 +149,15 @@ class DepthSource:
             camera_height_m: of the camera over the floor; None where it is not known.
             size: height and width of the result where there is no ``raw``; else it has ``raw``'s.
             local: the local model, seen from the camera.
+            complete: for ``completed``: the completion of this image; None, or an error of it: the LiDAR alone.
 
         Raises:
             ValueError: arrays of other shapes, or no ``raw`` where the source needs it.
         """
         config = self.config
-        if config.source == "lidar":
-            return self._lidar(points, up, camera_height_m, raw.shape if raw is not None else size, local)
+        if config.source in ("lidar", "completed"):
+            size = raw.shape if raw is not None else size
+            return self._lidar(points, up, camera_height_m, size, local, complete)
         if raw is None:
             raise ValueError(f"source {config.source} needs the network's depth")
         fit = self.scaler.fit(raw, points)
@@ -183,7 +192,7 @@ class DepthSource:
             return replace(_of_fit(self.scaler.refuse(raw, message)), source=self.config.source)
         unknown = np.full(size, np.inf, np.float32)
         return DepthResult(
-            np.zeros(size, np.float32), unknown, False, 1.0, 0.0, 0.0, float("inf"), 0, message, "lidar"
+            np.zeros(size, np.float32), unknown, False, 1.0, 0.0, 0.0, float("inf"), 0, message, self.config.source
         )  # fmt: skip
 
     def network(
@@ -223,23 +232,49 @@ class DepthSource:
         return _Built(depth, sigma, free, structure, seen)
 
     def _lidar(
-        self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int], local: LocalView | None
-    ) -> DepthResult:
+        self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int],
+        local: LocalView | None, complete: Complete | None,
+    ) -> DepthResult:  # fmt: skip
         built = self._built(points, up, camera_height_m, size, local, None)
         quality = agreement(built.depth_m, points, self.config.scaler)
-        message = f"LiDAR alone: {quality:.0%} of {built.points} points on its surfaces; {_surfaces(built)}"
+        depth, sigma, name = built.depth_m, built.sigma, "LiDAR alone"
+        if complete is not None and not built.message:
+            ranges = self.structure.ranges(points, size)
+            try:
+                found = complete(prior_channels(built.depth_m, built.sigma, ranges, up, camera_height_m))
+                depth, sigma = arbitrate(built.depth_m, built.sigma, built.free_m, *found)
+                name = "LiDAR completed"
+            except (InferenceError, ValueError) as error:
+                name = f"LiDAR alone, no completion ({error})"
+        message = f"{name}: {quality:.0%} of {built.points} points on its surfaces; {_surfaces(built)}"
         return DepthResult(
-            depth_m=built.depth_m,
-            sigma=built.sigma,
+            depth_m=depth,
+            sigma=sigma,
             ok=not built.message,
             scale=1.0,
             shift=0.0,
             quality=quality,
-            relative_sigma=_median(built.sigma),
+            relative_sigma=_median(sigma),
             points=built.points,
             message=built.message or message,
-            source="lidar",
+            source=self.config.source,
         )
+
+
+def arbitrate(
+    depth_m: Floats, sigma: Floats, free_m: Floats, completed_m: Floats, completed_sigma: Floats
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth and relative sigma of the more certain of two sources in each pixel; all (H, W).
+
+    Args:
+        depth_m, sigma: of the LiDAR, 0 and inf where unknown.
+        free_m: nothing stands nearer than this.
+        completed_m, completed_sigma: of the completion; what is not a number counts as unknown.
+    """
+    usable = np.isfinite(completed_m) & (completed_m > 0) & np.isfinite(completed_sigma)
+    better = usable & ((depth_m <= 0) | (completed_sigma < sigma))
+    depth = np.where(better, np.maximum(completed_m, free_m), depth_m)
+    return depth.astype(np.float32), np.where(better, completed_sigma, sigma).astype(np.float32)
 
 
 def without_body(result: DepthResult, up: Floats, camera_height_m: float | None, elevation_deg: float) -> DepthResult:

@@ -37,6 +37,11 @@ class Model(Protocol):
     def estimate(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Depth (h, w) in the model's unit of a panorama (H, W, 3), 0 = unknown."""
 
+    def complete(
+        self, rgb: NDArray[np.uint8], prior: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Depth in metres and relative sigma, (h, w) each, of a panorama and a prior (5, h, w)."""
+
 
 class DepthEvaluationError(ValueError):
     """An image cannot be scored, or the settings contradict each other."""
@@ -59,7 +64,7 @@ class DepthSettings:
     """Evaluation settings.
 
     Attributes:
-        source: ``network``, ``lidar`` or ``fused``.
+        source: ``network``, ``lidar``, ``fused`` or ``completed``.
         lidar: simulated LiDAR that measures the ground truth; None: the network's metres are scored unscaled.
         camera_height_m: above the floor.
         method: of the scaler; empty for its default.
@@ -75,8 +80,8 @@ class DepthSettings:
             raise DepthEvaluationError(f"source {self.source} needs LiDAR points: add --lidar (and --depth)")
         if self.method and self.lidar is None:
             raise DepthEvaluationError("a scaling method needs LiDAR points: add --lidar (and --depth)")
-        if self.method and self.source == "lidar":
-            raise DepthEvaluationError("source lidar does not scale a network: omit the method")
+        if self.method and self.source in ("lidar", "completed"):
+            raise DepthEvaluationError(f"source {self.source} does not scale a network: omit the method")
         if not self.camera_height_m > 0:
             raise DepthEvaluationError(f"the camera's height must be above 0 (got {self.camera_height_m})")
 
@@ -95,7 +100,8 @@ class Scored:
             truth.
         after: metrics of the result; None without ground truth. ``weighted`` counts pixels by solid angle; ``shape``
             divides the result by its median ratio to the truth first, which shows the error that no scale can remove.
-        sigma_share: share of pixels whose error is within one sigma; None without LiDAR or ground truth.
+        sigma_shares: shares of pixels whose error is within one, two and three sigma; None without LiDAR or ground
+            truth.
         seconds_model, seconds_source: wall time of the network, and of scaling and fusion; ``cpu_source_s``: CPU time
             of scaling and fusion.
         fit: ``ok``, ``message``, ``scale``, ``shift``, ``quality``, ``relative_sigma``, ``points``; None without LiDAR.
@@ -110,7 +116,7 @@ class Scored:
     after: DepthMetrics | None
     weighted: DepthMetrics | None
     shape: DepthMetrics | None
-    sigma_share: float | None
+    sigma_shares: tuple[float, float, float] | None
     seconds_model: float
     seconds_source: float
     cpu_source_s: float
@@ -135,7 +141,8 @@ class Scored:
         for key in ("before", "after", "weighted", "shape"):
             metrics: DepthMetrics | None = getattr(self, key)
             row[_KEYS[key]] = metrics.as_dict() if metrics is not None else None
-        row["within_one_sigma"] = _rounded(self.sigma_share)
+        for index, name in enumerate(("one", "two", "three")):
+            row[f"within_{name}_sigma"] = _rounded(self.sigma_shares[index]) if self.sigma_shares else None
         row["fit"] = self.fit
         return row
 
@@ -155,6 +162,9 @@ class Evaluator:
         self.model = model if settings.source != "lidar" else None
         if self.model is None and settings.source != "lidar":
             raise DepthEvaluationError(f"source {settings.source} needs a model")
+        if settings.source == "completed" and self.model is not None and not self.model.manifest.prior_input:
+            raise DepthEvaluationError(f"{self.model.manifest.name} takes the image alone: source completed needs a "
+                                       "model of ic depth train")  # fmt: skip
         kind = self.model.manifest.output_kind if self.model else "metric"
         if kind != "metric" and settings.lidar is None:
             raise DepthEvaluationError(f"the model's depth is {kind}: metres come only from LiDAR, add --lidar")
@@ -194,7 +204,8 @@ class Evaluator:
             self.model.estimate(rgb)  # warm-up: the first run allocates memory
             self._warm = True
         begin = time.perf_counter()
-        raw = self.model.estimate(rgb) if self.model is not None else None
+        model, completes = self.model, settings.source == "completed"
+        raw = model.estimate(rgb) if model is not None and not completes else None
         between, cpu_s = time.perf_counter(), time.process_time()
         sigma = fit = None
         if settings.lidar is None:
@@ -202,12 +213,19 @@ class Evaluator:
             depth = raw
         else:
             assert points is not None
-            result = self.source.estimate(raw, points, _UP, settings.camera_height_m)
+            if completes:
+                assert model is not None
+                size = model.manifest.input_height, model.manifest.input_width
+                result = self.source.estimate(
+                    None, points, _UP, settings.camera_height_m, size, complete=lambda prior: model.complete(rgb, prior)
+                )
+            else:
+                result = self.source.estimate(raw, points, _UP, settings.camera_height_m)
             depth, sigma = result.depth_m, result.sigma
             keys = ("ok", "message", "scale", "shift", "quality", "relative_sigma", "points")
             fit = {key: _rounded(getattr(result, key)) for key in keys}
         end, cpu_s = time.perf_counter(), time.process_time() - cpu_s
-        before = after = weighted = shape = share = None
+        before = after = weighted = shape = shares = None
         if truth is not None:
             at_truth = look_up(depth, truth.shape)
             after = depth_metrics(at_truth, truth, known)
@@ -217,10 +235,10 @@ class Evaluator:
             if raw is not None and self.model is not None and self.model.manifest.output_kind == "metric":
                 before = depth_metrics(look_up(raw, truth.shape), truth, known)
             if sigma is not None:
-                share = _within_sigma(depth, sigma, nearest(truth, depth.shape))
+                shares = _within_sigma(depth, sigma, nearest(truth, depth.shape))
         return Scored(
             name, rgb, depth, truth, None if points is None else points.astype(np.float32), before, after, weighted,
-            shape, share, between - begin, end - between, cpu_s, fit,
+            shape, shares, between - begin, end - between, cpu_s, fit,
         )  # fmt: skip
 
 
@@ -246,11 +264,12 @@ def nearest(values: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
     return values[np.ix_(rows, columns)]
 
 
-def _within_sigma(depth: Floats, sigma: Floats, truth: Floats) -> float | None:
+def _within_sigma(depth: Floats, sigma: Floats, truth: Floats) -> tuple[float, float, float] | None:
     known = (truth > 0) & (depth > 0) & np.isfinite(sigma)
     if not known.any():
         return None
-    return float((np.abs(depth[known] - truth[known]) <= sigma[known] * truth[known]).mean())
+    ratio = np.abs(depth[known] - truth[known]) / (sigma[known] * truth[known])
+    return float((ratio <= 1).mean()), float((ratio <= 2).mean()), float((ratio <= 3).mean())
 
 
 def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: Model | None) -> dict[str, Any]:

@@ -30,25 +30,18 @@ def to_brightness(rgb: Tensor, brightness: float) -> Tensor:
     return (rgb * (brightness / 255 / mean).clamp(1 / _MAX_GAIN, _MAX_GAIN)).clamp(0.0, 1.0)
 
 
-def turn_and_mirror(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def turn_and_mirror(generator: torch.Generator, *maps: Tensor) -> list[Tensor]:
     """Rotate every panorama by a random yaw and mirror half of them; both are exact on equirect images.
 
     Args:
-        rgb: (B, 3, H, W).
-        depth: (B, H, W).
         generator: source of randomness.
+        maps: images and depth of the panoramas, (B, ..., H, W) each; all change in the same way.
     """
-    count, _, _, width = rgb.shape
+    count, width = len(maps[0]), maps[0].shape[-1]
     shifts = torch.randint(0, width, (count,), generator=generator).tolist()
     mirrored = torch.rand(count, generator=generator) < 0.5
-    pictures, depths = [], []
-    for index, shift in enumerate(shifts):
-        picture, distance = rgb[index].roll(shift, -1), depth[index].roll(shift, -1)
-        if mirrored[index]:
-            picture, distance = picture.flip(-1), distance.flip(-1)
-        pictures.append(picture)
-        depths.append(distance)
-    return torch.stack(pictures), torch.stack(depths)
+    turned = [[part[index].roll(shift, -1) for index, shift in enumerate(shifts)] for part in maps]
+    return [torch.stack([p.flip(-1) if m else p for p, m in zip(part, mirrored, strict=True)]) for part in turned]
 
 
 def photograph(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor:

@@ -20,11 +20,19 @@ class DatasetError(ValueError):
 
 @dataclass(frozen=True)
 class Sample:
-    """One panorama: ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W), radial metres, 0 = unknown; ``world``, its seed."""
+    """One panorama.
+
+    Attributes:
+        rgb: (H, W, 3) uint8.
+        depth_m: (H, W) radial metres, 0 = unknown.
+        world: its seed.
+        prior: (5, H, W) incomplete depth (``depth.completion.prior_channels``); None: the feed simulates it.
+    """
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.floating]
     world: int
+    prior: NDArray[np.floating] | None = None
 
 
 class Subset:
@@ -57,7 +65,7 @@ class _Joined:
 
 
 class PanoramaDataset:
-    """A folder with ``rgb.npy``, ``depth.npy`` (float16), ``world.npy`` and ``dataset.json``."""
+    """A folder with ``rgb.npy``, ``depth.npy`` and ``prior.npy`` (float16), ``world.npy`` and ``dataset.json``."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
@@ -65,6 +73,7 @@ class PanoramaDataset:
             self.info: dict[str, Any] = json.loads((self.folder / INFO).read_text(encoding="utf-8"))
             self.rgb = np.load(self.folder / "rgb.npy", mmap_mode="r")
             self.depth = np.load(self.folder / "depth.npy", mmap_mode="r")
+            self.prior = np.load(self.folder / "prior.npy", mmap_mode="r")
             self.world = np.load(self.folder / "world.npy")
         except (OSError, ValueError) as error:
             raise DatasetError(f"{self.folder}: not a panorama data folder ({error})") from error
@@ -75,7 +84,8 @@ class PanoramaDataset:
         return len(self.world)
 
     def __getitem__(self, index: int) -> Sample:
-        return Sample(np.asarray(self.rgb[index]), np.asarray(self.depth[index], np.float32), int(self.world[index]))
+        depth, prior = np.asarray(self.depth[index], np.float32), np.asarray(self.prior[index])
+        return Sample(np.asarray(self.rgb[index]), depth, int(self.world[index]), prior)
 
     def split(self, held_out_share: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Indices for training and for evaluation. Whole worlds are held out, the last ones.
@@ -106,6 +116,7 @@ def write_dataset(
     height, width = size
     rgb = np.lib.format.open_memmap(folder / "rgb.npy", "w+", np.uint8, (count, height, width, 3))
     depth = np.lib.format.open_memmap(folder / "depth.npy", "w+", np.float16, (count, height, width))
+    prior = np.lib.format.open_memmap(folder / "prior.npy", "w+", np.float16, (count, 5, height, width))
     world = np.lib.format.open_memmap(folder / "world.npy", "w+", np.int64, (count,))
     for index, sample in enumerate(samples):
         if index == count:
@@ -113,6 +124,7 @@ def write_dataset(
         if sample.rgb.shape != (height, width, 3) or sample.depth_m.shape != (height, width):
             raise DatasetError(f"sample {index}: rgb {sample.rgb.shape}, depth {sample.depth_m.shape}, expected {size}")
         rgb[index], depth[index], world[index] = sample.rgb, sample.depth_m, sample.world
+        prior[index] = 0 if sample.prior is None else sample.prior
         temporary = folder / (INFO + ".part")
         temporary.write_text(json.dumps({**info, "count": index + 1}, indent=2) + "\n", encoding="utf-8")
         temporary.replace(folder / INFO)

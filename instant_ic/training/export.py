@@ -1,4 +1,4 @@
-"""Export of SliceNet to ONNX with manifest and training record (torch and onnx)."""
+"""Export of SliceNet and the completion network to ONNX with manifest and training record (torch and onnx)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from instant_ic.depth.completion import PRIOR_CHANNELS
 from instant_ic.depth.manifest import ModelManifest, manifest_path, save_manifest
+from instant_ic.training.completion import CompletionNet
 from instant_ic.training.folding import fold_upsampling
 from instant_ic.training.slicenet import SliceNet
 
@@ -31,11 +33,14 @@ class ExportError(RuntimeError):
 
 
 def export_onnx(
-    model: SliceNet, path: str | Path, half_weights: bool = False, report: Callable[[str], None] = lambda line: None
+    model: SliceNet | CompletionNet,
+    path: str | Path,
+    half_weights: bool = False,
+    report: Callable[[str], None] = lambda line: None,
 ) -> dict[str, float]:
     """Export the network as ONNX of fixed shape and compare it with torch on a random image.
 
-    The decoder is folded (:mod:`.folding`), and batch norms are folded into the convolutions before them.
+    SliceNet's decoder is folded (:mod:`.folding`), and batch norms are folded into the convolutions before them.
 
     Args:
         model: the network; switched to evaluation mode.
@@ -54,11 +59,10 @@ def export_onnx(
     """
     path = Path(path)
     model.eval()
-    shape = (1, 3, model.config.height, model.config.width)
-    picture = torch.rand(shape, generator=torch.Generator().manual_seed(1))
+    inputs = _example(model)
     report("running the network in torch")
     with torch.inference_mode():
-        expected = model(picture).numpy()
+        expected = _depth(model(*inputs.values()))
     if not np.isfinite(expected).all() or not np.ptp(expected):
         raise ExportError("the network outputs no depth: all pixels have the same value, or none")
     with tempfile.TemporaryDirectory() as folder:
@@ -68,18 +72,19 @@ def export_onnx(
             # The tracing exporter is the fast one here; its successor handles the LSTM no better.
             warnings.simplefilter("ignore")
             torch.onnx.export(
-                fold_upsampling(model), (picture,), str(plain), dynamo=False, opset_version=OPSET,
-                input_names=["image"], output_names=["depth"],
+                fold_upsampling(model) if isinstance(model, SliceNet) else model, tuple(inputs.values()), str(plain),
+                dynamo=False, opset_version=OPSET, input_names=list(inputs),
+                output_names=["depth", "sigma"][: len(inputs)],
             )  # fmt: skip
         report("running the network in onnxruntime")
-        got = _run(plain, picture.numpy())
+        got = _run(plain, inputs)
         result = {"difference": _difference(got, expected)}
         told = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
         if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
             # Weights may amplify rounding beyond any fixed bound; a float64 run then shows which side is wrong.
             report(f"{told}; running torch in float64")
             with torch.inference_mode():
-                exact = copy.deepcopy(model).double()(picture.double()).numpy()
+                exact = _depth(copy.deepcopy(model).double()(*(value.double() for value in inputs.values())))
             result["rounding"] = _difference(expected, exact)
             if not _difference(got, exact) < max(2 * result["rounding"], MAX_RELATIVE_DIFFERENCE):
                 raise ExportError(f"{told}, {_difference(got, exact):.1e} to float64")
@@ -88,7 +93,7 @@ def export_onnx(
         if half_weights:
             report("converting the weights to float16 and running again")
             plain.write_bytes(_halve_weights(plain.read_bytes()))
-            result["half_difference"] = _difference(_run(plain, picture.numpy()), expected)
+            result["half_difference"] = _difference(_run(plain, inputs), expected)
             if not result["half_difference"] < MAX_HALF_DIFFERENCE:
                 raise ExportError(f"float16 weights change the depth by {result['half_difference']:.1e}")
             report(f"float16 weights change the depth by {result['half_difference']:.1e}")
@@ -101,11 +106,28 @@ def export_onnx(
     return result
 
 
-def _run(path: Path, picture: NDArray[np.float32]) -> NDArray[np.float32]:
+def _example(model: SliceNet | CompletionNet) -> dict[str, torch.Tensor]:
+    """Inputs by name: a random image, and for a completion a random prior of which some pixels are measured."""
+    height, width = model.config.height, model.config.width
+    generator = torch.Generator().manual_seed(1)
+    inputs = {"image": torch.rand((1, 3, height, width), generator=generator)}
+    if isinstance(model, CompletionNet):
+        prior = torch.rand((1, PRIOR_CHANNELS, height, width), generator=generator)
+        prior[:, 0] = 4 * prior[:, 0] * (prior[:, 1] > 0.3)
+        prior[:, 2] = ((prior[:, 2] > 0.95) & (prior[:, 0] > 0)).float()
+        inputs["prior"] = prior
+    return inputs
+
+
+def _depth(output: torch.Tensor | tuple[torch.Tensor, torch.Tensor]) -> NDArray[np.floating]:
+    return (output[0] if isinstance(output, tuple) else output).numpy()
+
+
+def _run(path: Path, inputs: dict[str, torch.Tensor]) -> NDArray[np.float32]:
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    return np.asarray(session.run(None, {"image": picture})[0])
+    return np.asarray(session.run(None, {name: value.numpy() for name, value in inputs.items()})[0])
 
 
 def _difference(got: NDArray[np.floating], expected: NDArray[np.floating]) -> float:
@@ -136,7 +158,7 @@ def _halve_weights(content: bytes) -> bytes:
 
 
 def export_model(
-    model: SliceNet,
+    model: SliceNet | CompletionNet,
     path: str | Path,
     name: str,
     licence: str,
@@ -163,6 +185,8 @@ def export_model(
         input_width=model.config.width,
         brightness=brightness,
         max_range_m=max_range_m,
+        prior_input="prior" if isinstance(model, CompletionNet) else "",
+        sigma_output="sigma" if isinstance(model, CompletionNet) else "",
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
     )
     save_manifest(manifest, manifest_path(path))

@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 from instant_ic.training.dataset import Sample
 from instant_ic.training.rooms import RoomsConfig, render_rooms
+from instant_ic.training.sparse import prior_of_image
 
-Batch = tuple[NDArray[np.uint8], NDArray[np.float32]]
-"""rgb (B, H, W, 3) uint8 and radial depth (B, H, W) metres, 0 = unknown."""
+Batch = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
+"""rgb (B, H, W, 3) uint8, radial depth (B, H, W) metres, 0 = unknown, and prior (B, 5, H, W)."""
 WORLD_TIMEOUT_S = 600.0
 
 
@@ -61,9 +62,12 @@ class Feed(Protocol):
     def close(self) -> None: ...
 
 
-def stack(samples: Sequence[Sample]) -> Batch:
-    """Stack panoramas of one size into a batch."""
-    return np.stack([s.rgb for s in samples]), np.stack([np.asarray(s.depth_m, np.float32) for s in samples])
+def stack(samples: Sequence[Sample], rng: np.random.Generator | None = None) -> Batch:
+    """Stack panoramas of one size into a batch; ``rng`` draws the prior of those without one."""
+    rng = rng or np.random.default_rng(0)
+    priors = [prior_of_image(s.depth_m, rng) if s.prior is None else np.asarray(s.prior, np.float32) for s in samples]
+    depths = [np.asarray(s.depth_m, np.float32) for s in samples]
+    return np.stack([s.rgb for s in samples]), np.stack(depths), np.stack(priors)
 
 
 class FileFeed:
@@ -110,7 +114,8 @@ class FileFeed:
         order = np.random.default_rng((self.seed, epoch)).permutation(self.indices)
         first = (place * self.ranks + self.rank) * self.batch_size
         picked = np.sort(np.take(order, np.arange(first, first + self.batch_size), mode="wrap"))
-        return stack(list(self._readers.map(lambda index: self.samples[int(index)], picked)))
+        rng = np.random.default_rng((self.seed, step, self.rank))
+        return stack(list(self._readers.map(lambda index: self.samples[int(index)], picked)), rng)
 
     def close(self) -> None:
         self._readers.shutdown(cancel_futures=True)
@@ -203,7 +208,8 @@ class MixedFeed:
 
     def batch(self, step: int) -> Batch:
         parts = [feed.batch(step) for feed in self.feeds]
-        return np.concatenate([rgb for rgb, _ in parts]), np.concatenate([depth for _, depth in parts])
+        rgb, depth, prior = zip(*parts, strict=True)
+        return np.concatenate(rgb), np.concatenate(depth), np.concatenate(prior)
 
     def close(self) -> None:
         for feed in self.feeds:
@@ -259,6 +265,8 @@ class Renderers:
                 target=_render, args=(recipe, self._cache.name, os.getpid(), asked, given), daemon=True
             )
             process.start()
+            # Else the end of a process in the middle of a message would never be noticed.
+            given._writer.close()  # type: ignore[attr-defined]
             self._processes.append(process)
             self._asked.append(asked)
             self._given.append(given)
@@ -286,7 +294,9 @@ class Renderers:
             try:
                 samples, error = self._given[which].get(timeout=1.0)
                 break
-            except queue.Empty:
+            except (queue.Empty, EOFError) as none:
+                if isinstance(none, EOFError):
+                    self._processes[which].join(10)
                 if not self._processes[which].is_alive():
                     code = self._processes[which].exitcode
                     raise FeedError(f"a rendering process exited with {code} at world {self.seed_of(place)}") from None

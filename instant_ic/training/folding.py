@@ -61,26 +61,10 @@ def fold_kernel(kernel: Tensor, upscale: tuple[int, int]) -> Tensor:
     return torch.stack(phases, dim=1).flatten(0, 1)
 
 
-def unfold_kernel(kernels: Tensor, upscale: tuple[int, int]) -> Tensor:
-    """The inverse of :func:`fold_kernel`, up to rounding."""
-    count = upscale[0] * upscale[1]
-    phases = list(kernels.unflatten(0, (-1, count)).unbind(1))
-    for axis in (3, 2):
-        if upscale[axis - 2] == 2:
-            phases = [_whole(even, odd, axis) for even, odd in zip(phases[::2], phases[1::2], strict=True)]
-    (kernel,) = phases
-    return kernel
-
-
 def _halves(kernel: Tensor, axis: int) -> tuple[Tensor, Tensor]:
     first, middle, last = kernel.unbind(axis)
     nothing = torch.zeros_like(first)
     return torch.stack((first, middle + last, nothing), axis), torch.stack((nothing, first + middle, last), axis)
-
-
-def _whole(even: Tensor, odd: Tensor, axis: int) -> Tensor:
-    first, last = even.select(axis, 0), odd.select(axis, 2)
-    return torch.stack((first, even.select(axis, 1) - last, last), axis)
 
 
 def fold_upsampling(model: SliceNet) -> SliceNet:

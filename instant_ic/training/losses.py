@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 MIN_DEPTH_M = 0.1
+LAPLACE_68 = 1.15
+"""Scales of a Laplace distribution within which 68 % of it lie."""
 
 
 def berhu(error: Tensor, threshold: float) -> Tensor:
@@ -42,3 +44,15 @@ def edge_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
     across = weighted_mean((log_ratio - log_ratio.roll(1, -1)).abs(), valid & valid.roll(1, -1), row_weights)
     down = weighted_mean((log_ratio[:, 1:] - log_ratio[:, :-1]).abs(), valid[:, 1:] & valid[:, :-1], row_weights[1:])
     return across + down
+
+
+def sigma_loss(predicted: Tensor, sigma: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
+    """Negative log likelihood of log errors under a Laplace distribution of which 68 % lie within ``sigma``.
+
+    The depth gets no gradient: otherwise it would be trained least where it is worst.
+    """
+    valid = truth > 0
+    safe = torch.where(valid, truth, torch.ones_like(truth)).clamp_min(MIN_DEPTH_M)
+    error = (predicted.detach().clamp_min(MIN_DEPTH_M).log() - safe.log()).abs()
+    scale = sigma.clamp_min(1e-4) / LAPLACE_68
+    return weighted_mean(error / scale + scale.log(), valid, row_weights)

@@ -30,6 +30,7 @@ class RoomsConfig:
         camera_height_m: lowest and highest camera above the floor.
         tilt_deg: standard deviation of roll and pitch.
         clearance_m: distance from objects, minimum and maximum.
+        textures: folder of photographs that replace most procedural textures; empty: none.
     """
 
     worlds: int = 400
@@ -40,6 +41,7 @@ class RoomsConfig:
     camera_height_m: tuple[float, float] = (0.5, 1.7)
     tilt_deg: float = 1.5
     clearance_m: tuple[float, float] = (0.3, 0.7)
+    textures: str = ""
 
     def __post_init__(self) -> None:
         if self.worlds < 2 or self.poses < 1:
@@ -69,12 +71,16 @@ def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> It
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import World, random_world
     from instant_ic.training.interiors import interior_world
+    from instant_ic.training.photographs import with_photographs
+    from instant_ic.training.sparse import sample_prior
 
     make: Callable[[int], World] = interior_world if config.interiors == "wide" else random_world
     seeds = range(config.first_world, config.first_world + config.worlds) if worlds is None else worlds
     for seed in seeds:
         rng = np.random.default_rng((7, seed))
         world = make(seed)
+        if config.textures:
+            world = with_photographs(world, config.textures, rng)
         renderer = EquirectRenderer(world)
         try:
             poses = world.sample_free_poses(rng, config.poses, clearance_m=rng.uniform(*config.clearance_m))
@@ -85,4 +91,5 @@ def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> It
             height = rng.uniform(*config.camera_height_m)
             pose = pose_matrix(x, y, height, roll, pitch, math.remainder(yaw, math.tau))
             frame = renderer.render(pose, 2 * config.height, config.height)
-            yield Sample(frame.rgb, frame.depth_m, seed)
+            prior = sample_prior(renderer, pose, rng, (config.height, 2 * config.height))
+            yield Sample(frame.rgb, frame.depth_m, seed, prior.astype(np.float16))

@@ -90,17 +90,6 @@ class SliceNetConfig:
         return asdict(self)
 
 
-# The model that the project trains and ships.
-SMALL = SliceNetConfig(
-    backbone="resnet18",
-    height=256,
-    width_multiplier=0.5,
-    lstm_hidden=160,
-    column_stride=2,
-    decoder_floor=24,
-)
-
-
 class CircularPad(nn.Module):
     """Pads the width with columns from the opposite edge: the panorama has no left and right border."""
 
@@ -343,7 +332,7 @@ def load_checkpoint(path: str | Path) -> SliceNet:
             lists missing, unknown, misshapen and non-finite tensors.
     """
     path = Path(path)
-    payload = _read(path)
+    payload = read_checkpoint(path)
     if not isinstance(payload, dict):
         raise CheckpointError(f"{path}: holds {type(payload).__name__} instead of a checkpoint with 'state_dict'")
     if "state_dict" not in payload:
@@ -356,14 +345,14 @@ def load_checkpoint(path: str | Path) -> SliceNet:
     with torch.device("meta"):  # shapes only: allocates no weights that would be replaced at once
         model = SliceNet(config)
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
-    _check_state(f"{path}: does not fit {config.backbone}, {config.height} x {config.width}", state, expected)
+    check_state(f"{path}: does not fit {config.backbone}, {config.height} x {config.width}", state, expected)
     model.to_empty(device="cpu")
     model.load_state_dict(state, strict=True)
     model.set_normalisation()
     return model.eval()
 
 
-def _read(path: Path) -> Any:
+def read_checkpoint(path: Path) -> Any:
     try:
         if zipfile.is_zipfile(path):  # torch's format; torch itself does not verify the checksums
             with zipfile.ZipFile(path) as archive:
@@ -412,7 +401,7 @@ def _config(path: Path, payload: dict[str, Any]) -> SliceNetConfig:
     return config
 
 
-def _check_state(what: str, state: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:
+def check_state(what: str, state: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:
     """Raise one error that lists all differences."""
     faults = []
     if missing := [key for key in expected if key not in state]:

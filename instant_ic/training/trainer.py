@@ -1,4 +1,4 @@
-"""Trains SliceNet. Training can be stopped and resumed at any time, and runs on several GPUs under ``torchrun``.
+"""Trains the completion network. Training can be stopped and resumed, and runs on several GPUs under ``torchrun``.
 
 The schedule runs over wall time or epochs, whichever ends first: on a shared machine only the time is known beforehand.
 The evaluated and saved weights are an exponential moving average of the trained ones.
@@ -24,11 +24,11 @@ from torch.nn.parallel import DistributedDataParallel
 
 from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
 from instant_ic.training.augment import photograph, to_brightness, turn_and_mirror
-from instant_ic.training.feeds import Ahead, Feed, Samples
+from instant_ic.training.completion import CompletionNet
+from instant_ic.training.feeds import Ahead, Batch, Feed, Samples, stack
 from instant_ic.training.log import TrainingLog
-from instant_ic.training.losses import depth_loss, edge_loss
-from instant_ic.training.slicenet import CheckpointError, SliceNet, SliceNetConfig
-from instant_ic.training.weights import Start, fold_norms, unfold_norms
+from instant_ic.training.losses import depth_loss, edge_loss, sigma_loss
+from instant_ic.training.slicenet import CheckpointError
 
 POLE_WEIGHT = 0.1
 """Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
@@ -50,35 +50,32 @@ class TrainingConfig:
         weight_decay: of AdamW.
         warmup: share of the schedule in which the learning rate rises.
         average: decay of the weight average per step.
-        mix: share of the trained weights in the result; the rest are the start weights. A short training on different
-            images degrades the network on data it does not see. Weights between both ends perform well on old and new
-            data (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
         edge_share: weight of the edge loss.
+        sigma_share: weight of the loss of the uncertainty.
         photograph: augment images with the effects of a real camera.
         brightness: mean byte to which each image is scaled before the network, as in inference; 0: unchanged.
         evaluation_panoramas: number of held-out panoramas evaluated during training.
         checkpoint_s: seconds between checkpoints with evaluation.
         max_range_m: ground truth beyond it is unknown; output beyond it is clipped.
         mixed_precision: convolutions in bfloat16, or in float16 on a GPU without bfloat16.
-        threads: CPU threads. On two cores that are also used by others, two threads are several times slower than one:
-            each of the LSTM's many short steps waits for the slower thread.
+        threads: CPU threads. On cores that are also used by others more threads wait for each other.
         seed: of weights, order and augmentation.
     """
 
     minutes: float = 60.0
     epochs: int = 40
-    batch_size: int = 8
-    learning_rate: float = 2e-3
+    batch_size: int = 6
+    learning_rate: float = 1e-3
     weight_decay: float = 0.02
     warmup: float = 0.04
     average: float = 0.998
-    mix: float = 1.0
     edge_share: float = 0.5
+    sigma_share: float = 0.1
     photograph: bool = True
     brightness: float = 178.5
     evaluation_panoramas: int = 48
     checkpoint_s: float = 300.0
-    max_range_m: float = 16.0
+    max_range_m: float = 40.0
     mixed_precision: bool = True
     threads: int = 1
     seed: int = 0
@@ -90,8 +87,6 @@ class TrainingConfig:
                 raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
         if not 0 < self.warmup < 1 or not 0 <= self.average < 1:
             raise ValueError(f"warmup and average must lie in 0..1 (got {self.warmup}, {self.average})")
-        if not 0 < self.mix <= 1:
-            raise ValueError(f"mix must lie in 0..1, above 0 (got {self.mix})")
         if not 0 <= self.brightness <= 255:
             raise ValueError(f"brightness must lie in 0..255 (got {self.brightness})")
 
@@ -167,36 +162,28 @@ def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
             kept.copy_(new)
 
 
-def mixed(trained: SliceNet, initial: SliceNet, share: float) -> SliceNet:
-    """Interpolate the weights: ``share`` of ``trained``, the rest of ``initial``.
-
-    Batch norms are folded first, because their numbers mean different things in each network.
+def to_tensors(batch: Batch, max_range_m: float, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Convert a batch to tensors: (B, 3, H, W) in 0..1, ground truth (B, H, W), 0 where unknown or too far, and prior
+    (B, 5, H, W).
     """
-    result, start = copy.deepcopy(trained).cpu().eval(), copy.deepcopy(initial).cpu().eval()
-    fold_norms(result)
-    fold_norms(start)
-    update_average(result, start, share)
-    return result.to(next(trained.parameters()).device)
-
-
-def to_tensors(rgb: np.ndarray, depth: np.ndarray, max_range_m: float, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Convert a batch to tensors: (B, 3, H, W) in 0..1 and ground truth (B, H, W), 0 where unknown or too far."""
+    rgb, depth, prior = batch
     pictures = torch.tensor(rgb).to(device).permute(0, 3, 1, 2).float() / 255.0
     truth = torch.tensor(depth).to(device)
-    return pictures, torch.where(torch.isfinite(truth) & (truth <= max_range_m), truth, 0.0)
+    truth = torch.where(torch.isfinite(truth) & (truth <= max_range_m), truth, 0.0)
+    return pictures, truth, torch.tensor(prior).to(device)
 
 
 @torch.inference_mode()
-def evaluate(model: SliceNet, samples: Samples, max_range_m: float, brightness: float = 0.0) -> DepthMetrics:
+def evaluate(model: CompletionNet, samples: Samples, max_range_m: float, brightness: float = 0.0) -> DepthMetrics:
     """Mean metrics over panoramas, weighted by solid angle, without augmentation, in float32, on the model's device."""
     model.eval()
     device = next(model.parameters()).device
     weights = solid_angle_weights(model.config.height)[:, None]
     each = []
     for index in range(len(samples)):
-        sample = samples[index]
-        rgb, truth = to_tensors(sample.rgb[None], np.asarray(sample.depth_m, np.float32)[None], max_range_m, device)
-        predicted = model(to_brightness(rgb, brightness))[0].clamp(0.1, max_range_m)
+        batch = stack([samples[index]], np.random.default_rng(index))
+        rgb, truth, prior = to_tensors(batch, max_range_m, device)
+        predicted = model(to_brightness(rgb, brightness), prior)[0][0].clamp(0.1, max_range_m)
         each.append(depth_metrics(predicted.cpu().numpy(), truth[0].cpu().numpy(), weights=weights))
     return mean_metrics(each)
 
@@ -208,12 +195,11 @@ class Trainer:
     Attributes:
         feed: training batches, of ``config.batch_size``.
         held_out: panoramas for evaluation, from worlds or scenes that are not in the feed.
-        network: network to train.
+        model: network to train; it keeps the weights it has.
+        origin: where these weights come from, for the record.
         config: training parameters.
         output: checkpoint file.
         team: the processes of this training; by default this one on the CPU.
-        start: initial weights; random by default.
-        result: the weights that are evaluated and saved: the average, finally mixed with the start weights.
         command: the user's command line, for the record.
         report: receives human-readable lines.
         bar: receives the progress 0..1 after each step.
@@ -222,11 +208,11 @@ class Trainer:
 
     feed: Feed
     held_out: Samples
-    network: SliceNetConfig
+    model: CompletionNet
     config: TrainingConfig
     output: Path
     team: Team = field(default_factory=lambda: Team(torch.device("cpu")))
-    start: Start | None = None
+    origin: dict[str, Any] = field(default_factory=dict)
     command: str = ""
     report: Callable[[str], None] = print
     bar: Callable[[float], None] = lambda progress: None
@@ -239,26 +225,15 @@ class Trainer:
         torch.set_num_threads(self.config.threads)
         torch.manual_seed(self.config.seed)
         self._ahead = Ahead(self.feed)
+        self.network = self.model.config
         rows = np.maximum(solid_angle_weights(self.network.height), POLE_WEIGHT)
         self.row_weights = torch.from_numpy(rows).to(self.team.device)
-        rgb, depth = self.feed.batch(0)
+        rgb = self.feed.batch(0)[0]
         if rgb.shape[1:3] != (self.network.height, self.network.width):
             raise ValueError(f"the panoramas are {rgb.shape[1]} x {rgb.shape[2]}, the network takes "
                              f"{self.network.height} x {self.network.width}")  # fmt: skip
-        self.model = self.start.model if self.start else SliceNet(self.network)
-        self._initial: SliceNet | None = None
-        if self.config.mix < 1:
-            if self.start is None:
-                raise ValueError("mix needs weights to start from")
-            self._initial = copy.deepcopy(self.model)
-        if self.start is None:
-            self._start_at_typical_depth(depth)
-        elif self.start.folded:
-            pictures, truth = to_tensors(rgb, depth, self.config.max_range_m, torch.device("cpu"))
-            unfold_norms(self.model, self._augmented(pictures, truth)[0])
         self.model = self.model.to(self.team.device)
         self.average = copy.deepcopy(self.model).eval()
-        self.result = self.average
         if self.team.ranks > 1 and self.team.device.type == "cuda":
             self.model = nn.SyncBatchNorm.convert_sync_batchnorm(self.model)
         self._parallel: nn.Module = self.model
@@ -276,30 +251,19 @@ class Trainer:
         scales = self.config.mixed_precision and self._half == torch.float16
         self.scaler = torch.amp.GradScaler(self.team.device.type, enabled=scales)
 
-    @torch.no_grad()
-    def _start_at_typical_depth(self, depth: np.ndarray) -> None:
-        """Set mean and scale of the last norm to those of the data, which Adam's small steps would reach slowly."""
-        known = depth[(depth > 0) & (depth <= self.config.max_range_m)]
-        if not len(known):
-            raise ValueError("the first batch has no depth within max_range_m")
-        norm = self.model.decoder[-1].get_submodule("layers.1")
-        assert isinstance(norm, nn.BatchNorm2d)
-        norm.bias.fill_(float(np.median(known)))
-        norm.weight.fill_(max(0.1, float(known.std())))
-
     @property
     def progress(self) -> float:
         """Progress through the schedule, 0..1, by time or epochs."""
         by_time = self.elapsed_s / (60 * self.config.minutes)
         return min(1.0, max(by_time, self.step / (self.config.epochs * self.feed.steps_an_epoch)))
 
-    def _augmented(self, rgb: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+    def _augmented(self, rgb: Tensor, depth: Tensor, prior: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Augment with a generator seeded by step and process, so that a resumed run repeats the same augmentation."""
         generator = torch.Generator().manual_seed((self.config.seed << 40) + (self.step << 8) + self.team.rank)
-        rgb, depth = turn_and_mirror(rgb, depth, generator)
+        rgb, depth, prior = turn_and_mirror(generator, rgb, depth, prior)
         if self.config.photograph:
             rgb = photograph(rgb, depth, generator)
-        return to_brightness(rgb, self.config.brightness), depth
+        return to_brightness(rgb, self.config.brightness), depth, prior
 
     def train_step(self, progress: float | None = None) -> float:
         """Run one optimiser step and return the loss.
@@ -310,14 +274,15 @@ class Trainer:
         factor = schedule(self.progress if progress is None else progress, self.config.warmup)
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate * factor
-        batch = self._ahead.batch(self.step)
-        rgb, truth = self._augmented(*to_tensors(*batch, self.config.max_range_m, self.team.device))
+        batch = to_tensors(self._ahead.batch(self.step), self.config.max_range_m, self.team.device)
+        rgb, truth, prior = self._augmented(*batch)
         self.model.train()
         with torch.autocast(self.team.device.type, self._half, enabled=self.config.mixed_precision):
-            predicted = self._parallel(rgb)
-        predicted = predicted.float()
+            predicted, sigma = self._parallel(rgb, prior)
         loss = depth_loss(predicted, truth, self.row_weights)
         loss = loss + self.config.edge_share * edge_loss(predicted, truth, self.row_weights)
+        guessed = truth * (prior[:, 2] == 0)
+        loss = loss + self.config.sigma_share * sigma_loss(predicted, sigma, guessed, self.row_weights)
         if not torch.isfinite(loss):
             raise RuntimeError(f"step {self.step}: loss is {loss.item()}; lower learning_rate")
         self.optimizer.zero_grad(set_to_none=True)
@@ -365,8 +330,6 @@ class Trainer:
             if log is None:
                 return None
             self._row(log, losses, *last_row)
-            if self._initial is not None:
-                self.result = mixed(self.average, self._initial, self.config.mix)
             final = self._evaluate(self.held_out)
             self._checkpoint(log, final, losses)
             return final
@@ -393,7 +356,7 @@ class Trainer:
         return now, self.step
 
     def _evaluate(self, samples: Samples) -> DepthMetrics:
-        return evaluate(self.result, samples, self.config.max_range_m, self.config.brightness)
+        return evaluate(self.average, samples, self.config.max_range_m, self.config.brightness)
 
     def _checkpoint(self, log: TrainingLog, metrics: DepthMetrics, losses: list[float]) -> None:
         entry: dict[str, Any] = {"step": self.step, "minutes": round(self.elapsed_s / 60, 1), **metrics.as_dict()}
@@ -401,11 +364,10 @@ class Trainer:
         self.history.append(entry)
         state = {
             "config": self.network.as_dict(),
-            "state_dict": self.result.state_dict(),
+            "state_dict": self.average.state_dict(),
             "record": self.record(),
             "resume": {
                 "model": self.model.state_dict(),
-                "average": self.average.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
                 "scaler": self.scaler.state_dict(),
                 "step": self.step,
@@ -421,7 +383,7 @@ class Trainer:
         """Origin of the weights: command, start, data, network, training, device, results (plain values)."""
         return {
             "command": self.command,
-            "start": self.start.origin if self.start else None,
+            "start": self.origin,
             "network": self.network.as_dict(),
             "parameters": sum(p.numel() for p in self.model.parameters()),
             "training": asdict(self.config),
@@ -449,7 +411,7 @@ class Trainer:
             raise CheckpointError(f"{path}: not a checkpoint of tensors and plain values ({error})") from error
         if not isinstance(state, dict) or "resume" not in state or state.get("config") != self.network.as_dict():
             raise CheckpointError(f"{path}: not a checkpoint of a run with {self.network}")
-        self.average.load_state_dict(state["resume"].get("average", state["state_dict"]))
+        self.average.load_state_dict(state["state_dict"])
         self.model.load_state_dict(state["resume"]["model"])
         self.optimizer.load_state_dict(state["resume"]["optimizer"])
         self.scaler.load_state_dict(state["resume"]["scaler"])

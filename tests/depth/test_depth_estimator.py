@@ -9,8 +9,7 @@ import pytest
 import tiny_onnx
 
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.depth.manifest import ModelManifest, save_manifest
-from instant_ic.depth.model import InferenceError
+from instant_ic.depth.manifest import InferenceError, ModelManifest, save_manifest
 from instant_ic.jpeg import JpegError
 from instant_ic.limits import decode_rgb
 from instant_ic.msg import compressed_image_message, image_array

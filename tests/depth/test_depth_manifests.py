@@ -12,8 +12,8 @@ import yaml
 from onnx import helper
 from tiny_onnx import CHANNELS, channel
 
-from instant_ic.depth.manifest import ManifestError, load_manifest
-from instant_ic.depth.model import DepthModel, InferenceError
+from instant_ic.depth.manifest import InferenceError, ManifestError, load_manifest
+from instant_ic.depth.model import DepthModel
 from instant_ic.paths import share_dir
 
 EXAMPLES = sorted((share_dir("models") / "examples").glob("*.yaml"))

@@ -30,6 +30,7 @@ from instant_ic.msg import (
     stamp_ns,
     transform_message,
 )
+from instant_ic.training.completion import CompletionConfig, CompletionNet
 from instant_ic.training.export import export_model
 from instant_ic.training.slicenet import SliceNet, SliceNetConfig
 from nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
@@ -251,6 +252,34 @@ def test_lidar_alone_needs_no_network() -> None:
     for message in scaled:
         assert np.quantile(far_off(image_array(message), stamp_ns(message)), 0.99) < 0.04
     assert keyframes[0].fit and keyframes[0].source == "lidar" and keyframes[0].scale == 1.0
+
+
+def test_completion_runs_in_the_node_and_needs_no_estimator(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = CompletionNet(CompletionConfig(64, (8, 8, 8, 8), 2))
+    torch.nn.init.constant_(model.head.bias[-4:], -8.0)  # log sigma: more certain than the structure everywhere
+    torch.nn.init.constant_(model.head.bias[8:12], 20.0)  # gate: the prior where there is one
+    export_model(model.eval(), tmp_path / "c.onnx", "c", "Apache-2.0", 40.0)
+    config = DepthScalerConfig(source="completed", completion=str(tmp_path / "c.onnx"), provider="cpu",
+                               lidar=LidarDepthConfig(ceiling_height_m=2.6), max_rate_hz=1.0)  # fmt: skip
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthScalerNode, config)
+        drive(bus, 2.5, network=False)
+        scaled, keyframes = bus.messages("/depth/scaled"), bus.messages("/keyframe")
+        severity, text = level(node, "scale")
+    assert severity == 0 and text.startswith("LiDAR completed")
+    assert image_array(scaled[0]).shape == (64, 128)  # the model's
+    assert np.quantile(far_off(image_array(scaled[0]), stamp_ns(scaled[0])), 0.9) < 0.04
+    assert keyframes[0].fit and keyframes[0].source == "completed"
+    sigma = decode_sigma(image_array(keyframes[0].sigma))
+    assert np.isfinite(sigma).all() and np.median(sigma) < 0.01  # exp(-6), the smallest, not the structure's
+
+
+def test_completion_without_a_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="source completed needs a model"):
+        DepthScalerConfig(source="completed")
+    with LockstepBus(START) as bus, pytest.raises(NodeError, match=r"absent\.yaml: no manifest"):
+        bus.add(DepthScalerNode, DepthScalerConfig(source="completed", completion=str(tmp_path / "absent.onnx")))
 
 
 def images(bus: LockstepBus, x_m: list[float], begin: int, cloud: np.ndarray | None = None) -> list[int]:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from instant_ic.depth.completion import prior_channels
 from instant_ic.depth.fusion import FusionConfig, ceiling_height, correct
 from instant_ic.depth.lidar_depth import (
     LidarDepthConfig,
@@ -18,8 +19,9 @@ from instant_ic.depth.lidar_depth import (
     lonely,
     plane_height,
 )
+from instant_ic.depth.manifest import InferenceError
 from instant_ic.depth.scaler import ScalerConfig
-from instant_ic.depth.sources import SOURCES, DepthSource, SourceConfig, without_body
+from instant_ic.depth.sources import SOURCES, DepthSource, SourceConfig, arbitrate, without_body
 from instant_ic.depth.visibility import nearest_points
 from instant_ic.geometry.poses import rotation_matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -277,14 +279,14 @@ def raw_of(true: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("source", SOURCES)
 def test_each_source_in_the_room(source: str) -> None:
     config = SourceConfig(source=source, lidar=LidarDepthConfig(ceiling_height_m=2.6))
-    raw = None if source == "lidar" else raw_of(truth())
+    raw = None if source in ("lidar", "completed") else raw_of(truth())
     found = DepthSource(config).estimate(raw, POINTS, UP, CAMERA_M, size=SIZE)
     assert found.ok and found.source == source and found.depth_m.shape == SIZE
     assert found.depth_m.dtype == found.sigma.dtype == np.float32
     off = error(found.depth_m, truth())
-    assert off.mean() < {"network": 0.06, "lidar": 0.02, "fused": 0.02}[source]
+    assert off.mean() < {"network": 0.06, "lidar": 0.02, "fused": 0.02, "completed": 0.02}[source]
     assert 0.9 < found.quality <= 1 and 0 < found.relative_sigma < 0.1 and found.points > 3000
-    if source != "lidar":
+    if source in ("network", "fused"):
         assert found.scale == pytest.approx(2, rel=0.08)
 
 
@@ -344,7 +346,7 @@ def test_the_robot_under_the_camera_becomes_floor() -> None:
 
 
 def test_wrong_use_is_told() -> None:
-    with pytest.raises(ValueError, match="source must be one of network, lidar, fused"):
+    with pytest.raises(ValueError, match="source must be one of network, lidar, fused, completed"):
         SourceConfig(source="sonar")
     with pytest.raises(ValueError, match="source fused needs the network's depth"):
         DepthSource().estimate(None, POINTS, UP, CAMERA_M)
@@ -363,3 +365,75 @@ def test_a_wrong_network_makes_nothing_worse_than_the_lidar_alone(seed: int) -> 
     known = alone.depth_m > 0
     assert known.mean() > 0.99
     np.testing.assert_array_equal(fused.depth_m[known], alone.depth_m[known])
+
+
+def completed(complete, points=POINTS):
+    source = DepthSource(SourceConfig(source="completed"))
+    return source.estimate(None, points, UP, CAMERA_M, SIZE, complete=complete)
+
+
+def alone(points=POINTS):
+    return DepthSource(SourceConfig(source="lidar")).estimate(None, points, UP, CAMERA_M, SIZE)
+
+
+def test_prior_by_hand() -> None:
+    """Elevations of 4 rows: 67.5, 22.5, -22.5 and -67.5 degrees; a floor 1.2 m below."""
+    depth, sigma = np.full((4, 8), 2.0), np.full((4, 8), 0.1)
+    depth[0], sigma[0] = 0.0, np.inf
+    ranges_m = np.zeros((4, 8))
+    ranges_m[2, :3] = 2.05, 2.07, 2.0  # agrees within 2 cm and 2 %: 6.1 cm; not; agrees
+    depth[3, 0] = 50.0  # too far to count
+    prior = prior_channels(depth, sigma, ranges_m, UP, CAMERA_M)
+    assert prior.shape == (5, 4, 8) and prior.dtype == np.float32
+    np.testing.assert_array_equal(prior[0, :, 0], [0.0, 2.0, 2.0, 0.0])
+    np.testing.assert_allclose(prior[1, :, 0], [0.0, 0.1, 0.1, 0.0])
+    assert prior[2].sum() == 2 and prior[2, 2, 0] == prior[2, 2, 2] == 1
+    np.testing.assert_allclose(prior[3, :, 0], np.sin(np.radians([67.5, 22.5, -22.5, -67.5])), rtol=1e-6)
+    np.testing.assert_allclose(prior[4, :, 0], [0.0, 0.0, 1.2 / 0.38268, 1.2 / 0.92388], rtol=1e-4)
+    assert not prior_channels(depth, sigma, ranges_m, UP, None)[4].any()
+
+
+def test_the_more_certain_source_is_taken_in_each_pixel() -> None:
+    depth, sigma = np.array([[2.0, 2.0, 0.0, 0.0, 2.0]]), np.array([[0.1, 0.1, np.inf, np.inf, 0.1]])
+    free = np.array([[0.0, 0.0, 4.0, 0.0, 0.0]])
+    got, doubt = arbitrate(
+        depth, sigma, free, np.array([[3.0, 3.0, 3.0, 3.0, np.nan]]), np.array([[0.05, 0.2, 0.3, 0.3, 0.01]])
+    )
+    assert got.tolist() == [[3.0, 2.0, 4.0, 3.0, 2.0]]  # beams have passed the third pixel up to 4 m
+    np.testing.assert_allclose(doubt, [[0.05, 0.1, 0.3, 0.3, 0.1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_completion_with_an_honest_sigma_is_never_worse_than_the_lidar(seed: int) -> None:
+    """A completion that is wrong by as much as it says changes nothing that the LiDAR knows better, and a good one
+    improves the rest."""
+    rng, true, points = np.random.default_rng(seed), truth(HALL), revolution(HALL, noise_m=0.02)
+    wrong = rng.uniform(0.005, 0.6, SIZE)
+    found = completed(lambda prior: (true * np.exp(wrong * rng.choice([-1, 1], SIZE)), wrong), points)
+    before = alone(points)
+    kept = before.sigma <= wrong
+    assert 0.1 < kept.mean() < 0.999
+    np.testing.assert_array_equal(found.depth_m[kept], before.depth_m[kept])
+    np.testing.assert_array_equal(found.sigma[kept], before.sigma[kept])
+    assert (found.sigma <= before.sigma).all() and found.source == "completed"
+
+    def log_error(result) -> float:
+        return float(np.abs(np.log(np.maximum(result.depth_m, 0.1) / true)).mean())
+
+    assert log_error(found) <= log_error(before) + 0.005
+
+
+@pytest.mark.parametrize("error", [InferenceError("out of memory"), ValueError("no panorama")])
+def test_failed_completion_leaves_the_lidar(error: Exception) -> None:
+    def fails(prior):
+        raise error
+
+    found, before = completed(fails), alone()
+    np.testing.assert_array_equal(found.depth_m, before.depth_m)
+    assert found.ok and str(error) in found.message
+    np.testing.assert_array_equal(completed(None).depth_m, before.depth_m)
+
+
+def test_completion_is_not_asked_without_points() -> None:
+    found = completed(lambda prior: pytest.fail("asked"), POINTS[:100])
+    assert not found.ok and "LiDAR points" in found.message

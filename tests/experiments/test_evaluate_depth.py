@@ -211,7 +211,7 @@ def test_lidar_alone_needs_no_network():
     )
     assert scored.before is None
     assert scored.after.delta1 > 0.9
-    assert 0 < scored.sigma_share <= 1
+    assert 0 < scored.sigma_shares[0] <= scored.sigma_shares[1] <= scored.sigma_shares[2] <= 1
 
 
 def test_what_cannot_be_scored_says_why():

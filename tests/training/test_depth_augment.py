@@ -24,7 +24,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 def test_turn_and_mirror_keep_picture_and_depth_together() -> None:
     depth = torch.arange(32.0).repeat(6, 4, 1)
     rgb = depth[:, None].repeat(1, 3, 1, 1)
-    turned, distance = turn_and_mirror(rgb, depth, seeded())
+    turned, distance = turn_and_mirror(seeded(), rgb, depth)
     assert torch.equal(turned[:, 0], distance)
     steps = torch.remainder(distance.diff(dim=-1), 32)
     assert set(steps.unique().tolist()) == {1.0, 31.0}  # some turned, some mirrored too

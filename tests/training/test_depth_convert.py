@@ -16,7 +16,7 @@ from instant_ic.depth.manifest import load_manifest
 from instant_ic.depth.model import DepthModel
 from instant_ic.training import export
 from instant_ic.training.export import ExportError, export_onnx
-from instant_ic.training.folding import fold_kernel, fold_upsampling, unfold_kernel
+from instant_ic.training.folding import fold_kernel, fold_upsampling
 from instant_ic.training.slicenet import ConvStage, SliceNet, SliceNetConfig
 
 torch.set_num_threads(1)
@@ -68,11 +68,6 @@ def test_folded_kernel_by_hand() -> None:
     kernel = torch.tensor([1.0, 2.0, 4.0]).view(1, 1, 3, 1).expand(1, 1, 3, 3)
     even, odd = fold_kernel(kernel, (2, 1))[:, 0, :, 0].tolist()
     assert (even, odd) == ([1, 6, 0], [0, 3, 4])  # (w0, w1 + w2, 0) and (0, w0 + w1, w2)
-    kernel = torch.randn(3, 2, 3, 3)
-    for upscale in ((1, 1), (2, 1), (2, 2)):
-        folded = fold_kernel(kernel, upscale)
-        assert folded.shape == (3 * upscale[0] * upscale[1], 2, 3, 3)
-        torch.testing.assert_close(unfold_kernel(folded, upscale), kernel)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,8 @@ def stripes(count: int, worlds: int, height: int = 8) -> list[Sample]:
     for index in range(count):
         depth = np.full((height, 2 * height), 1.0 + index % 4, np.float32)
         rgb = np.repeat((depth * 50).astype(np.uint8)[..., None], 3, axis=-1)
-        samples.append(Sample(rgb, depth, 100 + index * worlds // count))
+        prior = np.full((5, height, 2 * height), index, np.float16)
+        samples.append(Sample(rgb, depth, 100 + index * worlds // count, prior))
     return samples
 
 
@@ -29,6 +30,7 @@ def test_folder_gives_back_what_was_written(folder: Path) -> None:
     for index, sample in enumerate(stripes(12, 4)):
         np.testing.assert_array_equal(data[index].rgb, sample.rgb)
         np.testing.assert_array_equal(data[index].depth_m, sample.depth_m)
+        np.testing.assert_array_equal(data[index].prior, sample.prior)
         assert data[index].world == sample.world
 
 

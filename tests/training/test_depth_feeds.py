@@ -19,12 +19,14 @@ RECIPE = RoomsConfig(worlds=50, poses=2, height=32, first_world=300_000, interio
 
 def marked(number: int) -> Sample:
     """A panorama whose values tell its number."""
-    return Sample(np.full((4, 8, 3), number, np.uint8), np.full((4, 8), number, np.float32), number)
+    prior = np.full((5, 4, 8), number, np.float16)
+    return Sample(np.full((4, 8, 3), number, np.uint8), np.full((4, 8), number, np.float32), number, prior)
 
 
 def numbers(batch: feeds.Batch) -> list[int]:
-    rgb, depth = batch
-    assert rgb.dtype == np.uint8 and depth.dtype == np.float32
+    rgb, depth, prior = batch
+    assert rgb.dtype == np.uint8 and depth.dtype == prior.dtype == np.float32
+    np.testing.assert_array_equal(prior[:, 4], depth)
     np.testing.assert_array_equal(rgb[..., 0], depth)
     return [int(value) for value in depth[:, 0, 0]]
 
@@ -117,7 +119,7 @@ def test_next_batch_is_made_ahead_and_its_error_arrives() -> None:
         asked.append(step)
         if step == 2:
             raise FeedError("no more")
-        return marked(step).rgb[None], marked(step).depth_m[None]
+        return feeds.stack([marked(step)])
 
     ahead = Ahead(SimpleNamespace(batch=batch, close=lambda: asked.append("closed")))
     assert numbers(ahead.batch(0)) == [0] and numbers(ahead.batch(1)) == [1]
@@ -133,7 +135,7 @@ def test_closing_does_not_wait_for_a_batch_that_does_not_come() -> None:
     def batch(step: int) -> feeds.Batch:
         if step and not closed.wait(60):
             raise AssertionError("closing waited for the batch")
-        return marked(step).rgb[None], marked(step).depth_m[None]
+        return feeds.stack([marked(step)])
 
     ahead = Ahead(SimpleNamespace(batch=batch, close=closed.set))
     ahead.batch(0)
@@ -148,6 +150,7 @@ def test_worlds_come_in_order_from_processes_and_a_dead_one_is_told() -> None:
             for mine, other in zip(renderers.world(), render_rooms(RECIPE, [seed]), strict=True):
                 np.testing.assert_array_equal(mine.rgb, other.rgb)
                 np.testing.assert_array_equal(mine.depth_m, other.depth_m)
+                np.testing.assert_array_equal(mine.prior, other.prior)
         cache = renderers._cache.name
         assert Path(cache).is_dir()
         renderers._processes[0].kill()

@@ -20,7 +20,7 @@ from instant_ic.cli.errors import UserError
 from instant_ic.training import feeds
 from instant_ic.training.dataset import DatasetError, Sample
 from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig
-from instant_ic.training.slicenet import CheckpointError, SliceNetConfig
+from instant_ic.training.slicenet import CheckpointError
 
 SEEDS: list[int] = []
 
@@ -28,13 +28,13 @@ SEEDS: list[int] = []
 def ic(*words: str) -> int:
     parser = argparse.ArgumentParser(prog="ic")
     depth_train.add_parser(parser.add_subparsers(required=True))
-    args = parser.parse_args(["train", *words])
+    args = parser.parse_args(["train", "--height", "64", "--encoder", "none", *words])
     return int(args.func(args))
 
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A network of 64 rows, and worlds that are rendered at once."""
+    """Worlds that are rendered at once."""
 
     def render(recipe: RoomsConfig, worlds: list[int]) -> Iterator[Sample]:
         for seed in worlds:
@@ -45,8 +45,6 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
     SEEDS.clear()
     monkeypatch.setattr(feeds, "render_rooms", render)
-    small = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, decoder_floor=8)
-    monkeypatch.setattr("instant_ic.training.slicenet.SMALL", small)
 
 
 def plain_folder(root: Path) -> str:
@@ -118,13 +116,14 @@ def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
 @pytest.mark.parametrize(
     ("words", "error", "message"),
     [
-        (("--network", "resnet18"), UserError, "BACKBONE:HEIGHT"),
-        (("--network", "vgg:64"), UserError, "backbone must be one of"),
+        (("--height", "100"), UserError, "multiple of 32"),
+        (("--encoder", "/absent.pth"), CheckpointError, "no such file"),
+        (("--textures", "/absent"), DatasetError, "no textures"),
         (("--device", "tpu9"), UserError, "device 'tpu9'"),
         (("--data", "m3d:/absent"), DatasetError, "no such folder"),
         (("--generated", "none"), UserError, "nothing to train on"),
         (("--worlds", "899999"), UserError, "for evaluation"),
-        (("--init", "/absent.onnx"), CheckpointError, "cannot be read"),
+        (("--init", "/absent.pt"), CheckpointError, "no such file"),
         (("--checkpoint", "/tmp"), UserError, "is a folder"),
     ],
 )
@@ -137,11 +136,19 @@ def test_mistakes_are_told(words: tuple[str, ...], error: type[Exception], messa
 def test_two_processes_train_one_network(tmp_path: Path) -> None:
     data, weights = plain_folder(tmp_path / "mine"), tmp_path / "w.pt"
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
-               "instant_ic.cli.main", "depth", "train", "--network", "resnet18:64", "--data", data, "--batch-size", "1",
-               "--epochs", "1", "--checkpoint", str(weights), "--device", "cpu"]  # fmt: skip
+               "instant_ic.cli.main", "depth", "train", "--height", "64", "--encoder", "none", "--data", data,
+               "--batch-size", "1", "--epochs", "1", "--checkpoint", str(weights), "--device", "cpu"]  # fmt: skip
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=280, env={**os.environ, "OMP_NUM_THREADS": "1"}
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert record(weights)["device"].startswith("2 x CPU") and record(weights)["steps"] == 2  # 5 panoramas, 2 a step
     assert done.stdout.count("training on 2 x CPU") == 1 and done.stdout.count("held-out panoramas:") == 1
+
+
+def test_preset_sets_what_is_not_given(tmp_path: Path) -> None:
+    data = plain_folder(tmp_path / "mine")
+    words = ("--data", data, "--workers", "0", "--epochs", "1", "--checkpoint", str(tmp_path / "w.pt"))
+    assert ic("--preset", "gpu", "--batch-size", "2", *words) == 0
+    made = record(tmp_path / "w.pt")["training"]
+    assert (made["batch_size"], made["minutes"], made["learning_rate"]) == (2, 20.0, 2e-3)

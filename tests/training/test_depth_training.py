@@ -1,6 +1,5 @@
-"""Training on a few striped pictures: it learns, repeats, is taken up again, and records what it did."""
+"""Training on a few striped images: it learns, repeats, resumes, and records what it did."""
 
-import copy
 import csv
 import json
 from pathlib import Path
@@ -10,14 +9,15 @@ import numpy as np
 import pytest
 import torch
 
+from instant_ic.training.completion import CompletionConfig, CompletionNet, load_completion
 from instant_ic.training.dataset import Sample, Subset
 from instant_ic.training.feeds import FileFeed
 from instant_ic.training.log import TrainingLog
-from instant_ic.training.slicenet import CheckpointError, SliceNet, SliceNetConfig, load_checkpoint
+from instant_ic.training.slicenet import CheckpointError
+from instant_ic.training.sparse import nothing
 from instant_ic.training.trainer import Team, Trainer, TrainingConfig, evaluate, schedule, to_tensors, update_average
-from instant_ic.training.weights import fold_norms, load_start
 
-TINY = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, decoder_floor=8)
+TINY = CompletionConfig(64, (8, 8, 8, 8), 2)
 
 
 def stripes(count: int, height: int = 64) -> list[Sample]:
@@ -27,18 +27,21 @@ def stripes(count: int, height: int = 64) -> list[Sample]:
         depth = np.full((height, 2 * height), 1.0 + index % 4, np.float32)
         depth[:2] = 0.0
         rgb = np.repeat((depth * 50).astype(np.uint8)[..., None], 3, axis=-1)
-        samples.append(Sample(rgb, depth, index))
+        samples.append(Sample(rgb, depth, index, nothing(depth.shape, (0, 0, 1), None)))
     return samples
 
 
-def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, mix: float = 1.0, **options) -> Trainer:
+def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, **options) -> Trainer:
     samples = samples or stripes(12)
     config = TrainingConfig(
         minutes=60, epochs=epochs, batch_size=3, threads=1, mixed_precision=False, average=0.8, learning_rate=1e-2,
-        photograph=False, brightness=0.0, mix=mix,
+        photograph=False, brightness=0.0,
     )  # fmt: skip
     feed = FileFeed(samples, np.arange(9), 3, info={"kind": "stripes"})
-    return Trainer(feed, Subset(samples, range(9, 12)), TINY, config, output, report=lambda line: None, **options)
+    torch.manual_seed(0)
+    return Trainer(
+        feed, Subset(samples, range(9, 12)), CompletionNet(TINY), config, output, report=lambda line: None, **options
+    )
 
 
 @pytest.fixture(scope="module")
@@ -59,34 +62,11 @@ def test_training_learns(trained: SimpleNamespace) -> None:
     assert trained.shares == sorted(trained.shares) and trained.shares[-1] == 1.0
 
 
-def test_result_can_be_mixed_with_the_start(trained: SimpleNamespace, tmp_path: Path) -> None:
-    start = load_start(trained.path, TINY)
-    before = copy.deepcopy(start.model)
-    run = trainer(tmp_path / "m.pt", 1, start=start, mix=0.25)
-    run.run()
-    run.close()
-    saved, key = load_checkpoint(tmp_path / "m.pt").state_dict(), "bi_rnn.weight_hh_l0"
-    assert not torch.equal(run.average.state_dict()[key], before.state_dict()[key])
-    pictures = torch.rand(1, 3, 64, 128, generator=torch.Generator().manual_seed(0))
-    folded = []
-    for model in (before, run.average):
-        folded.append(copy.deepcopy(model).eval())
-        fold_norms(folded[-1])
-        torch.testing.assert_close(folded[-1](pictures), model.eval()(pictures), rtol=1e-4, atol=1e-4)
-    for name, value in saved.items():
-        ends = [model.state_dict()[name] for model in folded]
-        if value.is_floating_point():
-            torch.testing.assert_close(value, 0.75 * ends[0] + 0.25 * ends[1], rtol=1e-4, atol=1e-6)
-    assert run.record()["training"]["mix"] == 0.25
-    with pytest.raises(ValueError, match="mix needs weights to start from"):
-        trainer(tmp_path / "n.pt", 1, mix=0.25)
-
-
 def test_record_tells_what_made_the_weights(trained: SimpleNamespace) -> None:
     record = torch.load(trained.path, weights_only=True)["record"]
     assert record["data"] == {"kind": "stripes", "panoramas": 9} and record["held_out"] == 3
     assert (record["steps"], record["epochs"], record["command"]) == (36, 12.0, "ic depth train")
-    assert record["device"].startswith("1 x CPU") and record["start"] is None
+    assert record["device"].startswith("1 x CPU") and record["start"] == {}
     assert record["history"][-1]["mre"] == round(trained.metrics.mre, 5)
     json.dumps(record)
 
@@ -117,13 +97,13 @@ def test_same_seed_gives_the_same_weights_also_when_taken_up_again(tmp_path: Pat
         assert all(
             torch.equal(a, b) for a, b in zip(mine.state_dict().values(), other.state_dict().values(), strict=True)
         )
-    loaded = load_checkpoint(tmp_path / "part.pt")
+    loaded = load_completion(tmp_path / "part.pt")
     assert all(torch.equal(a, b) for a, b in zip(loaded.parameters(), again.average.parameters(), strict=True))
 
 
 def test_only_a_run_of_this_network_is_taken_up(tmp_path: Path) -> None:
     run = trainer(tmp_path / "x.pt", 1)
-    torch.save({"config": SliceNetConfig().as_dict(), "state_dict": {}, "resume": {}}, tmp_path / "other.pt")
+    torch.save({"config": CompletionConfig().as_dict(), "state_dict": {}, "resume": {}}, tmp_path / "other.pt")
     (tmp_path / "broken.pt").write_bytes(b"no checkpoint")
     for name, words in (("other", "not a checkpoint of a run"), ("broken", "not a checkpoint of tensors"),
                         ("absent", "no such checkpoint")):  # fmt: skip
@@ -132,24 +112,23 @@ def test_only_a_run_of_this_network_is_taken_up(tmp_path: Path) -> None:
     run.close()
 
 
-def test_pictures_of_another_size_and_no_depth_are_refused(tmp_path: Path) -> None:
+def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="32 x 64, the network takes 64 x 128"):
         trainer(tmp_path / "x.pt", 1, stripes(12, height=32))
-    far = [Sample(s.rgb, s.depth_m + 20, s.world) for s in stripes(12)]
-    with pytest.raises(ValueError, match="no depth within max_range_m"):
-        trainer(tmp_path / "x.pt", 1, far)
 
 
 def test_truth_that_is_unknown_or_too_far_is_zero() -> None:
     depth = np.array([[[1.0, 17.0, np.nan, np.inf]]], np.float32)
-    rgb, truth = to_tensors(np.full((1, 1, 4, 3), 51, np.uint8), depth, 16.0, torch.device("cpu"))
+    batch = np.full((1, 1, 4, 3), 51, np.uint8), depth, np.zeros((1, 5, 1, 4), np.float32)
+    rgb, truth, _ = to_tensors(batch, 16.0, torch.device("cpu"))
     assert truth.tolist() == [[[1.0, 0.0, 0.0, 0.0]]]
     assert rgb.shape == (1, 3, 1, 4) and torch.allclose(rgb, torch.tensor(0.2))
 
 
 def test_evaluation_weighs_by_solid_angle(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = SliceNet(TINY)
-    monkeypatch.setattr(SliceNet, "forward", lambda self, x: torch.full((1, 64, 128), 2.0))
+    model = CompletionNet(TINY)
+    same = torch.full((1, 64, 128), 2.0)
+    monkeypatch.setattr(CompletionNet, "forward", lambda self, image, prior: (same, same))
     depth = np.full((64, 128), 2.0, np.float32)
     depth[:16] = 1.0  # the upper 45° to 90°: (1 - sin 45°) / 2 of the sphere, a quarter of the rows; relative error 1
     got = evaluate(model, [Sample(np.zeros((64, 128, 3), np.uint8), depth, 0)], 16.0)

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from instant_ic.training.slicenet import (
-    SMALL,
     CheckpointError,
     CircularPad,
     Contraction,
@@ -269,9 +268,3 @@ def test_configuration_is_checked() -> None:
         SliceNetConfig(height=200)
     with pytest.raises(ValueError, match="column_stride"):
         SliceNetConfig(column_stride=3)
-
-
-def test_small_model_is_small() -> None:
-    with torch.device("meta"):
-        count = sum(p.numel() for p in SliceNet(SMALL).parameters())
-    assert count < 5_000_000

@@ -29,9 +29,37 @@ def add_parser(subparsers: Any) -> None:
     )
     commands = parser.add_subparsers(dest="depth_command", required=True)
     depth_train.add_parser(commands)
+    _add_textures(commands)
     _add_convert(commands)
     _add_check(commands)
     _add_estimate(commands)
+
+
+def _add_textures(commands: Any) -> None:
+    parser = commands.add_parser(
+        "textures",
+        help="unpack photographic textures for ic depth train",
+        description="Write the surface textures of a robosuite wheel (MIT licence) as JPEG files into a folder, for\n"
+        "ic depth train --textures. Get the wheel with: pip download --no-deps robosuite==1.5.2",
+        epilog="example: ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("wheel", type=Path, help="the wheel")
+    parser.add_argument("-o", "--output", type=Path, default=Path("runs/textures"), help="folder (%(default)s)")
+    parser.set_defaults(func=textures)
+
+
+def textures(args: argparse.Namespace) -> int:
+    """``ic depth textures``."""
+    from instant_ic.training.dataset import DatasetError
+    from instant_ic.training.photographs import unpack
+
+    try:
+        count = unpack(args.wheel, args.output)
+    except DatasetError as error:
+        raise UserError(str(error)) from error
+    print(f"wrote {count} textures to {args.output}")
+    return 0
 
 
 def _add_convert(commands: Any) -> None:
@@ -146,8 +174,7 @@ def check(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from instant_ic.depth.manifest import ManifestError
-    from instant_ic.depth.model import InferenceError
+    from instant_ic.depth.manifest import InferenceError, ManifestError
 
     begin = time.perf_counter()
     model = _load(args)
@@ -194,7 +221,7 @@ def estimate(args: argparse.Namespace) -> int:
     import numpy as np
 
     from instant_ic.depth.colour import depth_picture
-    from instant_ic.depth.model import InferenceError
+    from instant_ic.depth.manifest import InferenceError
     from instant_ic.limits import load_image
 
     picture = load_image(args.image, cv2.IMREAD_COLOR)

@@ -32,7 +32,7 @@ def add_kind(kinds: Any) -> None:
     parser.add_argument(
         "--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)"
     )
-    parser.add_argument("--source", choices=("network", "lidar", "fused"),
+    parser.add_argument("--source", choices=("network", "lidar", "fused", "completed"),
                         help="depth source (default: fused with --lidar, else network)")  # fmt: skip
     parser.add_argument(
         "--lidar", action="store_true", help="scale the depth by a simulated VLP-16 that measures the true depth"
@@ -65,8 +65,8 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     """Run ``ic evaluate depth``; return the exit status."""
     from instant_ic.cli.progress import progress
     from instant_ic.depth.files import DepthFileError, load_depth, load_picture
-    from instant_ic.depth.manifest import ManifestError
-    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel, InferenceError
+    from instant_ic.depth.manifest import InferenceError, ManifestError
+    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
     from instant_ic.experiments.depth import DepthEvaluationError, DepthSettings, Evaluator, LidarSettings, report
     from instant_ic.experiments.depth_files import PairError, find_pictures, pair, unit_warning
     from instant_ic.experiments.depth_pictures import Sheets
