@@ -48,8 +48,9 @@ FLOOR = -6.0
 DOUBT = -5.5
 """Log-odds above which scans are kept out of the map: a quarter of a scan's evidence is enough. A scan that two signs
 speak against stays out in any case: it would agree with its own copy."""
-LOST = 4.0
-"""Log-odds above which the doubt is confirmed."""
+LOST = 0.0
+"""Log-odds from which the robot is lost. Scans of one place agree or disagree with the map together, so later ones that
+fit do not restore the trust; only recognition does."""
 UNSEEN_S, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 0.6, -1.0
 """After a second without a matched scan the log-odds grow by this much a second, up to a limit."""
 LONGEST_DOUBT = 30
@@ -193,7 +194,7 @@ class IntegrityMonitor:
 
     @property
     def lost(self) -> bool:
-        """Whether the doubt is confirmed."""
+        """Whether the pose must no longer be used, and the map be left as it is."""
         return self._log_odds >= LOST
 
     @property
@@ -267,7 +268,7 @@ class IntegrityMonitor:
         self._log_odds += evidence * min(1.0, max(elapsed_s, 0.0) / EVIDENCE_S)
         self._log_odds = min(max(self._log_odds, FLOOR), LOST + EVIDENCE)
         self._doubtful_scans = self._doubtful_scans + 1 if self.doubts else 0
-        if self._doubtful_scans > LONGEST_DOUBT and self._log_odds < 0.0:
+        if self._doubtful_scans > LONGEST_DOUBT and not self.lost:
             self._log_odds, self._doubtful_scans, self._suspicious = FLOOR, 0, False
 
 
