@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import resource
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -169,6 +169,15 @@ def relation_error(trajectory: FloatArray, relations: Relations) -> RelationErro
     return RelationError(np.array(translation), np.array(rotation))
 
 
+def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_s: float = 0.006) -> FloatArray:
+    """Scan times (n,) in the clock that the relations use; the log may have two."""
+    own = np.array([entry.scan.stamp_ns * 1e-9 for entry in entries])
+    logger = np.array([np.nan if entry.logger_s is None else entry.logger_s for entry in entries])
+    if np.isfinite(logger).all() and relations.near(logger, tolerance_s) > relations.near(own, tolerance_s):
+        return logger
+    return own
+
+
 @dataclass(frozen=True)
 class LogResult:
     """Result of running SLAM on a log.
@@ -176,7 +185,6 @@ class LogResult:
     Attributes:
         trajectory: ``t x y yaw`` (n, 4), one row per scan, map_from_base after the last optimisation, seconds.
         online: the same with the poses published online.
-        logger_s: scan times by the log's second time column (n,), NaN without one.
         cpu_ms: CPU milliseconds of the scan thread per scan (n,), including the transfer of optimisation results.
         background_ms: CPU milliseconds of loop closure and optimisation after each scan (n,).
         scores: match score of each scan (n,).
@@ -186,7 +194,6 @@ class LogResult:
 
     trajectory: FloatArray
     online: FloatArray
-    logger_s: FloatArray
     cpu_ms: FloatArray
     background_ms: FloatArray
     scores: FloatArray
@@ -207,13 +214,6 @@ class LogResult:
             "statuses": self.statuses,
             **self.slam.figures(),
         }
-
-    def relation_times(self, relations: Relations, tolerance_s: float) -> FloatArray:
-        """Scan times (n,) in the clock that the relations use; the log may have two."""
-        own, logger = self.trajectory[:, 0], self.logger_s
-        if np.isfinite(logger).all() and relations.near(logger, tolerance_s) > relations.near(own, tolerance_s):
-            return logger
-        return own
 
 
 def run_log(
@@ -242,7 +242,6 @@ def run_log(
     slam: Slam = GridSlam(config) if particles is None else ParticleSlam(particles, config)
     warm_up(config)
     stamps: list[float] = []
-    logger: list[float] = []
     online: list[FloatArray] = []
     anchors: list[tuple[Anchor | None, FloatArray]] = []
     cpu_ms: list[float] = []
@@ -267,7 +266,6 @@ def run_log(
         cpu_ms.append(1e3 * (time.thread_time() - worked + scanned - begin))
         background_ms.append(1e3 * (worked - scanned))
         stamps.append(entry.scan.stamp_ns * 1e-9)
-        logger.append(math.nan if entry.logger_s is None else entry.logger_s)
         online.append(result.map_from_base)
         scores.append(result.score)
         statuses[result.status.value] = statuses.get(result.status.value, 0) + 1
@@ -283,7 +281,6 @@ def run_log(
     return LogResult(
         np.column_stack([stamps, np.array(final)]),
         np.column_stack([stamps, np.array(online)]),
-        np.array(logger),
         np.array(cpu_ms),
         np.array(background_ms),
         np.array(scores),
@@ -337,10 +334,11 @@ def evaluate_log(
     Figures of the final trajectory have plain names; ``online_translation_mean_m`` and ``online_rotation_mean_deg``
     refer to the poses published online.
     """
+    entries = list(entries)
     result = run_log(entries, config, particles=particles, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
     report: dict[str, object] = {}
     if relations is not None:
-        times = result.relation_times(relations, tolerance_s)
+        times = relation_times(entries, relations, tolerance_s)
         order = np.argsort(times, kind="stable")
         final, online = (
             relation_error(np.column_stack([times, run[:, 1:]])[order], relations).summary()

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import copy
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.poses import compose2, relative2
+from instant_ic.experiments.slam import Relations, perturb_odometry, relation_error, relation_times
+from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import warm_up
 from instant_ic.slam.localization import SavedMap
@@ -37,6 +39,10 @@ STEADY_SCANS = 10
 """The robot has recovered when this many scans in a row are trusted and right."""
 RANGE_NOISE_M = 0.01
 """Added to scans shown for the second time: they must not be equal to those in the map."""
+WRONG_RAD = 0.2
+"""A relocalization farther from the reference in heading, or by `WRONG_M`, is wrong."""
+RELOCALIZATION_S, IN_TIME_S = 6.0, 2.0
+"""How long a relocalization may take, and how long it should."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +79,6 @@ class CleanRun:
             start = compose2(self.online[anchor], relative2(self.final[anchor], np.zeros(3)))
             references.append(np.array([compose2(start, pose) for pose in self.final[source]]))
         return np.min([np.hypot(*(poses - reference)[:, :2].T) for reference in references], axis=0)
-
-
-Place = tuple[Sequence[LogEntry], int, int, FloatArray, np.random.Generator]
 
 
 def _part(entries: Sequence[LogEntry], at: int) -> range:
@@ -177,6 +180,7 @@ def whole_log_faults(entries: Sequence[LogEntry], rng: np.random.Generator) -> d
         return Faulted(list(entries[::n]), everything[::n])
 
     return {
+        "odometry_noise": lambda: Faulted(list(entries), everything),
         "yaw_scale_plus": lambda: Faulted(_scaled_yaw(entries, 1 + YAW_SCALE), everything),
         "yaw_scale_minus": lambda: Faulted(_scaled_yaw(entries, 1 - YAW_SCALE), everything),
         "every_2nd_scan": lambda: every(2),
@@ -192,8 +196,9 @@ PLACE_FAULTS: dict[str, Callable[[Sequence[LogEntry], int, int, np.random.Genera
     "blind_10s": blind,
 }
 KIDNAPPINGS = ("kidnapped_mapping", "kidnapped_localized")
-FAULTS = (*PLACE_FAULTS, *KIDNAPPINGS, "yaw_scale_plus", "yaw_scale_minus", "every_2nd_scan", "every_5th_scan",
-          "no_odometry", "third_of_beams_zero")  # fmt: skip
+RELOCALIZATION = "relocalization"
+FAULTS = (*PLACE_FAULTS, *KIDNAPPINGS, "odometry_noise", "yaw_scale_plus", "yaw_scale_minus", "every_2nd_scan",
+          "every_5th_scan", "no_odometry", "third_of_beams_zero", RELOCALIZATION)  # fmt: skip
 
 
 def _steps(slam: GridSlam, entries: Sequence[LogEntry], last_ns: int | None = None) -> Iterator[SlamResult]:
@@ -212,9 +217,10 @@ def _steps(slam: GridSlam, entries: Sequence[LogEntry], last_ns: int | None = No
 
 @dataclass(frozen=True)
 class FaultRun:
-    """One fault at one place: errors (n,) in metres, trust (n,) and time (n,) in seconds since the fault."""
+    """One fault at one place: errors and bounds (n,) in metres, trust (n,), time (n,) in seconds since the fault."""
 
     error_m: FloatArray
+    bound_m: FloatArray
     trusted: NDArray[np.bool_]
     time_s: FloatArray
 
@@ -235,6 +241,7 @@ class FaultRun:
             "end_error_m": float(self.error_m[-1]),
             "wrong_scans": int(wrong.sum()),
             "trusted_wrong_scans": int((wrong & self.trusted).sum()),
+            "trusted_beyond_bound_scans": int((self.trusted & wrong & (self.error_m > self.bound_m)).sum()),
             "untrusted_right_scans": int((~wrong & ~self.trusted).sum()),
             "detected_after_scans": None if detected is None or onset is None else detected - onset,
             "recovered_after_s": None if recovered is None else float(self.time_s[recovered]),
@@ -242,13 +249,13 @@ class FaultRun:
         }
 
 
-def _run(slam: GridSlam, faulted: Faulted, clean: CleanRun, anchor: int | None, last_ns: int | None) -> FaultRun:
+def _run(slam: GridSlam, faulted: Faulted, clean: CleanRun, anchor: int | None, last_ns: int) -> FaultRun:
     results = list(_steps(slam, faulted.entries, last_ns))
     poses = np.array([result.map_from_base for result in results])
     stamps = np.array([entry.scan.stamp_ns for entry in faulted.entries])
     trusted = np.array([result.trusted for result in results])
-    start = stamps[0] if last_ns is None else last_ns
-    return FaultRun(clean.errors(poses, faulted.source, anchor), trusted, (stamps - start) * 1e-9)
+    bounds = np.array([result.integrity.position_bound_m for result in results])
+    return FaultRun(clean.errors(poses, faulted.source, anchor), bounds, trusted, (stamps - last_ns) * 1e-9)
 
 
 def summary(runs: Sequence[dict[str, float | int | None]]) -> dict[str, object]:
@@ -256,7 +263,9 @@ def summary(runs: Sequence[dict[str, float | int | None]]) -> dict[str, object]:
     wrong = [run for run in runs if run["wrong_scans"]]
     scans = [run["detected_after_scans"] for run in wrong if run["detected_after_scans"] is not None]
     seconds = [run["recovered_after_s"] for run in wrong if run["recovered_after_s"] is not None]
-    trusted_wrong = [int(run["trusted_wrong_scans"] or 0) for run in runs]
+    trusted_wrong, beyond = (
+        [int(run[key] or 0) for run in runs] for key in ("trusted_wrong_scans", "trusted_beyond_bound_scans")
+    )
     return {
         "places": len(runs),
         "went_wrong": len(wrong),
@@ -264,6 +273,7 @@ def summary(runs: Sequence[dict[str, float | int | None]]) -> dict[str, object]:
         "scans_to_detection_max": max(scans, default=None),
         "trusted_wrong_scans_median": float(np.median(trusted_wrong)) if runs else None,
         "trusted_wrong_scans_max": max(trusted_wrong, default=None),
+        "trusted_beyond_bound_scans_max": max(beyond, default=None),
         "over_10_trusted_wrong_scans": sum(count > 10 for count in trusted_wrong),
         "recovered": len(seconds),
         "recovery_s_median": float(np.median(np.array(seconds, dtype=np.float64))) if seconds else None,
@@ -279,6 +289,8 @@ def evaluate_faults(
     *,
     places: int = 5,
     seed: int = 0,
+    noise_seeds: int = 1,
+    relations: Relations | None = None,
     faults: Sequence[str] = FAULTS,
     on_step: Callable[[str], None] | None = None,
 ) -> dict[str, object]:
@@ -289,6 +301,9 @@ def evaluate_faults(
         config: defaults when None.
         places: number of places for a fault at a place; chosen by ``seed``, the same for every fault.
         seed: of the places and of all other choices.
+        noise_seeds: runs of each fault that lasts the whole log; the first has the log's own odometry, the others noise
+            (`perturb_odometry`).
+        relations: for the accuracy of the runs over the whole log.
         faults: names of `FAULTS`.
         on_step: called with the name of what runs next.
 
@@ -299,8 +314,8 @@ def evaluate_faults(
     unknown = [name for name in faults if name not in FAULTS]
     if unknown:
         raise ValueError(f"unknown fault {unknown[0]!r}; known: {', '.join(FAULTS)}")
-    if places < 1:
-        raise ValueError(f"places must be at least 1 (got {places})")
+    if places < 1 or noise_seeds < 1:
+        raise ValueError(f"places and noise_seeds must be at least 1 (got {places}, {noise_seeds})")
     if len(entries) < 2 * LEAST_SCANS:
         raise LogError(f"the log has {len(entries)} scans: too few to put faults into it ({2 * LEAST_SCANS} needed)")
     warm_up(config)
@@ -347,16 +362,91 @@ def evaluate_faults(
     makers = whole_log_faults(entries, rng)
     for name in [name for name in faults if name in makers]:
         tell(name)
-        faulted = makers[name]()
-        slam = GridSlam(config)
-        run = _run(slam, faulted, clean, None, None)
-        errors = run.error_m
-        report[name] = {
-            **run.figures(),
-            "mean_error_m": float(errors.mean()),
-            "p99_error_m": float(np.percentile(errors, 99)),
-        }
+        report[name] = _whole_log(makers[name](), config, clean, noise_seeds, relations)
+    if RELOCALIZATION in faults:
+        tell(RELOCALIZATION)
+        report[RELOCALIZATION] = relocalizations(entries, config, places, rng)
     return report
+
+
+def _whole_log(
+    faulted: Faulted, config: SlamConfig | None, clean: CleanRun, noise_seeds: int, relations: Relations | None
+) -> dict[str, object]:
+    """Figures of a fault that lasts the whole log, over seeds of odometry noise."""
+    runs: list[dict[str, float | int]] = []
+    for noise in range(noise_seeds):
+        entries = faulted.entries if noise == 0 else list(perturb_odometry(faulted.entries, noise))
+        run, _ = _clean_run(entries, config, [])
+        online = clean.errors(run.online, faulted.source, None)
+        wrong = online > WRONG_M
+        figures: dict[str, float | int] = {
+            "final_error_mean_m": float(np.hypot(*(run.final - clean.final[faulted.source])[:, :2].T).mean()),
+            "online_error_mean_m": float(online.mean()),
+            "online_error_max_m": float(online.max()),
+            "wrong_scans": int(wrong.sum()),
+            "trusted_wrong_scans": int((wrong & run.trusted).sum()),
+        }
+        if relations is not None:
+            times = relation_times(entries, relations)
+            order = np.argsort(times, kind="stable")
+            error = relation_error(np.column_stack([times, run.final])[order], relations).summary()
+            figures.update({key: error[key] for key in ("translation_mean_m", "rotation_mean_deg")})
+        runs.append(figures)
+    key = "final_error_mean_m" if relations is None else "translation_mean_m"
+    errors = np.array([run[key] for run in runs])
+    return {
+        "median_m": float(np.median(errors)),
+        "max_m": float(errors.max()),
+        "over_twice_median": int((errors > 2 * np.median(errors)).sum()),
+        "runs": runs,
+    }
+
+
+def relocalizations(
+    entries: Sequence[LogEntry], config: SlamConfig | None, starts: int, rng: np.random.Generator
+) -> dict[str, object]:
+    """Figures of robots that are switched on at ``starts`` places of a map.
+
+    Every second scan makes the map; the others are what the robots see. Their odometry starts anywhere.
+    """
+    made, _ = _clean_run(entries[::2], config, [])
+    seen = entries[1::2]
+    # Between two scans of the map the robot is between their poses.
+    stamps = np.array([entry.scan.stamp_ns for entry in entries], dtype=np.float64)
+    truth = np.column_stack([
+        np.interp(stamps[1::2], stamps[::2], values)
+        for values in (made.final[:, 0], made.final[:, 1], np.unwrap(made.final[:, 2]))
+    ])  # fmt: skip
+    grid = made.slam.grid()
+    found_s: list[float] = []
+    cpu_s: list[float] = []
+    wrong = ambiguous = 0
+    for place in rng.integers(0, max(len(seen) - LEAST_SCANS // 2, 1), starts):
+        anywhere = np.array([*rng.uniform(-50.0, 50.0, 2), rng.uniform(-math.pi, math.pi)])
+        last_ns = seen[place].scan.stamp_ns + int(RELOCALIZATION_S * 1e9)
+        shown = [_moved_odometry(entry, anywhere) for entry in seen[place:] if entry.scan.stamp_ns <= last_ns]
+        saved = SavedMap(config or SlamConfig(), grid)
+        begin = time.process_time()
+        for k, result in enumerate(_steps(GridSlam(config, saved), shown)):
+            if result.localized:
+                rest = relative2(truth[place + k], result.map_from_base)
+                wrong += bool(math.hypot(rest[0], rest[1]) > WRONG_M or abs(wrap_angle(float(rest[2]))) > WRONG_RAD)
+                found_s.append((shown[k].scan.stamp_ns - shown[0].scan.stamp_ns) * 1e-9)
+                break
+        cpu_s.append(time.process_time() - begin)
+        ambiguous += not saved.located and saved.ambiguous
+    seconds, cpu = np.array(found_s), np.array(cpu_s)
+    return {
+        "starts": starts,
+        "found": len(seconds),
+        "wrong": wrong,
+        "ambiguous": ambiguous,
+        "found_in_time": int((seconds <= IN_TIME_S).sum()),
+        "seconds_median": float(np.median(seconds)) if len(seconds) else None,
+        "seconds_p95": float(np.percentile(seconds, 95)) if len(seconds) else None,
+        "cpu_s_median": float(np.median(cpu)),
+        "cpu_s_p95": float(np.percentile(cpu, 95)),
+    }
 
 
 def _clean_run(

@@ -98,7 +98,7 @@ class FrontEnd:
         self.config = config
         self.trajectory = Trajectory()
         self._field = LikelihoodField(config.field, config.match.recovery_translation_m + 0.5)
-        self._lost_variance = 0.0
+        self._lost_sigma_m = self._lost_sigma_rad = 0.0
         self._usual_score = 0.0
         self._covariance = np.zeros((3, 3))
         self._known: FloatArray | None = None
@@ -191,11 +191,10 @@ class FrontEnd:
             if wide is not None:
                 match, status = wide, SlamStatus.RECOVERED
         if match.score < config.min_score:
-            self._lost_variance += float(guess.sigma[0] ** 2)
             return Track(guess.pose, self._grown_covariance(guess), match.score, SlamStatus.LOST, None)
 
         accepted = accept is None or accept(match.pose, match.score, status is SlamStatus.RECOVERED)
-        self._lost_variance = 0.0
+        self._lost_sigma_m = self._lost_sigma_rad = 0.0
         self._usual_score += SCORE_MEMORY * (match.score - self._usual_score)
         self._covariance = match.covariance
         added: Keyframe | None = None
@@ -210,8 +209,8 @@ class FrontEnd:
         """Start a new local map and trajectory with a scan, at the predicted pose."""
         self._known = None
         self.trajectory = Trajectory()
-        self._lost_variance = 0.0
         covariance = self._grown_covariance(guess)
+        self._lost_sigma_m = self._lost_sigma_rad = 0.0
         keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
         return Track(guess.pose, covariance, 0.0, SlamStatus.RESTARTED, keyframe)
 
@@ -235,9 +234,7 @@ class FrontEnd:
 
     def _search_all_headings(self, points: FloatArray, guess: Guess, score: float) -> Match | None:
         """Best pose over all headings near the guess; None unless it is unique and clearly better than ``score``."""
-        sigma = math.sqrt(float(guess.sigma[0] ** 2) + self._lost_variance)
-        reach_m = min(self.config.match.recovery_translation_m + WIDE_SIGMAS * sigma, WIDE_REACH_M)
-        found = find_place(self._field, points, guess.pose, reach_m, math.pi)
+        found = find_place(self._field, points, guess.pose, self.reach_m(guess), math.pi)
         if found is None or found.score < self.config.match.recovery_score:
             return None
         other = max(score, found.runner_up)
@@ -245,7 +242,21 @@ class FrontEnd:
             return None
         return Match(found.pose, found.covariance, found.score, False)
 
+    def reach_m(self, guess: Guess) -> float:
+        """Distance from the guess within which the robot is, by odometry since the last match."""
+        sigma_m = float(guess.sigma[0]) + self._lost_sigma_m
+        return min(self.config.match.recovery_translation_m + WIDE_SIGMAS * sigma_m, WIDE_REACH_M)
+
+    def jump_sigmas(self, guess: Guess, pose: FloatArray) -> float:
+        """Distance of a pose (3,) from the guess, in position or heading: standard deviations since the last match."""
+        step = relative2(guess.pose, pose)
+        translation = math.hypot(step[0], step[1]) / (float(guess.sigma[0]) + self._lost_sigma_m)
+        return max(translation, abs(float(step[2])) / (float(guess.sigma[2]) + self._lost_sigma_rad))
+
     def _grown_covariance(self, guess: Guess) -> FloatArray:
+        # Odometry errs by its scale: the errors of the steps without a match add up.
+        self._lost_sigma_m += float(guess.sigma[0])
+        self._lost_sigma_rad += float(guess.sigma[2])
         self._covariance = self._covariance + turned(np.diag(guess.sigma**2), float(guess.pose[2]))
         return self._covariance
 

@@ -105,6 +105,7 @@ class GridSlam:
         self.monitor = IntegrityMonitor()
         self._framed = saved is None
         self._apart = False  # a session began after the robot was lost in the map being made
+        self._reach_m = math.inf  # distance from odometry within which the robot is searched for
         self._found_before: tuple[FloatArray, FloatArray] | None = None
         self._saved_cells: tuple[SavedMap, OccupancyMap] | None = None  # a saved map, to compare scans with
         self.map_from_base: FloatArray = np.zeros(3)
@@ -237,7 +238,8 @@ class GridSlam:
         job: Callable[[], Place | Outcome] | None = None
         if self.saved is not None and not self.saved.located:
             recent = self.front_end.trajectory.recent(QUERY_KEYFRAMES)
-            job = None if self._points is None else self.saved.search_job(recent, self.map_from_base, self._points)
+            if self._points is not None and self._stamp_ns is not None:
+                job = self.saved.search_job(recent, self.map_from_base, self._points, self._stamp_ns, self._reach_m)
         elif self.config.loop.enabled and not self._broken and not self.front_end.in_known_map:
             new = self.front_end.trajectory.keyframes[self._handed_over :]
             self._handed_over += len(new)
@@ -327,7 +329,7 @@ class GridSlam:
 
         def accept(pose: FloatArray, score: float, recovered: bool) -> bool:
             contradicted = self._compared_map().contradiction(pose, points)
-            self.monitor.matched(contradicted, score, elapsed_s, recovered)
+            self.monitor.matched(contradicted, score, elapsed_s, recovered, self.front_end.jump_sigmas(guess, pose))
             return not self.monitor.doubts
 
         track = self.front_end.track(points, guess, stamp_ns, accept)
@@ -363,6 +365,8 @@ class GridSlam:
         self.map.version = version + 1
         self._handed_over, self._merged, self._edges = 0, 0, []
         self._found_before = None
+        # After a gap the robot is where odometry says, within its error; otherwise it may have been carried anywhere.
+        self._reach_m = NEAR_M + self.front_end.reach_m(guess) if self.monitor.after_gap else math.inf
         self.monitor.restart()
         return self.front_end.restart(points, guess, stamp_ns)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
@@ -28,9 +29,11 @@ FIRST_FLOOR, FLOOR_STEP = 0.9, 0.1
 """Score above which all poses are examined first, and its step down: a good place makes those below needless."""
 MIN_GAIN = 0.2
 """Share of the residual of every other place that the found place must explain."""
-MAX_STARTS, MAX_NODES = 150, 1_000_000
+MAX_STARTS, MAX_NODES = 150, 1_200_000
 """Maximum numbers of refined poses and of bounds of a search. A search that needs more has not shown that its place is
 the only one, so that place is ambiguous."""
+SEARCH_PERIOD_S = 0.5
+"""Least time between the scans of two searches: a lost robot must not spend its time on searching."""
 SAME_M, SAME_RAD = 0.3, 0.1
 """Largest difference between the places of two scans that confirm each other."""
 UNKNOWN_STEP = np.diag([100.0, 100.0, 10.0])
@@ -116,15 +119,25 @@ class Localizer:
         self._rotations = math.ceil(2 * math.pi / ROTATION_STEP_RAD)
         self._min_score = config.loop.min_score
 
-    def find(self, points: FloatArray) -> tuple[Found | None, bool]:
-        """Return the only pose where the points (n, 2), in the base frame, fit, and whether several places fit."""
+    def find(
+        self, points: FloatArray, centre: FloatArray | None = None, reach_m: float = math.inf
+    ) -> tuple[Found | None, bool]:
+        """Return the only pose where the points (n, 2), in the base frame, fit, and whether several places fit.
+
+        Only positions within ``reach_m`` of ``centre`` (2,) are searched, if there is one.
+        """
         if len(points) < 10:
             return None, False
         # In an order without a pattern the sums of the bounds reach their end, or their floor, soonest.
         few = points[np.random.default_rng(0).permutation(len(points))[:POINTS]]
-        floor = FIRST_FLOOR
+        nodes = np.argwhere(self._free[-1])
+        if centre is not None:
+            side = self._field.resolution * (POOL << (LEVELS - 1))
+            off = self._field.origin + side * (nodes[:, ::-1] + 0.5) - centre
+            nodes = nodes[np.hypot(off[:, 0], off[:, 1]) <= reach_m + side]
+        floor, left = FIRST_FLOOR, MAX_NODES
         while True:
-            starts = self._starts(few, floor)
+            starts, left = self._starts(few, nodes, floor, left)
             if starts is None or len(starts) > MAX_STARTS:
                 return None, True
             found = self._refined(points, starts)
@@ -146,20 +159,23 @@ class Localizer:
         """Score of another place from which on a place with ``score`` is ambiguous."""
         return (score - MIN_GAIN) / (1.0 - MIN_GAIN)
 
-    def _starts(self, points: FloatArray, floor: float) -> FloatArray | None:
-        """Poses (k, 3), best bound first, around which every score of ``floor`` or more lies; None if too many."""
+    def _starts(
+        self, points: FloatArray, nodes: NDArray[np.intp], floor: float, left: int
+    ) -> tuple[FloatArray | None, int]:
+        """Poses (k, 3), best bound first, around which every score of ``floor`` or more in ``nodes`` (n, 2) lies.
+
+        None if that takes more than ``left`` bounds; the second value is what remains of them.
+        """
         step = 2 * math.pi / self._rotations
-        nodes = np.argwhere(self._free[-1])
         nodes = np.column_stack(
             [np.repeat(np.arange(self._rotations), len(nodes)), np.tile(nodes, (self._rotations, 1))]
         ).astype(np.int32)
-        visited = 0
         bounds = np.zeros(0, dtype=np.float32)
         for level in range(LEVELS - 1, -1, -1):
             resolution = self._field.resolution * (POOL << level)
-            visited += len(nodes)
-            if visited > MAX_NODES:
-                return None
+            left -= len(nodes)
+            if left < 0:
+                return None, 0
             bounds = bound_nodes(self._pooled[level], self._field.origin, resolution, points, nodes, floor, step)
             nodes, bounds = nodes[bounds >= floor], bounds[bounds >= floor]
             if level > 0:
@@ -174,7 +190,7 @@ class Localizer:
         kept = np.array(taken, dtype=np.float64).reshape(-1, 3)
         coarse = POOL * self._field.resolution
         places = self._field.origin + coarse * (kept[:, [2, 1]] + 0.5)
-        return np.column_stack([places, kept[:, 0] * step])
+        return np.column_stack([places, kept[:, 0] * step]), left
 
     def _refined(self, points: FloatArray, starts: FloatArray) -> list[Found]:
         """Best poses near ``starts`` (k, 3), best first."""
@@ -246,6 +262,7 @@ class SavedMap:
         self.ambiguous = False
         self._config = config
         self._searched: Keyframe | None = None
+        self._searched_ns = 0
         self._unconfirmed: FloatArray | None = None
 
     @property
@@ -258,18 +275,25 @@ class SavedMap:
         """Whether the map is still as it was read."""
         return not (self.extends and self.located)
 
-    def search_job(self, recent: Sequence[Keyframe], pose: FloatArray, scan: ScanPoints) -> Callable[[], Place] | None:
+    def search_job(
+        self, recent: Sequence[Keyframe], pose: FloatArray, scan: ScanPoints, stamp_ns: int, reach_m: float = math.inf
+    ) -> Callable[[], Place] | None:
         """Return a job that searches the map for the recent keyframes and the newest scan, whose pose is ``pose`` (3,).
 
-        None if the newest keyframe was searched for already and no place waits for its confirmation.
+        A finite ``reach_m`` limits the search to the surroundings of ``pose``.
+        None if the newest keyframe was searched for already and no place waits for its confirmation, or if the search
+        before was less than `SEARCH_PERIOD_S` ago.
         """
         if not recent or (recent[-1] is self._searched and self._unconfirmed is None):
             return None
-        self._searched = recent[-1]
+        if self._searched is not None and stamp_ns - self._searched_ns < SEARCH_PERIOD_S * 1e9:
+            return None
+        self._searched, self._searched_ns = recent[-1], stamp_ns
         query = gather([*(k.map_from_base for k in recent), pose], [*(k.scan for k in recent), scan])
 
         def search() -> Place:
-            found, self.ambiguous = self.localizer.find(query)
+            near = pose[:2] if math.isfinite(reach_m) else None
+            found, self.ambiguous = self.localizer.find(query, near, reach_m)
             if not self._confirmed(found, pose):
                 found = None
             return Place(pose, found, self.build_map() if found is not None and self.extends else None)

@@ -62,27 +62,42 @@ def steady(scans: int = 30) -> IntegrityMonitor:
     return monitor
 
 
-def test_three_contradicted_scans_take_the_trust_and_five_confirm() -> None:
-    # Full evidence is 2 a scan at 10 Hz, from -6: at 0 after three scans, at 4 after five.
+def test_three_contradicted_scans_take_the_trust() -> None:
+    # Full evidence is 2 a scan at 10 Hz, from -6: at 0 after three scans.
     monitor = steady()
-    trusted = []
-    for _ in range(5):
+    lost = []
+    for _ in range(3):
         monitor.matched(0.5, 0.4, 0.1)
         assert monitor.doubts
-        trusted.append(monitor.lost_probability < UNTRUSTED)
-    assert trusted == [True, True, False, False, False]
-    assert monitor.lost
-    assert monitor.lost_probability == pytest.approx(1 / (1 + math.exp(-4.0)))
+        lost.append(monitor.lost)
+    assert lost == [False, False, True]
+    assert monitor.lost_probability == pytest.approx(UNTRUSTED)
 
 
 def test_evidence_counts_by_time() -> None:
-    # At 40 Hz a scan has a quarter of the evidence: 20 scans instead of 5.
+    # At 40 Hz a scan has a quarter of the evidence: 12 scans instead of 3.
     monitor = steady()
     scans = 0
     while not monitor.lost:
         monitor.matched(0.5, 0.4, 0.025)
         scans += 1
-    assert scans == 20
+    assert scans == 12
+
+
+def test_a_match_far_from_its_guess_counts_while_the_score_is_low() -> None:
+    # The jump of 6 σ is full evidence with the drop of the score, and remains until a scan fits: 2 a scan from -6.
+    monitor = steady()
+    for jump in (6.0, 0.0, 0.0):
+        assert not monitor.lost
+        monitor.matched(0.02, 0.6, 0.1, jump_sigmas=jump)
+    assert monitor.lost
+    slipped = steady()
+    for _ in range(50):  # the wheels slip, and every scan fits
+        slipped.matched(0.02, 0.9, 0.1, jump_sigmas=6.0)
+    assert not slipped.doubts
+    slipped.matched(0.02, 0.9, 0.1)
+    slipped.matched(0.02, 0.6, 0.1)  # later, at a door: the jump is forgotten
+    assert slipped.lost_probability < 0.01
 
 
 @pytest.mark.parametrize(("contradicted", "score"), [(0.5, 0.9), (0.02, 0.7)])

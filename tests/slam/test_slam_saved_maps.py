@@ -274,7 +274,7 @@ def test_a_place_needs_a_second_scan_and_an_ambiguous_one_is_named(made: tuple[P
     entry = journey.entries[0]
     states = []
     for index in range(2):  # the robot stands: no second keyframe is needed
-        scan = replace(entry.scan, stamp_ns=entry.scan.stamp_ns + index * 10**8)
+        scan = replace(entry.scan, stamp_ns=entry.scan.stamp_ns + index * 5 * 10**8)
         result = slam.process(scan, entry.odom_pose, entry.base_from_laser)
         job = slam.background_job()
         assert job is not None

@@ -66,6 +66,10 @@ def add_kind(kinds: Any) -> None:
     parser.add_argument(
         "--seed", type=int, default=0, metavar="N", help="of --faults: chooses the places (default: %(default)d)"
     )
+    parser.add_argument(
+        "--noise-seeds", type=int, default=1, metavar="N",
+        help="of --faults: runs of each fault over the whole log, the first without noise (default: %(default)d)",
+    )  # fmt: skip
     parser.set_defaults(func=evaluate_slam)
 
 
@@ -93,8 +97,9 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         raise UserError(f"--tolerance must be > 0 (got {args.tolerance:g})", 2)
     if args.faults and args.backend != "graph":
         raise UserError("--faults needs --backend graph", 2)
-    if args.places < 1:
-        raise UserError(f"--places must be at least 1 (got {args.places})", 2)
+    for name in ("places", "noise_seeds"):
+        if getattr(args, name) < 1:
+            raise UserError(f"--{name.replace('_', '-')} must be at least 1 (got {getattr(args, name)})", 2)
     if args.particles < 1:
         raise UserError(f"--particles must be at least 1 (got {args.particles})", 2)
     overrides = [f"grid_slam.{override}" for override in args.param]
@@ -127,7 +132,8 @@ def evaluate_slam(args: argparse.Namespace) -> int:
             if args.faults:
                 faults = FAULTS if args.faults == "all" else tuple(args.faults.split(","))
                 report = evaluate_faults(
-                    entries, config, places=args.places, seed=args.seed, faults=faults,
+                    entries, config, places=args.places, seed=args.seed, noise_seeds=args.noise_seeds,
+                    relations=relations, faults=faults,
                     on_step=lambda name: progress.update(task, description=name),
                 )  # fmt: skip
                 return _write_faults(folder, {"log": args.log.name, "seed": args.seed, **report}, args.json)
