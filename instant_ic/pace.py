@@ -260,7 +260,7 @@ def current() -> Pace:
 
 
 def use(pace: Pace) -> None:
-    """Set this process's pace; call it before the clocks are used."""
+    """Set this process's pace; call it before the clocks are made."""
     global _current
     _current = pace
 

@@ -25,15 +25,17 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The machine's clock, at this process's pace (:mod:`instant_ic.pace`)."""
+    """The machine's clock, at this process's pace (:mod:`instant_ic.pace`), which :func:`pace.use` sets before.
 
-    def now_ns(self) -> int:
-        """Nanoseconds since the epoch."""
-        return pace.current().now_ns()
+    Attributes:
+        now_ns: returns nanoseconds since the epoch.
+        steady_ns: returns nanoseconds of a clock that never jumps, even when somebody sets the machine's clock.
+    """
 
-    def steady_ns(self) -> int:
-        """Nanoseconds of a clock that never jumps, even when somebody sets the machine's clock."""
-        return pace.current().steady_ns()
+    def __init__(self) -> None:
+        current = pace.current()
+        self.now_ns = time.time_ns if current.real else current.now_ns
+        self.steady_ns = time.monotonic_ns if current.real else current.steady_ns
 
 
 class ManualClock:

@@ -19,9 +19,11 @@ INLINE, SHARED = (int.from_bytes(MAGIC + bytes([VERSION, kind, 0, 0]), "little")
 REFERENCE = struct.Struct("<IIII")
 """Where a payload lies: process and descriptor of its slot, number of the slot, smallest number still in use."""
 
-KEY_INLINE, KEY_SHARED, KEY_COPY, KEY_LATCHED = b"\0", b"\1", b"\2", b"\3"
-"""What follows the topic's name in the key: an inline message, a reference, the inline copy of a referenced message,
-and (with 8 more bytes) the last value for one late joiner."""
+KEY_INLINE, KEY_SHARED = b"\0", b"\1"
+"""What follows the topic's name in the key: the third part is the payload, or a reference to it."""
+
+KEY_COPY = b"="
+"""What precedes the name in the key of the inline copy of a referenced message; readers of the name do not get it."""
 
 MOST_BYTES = 0xFFFFFFFF
 """Largest payload, in bytes."""

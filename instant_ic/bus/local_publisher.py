@@ -17,7 +17,6 @@ from instant_ic.bus.frame import (
     INLINE,
     KEY_COPY,
     KEY_INLINE,
-    KEY_LATCHED,
     KEY_SHARED,
     MOST_BYTES,
     REFERENCE,
@@ -50,9 +49,6 @@ log = logging.getLogger(__name__)
 class LocalPublisher:
     """Publisher of one topic of one node.
 
-    The socket runs in ``XPUB_MANUAL`` mode: this class decides which keys a subscription receives, so that a last
-    value can be sent to one late joiner alone.
-
     Args:
         host: the node's transport.
         topic, type_name, qos: what it publishes.
@@ -69,7 +65,7 @@ class LocalPublisher:
         self.type_name = type_name
         self.qos = qos
         self.stats = PublisherStats()
-        self._host = host
+        self._now_ns, self._steady_ns = host.now_ns, host.steady_ns
         self._on_close = on_close
         self._lock = threading.RLock()  # publish may be called from any thread; the bus thread serves subscriptions
         self._name = topic.encode()
@@ -82,14 +78,13 @@ class LocalPublisher:
         self._pool = SlotPool(self._id)
         self._memory_retry_s = 0.0
         self._inlined: deque[tuple[int, int]] = deque()  # sequence and size of large messages through the socket
-        self._inlined_bytes = 0
         self._last: tuple[bytes, Buffer, Slot | None] | None = None  # header, third part, slot of the latched value
         self._closed = False
         self._claim, self._path = registry.claim_socket(host.run_dir, topic, host.node)
         self._socket = host.context.socket(zmq.XPUB)
         try:
             self._socket.setsockopt(zmq.LINGER, int(LINGER_S * 1000))
-            self._socket.setsockopt(zmq.XPUB_MANUAL, 1)
+            self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # each subscription is seen here, not only a key's first
             # For good: libzmq can stall a connection for ever when the limit is lowered on a socket in use.
             self._socket.setsockopt(zmq.SNDHWM, _QUEUE_BYTES // SHARED_FROM_BYTES)
             self._socket.bind(f"ipc://{self._path}")
@@ -141,10 +136,10 @@ class LocalPublisher:
                 return
             header = self._header(INLINE, size, publish_ns)
             if self._subscribers:
-                self._emit(KEY_INLINE, header, body)
+                self._emit(self._name + KEY_INLINE, header, body)
             if self.qos.latched:
                 self._last = header, bytes(body), None
-        self.stats.add(self._host.steady_ns(), size)
+        self.stats.add(self._steady_ns(), size)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
         """Send ``size`` bytes that ``fill`` writes in place, without a further copy and without waiting.
@@ -172,10 +167,10 @@ class LocalPublisher:
                 body = bytearray(size)
                 fill(memoryview(body))
                 header = self._header(INLINE, size, publish_ns)
-                self._emit(KEY_INLINE, header, body)
+                self._emit(self._name + KEY_INLINE, header, body)
                 if self.qos.latched:
                     self._last = header, body, None
-        self.stats.add(self._host.steady_ns(), size)
+        self.stats.add(self._steady_ns(), size)
 
     def serve(self) -> None:
         """Handle new and ended subscriptions; on the bus thread, when :attr:`fd` is readable.
@@ -190,12 +185,8 @@ class LocalPublisher:
                     request = b""
                 if request[:2] in (b"\1!", b"\0!"):
                     self._on_announcement(request[1:], request[0] == 1)
-                elif request[:1] == b"\1":
-                    self._on_subscription(request[1:])
-                elif request[:1] == b"\0":
-                    self._count(self._keys(request[1:]), -1)
-                    for key in self._keys(request[1:]):
-                        self._socket.setsockopt(zmq.UNSUBSCRIBE, self._name + key)
+                elif request[:1] in (b"\1", b"\0"):
+                    self._on_subscription(request[1:], request[0] == 1)
 
     def close(self) -> None:
         """End the topic and remove it from the registry; the last messages get up to 0.2 s to leave."""
@@ -224,12 +215,12 @@ class LocalPublisher:
 
     def _header(self, kind: int, size: int, publish_ns: int | None) -> bytes:
         self._sequence += 1
-        stamp = self._host.now_ns() if publish_ns is None else publish_ns
+        stamp = self._now_ns() if publish_ns is None else publish_ns
         return HEADER.pack(kind, self._sequence, stamp, self._id, self._type_hash, size)
 
     def _emit(self, key: bytes, header: bytes, body: Buffer) -> None:
         send = self._socket.send
-        send(self._name + key, _MORE)
+        send(key, _MORE)
         send(header, _MORE)
         send(body)
 
@@ -237,11 +228,10 @@ class LocalPublisher:
         """Whether a large message may go through the socket: its own limit counts messages, not bytes."""
         seen = min((progress.sequence() for progress in self._progress.values()), default=self._sequence)
         while self._inlined and self._inlined[0][0] <= seen:
-            self._inlined_bytes -= self._inlined.popleft()[1]
-        if self._inlined and self._inlined_bytes + size > _QUEUE_BYTES:
+            self._inlined.popleft()
+        if self._inlined and sum(waiting for _, waiting in self._inlined) + size > _QUEUE_BYTES:
             return False
         self._inlined.append((self._sequence + 1, size))
-        self._inlined_bytes += size
         return True
 
     def _send_shared(self, slot: Slot, size: int, fill: Callable[[memoryview], None], publish_ns: int | None) -> None:
@@ -256,9 +246,9 @@ class LocalPublisher:
         if self.qos.latched:
             self._last = header, reference, slot
         if self._subscribers:
-            self._emit(KEY_SHARED, header, reference)
+            self._emit(self._name + KEY_SHARED, header, reference)
         if self._copies:
-            self._emit(KEY_COPY, _inline(header), slot.view(size))
+            self._emit(KEY_COPY + self._name, _inline(header), slot.view(size))
 
     def _slot(self, size: int) -> Slot | None:
         """A locked slot, or None when this message must go through the socket."""
@@ -293,34 +283,21 @@ class LocalPublisher:
 
     # -- subscriptions ---------------------------------------------------------------------------
 
-    def _keys(self, prefix: bytes) -> tuple[bytes, ...]:
-        """Keys that a subscription receives: by the topic's name all, without the inline copies."""
-        if self._name.startswith(prefix):
-            return KEY_INLINE, KEY_SHARED
-        key = prefix.removeprefix(self._name)
-        return (key,) if key in (KEY_INLINE, KEY_SHARED, KEY_COPY) else ()
-
-    def _count(self, keys: tuple[bytes, ...], one: int) -> None:
-        self._subscribers += one * (KEY_INLINE in keys)
-        self._copies += one * (KEY_COPY in keys)
-
-    def _on_subscription(self, prefix: bytes) -> None:
-        keys = self._keys(prefix)
-        for key in keys:
-            self._socket.setsockopt(zmq.SUBSCRIBE, self._name + key)
-        self._count(keys, 1)
-        if self._last is None or not keys:
+    def _on_subscription(self, prefix: bytes, begins: bool) -> None:
+        """Count a reader, and give it the last value; the others get it again and know its sequence."""
+        every = self._name.startswith(prefix)
+        inline, copies = every or prefix == self._name + KEY_INLINE, prefix == KEY_COPY + self._name
+        self._subscribers += inline if begins else -inline
+        self._copies += copies if begins else -copies
+        if not begins or self._last is None:
             return
         header, body, slot = self._last
-        if len(keys) > 1:
-            alone = self._name + KEY_LATCHED + os.urandom(8)  # in manual mode only the newest subscriber gets this key
-            self._socket.setsockopt(zmq.SUBSCRIBE, alone)
-            self._emit(alone[len(self._name) :], header, body)
-            self._socket.setsockopt(zmq.UNSUBSCRIBE, alone)
-        elif slot is None and keys == (KEY_INLINE,):  # others get it again and know its sequence
-            self._emit(KEY_INLINE, header, body)
-        elif slot is not None and keys == (KEY_COPY,):
-            self._emit(KEY_COPY, _inline(header), slot.view(unpack_header(header)[5]))
+        if slot is None and inline:
+            self._emit(self._name + KEY_INLINE, header, body)
+        elif slot is not None and every:
+            self._emit(self._name + KEY_SHARED, header, body)
+        elif slot is not None and copies:
+            self._emit(KEY_COPY + self._name, _inline(header), slot.view(unpack_header(header)[5]))
 
     def _on_announcement(self, announcement: bytes, begins: bool) -> None:
         if not begins:

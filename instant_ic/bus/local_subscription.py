@@ -20,7 +20,7 @@ from instant_ic.bus import registry
 from instant_ic.bus.frame import KEY_COPY, KEY_INLINE, REFERENCE, SHARED, FrameError, Header, type_digest, unpack_header
 from instant_ic.bus.host import Host
 from instant_ic.bus.qos import QoS
-from instant_ic.bus.shm import ProgressPage, SlotMapping
+from instant_ic.bus.shm import ProgressPage, Slot
 from instant_ic.bus.transport import Received, Stats
 
 VIEWS_HELD = 4
@@ -47,9 +47,10 @@ class _Source:
     def __init__(self, info: registry.PublisherInfo) -> None:
         self.info = info
         self.node, self.type_name = info.node, info.type_name
-        self.refused = False
+        self.address = f"ipc://{info.socket}"  # a successor of the same node has the same
+        self.left_s = 0.0  # when it was noticed that it has left the registry; 0: it has not
         self.expected = 0  # sequence of the next message; 0 before the first
-        self.slots: dict[int, SlotMapping] = {}
+        self.slots: dict[int, Slot] = {}
         self.mapped = False  # a slot could be opened once, so that others can be
         self.views = 0
 
@@ -60,7 +61,7 @@ class LocalSubscription:
     Args:
         host: the node's transport.
         topic, type_name, qos: what it reads; ``type_name`` None accepts any type.
-        on_ready: called when messages have arrived.
+        on_ready: called when there are messages after there were none; it must not wait.
         on_close: called once when the subscription is closed.
 
     Raises:
@@ -80,12 +81,9 @@ class LocalSubscription:
         self.type_name = type_name
         self.qos = qos
         self.stats = Stats()
-        self.on_ready = on_ready
-        self.waker: object = None  # its `set` is `on_ready`, which the thread waiting on it need not call
-        self.fresh = False
         self.publishers: list[registry.PublisherInfo] = []
         self._host = host
-        self._on_close = on_close
+        self._on_ready, self._on_close = on_ready, on_close
         self._name = self.topic.encode()
         self._digest = type_digest(type_name) if type_name else None
         self._lock = threading.Lock()
@@ -96,10 +94,8 @@ class LocalSubscription:
         registry.own_folder(Path(self._folder))
         self._seen_mtime = -1
         self._next_look = self._next_full_look = 0.0
-        self._sources: dict[bytes, _Source] = {}
-        self._connected: set[str] = set()  # paths of publishers' sockets
-        self._left: dict[str, float] = {}  # of these, those that have left the registry: when this was noticed
-        self._looked_up: dict[bytes, float] = {}  # identities that are not in the registry: when they were looked up
+        self._sources: dict[bytes, _Source] = {}  # by identity; a connection to each
+        self._next_search = 0.0
         self._told: set[object] = set()
         self._socket = host.context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -123,39 +119,38 @@ class LocalSubscription:
         if mtime == self._seen_mtime and now < self._next_look:
             return
         self._next_look = now + _LOOK_S
-        complete = len(self._connected) == len(self.publishers)  # none to connect again, none in its grace
+        complete = len(self._sources) == len(self.publishers)  # none to connect again, none in its grace
         known = mtime == self._seen_mtime and now < self._next_full_look and complete
         if known and all(registry.running(info) for info in self.publishers):
             return
         self._seen_mtime, self._next_full_look = mtime if registry.settled(mtime) else -1, now + _FULL_LOOK_S
         self._look_up(now)
-        for path in [path for path, left_s in self._left.items() if now - left_s > _GRACE_S]:
-            self.read()
-            self._socket.disconnect(f"ipc://{path}")
-            self._connected.discard(path)
-            del self._left[path]
-        present = {bytes.fromhex(info.id) for info in self.publishers}
+        self.read()  # the last messages of those that left; an event may have been taken from `fd` here
         for identity, source in list(self._sources.items()):
-            if identity not in present and str(source.info.socket) not in self._connected:
-                self._forget(identity)
-        self.read()  # an event may have been taken from `fd` here
+            if source.left_s and now - source.left_s > _GRACE_S:
+                del self._sources[identity]
+                self._page.forget(identity)
+                if not self._connected(source.address):
+                    self._socket.disconnect(source.address)
+
+    def _connected(self, address: str) -> bool:
+        return any(source.address == address for source in self._sources.values())
 
     def _look_up(self, now: float) -> None:
         """Read the registry, and connect to publishers that are new in it."""
         self.publishers = registry.topic_publishers(self._host.run_dir, self.topic)
-        for info in self.publishers:
-            path = str(info.socket)
-            if path not in self._connected:
+        present = {bytes.fromhex(info.id): info for info in self.publishers}
+        for identity in present.keys() - self._sources.keys():
+            source = _Source(present[identity])
+            if not self._connected(source.address):
                 try:
-                    self._socket.connect(f"ipc://{path}")
+                    self._socket.connect(source.address)
                 except zmq.ZMQError as error:
-                    self._complain(path, f"{path} cannot be connected: {error}")
+                    self._complain(source.address, f"{source.address} cannot be connected: {error}")
                     continue
-            self._connected.add(path)
-            # From now on its messages are known, also one that is read after it has left.
-            self._sources.setdefault(bytes.fromhex(info.id), _Source(info))
-        present = {str(info.socket) for info in self.publishers}
-        self._left = {path: self._left.get(path, now) for path in self._connected - present}
+            self._sources[identity] = source  # its messages are known from now on, also after it has left
+        for identity, source in self._sources.items():
+            source.left_s = 0.0 if identity in present else source.left_s or now
 
     def read_rest(self) -> None:
         """Read what :meth:`read` of one message has left; usually nothing."""
@@ -168,12 +163,10 @@ class LocalSubscription:
         receive = socket.recv
         while True:
             try:
-                key = receive(_NOBLOCK)
+                receive(_NOBLOCK)  # the key
             except zmq.Again:
                 return
             try:
-                if not key.startswith(self._name):
-                    raise FrameError(f"message with the key {key[:40]!r}")
                 # A missing part shows as the next message's key, or as none: neither is a header.
                 header = unpack_header(receive(_NOBLOCK))
                 if header[0] == SHARED or header[5] < _LARGE_FROM_BYTES:
@@ -220,17 +213,18 @@ class LocalSubscription:
         )
         with self._lock:
             queue = self._queue
-            if queue:
-                if self._depth == 1:
-                    for index, other in enumerate(queue):
-                        if other.publisher == node:
-                            del queue[index]
-                            break
-                elif len(queue) >= self._depth:
-                    self.stats.lose(queue.popleft().publisher, 1)
+            waiting = len(queue)
+            if waiting and self._depth == 1:
+                for index, other in enumerate(queue):
+                    if other.publisher == node:
+                        del queue[index]
+                        break
+            elif waiting >= self._depth:
+                self.stats.lose(queue.popleft().publisher, 1)
             queue.append(message)
+        if not waiting:
+            self._on_ready()
         self.stats.add(steady, size)
-        self.fresh = True
 
     def _met(self, publisher: bytes) -> _Source:
         """The publisher of a first message.
@@ -239,17 +233,12 @@ class LocalSubscription:
             FrameError: the registry does not name it.
         """
         now = time.monotonic()
-        if now >= self._looked_up.get(publisher, 0.0):
+        if now >= self._next_search:
             self._look_up(now)
             if publisher in self._sources:
                 return self._sources[publisher]
-            if len(self._looked_up) < _MOST_UNKNOWN:
-                self._looked_up[publisher] = now + _LOOK_S
+            self._next_search = now + _LOOK_S
         raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")
-
-    def _forget(self, publisher: bytes) -> None:
-        del self._sources[publisher]
-        self._page.forget(publisher)
 
     def _shared(self, source: _Source, header: Header, body: bytes | memoryview) -> memoryview | None:
         """The message in shared memory; None when its slot holds another message by now."""
@@ -262,7 +251,7 @@ class LocalSubscription:
         slot = source.slots.get(number)
         if slot is None:
             try:
-                slot = source.slots[number] = SlotMapping(pid, fd, publisher)
+                slot = source.slots[number] = Slot.open(pid, fd, publisher)
                 source.mapped = True
             except OSError as error:
                 if source.mapped and error.errno == errno.ENOENT:
@@ -280,7 +269,7 @@ class LocalSubscription:
         weakref.finalize(array, self._done, source, slot, sequence).atexit = False
         return array.data
 
-    def _done(self, source: _Source, slot: SlotMapping, sequence: int) -> None:
+    def _done(self, source: _Source, slot: Slot, sequence: int) -> None:
         """Unlock a slot when its last view is gone; may run in any thread."""
         if slot.sequence != sequence:
             self.stats.overwritten += 1
@@ -290,13 +279,13 @@ class LocalSubscription:
 
     def _without_shared_memory(self, source: _Source, sequence: int, error: OSError) -> NoReturn:
         """Replace the subscription by one to inline messages only."""
-        source.expected = source.expected or sequence  # the last value comes again
-        self._socket.setsockopt(zmq.SUBSCRIBE, self._name + KEY_INLINE)
-        self._socket.setsockopt(zmq.SUBSCRIBE, self._name + KEY_COPY)
-        if self._name not in self._told:
-            self._told.add(self._name)
-            self._socket.setsockopt(zmq.UNSUBSCRIBE, self._name)
-            self._socket.setsockopt(zmq.UNSUBSCRIBE, self._page.announcement)
+        if KEY_COPY not in self._told:
+            self._told.add(KEY_COPY)
+            source.expected = source.expected or sequence  # the last value comes again
+            for wanted in (self._name + KEY_INLINE, KEY_COPY + self._name):
+                self._socket.setsockopt(zmq.SUBSCRIBE, wanted)
+            for unwanted in (self._name, self._page.announcement):
+                self._socket.setsockopt(zmq.UNSUBSCRIBE, unwanted)
         raise FrameError(
             f"shared memory of {source.node} cannot be used ({error.strerror or error}); asking for large messages "
             "through the socket, which is slower"

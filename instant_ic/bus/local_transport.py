@@ -1,8 +1,8 @@
 """Topics of one node on one machine: ZeroMQ sockets found through the registry; no broker, no master.
 
-Which thread reads: while the node's thread waits in :meth:`Waker.wait`, it reads its own sockets, so a message wakes
-only that thread. During a long callback the bus thread reads instead, so that the newest message does not grow old in
-a queue. The bus thread also serves new subscriptions and looks for publishers.
+Which thread reads: while the node's thread waits in :meth:`LocalTransport.wait`, it reads its own sockets, so a message
+wakes only that thread. During a long callback the bus thread reads instead, so that the newest message does not grow
+old in a queue. The bus thread also serves new subscriptions and looks for publishers.
 
 A thread that wakes runs with cold caches: a message then costs ten times what it costs in a row of messages. So no
 thread wakes to look whether there is something to do, except for publishers.
@@ -37,56 +37,8 @@ _CLOSE_S = 5.0
 log = logging.getLogger(__name__)
 
 
-class Waker:
-    """Like a :class:`threading.Event` for the one thread that waits; its ``wait`` also reads the node's sockets."""
-
-    def __init__(self, transport: LocalTransport) -> None:
-        self._transport = transport
-        self._set = False
-        self._written = False
-        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._poll = select.poll()
-        self._poll.register(self.fd, select.POLLIN)
-
-    def set(self) -> None:
-        """End the present or the next wait; may be called from any thread."""
-        if self._set:
-            return
-        self._set = True
-        if threading.get_ident() != self._transport.driver:
-            self._written = True
-            os.eventfd_write(self.fd, 1)
-
-    def clear(self) -> None:
-        self._set = False
-        if self._written:
-            self._written = False
-            self.drain()
-
-    def is_set(self) -> bool:
-        return self._set
-
-    def rest(self, timeout: float) -> None:
-        self._poll.poll(1000.0 * timeout)
-
-    def drain(self) -> None:
-        """Take the event from the descriptor, which would end every later wait at once."""
-        with contextlib.suppress(BlockingIOError):
-            os.eventfd_read(self.fd)
-
-    def close(self) -> None:
-        """Close the event; later calls of ``set`` do nothing."""
-        self._set = True
-        os.close(self.fd)
-
-    def wait(self, timeout: float) -> None:
-        """Read the node's sockets until a message arrives, the event is set, or the time is over."""
-        if not self._set:
-            self._transport.wait(timeout)
-
-
 class LocalTransport:
-    """Topics of one node.
+    """Topics of one node, and the event that its thread waits on: waiting reads the node's sockets.
 
     Args:
         run_dir: the run directory; created if missing.
@@ -112,35 +64,57 @@ class LocalTransport:
         self._host = Host(run_dir, node, now_ns, steady_ns)
         self.run_dir = self._host.run_dir
         self.node = node
-        self.driver: int | None = None
-        self._lock = threading.Lock()
+        self._driver: int | None = None  # the thread that waits
+        self._set = self._written = False
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._wake_poll = select.poll()
+        self._wake_poll.register(self._wake, select.POLLIN)
         self._read_lock = threading.RLock()
-        self._publishers: list[LocalPublisher] = []
-        self._subscriptions: list[LocalSubscription] = []
+        self._writers: dict[int, LocalPublisher] = {}  # by the descriptor of its socket
         self._readers: dict[int, LocalSubscription] = {}
+        self._unread: list[LocalSubscription] = []  # may have more, which their descriptors do not show
         self._stop = threading.Event()
         self._inputs = select.epoll()
         self._events = select.epoll()
-        self._writers: dict[int, LocalPublisher] = {}
         self._poke = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._events.register(self._poke, select.EPOLLIN)
         self._waiting = False
         self._left_s = time.monotonic()
         self._slow_until_s = 0.0
         self._bus_reads = True
+        self._inputs.register(self._wake, select.EPOLLIN)
+        self._events.register(self._poke, select.EPOLLIN)
         self._events.register(self._inputs.fileno(), select.EPOLLIN)
-        self._waker: Waker | None = None
-        self._look_now = False
-        self._unread: list[LocalSubscription] = []  # may have more, which their descriptors do not show
+        self._next_look_s = 0.0
         self._thread = threading.Thread(target=self._run, name="bus", daemon=True)
         self._thread.start()
 
-    def waker(self) -> Waker:
-        """The event that the node's thread waits on; one per transport."""
-        if self._waker is None:
-            self._waker = Waker(self)
-            self._inputs.register(self._waker.fd, select.EPOLLIN)
-        return self._waker
+    def waker(self) -> LocalTransport:
+        """The event that the node's thread waits on."""
+        return self
+
+    def set(self) -> None:
+        """End the present or the next wait; may be called from any thread."""
+        if not self._set:
+            self._set = True
+            if threading.get_ident() != self._driver:
+                self._written = True
+                os.eventfd_write(self._wake, 1)
+
+    def clear(self) -> None:
+        """Let later waits wait."""
+        self._set = False
+        if self._written:
+            self._written = False
+            self._drain()
+
+    def is_set(self) -> bool:
+        """Whether the next wait ends at once."""
+        return self._set
+
+    def _drain(self) -> None:
+        """Take the event from its descriptor, which would end every later wait at once."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._wake)
 
     def advertise(self, topic: str, type_name: str, qos: QoS) -> LocalPublisher:
         """Create a publisher, which readers can find at once.
@@ -149,44 +123,39 @@ class LocalTransport:
             RegistryError: the node already publishes the topic, or the path is too long.
         """
         publisher = LocalPublisher(self._host, registry.check_topic(topic), type_name, qos, self._forget_publisher)
-        with self._lock:
-            self._publishers.append(publisher)
-            self._writers[publisher.fd] = publisher
-            self._events.register(publisher.fd, select.EPOLLIN)
+        self._writers[publisher.fd] = publisher
+        self._events.register(publisher.fd, select.EPOLLIN)
         return publisher
 
     def subscribe(self, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]) -> LocalSubscription:
-        """Subscribe to all present and future publishers; ``type_name`` None accepts any type."""
+        """Subscribe to all present and future publishers.
+
+        Args:
+            topic, qos: what to read.
+            type_name: its type; None accepts any.
+            on_ready: called when :meth:`LocalSubscription.take` has messages again, on the thread that reads; it must
+                not wait.
+        """
         with self._read_lock:
             subscription = LocalSubscription(self._host, topic, type_name, qos, on_ready, self._forget_subscription)
-            if self._waker is not None and on_ready == self._waker.set:
-                subscription.waker = self._waker
             self._readers[subscription.fd] = subscription
             self._inputs.register(subscription.fd, select.EPOLLIN)
-        with self._lock:
-            self._subscriptions.append(subscription)
-            self._look_now = True
+        self._next_look_s = 0.0
         os.eventfd_write(self._poke, 1)
         return subscription
 
     def _forget_publisher(self, publisher: LocalPublisher) -> None:
         """Stop serving a publisher; its socket closes next."""
-        with self._lock:
-            if publisher in self._publishers:
-                self._publishers.remove(publisher)
-                del self._writers[publisher.fd]
-                self._events.unregister(publisher.fd)
+        if self._writers.pop(publisher.fd, None) is not None:
+            self._events.unregister(publisher.fd)
 
     def _forget_subscription(self, subscription: LocalSubscription) -> None:
         """Stop reading a subscription and close its socket."""
-        with self._lock:
-            if subscription not in self._subscriptions:
-                return
-            self._subscriptions.remove(subscription)
         with self._read_lock:
-            del self._readers[subscription.fd]
-            self._inputs.unregister(subscription.fd)
-            subscription.shut()
+            if self._readers.get(subscription.fd) is subscription:  # not closed before
+                del self._readers[subscription.fd]
+                self._inputs.unregister(subscription.fd)
+                subscription.shut()
 
     def close(self) -> None:
         """Close everything; the last messages get up to 0.2 s to leave."""
@@ -195,15 +164,15 @@ class LocalTransport:
         self._stop.set()
         os.eventfd_write(self._poke, 1)
         self._thread.join(timeout=_CLOSE_S)
-        for subscription in list(self._subscriptions):
+        for subscription in list(self._readers.values()):
             subscription.close()
-        for publisher in list(self._publishers):
+        for publisher in list(self._writers.values()):
             publisher.close()
         with self._read_lock:
-            if self._waker is not None:
-                self._waker.close()
+            self._set = True  # later calls of `set` do nothing
             self._inputs.close()
             self._events.close()
+            os.close(self._wake)
             os.close(self._poke)
         started_s = time.monotonic()
         self._host.context.term()
@@ -213,22 +182,23 @@ class LocalTransport:
     # -- reading ---------------------------------------------------------------------------------
 
     def wait(self, timeout: float) -> None:
-        """Read the node's sockets until a message arrives or the time is over; on the node's thread."""
+        """Read the node's sockets until a message arrives, the event is set, or the time is over."""
+        if self._set:
+            return
         self._waiting = True
-        self.driver = threading.get_ident()
-        waker = self._waker
+        self._driver = threading.get_ident()
         if self._bus_reads:
-            with self._read_lock:  # the bus thread may just be taking the event from the waker's descriptor
+            with self._read_lock:  # the bus thread may just be taking the event from its descriptor
                 self._hand_reading(False)
-            timeout = 0.0 if waker is not None and waker.is_set() else timeout
         now = time.monotonic()
         if now - self._left_s > _BUSY_S:
             self._slow_until_s = now + _SLOW_FOR_S
-        if not (self._unread and self._read_rest()):
-            if self.patient and waker is not None:
-                waker.rest(timeout)
-                timeout = 0.0
-            self._drain(self._inputs.poll(timeout, 64), waker)
+        self._read_rest()
+        if self.patient and not self._set:
+            self._wake_poll.poll(1000.0 * timeout)
+        if self.patient or self._set:
+            timeout = 0.0
+        self._read(self._inputs.poll(timeout, 64), one=True)
         self._left_s = time.monotonic()
         if self.patient:
             self._read_rest()
@@ -241,66 +211,50 @@ class LocalTransport:
         self._bus_reads = to_bus
         self._events.modify(self._inputs.fileno(), select.EPOLLIN if to_bus else 0)
 
-    def _read_rest(self) -> bool:
-        """Read what was left of sockets of which one message was read; True if there was any."""
-        fresh: list[LocalSubscription] = []
-        with self._read_lock:
-            unread, self._unread = self._unread, []
-            for subscription in unread:
-                if subscription.fd in self._readers:
-                    subscription.read_rest()
-                    if subscription.fresh:
-                        subscription.fresh = False
-                        fresh.append(subscription)
-        for subscription in fresh:
-            subscription.on_ready()
-        return bool(fresh)
-
-    def _drain(self, events: list[tuple[int, int]], reader: Waker | None) -> None:
-        """Read what waits, and notify every subscription that ``reader`` does not serve."""
-        others: list[LocalSubscription] = []
+    def _read(self, events: list[tuple[int, int]], one: bool) -> None:
+        """Read what waits, or ``one`` message of each socket: looking for more would delay it."""
         with self._read_lock:
             for fd, _ in events:
                 subscription = self._readers.get(fd)
-                if subscription is None:  # the waker: left as it is, it would end every poll of the bus thread at once
-                    if self._waker is not None and (reader is not None or not self._waiting):
-                        self._waker.drain()
-                else:
-                    subscription.read(one=reader is not None)  # looking for more would delay this one
-                    if reader is not None:
+                if subscription is not None:
+                    subscription.read(one)
+                    if one:
                         self._unread.append(subscription)
-                    if subscription.fresh:
-                        subscription.fresh = False
-                        if reader is None or subscription.waker is not reader:
-                            others.append(subscription)
-        for subscription in others:
-            subscription.on_ready()
+                elif one or not self._waiting:  # the event; left as it is, it would end every poll at once
+                    self._drain()
+
+    def _read_rest(self) -> None:
+        """Read what was left of sockets of which one message was read."""
+        if self._unread:
+            with self._read_lock:
+                unread, self._unread = self._unread, []
+                for subscription in unread:
+                    if self._readers.get(subscription.fd) is subscription:
+                        subscription.read_rest()
 
     def _run(self) -> None:
         inputs = self._inputs.fileno()
-        next_look = 0.0
         early = False
         while not self._stop.is_set():
             now = time.monotonic()
-            if self._look_now or now >= next_look:
-                self._look_now = False
-                next_look = now + (_DISCOVERY_S if self._look() else 1.0)
+            if now >= self._next_look_s:
+                self._next_look_s = now + _IDLE_S
+                if self._look() and self._readers:
+                    self._next_look_s = min(self._next_look_s, now + _DISCOVERY_S)
             if not (self._waiting or self._bus_reads or self.patient) and now - self._left_s > _BUSY_S:
                 self._hand_reading(True)
                 self._read_rest()
-            timeout = min(_IDLE_S, next_look - now) if self._subscriptions else _IDLE_S
-            if early:
-                timeout = min(timeout, _BUSY_S)
+            timeout = _BUSY_S if early else max(0.0, self._next_look_s - now)
             early = False
             try:
-                for fd, _ in self._events.poll(max(0.0, timeout), 64):
+                for fd, _ in self._events.poll(timeout, 64):
                     if fd == inputs:
                         # Most callbacks end soon: two threads that read in turn would wait for each other all the time.
                         early = not self._waiting and time.monotonic() - self._left_s < _BUSY_S
                         if early:
                             self._hand_reading(False)
                         else:
-                            self._drain(self._inputs.poll(0, 64), None)
+                            self._read(self._inputs.poll(0, 64), one=False)
                     elif fd == self._poke:
                         os.eventfd_read(fd)
                     elif (publisher := self._writers.get(fd)) is not None:
@@ -311,19 +265,15 @@ class LocalTransport:
 
     def _look(self) -> bool:
         """Look for publishers; False when the run directory is gone."""
-        fine = True
         for publisher in list(self._writers.values()):
             publisher.serve()
-        for subscription in list(self._subscriptions):
+        fine = True
+        for subscription in list(self._readers.values()):
             with self._read_lock:
-                if subscription.fd not in self._readers:  # just closed
-                    continue
                 try:
-                    subscription.discover()
+                    if self._readers.get(subscription.fd) is subscription:  # not just closed
+                        subscription.discover()
                 except OSError as error:
                     log.error("%s: %s", subscription.topic, error)
                     fine = False
-                fresh, subscription.fresh = subscription.fresh, False
-            if fresh and not self.patient:
-                subscription.on_ready()
         return fine

@@ -88,7 +88,8 @@ class Publisher:
 class Subscription:
     """A subscribed topic with its callback."""
 
-    def __init__(self, callback: Callable[[Received], None]) -> None:
+    def __init__(self, topic: str, callback: Callable[[Received], None]) -> None:
+        self.label = f"callback of {topic}"
         self.callback = callback
         self.raw: RawSubscription  # set by the node right after construction
 
@@ -578,10 +579,12 @@ class Node(Generic[ConfigT]):
 
     def _inputs(self) -> list[Subscription]:
         """Subscriptions to read now; before simulated time has started, only ``/clock``."""
-        if not self.use_sim_time or self._clock_in is None or self.clock.now_ns() > 0:
+        if self._clock_in is None:
+            return self.subscriptions
+        if self.clock.now_ns() > 0:
             if self._diagnoses.get("simulated time", (OK,))[0] != OK:
                 self.diagnose("simulated time", OK, "running")
-            return list(self.subscriptions)
+            return self.subscriptions
         if time.monotonic() > self._began_s + _NO_CLOCK_S:
             self.diagnose("simulated time", WARN, f"use_sim_time is set, waiting for {self._clock_in.raw.topic}")
         return [self._clock_in]
@@ -621,8 +624,10 @@ class Node(Generic[ConfigT]):
             ran = True
         pending: list[tuple[int, Subscription, Received]] = []
         for subscription in self._inputs():
-            pending += [(received.order, subscription, received) for received in subscription.raw.take()]
-        pending.sort(key=lambda entry: entry[0])
+            for received in subscription.raw.take():
+                pending.append((received.order, subscription, received))
+        if len(pending) > 1:
+            pending.sort(key=lambda entry: entry[0])
         for index, (_, subscription, received) in enumerate(pending):
             if index and subscription.raw.qos.depth == 1 and not self.lockstep:
                 # Earlier callbacks may have taken long: for a newest-only topic, use what has arrived since.
@@ -631,7 +636,7 @@ class Node(Generic[ConfigT]):
                         received = newer
                     else:
                         pending.append((newer.order, subscription, newer))
-            self._guard(f"callback of {received.topic}", subscription.callback, received)
+            self._guard(subscription.label, subscription.callback, received)
             ran = True
         return self._fire_timers() or ran
 
@@ -795,8 +800,9 @@ class Node(Generic[ConfigT]):
     # -- internals -------------------------------------------------------------------------------
 
     def _subscribe(self, topic: str, name: str | None, callback: Callable[[Received], None], qos: QoS) -> Subscription:
-        subscription = Subscription(callback)
-        subscription.raw = self._transport.subscribe(self.resolve(topic), name, qos, self._wake.set)
+        topic = self.resolve(topic)
+        subscription = Subscription(topic, callback)
+        subscription.raw = self._transport.subscribe(topic, name, qos, self._wake.set)
         self.subscriptions.append(subscription)
         self._registry_changed()
         return subscription

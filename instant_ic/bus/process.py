@@ -145,11 +145,11 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     except (params.ParameterError, registry.RegistryError) as error:
         log.error("%s", error)
         return 2
-    clock: Clock = ManualClock() if process.use_sim_time else SystemClock()
     run_dir = args.run_dir or paths.run_dir()
     try:
         registry.prepare(run_dir)  # before anything in it is trusted
         pace.use(pace.read(run_dir))
+        clock: Clock = ManualClock() if process.use_sim_time else SystemClock()
         transport = LocalTransport(run_dir, args.name, clock.now_ns, clock.steady_ns)
         claim = registry.Claim(run_dir / "nodes" / args.name, f"node {args.name}")
     except (registry.RegistryError, pace.PaceError) as error:

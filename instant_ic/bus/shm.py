@@ -11,7 +11,6 @@ of memory in which it stores how far it has read (its progress).
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import fcntl
 import mmap
@@ -51,14 +50,6 @@ def _sealed(size: int) -> int:
     return fd
 
 
-def _seal_writing(fd: int) -> None:
-    try:
-        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _F_SEAL_FUTURE_WRITE)
-    except OSError as error:
-        if error.errno != errno.EINVAL:  # kernels before 5.1 do not support this seal
-            raise
-
-
 def _open_sealed(pid: int, fd: int, least: int) -> int:
     """Open another process's ``memfd`` for reading.
 
@@ -78,64 +69,112 @@ def _open_sealed(pid: int, fd: int, least: int) -> int:
 
 
 class Slot:
-    """Memory of one message, on the publisher's side.
+    """Memory of one message, on either side; made by :meth:`create` or :meth:`open`, closed when nothing refers to it.
 
     Args:
+        fd: its ``memfd``, which the slot then owns.
+        access: ``mmap.PROT_READ``, for the publisher with ``mmap.PROT_WRITE``.
+
+    Attributes:
         number: unique within a publisher.
-        size: bytes of the largest message that must fit.
-        publisher: 8 bytes that identify the publisher.
+        capacity: bytes of the largest message.
+        held: the message is leased.
 
     Raises:
-        OSError: the machine does not have that much free memory.
+        OSError: it cannot be mapped.
     """
 
-    def __init__(self, number: int, size: int, publisher: bytes) -> None:
-        self.number = number
-        self.sequence = 0
-        length = -(-(size * 9 // 8 + _PAYLOAD_AT) // _STEP) * _STEP  # some spare space: compressed images vary in size
-        self.capacity = length - _PAYLOAD_AT
-        self.fd = _sealed(length)
+    def __init__(self, fd: int, access: int, number: int = 0) -> None:
         try:
-            self._map = mmap.mmap(
-                self.fd, length, mmap.MAP_SHARED | mmap.MAP_POPULATE, mmap.PROT_READ | mmap.PROT_WRITE
-            )
-            _seal_writing(self.fd)
+            self._map = mmap.mmap(fd, os.fstat(fd).st_size, mmap.MAP_SHARED | mmap.MAP_POPULATE, access)
         except BaseException:
-            os.close(self.fd)
+            os.close(fd)
             raise
-        _SLOT.pack_into(self._map, 0, 0, publisher)
+        self.fd = fd
+        self.number = number
+        self.capacity = len(self._map) - _PAYLOAD_AT
+        self.held = False
 
-    def lock(self) -> bool:
-        """Take the exclusive lock; False while a reader uses the message."""
+    @classmethod
+    def create(cls, number: int, size: int, publisher: bytes) -> Slot:
+        """A publisher's slot for messages of ``size`` bytes and a little more: compressed images vary in size.
+
+        Raises:
+            OSError: the machine does not have that much free memory.
+        """
+        length = -(-(size * 9 // 8 + _PAYLOAD_AT) // _STEP) * _STEP
+        slot = cls(_sealed(length), mmap.PROT_READ | mmap.PROT_WRITE, number)
         try:
-            fcntl.flock(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.fcntl(slot.fd, fcntl.F_ADD_SEALS, _F_SEAL_FUTURE_WRITE)
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # kernels before 5.1 do not support this seal
+                raise
+        _SLOT.pack_into(slot._map, 0, 0, publisher)
+        return slot
+
+    @classmethod
+    def open(cls, pid: int, fd: int, publisher: bytes) -> Slot:
+        """Another process's slot, read-only.
+
+        Raises:
+            FileNotFoundError: the slot is gone.
+            OSError: it cannot be opened or mapped.
+        """
+        slot = cls(_open_sealed(pid, fd, _PAYLOAD_AT), mmap.PROT_READ)
+        if _SLOT.unpack_from(slot._map)[1] != publisher:
+            raise FileNotFoundError(errno.ENOENT, "a slot of another publisher")
+        return slot
+
+    @property
+    def sequence(self) -> int:
+        """Sequence of the message in the slot; 0 while one is being written."""
+        return int(_SLOT.unpack_from(self._map)[0])
+
+    def lock(self, kind: int = fcntl.LOCK_EX) -> bool:
+        """Take the lock; False while another process holds it."""
+        try:
+            fcntl.flock(self.fd, kind | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         return True
 
+    def unlock(self) -> None:
+        fcntl.flock(self.fd, fcntl.LOCK_UN)
+
     def begin(self, size: int) -> memoryview:
         """Memory for the next message of ``size`` bytes, under the lock; the previous message becomes invalid."""
-        struct.pack_into("<Q", self._map, 0, 0)
-        self.sequence = 0
+        self.finish(0)
         return memoryview(self._map)[_PAYLOAD_AT : _PAYLOAD_AT + size]
 
     def finish(self, sequence: int) -> None:
         """Mark the message as complete."""
         struct.pack_into("<Q", self._map, 0, sequence)
-        self.sequence = sequence
 
-    def unlock(self) -> None:
-        fcntl.flock(self.fd, fcntl.LOCK_UN)
+    def lease(self, sequence: int, size: int) -> bool:
+        """Lock the slot for reading; False, and not locked, when it does not hold this message any more."""
+        if self.held or size > self.capacity or not self.lock(fcntl.LOCK_SH):
+            return False
+        self.held = self.sequence == sequence
+        if not self.held:
+            self.unlock()
+        return self.held
+
+    def release(self) -> None:
+        """End the lease."""
+        self.unlock()
+        self.held = False
 
     def view(self, size: int) -> memoryview:
         """Read-only view of the message."""
         return memoryview(self._map)[_PAYLOAD_AT : _PAYLOAD_AT + size].toreadonly()
 
     def close(self) -> None:
-        """Release the publisher's share; readers keep theirs."""
-        os.close(self.fd)
-        with contextlib.suppress(BufferError):  # a view is still being sent; the memory is freed with it
-            self._map.close()
+        """Close the descriptor, and with it the lock; views keep the memory, and other processes their share."""
+        fd, self.fd = getattr(self, "fd", -1), -1
+        if fd >= 0:
+            os.close(fd)
+
+    __del__ = close
 
 
 class SlotPool:
@@ -185,7 +224,7 @@ class SlotPool:
         if len(self.slots) >= most or sum(slot.capacity for slot in self.slots) + size > self._most_bytes:
             return None
         self._next += 1
-        slot = Slot(self._next, size, self._publisher)
+        slot = Slot.create(self._next, size, self._publisher)
         slot.lock()
         self.slots.append(slot)
         return slot
@@ -195,64 +234,6 @@ class SlotPool:
         for slot in self.slots:
             slot.close()
         self.slots.clear()
-
-
-class SlotMapping:
-    """A publisher's slot on the reader's side, read-only.
-
-    Args:
-        pid, fd: process and descriptor of the slot.
-        publisher: 8 bytes that identify the publisher.
-
-    Raises:
-        FileNotFoundError: the slot is gone.
-        OSError: it cannot be opened or mapped.
-    """
-
-    def __init__(self, pid: int, fd: int, publisher: bytes) -> None:
-        self.held = False
-        self._fd = _open_sealed(pid, fd, _PAYLOAD_AT)
-        try:
-            self._length = os.fstat(self._fd).st_size
-            self._map = mmap.mmap(self._fd, self._length, mmap.MAP_SHARED | mmap.MAP_POPULATE, mmap.PROT_READ)
-            if _SLOT.unpack_from(self._map)[1] != publisher:
-                raise FileNotFoundError(errno.ENOENT, "a slot of another publisher")
-        except BaseException:
-            os.close(self._fd)
-            self._fd = -1
-            raise
-
-    @property
-    def sequence(self) -> int:
-        """Sequence of the message in the slot; 0 while one is being written."""
-        return int(_SLOT.unpack_from(self._map)[0])
-
-    def lease(self, sequence: int, size: int) -> bool:
-        """Lock the slot; False, and not locked, when it does not hold this message any more."""
-        if self.held or _PAYLOAD_AT + size > self._length:
-            return False
-        try:
-            fcntl.flock(self._fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:  # the publisher is writing the next message
-            return False
-        self.held = True
-        if self.sequence == sequence:
-            return True
-        self.release()
-        return False
-
-    def release(self) -> None:
-        fcntl.flock(self._fd, fcntl.LOCK_UN)
-        self.held = False
-
-    def view(self, size: int) -> memoryview:
-        """Read-only view of the message."""
-        return memoryview(self._map)[_PAYLOAD_AT : _PAYLOAD_AT + size]
-
-    def __del__(self) -> None:
-        """Close the descriptor, and with it the lock; the last view has gone."""
-        if getattr(self, "_fd", -1) >= 0:
-            os.close(self._fd)
 
 
 class ProgressPage:
@@ -285,11 +266,10 @@ class ProgressPage:
         """Note that the message of this sequence, and all before it, have been looked at."""
         place = self._places.get(publisher)
         if place is None:
-            taken = set(self._places.values())
-            place = next((k for k in range(_ENTRIES) if k not in taken), None)
-            if place is None:
+            free = set(range(_ENTRIES)) - set(self._places.values())
+            if not free:
                 return
-            self._places[publisher] = place
+            place = self._places[publisher] = min(free)
         _ENTRY.pack_into(self._memory, place * _ENTRY.size, publisher, sequence)
 
     def forget(self, publisher: bytes) -> None:

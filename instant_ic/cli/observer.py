@@ -37,13 +37,13 @@ class Observer:
     def __init__(self, topics: str | Sequence[str], use_sim_time: bool = False, run_dir: Path | None = None) -> None:
         names = [topics] if isinstance(topics, str) else list(topics)
         self.topics = list(dict.fromkeys(absolute(name) for name in names))
-        self.clock: Clock = ManualClock() if use_sim_time else SystemClock()
         self._run_dir = run_dir or paths.run_dir()
         registry.prepare(self._run_dir)  # checks its owner before any content is used
         try:
             pace.use(pace.read(self._run_dir))
         except pace.PaceError as error:
             raise registry.RegistryError(str(error)) from error
+        self.clock: Clock = ManualClock() if use_sim_time else SystemClock()
         self.received = 0
         """Messages yielded by :meth:`batches`."""
         self._ready = threading.Event()

@@ -23,11 +23,12 @@ _POINT_FIELD_TYPES = {
     1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8",
 }  # fmt: skip
 _POINT_FIELD_CODES = {np.dtype(v): k for k, v in _POINT_FIELD_TYPES.items()}
-_IMAGE_DTYPES = {
+_IMAGE_CODES = {
     "mono8": ("u1", 1), "8UC1": ("u1", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3), "8UC3": ("u1", 3),
     "rgba8": ("u1", 4), "bgra8": ("u1", 4), "mono16": ("<u2", 1), "16UC1": ("<u2", 1),
     "32FC1": ("<f4", 1), "32FC3": ("<f4", 3), "64FC1": ("<f8", 1),
 }  # fmt: skip
+_IMAGE_DTYPES = {encoding: (np.dtype(code), channels) for encoding, (code, channels) in _IMAGE_CODES.items()}
 
 
 # -- time and header -----------------------------------------------------------------------------
@@ -70,17 +71,17 @@ def image_message(array: NDArray[Any], encoding: str, frame_id: str, stamp: int)
         raise MessageError(f"image encoding {encoding!r} is not one of {', '.join(_IMAGE_DTYPES)}")
     dtype, channels = _IMAGE_DTYPES[encoding]
     shape_fits = array.ndim == 2 if channels == 1 else array.ndim == 3 and array.shape[2] == channels
-    if not shape_fits or array.dtype != np.dtype(dtype):
+    if not shape_fits or array.dtype != dtype:
         raise MessageError(f"array {array.shape} {array.dtype} does not fit encoding {encoding}")
     height, width = array.shape[:2]
-    data = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+    data = array.ravel().view(np.uint8)
     return message_type("Image")(
         header=header(frame_id, stamp),
         height=height,
         width=width,
         encoding=encoding,
         is_bigendian=0,
-        step=width * channels * np.dtype(dtype).itemsize,
+        step=width * channels * dtype.itemsize,
         data=data,
     )
 
@@ -93,20 +94,17 @@ def image_array(message: Any) -> NDArray[Any]:
     """
     if message.encoding not in _IMAGE_DTYPES:
         raise MessageError(f"image encoding {message.encoding!r} is not one of {', '.join(_IMAGE_DTYPES)}")
-    dtype_name, channels = _IMAGE_DTYPES[message.encoding]
-    dtype = np.dtype(dtype_name)
+    dtype, channels = _IMAGE_DTYPES[message.encoding]
     if message.is_bigendian and dtype.itemsize > 1:
         raise MessageError("big-endian images are not supported: send them little-endian")
     row = message.width * channels * dtype.itemsize
-    data = np.asarray(message.data)
-    if message.step < row or data.size < message.step * message.height:
-        raise MessageError(
-            f"image {message.width}×{message.height} {message.encoding} with step {message.step} "
-            f"has only {data.size} bytes"
-        )
-    rows = data[: message.step * message.height].reshape(message.height, message.step)[:, :row]
-    array = np.ascontiguousarray(rows).view(dtype)
-    return array if channels == 1 else array.reshape(message.height, message.width, channels)
+    data, height, width, step = message.data, message.height, message.width, message.step
+    if step < row or data.size < step * height:
+        raise MessageError(f"image {width}×{height} {message.encoding} with step {step} has only {data.size} bytes")
+    shape, strides = (height, width, channels), (step, channels * dtype.itemsize, dtype.itemsize)
+    end = None if channels > 1 else 2
+    array: NDArray[Any] = np.ndarray(shape[:end], dtype, data, 0, strides[:end])
+    return array if step == row else np.ascontiguousarray(array)
 
 
 def compressed_image_message(

@@ -87,6 +87,16 @@ class Definition:
 
         return generate_deserialize_cdr(self.fields, self._store, "be")
 
+    def deserialize(self, data: bytes | memoryview) -> Any:
+        """Return the message in CDR bytes; raises what generated code raises on wrong bytes."""
+        if len(data) < 4 or data[0] or data[1] > 1:
+            raise ValueError("no header of plain CDR")
+        read = self.deserialize_cdr_le if data[1] else self.deserialize_cdr_be
+        message, end = read(data[4:], 0, self.cls, self._store)
+        if end + 4 + 3 < len(data):  # CDR may pad by up to 3 bytes
+            raise ValueError(f"{len(data) - end - 4} bytes are left over")
+        return message
+
 
 class TypeIndex:
     """Definitions by full name."""
@@ -107,17 +117,6 @@ class TypeIndex:
         if found is None:
             found = self._definitions[name] = Definition(name, self.entries[name], self)
         return found
-
-    def deserialize_cdr(self, data: bytes | memoryview, name: str) -> Any:
-        """Return the message in CDR bytes; raises what generated code raises on wrong bytes."""
-        if len(data) < 4 or bytes(data[:2]) not in (b"\x00\x00", b"\x00\x01"):
-            raise ValueError("no header of plain CDR")
-        definition = self.get_msgdef(name)
-        read = definition.deserialize_cdr_le if data[1] else definition.deserialize_cdr_be
-        message, end = read(data[4:], 0, definition.cls, self)
-        if end + 4 + 3 < len(data):  # CDR may pad by up to 3 bytes
-            raise ValueError(f"{len(data) - end - 4} bytes are left over")
-        return message
 
 
 def entries_of(store: Typestore, names: set[str] | None = None) -> dict[str, Entry]:

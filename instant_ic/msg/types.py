@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from instant_ic.msg.store import TypeIndex, entries_of, read_entries
+from instant_ic.msg.store import Definition, TypeIndex, entries_of, read_entries
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 DEFINITIONS = Path(__file__).resolve().parent / "definitions"
 
-_LARGE = 1 << 14  # below this size, clearing the whole message is faster than finding out which parts need it
+_LARGE = 1 << 16  # below this size, clearing the whole message is faster than finding out which parts need it
 
 # Short names that several packages of Jazzy share, with the type that this stack means.
 _PREFERRED = {
@@ -147,8 +147,8 @@ def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
         rest = size
         if size >= _LARGE:
             rest -= max((v.nbytes for v in vars(message).values() if isinstance(v, np.ndarray)), default=0)
-        zeros = bytes(rest)
-        target[:rest], target[size - rest :] = zeros, zeros
+            target[size - rest :] = bytes(rest)
+        target[:rest] = bytes(rest)
         target[1] = 1  # little-endian
         try:
             end = definition.serialize_cdr_le(target[4:], 0, message, store)
@@ -170,12 +170,17 @@ def deserialize(data: bytes | bytearray | memoryview, name: str) -> Any:
     Raises:
         MessageError: unknown type, or the bytes are truncated or of another type.
     """
-    full = type_name(message_type(name))
-    view = data if isinstance(data, (bytes, memoryview)) else memoryview(data)
+    definition = _definition(name)
     try:
-        return _index().deserialize_cdr(view, full)
+        return definition.deserialize(data if isinstance(data, (bytes, memoryview)) else memoryview(data))
     except Exception as error:  # generated code may raise struct, index, unicode or value errors on foreign bytes
+        full = type_name(definition.cls)
         raise MessageError(f"{len(data)} bytes are not a {full}: {type(error).__name__}: {error}") from error
+
+
+@functools.cache
+def _definition(name: str) -> Definition:
+    return _index().get_msgdef(type_name(message_type(name)))
 
 
 def _first_bad_field(message: Any) -> str | None:

@@ -421,7 +421,7 @@ def test_reader_that_cannot_map_memory_asks_for_bytes(
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOMEM, "Cannot allocate memory")
 
-    monkeypatch.setattr("instant_ic.bus.local_subscription.SlotMapping", refuse)
+    monkeypatch.setattr("instant_ic.bus.local_subscription.Slot.open", refuse)
     out, reader = bus.publisher(qos=LATCHED), bus.reader()
     wait_for(lambda: out.subscriber_count == 1)
     out.send(numbered(1, LARGE))
@@ -588,4 +588,4 @@ def test_large_messages_through_the_socket_are_bounded_in_bytes(bus: Bus, monkey
     monkeypatch.setattr(out, "_progress", {b"": SimpleNamespace(sequence=lambda: 0, newest_only=False)})  # stopped
     for i in range(1, 200):
         out.send(numbered(i, 1 << 20))
-    assert out._inlined_bytes <= 128 << 20
+    assert sum(size for _, size in out._inlined) <= 128 << 20

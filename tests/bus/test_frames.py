@@ -24,7 +24,7 @@ from instant_ic.bus.frame import (
     type_digest,
     unpack_header,
 )
-from instant_ic.bus.shm import PeerProgress, ProgressPage, Slot, SlotMapping, SlotPool
+from instant_ic.bus.shm import PeerProgress, ProgressPage, Slot, SlotPool
 
 ID = b"publishr"
 
@@ -145,7 +145,7 @@ def written(pool: SlotPool, sequence: int, size: int = LARGE, must: int = 99, sh
 def test_slot_is_refilled_only_when_nobody_uses_or_still_wants_it() -> None:
     pool = SlotPool(ID)
     first = written(pool, 1)
-    reader = SlotMapping(os.getpid(), first.fd, ID)
+    reader = Slot.open(os.getpid(), first.fd, ID)
     assert reader.lease(1, LARGE)
     second = written(pool, 2)
     assert second is not first  # in use
@@ -169,11 +169,11 @@ def test_larger_message_takes_a_new_slot_and_drops_the_small() -> None:
 
 
 def test_mapping_is_read_only_sealed_and_checks_the_size() -> None:
-    slot = Slot(1, LARGE, ID)
+    slot = Slot.create(1, LARGE, ID)
     with slot.begin(LARGE) as target:
         target[:] = numbered(5, LARGE)
     slot.finish(5)
-    mapping = SlotMapping(os.getpid(), slot.fd, ID)
+    mapping = Slot.open(os.getpid(), slot.fd, ID)
     assert mapping.lease(5, slot.capacity)
     mapping.release()
     assert not mapping.lease(5, slot.capacity + 1) and not mapping.lease(4, LARGE)
@@ -186,16 +186,16 @@ def test_mapping_is_read_only_sealed_and_checks_the_size() -> None:
     with pytest.raises(OSError):
         mmap.mmap(slot.fd, 4096, mmap.MAP_SHARED, mmap.PROT_WRITE)
     with pytest.raises(FileNotFoundError):
-        SlotMapping(os.getpid(), slot.fd, b"somebody")
+        Slot.open(os.getpid(), slot.fd, b"somebody")
     assert mapping.lease(5, LARGE)
     slot.close()
     assert mapping.view(LARGE) == numbered(5, LARGE)  # the reader's share stays
 
 
 def test_writer_killed_in_a_slot_leaves_no_message_in_it() -> None:
-    slot = Slot(1, LARGE, ID)
+    slot = Slot.create(1, LARGE, ID)
     slot.finish(5)
-    mapping = SlotMapping(os.getpid(), slot.fd, ID)
+    mapping = Slot.open(os.getpid(), slot.fd, ID)
     assert slot.lock()
     slot.begin(LARGE).release()
     assert not mapping.lease(5, LARGE)  # being written

@@ -301,7 +301,7 @@ def test_an_event_that_is_written_late_ends_one_wait_not_all(bus):
     transport = bus.node("reader")
     waker = transport.waker()
     ends: list[None] = []
-    os.eventfd_write(waker.fd, 1)
+    os.eventfd_write(transport._wake, 1)
     deadline = time.monotonic() + 0.3
     while time.monotonic() < deadline:
         waker.wait(0.1)
@@ -319,8 +319,8 @@ def test_an_event_during_a_long_callback_does_not_keep_the_bus_thread_busy(bus, 
     waker.wait(0.01)
     wait_for(lambda: transport._bus_reads)  # the callback has become long
     rounds: list[None] = []
-    drain = transport._drain
-    monkeypatch.setattr(transport, "_drain", lambda *args: (rounds.append(None), drain(*args)))
+    read = transport._read
+    monkeypatch.setattr(transport, "_read", lambda *args, **names: (rounds.append(None), read(*args, **names)))
     publisher.send(b"first")  # the bus thread reads it and sets the event
     wait_for(lambda: waker.is_set())
     time.sleep(0.2)

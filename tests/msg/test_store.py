@@ -35,7 +35,7 @@ def test_messages_have_the_bytes_of_rosbags_in_both_byte_orders() -> None:
     index = TypeIndex(entries_of(typestore()))
     for little_endian in (True, False):
         data = typestore().serialize_cdr(scan, "sensor_msgs/msg/LaserScan", little_endian=little_endian)
-        back = index.deserialize_cdr(data, "sensor_msgs/msg/LaserScan")
+        back = index.get_msgdef("sensor_msgs/msg/LaserScan").deserialize(data)
         assert (back.header.stamp.nanosec, back.header.frame_id) == (7, "velodyne")
         assert np.array_equal(back.ranges, scan.ranges)
 
