@@ -8,6 +8,7 @@ import pytest
 from console_pages import BROWSER_TEST, WAIT_MS, expect_body, likeness_of, make_demo, picture_of, room_seen, wait_until
 
 from instant_ic.console import FrameKind
+from instant_ic.geometry.poses import quaternion_from_matrix
 
 pytestmark = BROWSER_TEST
 KEYFRAME = np.array([1.6, 0.2, 0.3])  # a box is 1.4 m ahead
@@ -15,7 +16,7 @@ DRAWN = """
     window.drawn = [];
     addEventListener("rendered", ({detail: {place, pose, blend}}) => drawn.push({place, pose, blend}));
 """
-SLOW_DISSOLVE = {"dissolve_ms": 60_000, "colour_release_s": 0, "ease_ms": 0}
+SLOW_DISSOLVE = {"colour_release_s": 0, "ease_ms": 0}
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +69,15 @@ def test_the_view_is_the_room_seen_from_the_vbot_and_no_view_is_requested(open_p
     wait_until(lambda: demo.server.drawn_ms() > drawn, page, "reports of what is shown")
 
 
-def test_the_dissolve_mixes_two_views_of_the_same_place(open_page, room):
+# The second with the camera's image by its depth; few frames a second, each no more than 0.2 s of the dissolve.
+@pytest.mark.parametrize(("query", "dissolve_ms"), [("", 60_000), ("?quality=full", 8_000)])
+def test_the_dissolve_mixes_two_views_of_the_same_place(open_page, room, query, dissolve_ms):
     demo = room
     demo.place(*KEYFRAME)
     demo.forced_mode = "real"
-    demo.server.page |= SLOW_DISSOLVE
+    demo.server.page |= SLOW_DISSOLVE | {"dissolve_ms": dissolve_ms}
     try:
-        page = open_layers(open_page, demo)
+        page = open_layers(open_page, demo, query)
         wait_until(lambda: not demo.server.needs_views(), page, "the layers")
         expect_body(page, "image", "live")
         demo.forced_mode = "virtual"
@@ -133,40 +136,61 @@ def test_the_cameras_image_is_shown_from_where_the_robot_is_now_until_a_key_swit
         page.wait_for_timeout(400)
         room_there = room_seen(there, 0.0, demo.look.pitch)
         demo.place(*there)
-        wait_until(lambda: psnr_db(picture_of(page), room_there) > 30, page, "the image by its depth")
+        header = {
+            "q": quaternion_from_matrix(demo._panorama_camera).tolist(),
+            "p": demo._panorama_camera[:3, 3].tolist(),
+        }
+
+        def shown_db():
+            """PSNR of an image as if it had just been taken at the keyframe's place."""
+            now_ms = demo.server.now_ms()
+            demo.server.send_frame(FrameKind.PANORAMA, {"captured_ms": now_ms} | header, demo._panorama)
+            page.wait_for_timeout(100)
+            return psnr_db(picture_of(page), room_there)
+
+        wait_until(lambda: shown_db() > 30, page, "the image by its depth")
         page.keyboard.press("v")
-        wait_until(lambda: psnr_db(picture_of(page), room_there) < 25, page, "the image as it was taken")
+        wait_until(lambda: shown_db() < 25, page, "the image as it was taken")
         at_keyframe = room_seen(tuple(KEYFRAME), 0.0, demo.look.pitch)
         assert psnr_db(picture_of(page), at_keyframe) > 30
     finally:
         demo.forced_mode, demo.images = "virtual", True
 
 
-# The robot drives at 0.3 m/s. Images come each 0.2 s, 0.1 s old; from 1 s on it is in ENTERING, from 2 s on in VIRTUAL.
+# The robot drives at 0.3 m/s. Images come each 0.2 s, 0.1 s old; from 1 s on it is in ENTERING, from 2 s on in VIRTUAL,
+# where the v-bot starts 3 cm back: where the shown image was taken. From 3 s on no image comes.
 GLIDE = """async () => {
     const {Images} = await import("/static/images.js");
     let now = 0;
     const viewer = {name: "webgl", slow: false, lost: false, sample() {}};
-    const images = new Images(viewer, {serverNow: () => now, roundTripMs: 10, connected: true, acknowledge() {}});
+    const images = new Images(viewer, {serverNow: () => now, roundTripMs: 0, connected: true, acknowledge() {}});
     images.layers = {version: 1, mount: [0.1, 0, 1.2]};
     images.colourReleaseMs = 0;
-    const places = [], at = (ms) => 0.0003 * ms, q = [0, 0, 0, 1];
-    for (; now < 2500; now += 10) {
-        if (now % 200 === 0) images.panorama = {q, p: [0.1 + at(now - 100), 0, 1.2], captured_ms: now - 100};
+    const frames = [], at = (ms) => 0.0003 * ms, q = [0, 0, 0, 1];
+    for (; now < 5000; now += 10) {
+        if (now % 200 === 0 && now < 3000)
+            images.panorama = {q, p: [0.1 + at(now - 100), 0, 1.2], captured_ms: now - 100};
         const mode = now < 1000 ? "real" : now < 2000 ? "entering" : "virtual", shown = now < 2000 ? "real" : "virtual";
-        const pose = [at(now), 0, 0], state = {at_ms: now, mode, shown, robot: pose, vbot: pose, twist: [0.3, 0]};
-        const {glide} = images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
-        places.push(glide && glide.to[0]);
+        const robot = [at(now), 0, 0], vbot = [at(now) - 0.03, 0, 0];
+        const state = {at_ms: now, mode, shown, robot, vbot, twist: [0.3, 0]};
+        const {glide, camera, blend} = images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
+        frames.push([glide ? glide.to[0] : NaN, camera.position[0], blend]);
     }
-    return places;
+    return frames.map((frame) => frame.map((value) => Number.isNaN(value) ? -1 : value));
 }"""
 
 
-def test_the_shown_place_goes_steadily_and_is_the_images_own_before_a_switch(open_page, room):
-    places = open_layers(open_page, room).evaluate(GLIDE)
-    steady = np.array(places[40:100])
-    assert steady == pytest.approx(0.1 + 0.003 * np.arange(40, 100), abs=0.001)  # 10 ms at 0.3 m/s, no steps of 6 cm
-    assert places[135:] == [None] * len(places[135:])  # 0.3 s after the change of mode: as it was taken
+def test_the_shown_place_goes_steadily_also_through_a_switch_and_an_old_image_stays(open_page, room):
+    frames = np.array(open_layers(open_page, room).evaluate(GLIDE))
+    steady = frames[40:200, 0]
+    assert steady == pytest.approx(0.1 + 0.003 * np.arange(40, 200), abs=0.001)  # 10 ms at 0.3 m/s, no steps of 6 cm
+    mixed = frames[(frames[:, 2] > 0) & (frames[:, 2] < 1)]
+    assert len(mixed) > 10
+    assert mixed[:, 0] == pytest.approx(mixed[:, 1])  # both from one place
+    steps = np.diff(frames[190:260, 1])
+    assert 0.001 < steps.min() and steps.max() < 0.0035  # the 3 cm go within 0.4 s
+    assert frames[260, 1] == pytest.approx(0.1 + 0.003 * 260 - 0.03, abs=0.001)
+    assert (frames[410:, 0] == -1).all()  # the last image is more than 1 s old
 
 
 # A v-bot at rest; the last state is 20 ms old when the operator's key goes down, and no other one comes.

@@ -40,7 +40,7 @@ const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
 const RELEASE_STEP_MS = 100; // the matched colour fades in steps too small to be seen
 const LAYERS_MS = 5000; // longest wait for the layers of a new link
 const ELSEWHERE_M = 0.5; // a camera image taken farther away is shown as it was taken
-const GLIDE_MS = 300; // time in which the camera's image comes to the robot's present place, and goes back
+const FROZEN_MS = 1000; // an older one too
 const LEAD_MS = 800; // time after a switch in which the way of a command to the robot comes to be predicted
 
 export class Images {
@@ -80,7 +80,6 @@ export class Images {
     /** @type {[number, number] | null} Position of the real robot's camera in the last scene, if it was shown. */
     this._followed = null;
     this._lead = 0; // share of the time that a command takes to the robot which is predicted
-    this._glide = 0; // 0: the place where the camera's image was taken, 1: the robot's present place
     this._virtual = false;
     // Time since which images of each kind are made at the shown robot; server's clock.
     this._since = { [PANORAMA]: 0, [VIEW]: 0 };
@@ -244,6 +243,7 @@ export class Images {
     /** @param {[number, number, number, number]} q */
     const relative = (q) => multiply(transpose(fromQuaternion(q)), mapFromLook);
     const q = this.motion.yaw === null ? null : this.panorama?.q;
+    const glide = this._glided(state);
     const viewTan = this.view ? Math.tan(this.view.fov / 2) : 1;
     /** @type {Scene} */
     const scene = {
@@ -252,8 +252,8 @@ export class Images {
       panoramaFromLook: q ? relative(q) : lookTurn,
       viewFromLook: this.view ? relative(this.view.q) : identity,
       viewTanHalf: [viewTan, viewTan / (this.view?.aspect ?? 1)],
-      glide: this._glided(state, elapsedMs),
-      camera: this.layers && this.rendersLayers ? this._camera(this.layers, mapFromLook, tanHalf) : null,
+      glide,
+      camera: this.layers && this.rendersLayers ? this._camera(this.layers, mapFromLook, tanHalf, glide) : null,
       blend: this.blend * this.blend * (3 - 2 * this.blend),
       panoramaColour: plain,
       viewColour: plain,
@@ -266,28 +266,27 @@ export class Images {
   }
 
   /**
-   * Where the camera's image is shown from: from the robot's present place, by the depth of the layers, so that few images
-   * a second look smooth. Near a switch, and while two images dissolve, each is where it was made.
-   * @param {State | null} state @param {number} elapsedMs @returns {Glide | null}
+   * Where the camera's image is shown from: from the shown robot's present place, by the depth of the layers, so that few
+   * images a second look smooth; null: as it was taken. An old image does not move: it must not look like a new one.
+   * @param {State | null} state @returns {Glide | null}
    */
-  _glided(state, elapsedMs) {
-    const { panorama, layers } = this, { own } = this.motion;
-    const wanted = this.glides && state?.mode === "real" && this.blend === 0;
-    this._glide = this.blend > 0 ? 0 : ramp(this._glide, wanted, elapsedMs / GLIDE_MS);
-    if (this._glide === 0 || !panorama?.q || !panorama.p || !own || !layers || !this.rendersLayers) return null;
-    const [x, y] = rotate(rotationZ(own[2]), layers.mount), [px, py, pz] = panorama.p;
-    const way = [own[0] + x - px, own[1] + y - py];
-    if (Math.hypot(...way) > ELSEWHERE_M) return null;
+  _glided(state) {
+    const { panorama, layers } = this, { pose } = this.motion;
+    if (!this.glides || !panorama?.q || !panorama.p || !pose || !layers || !this.rendersLayers) return null;
+    if (state && state.at_ms - panorama.captured_ms > FROZEN_MS) return null;
+    const [x, y] = rotate(rotationZ(pose[2]), layers.mount), [px, py, pz] = panorama.p;
+    if (Math.hypot(pose[0] + x - px, pose[1] + y - py) > ELSEWHERE_M) return null;
     const from = { mapFromCamera: fromQuaternion(panorama.q), position: panorama.p };
-    return { from, to: [px + this._glide * way[0], py + this._glide * way[1], pz] };
+    return { from, to: [pose[0] + x, pose[1] + y, pz] };
   }
 
   /**
-   * The v-bot's camera; null: its pose is unknown. Once the real robot is shown again, it goes on from where it was with
+   * The v-bot's camera; null: its pose is unknown. Where the camera's image glides, both are shown from one place. Else, once the real robot is shown again, it goes on from where it was with
    * that robot, so that both images of the dissolve move alike.
-   * @param {LayersHeader} layers @param {Mat3} mapFromLook @param {[number, number]} tanHalf @returns {Camera | null}
+   * @param {LayersHeader} layers @param {Mat3} mapFromLook @param {[number, number]} tanHalf @param {Glide | null} glide
+   * @returns {Camera | null}
    */
-  _camera({ mount }, mapFromLook, tanHalf) {
+  _camera({ mount }, mapFromLook, tanHalf, glide) {
     const { own } = this.motion, before = this._followed;
     if (own) {
       const [dx, dy] = rotate(rotationZ(own[2]), mount), x = own[0] + dx, y = own[1] + dy;
@@ -295,6 +294,7 @@ export class Images {
       else if (before) this._now = [this._now[0] + x - before[0], this._now[1] + y - before[1]];
       this._followed = this._virtual ? null : [x, y];
     }
+    if (glide) this._now = [glide.to[0], glide.to[1]];
     if (!this._now) return null;
     this.place = this._now;
     return { mapFromLook, position: [...this._now, mount[2]], tanHalf };

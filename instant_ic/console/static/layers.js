@@ -160,8 +160,9 @@ export class LayerRenderer {
    * @param {Camera} camera @param {number} width @param {number} height
    * @param {Colour} tint gain and offset of the colours
    * @param {Photo | null} photo takes the place of the layers' own colours, and of guesses
+   * @param {boolean} mixed blending is on: each pixel is written once, the nearest surface found before
    */
-  render(camera, width, height, tint, photo = null) {
+  render(camera, width, height, tint, photo = null, mixed = false) {
     const gl = this._gl, program = this._program, at = this._at;
     gl.viewport(0, 0, width, height);
     gl.useProgram(program);
@@ -197,7 +198,16 @@ export class LayerRenderer {
       gl.uniform3fv(at("imagePosition"), rotate(panoramaFromMap, [cx - px, cy - py, cz - pz]));
       gl.uniform1i(at("soft"), Number(surface.confidence !== null));
       gl.bindVertexArray(vertices);
+      if (mixed) {
+        gl.colorMask(false, false, false, false);
+        gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
+        gl.colorMask(true, true, true, true);
+        gl.depthFunc(gl.EQUAL);
+        gl.stencilFunc(gl.EQUAL, 1 << k, (2 << k) - 1);
+        gl.stencilOp(gl.KEEP, gl.KEEP, gl.KEEP);
+      }
       gl.drawElements(gl.TRIANGLES, count, gl.UNSIGNED_INT, 0);
+      gl.depthFunc(gl.LESS);
     });
     gl.bindVertexArray(null);
     gl.disable(gl.DEPTH_TEST);

@@ -93,7 +93,7 @@ export class GlViewer {
     const gl = this.gl, { width, height } = this.canvas;
     if (scene.blend > 0) this._renderVirtual(scene, width, height, scene.viewColour);
     if (scene.blend < 1) {
-      // Over the virtual space: each pixel is rendered once, so it may be mixed at once.
+      // Over the virtual space.
       if (scene.blend > 0) gl.enable(gl.BLEND);
       gl.blendColor(0, 0, 0, 1 - scene.blend);
       gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
@@ -145,7 +145,10 @@ export class GlViewer {
     const { glide, mapFromLook, tanHalf } = scene, image = this._panorama;
     this.gl.viewport(0, 0, width, height);
     if (!glide || !this._renderer.ready) this._renderer.renderFar(image, scene.panoramaFromLook, tanHalf, colour);
-    else this._renderer.render({ mapFromLook, position: glide.to, tanHalf }, width, height, colour, { image, ...glide.from });
+    else {
+      const camera = { mapFromLook, position: glide.to, tanHalf };
+      this._renderer.render(camera, width, height, colour, { image, ...glide.from }, this.gl.isEnabled(this.gl.BLEND));
+    }
   }
 
   /** @param {Scene} scene @param {number} width @param {number} height @param {Colour} colour */
