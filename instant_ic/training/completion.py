@@ -24,7 +24,8 @@ MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 40.0
 _TYPICAL_LOG_M = 0.9
 """Logarithm of a room's typical depth, where an image without any prior starts."""
 _START_GATE = 3.0
-_START_LOG_SIGMA = -3.0
+_UNKNOWN_LOG_SIGMA = -1.0
+"""Where there is no prior, whose sigma is the start elsewhere."""
 
 # Blocks of EfficientNet-lite0: repeats, kernel, stride, expansion, outputs. Stem and last stage are fixed in "lite".
 _STAGES = (
@@ -200,7 +201,7 @@ class CompletionNet(nn.Module):
         nn.init.zeros_(self.head.weight)
         nn.init.normal_(self.encoder.geometry.weight, std=0.02)
         with torch.no_grad():  # the network starts as the prior
-            start = torch.tensor([0.0, _TYPICAL_LOG_M, _START_GATE, _START_LOG_SIGMA])
+            start = torch.tensor([0.0, _TYPICAL_LOG_M, _START_GATE, 0.0])
             assert self.head.bias is not None
             self.head.bias.copy_(start.repeat_interleave(4))
 
@@ -210,10 +211,11 @@ class CompletionNet(nn.Module):
         log_prior = torch.where(depth > 0, depth.clamp(MIN_DEPTH_M, MAX_DEPTH_M), torch.ones_like(depth)).log()
         shown = (floor > 0).to(image.dtype)
         log_floor = torch.where(floor > 0, floor.clamp(MIN_DEPTH_M, MAX_DEPTH_M), torch.ones_like(floor)).log()
-        log_sigma = (sigma.clamp(0.003, 1.0).log() + 3.0) * known
+        log_sigma = sigma.clamp(0.003, 1.0).log()
         geometry = torch.stack(
-            (known, (log_prior - 1.0) * known, 0.5 * log_sigma, measured, rise, shown, (log_floor - 1.0) * shown,
-             (log_prior - log_floor) * known * shown, 0.4 * log_prior.exp() * rise * known),
+            (known, (log_prior - 1.0) * known, 0.5 * (log_sigma + 3.0) * known, measured, rise,
+             shown, (log_floor - 1.0) * shown, (log_prior - log_floor) * known * shown,
+             0.4 * log_prior.exp() * rise * known),
             dim=1,
         )  # fmt: skip
         colours = (image - _IMAGE_MEAN) / _IMAGE_STD
@@ -229,7 +231,7 @@ class CompletionNet(nn.Module):
         share = torch.sigmoid(gate) * known
         log_depth = share * (log_prior + change) + (1 - share) * alone
         complete = log_depth.clamp(-2.4, 3.7).exp()
-        doubt = spread.clamp(-6.0, 1.0).exp()
+        doubt = (torch.where(depth > 0, log_sigma, _UNKNOWN_LOG_SIGMA) + spread).clamp(-6.0, 1.0).exp()
         return torch.where(measured > 0, depth, complete), torch.where(measured > 0, sigma, doubt)
 
 

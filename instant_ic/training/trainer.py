@@ -34,6 +34,10 @@ POLE_WEIGHT = 0.1
 """Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
 hardly trained, and appear as spikes above and below the camera in the point cloud.
 """
+DECODER_RATE, HEAD_RATE = 3.0, 10.0
+"""Learning rates of what starts from nothing, over that of the pretrained encoder. The head starts at 0, and Adam moves
+a weight by no more than the rate a step.
+"""
 TEAM_TIMEOUT = timedelta(minutes=20)
 """A process that waits longer for the others exits with an error."""
 
@@ -46,7 +50,7 @@ class TrainingConfig:
         minutes: wall time of the learning rate schedule, after which training ends.
         epochs: passes over the data after which training ends, if that comes first.
         batch_size: panoramas per step and process.
-        learning_rate: maximum, of AdamW.
+        learning_rate: maximum, of AdamW, for the encoder.
         weight_decay: of AdamW.
         warmup: share of the schedule in which the learning rate rises.
         average: decay of the weight average per step.
@@ -240,12 +244,15 @@ class Trainer:
         if self.team.ranks > 1:
             ids = [self.team.device.index] if self.team.device.type == "cuda" else None
             self._parallel = DistributedDataParallel(self.model, device_ids=ids)
-        decayed = [p for p in self.model.parameters() if p.ndim > 1]
-        plain = [p for p in self.model.parameters() if p.ndim <= 1]
-        self.optimizer = torch.optim.AdamW(
-            [{"params": decayed, "weight_decay": self.config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
-            lr=self.config.learning_rate,
-        )
+        groups = []
+        new = ("encoder.geometry.", "up", "slices.")
+        pretrained = ("encoder.stem.", "encoder.blocks.")
+        for faster, inside in ((1.0, pretrained), (DECODER_RATE, new), (HEAD_RATE, ("head.",))):
+            part = [p for name, p in self.model.named_parameters() if name.removeprefix("module.").startswith(inside)]
+            for decay, chosen in ((self.config.weight_decay, True), (0.0, False)):
+                parameters = [p for p in part if (p.ndim > 1) == chosen]
+                groups.append({"params": parameters, "weight_decay": decay, "faster": faster})
+        self.optimizer = torch.optim.AdamW(groups, lr=self.config.learning_rate)
         cuda = self.team.device.type == "cuda"
         self._half = torch.float16 if cuda and not torch.cuda.is_bf16_supported() else torch.bfloat16
         scales = self.config.mixed_precision and self._half == torch.float16
@@ -273,7 +280,7 @@ class Trainer:
         """
         factor = schedule(self.progress if progress is None else progress, self.config.warmup)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * factor
+            group["lr"] = self.config.learning_rate * factor * group["faster"]
         batch = to_tensors(self._ahead.batch(self.step), self.config.max_range_m, self.team.device)
         rgb, truth, prior = self._augmented(*batch)
         self.model.train()

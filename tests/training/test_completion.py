@@ -38,7 +38,8 @@ def test_untrained_network_gives_the_prior_and_a_typical_depth() -> None:
     known, unknown = np.exp(0.9526 * np.log(2) + 0.0474 * 0.9), np.exp(0.9)
     torch.testing.assert_close(depth[0, 5, 64:], torch.full((64,), float(known)), rtol=1e-4, atol=0)
     torch.testing.assert_close(depth[0, :, :64], torch.full((64, 64), float(unknown)), rtol=1e-4, atol=0)
-    assert sigma[0, 5, 100].item() == pytest.approx(np.exp(-3), rel=1e-4)
+    assert sigma[0, 5, 100].item() == pytest.approx(0.05, rel=1e-4)  # the prior's
+    assert sigma[0, 5, 10].item() == pytest.approx(np.exp(-1), rel=1e-4)
 
 
 @torch.inference_mode()
