@@ -1,4 +1,4 @@
-"""Any depth image is refused with a reason or goes through the whole chain: keyframe, occupancy, training, views."""
+"""Any depth image is refused with a reason or goes through the whole chain, from the keyframe to views and layers."""
 
 import dataclasses
 import math
@@ -19,6 +19,7 @@ from instant_ic.vspace import (
     VirtualSpaceConfig,
 )
 from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.layers import LayerEncoder, decode
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.vspace.prior import SKY, prepare
 
@@ -26,7 +27,7 @@ RGB = box_room.panorama(np.eye(4), 16).rgb
 VALUES = (0.0, 1e-30, 0.05, 0.2, 1.0, 3.0, 29.99, 30.0, 1e4, 1e30, 1e300, math.nan, math.inf, -math.inf, -1.0)
 CONFIG = VirtualSpaceConfig(
     device="cpu",
-    keyframes=3,
+    keyframes=2,  # a third one is kept, and field and warp are compared by it
     field=FieldConfig(levels=2, log2_table=10, hidden=8),
     train=TrainConfig(ray_columns=8, ray_rows=8),
     geometry=GeometryConfig(cell_m=0.2, max_cells=200_000),
@@ -57,6 +58,31 @@ def ragged_sky(height):
     return depth
 
 
+def room_but(value, rows=slice(None), columns=slice(None)):
+    """A room's depth, 32 × 64, with a value in a rectangle."""
+    depth = box_room.panorama(np.eye(4), 32).depth_m.copy()
+    depth[rows, columns] = value
+    return depth
+
+
+NAMED = {
+    "all unknown": room_but(0.0),
+    "all far": room_but(1e4),
+    "all NaN": room_but(math.nan),
+    "sky": room_but(0.0, slice(0, 14)),
+    "one pixel known": np.where(np.arange(32 * 64).reshape(32, 64) == 700, np.float32(2.0), np.float32(0.0)),
+    "one pixel unknown": room_but(0.0, 20, 30),
+    "one pixel far": room_but(1e4, 20, 30),
+    "one pixel near": room_but(0.05, 20, 30),
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_named_depth_images_among_good_ones(name):
+    chain([room_but(3.0, 20, 30), NAMED[name], room_but(2.0, 9, 9)], 0.02, 0.3)
+    chain([NAMED[name]], 0.02, 0.3)
+
+
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     depths=st.lists(depth_images(), min_size=1, max_size=3),
@@ -67,7 +93,12 @@ def ragged_sky(height):
 @example(depths=[ragged_sky(32)], sigma=0.02, step_m=0.0, robot=None)
 def test_any_depth_is_refused_or_shown(depths, sigma, step_m, robot):
     """``robot``: the first of 16 rows that show it."""
-    space = VirtualSpace(CONFIG, robot=None if robot is None else np.arange(16)[:, None].repeat(32, 1) >= robot)
+    chain(depths, sigma, step_m, None if robot is None else np.arange(16)[:, None].repeat(32, 1) >= robot)
+
+
+def chain(depths, sigma, step_m, robot=None):
+    """Keyframes of these depths, ``step_m`` apart, from their preparation to views and layers."""
+    space = VirtualSpace(CONFIG, robot=robot)
     for number, depth in enumerate(depths):
         try:
             prepared = space.prepare(RGB, depth, pose_matrix(number * step_m, 0.1, 0, yaw=number), sigma)
@@ -88,6 +119,10 @@ def test_any_depth_is_refused_or_shown(depths, sigma, step_m, robot):
         assert view.confidence.min() >= 0 and view.confidence.max() <= 1
         assert not math.isnan(view.expected_psnr_db)
     assert not math.isnan(space.expected_psnr_db(pose))
+    count = len(space.keyframes)
+    layers = LayerEncoder().encode(space.shown, range(count), [None] * count)
+    space.show(decode(layers, CONFIG.panorama_width, CONFIG.geometry))
+    assert np.isfinite(space.render(pose, 24, 16, 1.5).depth_m).all()
 
 
 def test_quads_have_no_corner_in_the_sky():
