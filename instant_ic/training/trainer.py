@@ -248,7 +248,7 @@ class Trainer:
         new = ("encoder.geometry.", "up", "slices.")
         pretrained = ("encoder.stem.", "encoder.blocks.")
         for faster, inside in ((1.0, pretrained), (DECODER_RATE, new), (HEAD_RATE, ("head.",))):
-            part = [p for name, p in self.model.named_parameters() if name.removeprefix("module.").startswith(inside)]
+            part = [p for name, p in self.model.named_parameters() if name.startswith(inside)]
             for decay, chosen in ((self.config.weight_decay, True), (0.0, False)):
                 parameters = [p for p in part if (p.ndim > 1) == chosen]
                 groups.append({"params": parameters, "weight_decay": decay, "faster": faster})
