@@ -21,6 +21,7 @@ UNSEEN, OPEN, PLATE = -2, -1, -10  # values of the index of columns
 _BESIDE_M = 0.02  # a beam that passes a column's mean at this distance says nothing about its surface
 _CROWDED_M = 1.2  # nearer, beams pass so close to each other that a quarter of them is enough
 _SHORT_OF_M = 0.12  # beams free space up to this distance before their end
+_THING_CELLS = 12  # sides of a thing take their height from columns so far away
 _MOST_POINTS = 256.0  # a column's sums are halved from here on, so that they follow changes
 
 # How a voxel of a column is known to be solid.
@@ -166,7 +167,8 @@ def solid_columns(key, odds, sums, last, now, keep, cell, ground, top, index):  
                         break
     codes = np.zeros((count, levels), np.uint8)
     faces = np.zeros((count, 6), np.float32)
-    tops = np.zeros((count, 2), np.int32)  # one past the highest measured level, first free level above
+    # One past the highest measured level, first free level above, one past the highest that beams met again and again.
+    tops = np.zeros((count, 3), np.int32)
     for a in range(n):
         for b in range(n):
             at = index[a, b]
@@ -177,12 +179,15 @@ def solid_columns(key, odds, sums, last, now, keep, cell, ground, top, index):  
                 if odds[a, b, level] < OCCUPIED:
                     continue
                 codes[at, level] = MEASURED
+                if odds[a, b, level] >= 2 * HIT:
+                    tops[at, 2] = level + 1
                 _fill_between(codes[at], odds[a, b], below, level, ground)
                 below = level
             tops[at, 0] = tops[at, 1] = below + 1
             while tops[at, 1] < levels and odds[a, b, tops[at, 1]] > FREE:
                 tops[at, 1] += 1
             _set_face(key, sums, index, a, b, cell, faces[at])
+    highest = _highest_around(key, index, tops, top)
     for a in range(n):
         for b in range(n):
             at = index[a, b]
@@ -205,11 +210,35 @@ def solid_columns(key, odds, sums, last, now, keep, cell, ground, top, index):  
             elif end >= top and ends > 2 * open_above:
                 end = tops[at, 0]
             elif end < top:
-                # It ends somewhere between the highest point and the lowest beam above.
-                end = (tops[at, 0] + end) // 2
+                # It ends somewhere between the highest point and the lowest beam above, as high as the thing around.
+                end = max((tops[at, 0] + end) // 2, highest[at])
             codes[at, tops[at, 0] : end] = UP
     _bridge(key, index, faces, cell)
     return codes, faces
+
+
+@njit(cache=True)
+def _highest_around(key, index, tops, top):  # type: ignore[no-untyped-def]
+    """One past the highest measured level of the thing that each column belongs to, (M,), as far as its own is open.
+
+    A side that is seen from near alone is not met by the beams that met the front's upper edge from afar.
+    """
+    n = key.shape[0]
+    places = np.argwhere(index >= 0)
+    highest = tops[:, 2].copy()
+    for _ in range(_THING_CELLS):
+        before = highest.copy()
+        for a, b in places:
+            at, x0, y0 = index[a, b], key[a, b, 0], key[a, b, 1]
+            if tops[at, 1] >= top:
+                continue
+            for i in range(-1, 2):
+                for j in range(-1, 2):
+                    p, q = (x0 + i) & (n - 1), (y0 + j) & (n - 1)
+                    beside = index[p, q]
+                    if beside >= 0 and tops[beside, 1] < top and key[p, q, 0] == x0 + i and key[p, q, 1] == y0 + j:
+                        highest[at] = max(highest[at], min(before[beside], tops[at, 1]))
+    return highest
 
 
 @njit(cache=True)

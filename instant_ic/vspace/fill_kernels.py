@@ -1,4 +1,4 @@
-"""CPU kernel of ``prior.fill_holes`` (numba): reads each pixel once and computes holes only."""
+"""CPU kernels of ``prior`` (numba): filling holes, each pixel read once, and the ends of assumed tops."""
 
 from __future__ import annotations
 
@@ -76,3 +76,51 @@ def pull_push(values, weight, sizes, levels):  # type: ignore[no-untyped-def]
                 total = max(levels[n, channels], np.float32(1e-30))
                 for c in range(channels):
                     values[y, x, c] = levels[n, c] / total
+
+
+@njit(**_OPTIONS)
+def cut_tops(inverse, sigma, rgb, room, reach, step, assumed, contrast, share):  # type: ignore[no-untyped-def]
+    """End the assumed tops of things where the image does: beyond, the surface above goes on.
+
+    A top is assumed where its depth is less sure than that of the thing below it. Its rows, from above, belong to what
+    is seen above it as long as their colour does.
+
+    Args:
+        inverse, sigma: inverse depth and its relative standard deviation, (h, w) float32; in and out.
+        rgb: (h, w, 3) float32; room: (h, w) where pixels show surfaces.
+        reach: rows of a top, at most; step: a thing is nearer than what is above it by this factor.
+        assumed: sigma of an assumed depth, at least, and at least twice that of the thing.
+        contrast: of the colours of both, at least; share of the thing's colour in a pixel that belongs to it.
+    """
+    height, width = inverse.shape
+    above, thing = np.zeros(3, np.float32), np.zeros(3, np.float32)
+    for u in range(width):
+        for v in range(3, height - reach - 2):
+            if sigma[v, u] < assumed or inverse[v, u] < step * inverse[v - 1, u]:
+                continue
+            if not (room[v, u] and room[v - 1, u] and room[v - 2, u]):
+                continue
+            end = v + 1
+            while end < v + reach and sigma[end, u] >= assumed:
+                low, high = min(inverse[end, u], inverse[end - 1, u]), max(inverse[end, u], inverse[end - 1, u])
+                if high > step * low:
+                    break
+                end += 1
+            square = np.float32(0)
+            for c in range(3):
+                above[c] = np.float32(0.5) * (rgb[v - 2, u, c] + rgb[v - 3, u, c])
+                thing[c] = np.float32(0.5) * (rgb[end, u, c] + rgb[end + 1, u, c])
+                square += (thing[c] - above[c]) ** 2
+            if 2 * sigma[end, u] > sigma[v, u] or square < contrast * contrast:
+                continue
+            slope = inverse[v - 1, u] - inverse[v - 2, u]
+            if abs(slope) > np.float32(0.1) * inverse[v - 1, u]:
+                slope = np.float32(0)
+            for row in range(v, end):
+                along = np.float32(0)
+                for c in range(3):
+                    along += (rgb[row, u, c] - above[c]) * (thing[c] - above[c])
+                if along > share * square:
+                    break
+                inverse[row, u] = inverse[row - 1, u] + slope
+                sigma[row, u] = sigma[row - 1, u]

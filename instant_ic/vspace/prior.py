@@ -21,6 +21,9 @@ EDGE_RAD = 0.05
 
 ROOM, ROBOT, SKY, MOVED = 0, 1, 2, 3
 """Content of a pixel: a part of the place; the robot itself; the sky; something that has moved away."""
+_TOP_RAD, _TOP_STEP, _ASSUMED, _CONTRAST, _THING_SHARE = 0.15, 1.3, 0.05, 30.0, 0.15
+"""Of assumed tops, see ``fill_kernels.cut_tops``: their height in the image, the step above them, sigma, grey levels,
+and the share of the thing in a mixed colour."""
 _SKY_RISE = 0.17  # sine of the elevation that unknown regions must lie above, on the mean, to be the sky
 
 
@@ -115,13 +118,15 @@ def prepare(
     known: NDArray[np.bool_] = depth > 0
     with np.errstate(divide="ignore"):
         inverse = np.where(known, 1.0 / np.clip(depth, config.min_depth_m, config.max_depth_m), 0.0)
-    inverse = fill_holes(inverse.astype(np.float32), known & ~sky)
+    inverse = np.ascontiguousarray(fill_holes(inverse.astype(np.float32), known & ~sky))
     inverse[sky] = 1 / config.max_depth_m
+    if np.ndim(relative_sigma):
+        _cut_tops(inverse, each, rgb, content == ROOM)
     known |= sky
     band = float(np.clip(config.band_sigmas * sigma, config.band_min, config.band_max))
     return PanoramaPrior(
         rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile again
-        inverse_depth=np.ascontiguousarray(inverse),
+        inverse_depth=inverse,
         known=(known & ((each <= MOST_SIGMA) | sky) & (content != ROBOT)).astype(np.uint8),
         depth_edge=edge_quads(inverse, config.torn_ratio),
         map_from_camera=np.array(map_from_camera, np.float64),
@@ -131,6 +136,21 @@ def prepare(
         usable=(content == ROOM).astype(np.uint8),
         content=content,
     )
+
+
+def _cut_tops(
+    inverse: NDArray[np.float32], sigma: NDArray[np.float32], rgb: NDArray[np.uint8], room: NDArray[np.bool_]
+) -> None:
+    """End assumed tops of things where the image does, in place; without numba they stay."""
+    try:
+        from instant_ic.vspace.fill_kernels import cut_tops
+    except ImportError:
+        return
+    height, width = inverse.shape
+    colours = area_average(rgb, height, width).astype(np.float32)
+    reach = max(2, round(_TOP_RAD / np.pi * height))
+    step, assumed, contrast, share = (np.float32(value) for value in (_TOP_STEP, _ASSUMED, _CONTRAST, _THING_SHARE))
+    cut_tops(inverse, sigma, colours, room, reach, step, assumed, contrast, share)
 
 
 def _check_panorama(rgb: NDArray[np.uint8]) -> None:

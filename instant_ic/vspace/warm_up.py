@@ -34,7 +34,7 @@ def warm_up(config: VirtualSpaceConfig) -> None:
     aside = np.eye(4)
     aside[1, 3] = 1.0
     for pose in (np.eye(4), aside)[: config.keyframes]:
-        space.set_keyframe(rgb, depth, pose, 0.05)
+        space.set_keyframe(rgb, depth, pose, np.full_like(depth, 0.05))
     pose = aside if config.keyframes == 1 else np.eye(4)
     space.render(pose, 32, 16, math.pi / 2)
     if space.config.source == "field":

@@ -111,6 +111,21 @@ def test_a_thing_ends_half_way_between_its_highest_point_and_the_lowest_beam_abo
     assert 1.2 + 2.0 * np.tan(elevation[of_thing].max()) == pytest.approx(0.8, abs=0.06)  # a voxel is 0.05 m
 
 
+def test_a_side_is_as_high_as_the_rest_of_the_thing() -> None:
+    """Right of y = 0 measured up to 0.9 m, left of it up to 0.6 m; beams pass at 1 m and more above both."""
+    model, origin = LocalModel(LocalModelConfig(behind_m=0.0)), np.array([0.0, 0.0, 0.6])
+    y = np.arange(-0.5, 0.5, 0.02)
+    on = np.stack(np.meshgrid([2.0], y, np.arange(0.02, 0.9, 0.02)), -1).reshape(-1, 3)
+    on = on[(on[:, 1] < 0) | (on[:, 2] < 0.6)]
+    above = np.stack(np.meshgrid([4.0], 2 * y, np.arange(1.4, 2.0, 0.02)), -1).reshape(-1, 3)
+    for _ in range(4):
+        model.add(np.vstack([on, above]), origin, stride=1)
+    depth = model.render(pose_matrix(0.0, 0.0, 1.2), (512, 1024)).depth_m[:, 496]  # y = 0.2 m
+    elevation = np.pi / 2 - (np.arange(512) + 0.5) * np.pi / 512
+    of_thing = np.abs(depth * np.cos(elevation) - 2.01) < 0.05
+    assert 1.2 + 2.0 * np.tan(elevation[of_thing].max()) == pytest.approx(0.9, abs=0.06)  # a voxel is 0.05 m
+
+
 def test_what_has_gone_vanishes() -> None:
     """Somebody stands 2 m ahead for a second, then leaves; the robot stands."""
     person = (np.array([2.0, -0.2, 0.0]), np.array([2.3, 0.2, 1.7]))

@@ -60,3 +60,38 @@ def test_a_slope_with_noise_is_no_edge_and_a_step_is():
     # A large difference is an edge however much leans away around it.
     slope[:, 16:24] /= 1.4
     assert edge_quads(slope, 0.05)[1, 15]
+
+
+def a_thing(top_sigma: float, seen_rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Image, depth and sigma (128, 256): a dark thing at 1 m below row 80 before a bright wall at 4 m.
+
+    Its top is assumed in rows 76 to 79; the image shows it only in the last ``seen_rows`` of them.
+    """
+    rgb = np.full((128, 256, 3), 200, np.uint8)
+    rgb[80 - seen_rows :] = 50
+    depth, sigma = np.full((128, 256), 4.0, np.float32), np.full((128, 256), 0.012, np.float32)
+    depth[76:] = 1.0
+    sigma[76:80] = top_sigma
+    return rgb, depth, sigma
+
+
+@pytest.mark.parametrize(("seen", "first"), [(0, 80), (1, 79), (2, 78), (4, 76)])
+def test_an_assumed_top_ends_where_the_image_does(seen: int, first: int) -> None:
+    """The wall's inverse depth goes on down to the first row of the thing's colour."""
+    rgb, depth, sigma = a_thing(0.07, seen)
+    found = prepare(rgb, depth, CAMERA, sigma, GeometryConfig(), 2048)
+    np.testing.assert_allclose(found.inverse_depth[:first], 0.25)
+    np.testing.assert_allclose(found.inverse_depth[first:], 1.0)
+    assert (found.sigma[76:first] == np.float32(0.012)).all()
+    assert np.flatnonzero(found.depth_edge[:, 64]).tolist() == [first - 1]
+
+
+def test_a_measured_top_stays_and_so_does_one_of_the_walls_colour() -> None:
+    rgb, depth, sigma = a_thing(0.02, 1)
+    assert (prepare(rgb, depth, CAMERA, sigma, GeometryConfig(), 2048).inverse_depth[76:] == 1).all()
+    rgb, depth, sigma = a_thing(0.07, 1)
+    rgb[79:] = 190  # 17 grey levels from the wall's, over all three channels
+    assert (prepare(rgb, depth, CAMERA, sigma, GeometryConfig(), 2048).inverse_depth[76:] == 1).all()
+    # Where nothing is sure, nothing is cut.
+    rgb, depth, sigma = a_thing(0.07, 1)
+    assert (prepare(rgb, depth, CAMERA, np.full_like(sigma, 0.3), GeometryConfig(), 2048).inverse_depth[76:] == 1).all()
