@@ -22,7 +22,8 @@ All times start at the browser's time of the key event:
 
 They include the robot's own acceleration: 2 mm take 71 ms at 0.8 m/s2. ``steps_ms`` breaks the time down by step, and
 ``draws_hz`` is the page's frame rate while the v-bot moved. Reading back delays the frames up to the first one that
-differs. ``server_views`` counts the views that `nerf` rendered meanwhile: none for a page that renders by itself.
+differs. ``server_views`` counts the views to be shown that `nerf` rendered meanwhile: none for a page that renders by
+itself.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ import numpy as np
 
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.console import demo_world
+from instant_ic.console.view import PROBE
 from instant_ic.experiments.stack import Stack, free_port
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -187,7 +189,7 @@ class Robot:
         self.requested = pose
 
     def on_view(self, message: Any) -> None:
-        self.views += 1
+        self.views += message.width > 2 * PROBE[0]  # smaller ones are only judged
         if "request" in self.marks and np.abs(matrix_from_pose(message.pose) - self.requested).max() < 1e-6:
             self.mark("view")
 

@@ -8,7 +8,9 @@ ahead, on a curve, turned. ``page``: read back from the page's canvas in headles
 look-ups that the page uses where the CPU renders; ``cpu``: ``VirtualSpace.render`` of the same keyframes. PSNR in dB
 against the simulator's truth, supersampled 3 × 3: ``seen`` of the pixels that a keyframe has seen, ``all`` of the whole
 view. The page shows what nobody has seen blurred and paler, the CPU's view does not, so only ``seen`` compares like
-with like. Target: no view of the page is more than 0.3 dB below the CPU's there.
+with like. Target: no view of the page is more than 0.3 dB below the CPU's there. ``real``: the camera's image, taken
+0.8 m from the keyframe, when the robot has driven on by some centimetres, ahead and to the side: PSNR against the truth
+where the robot is, as the image was taken and moved by the depth of the layers (``smooth motion``).
 """
 
 from __future__ import annotations
@@ -46,6 +48,7 @@ JPEG_QUALITY = 95
 AHEAD_M, CURVE_M = (0.0, 0.25, 0.5, 1.0, 1.5, 2.0), (0.75, 1.25)
 TURNED = ((0.5, 0.8), (0.25, -1.5))
 """Distance ahead in m, and turn in rad."""
+PHOTO_M, LATER_CM = 0.8, (0, 7, 14, 21)
 
 
 def views(world: Any, start: tuple[float, float, float]) -> dict[str, Any]:
@@ -104,6 +107,7 @@ def measure(
         if strips is not None:
             strip = np.hstack([truth, *shown.values()])[..., ::-1]
             cv2.imwrite(str(strips / f"{Path(name.replace(':', '-')).stem}-{number}.jpg"), strip)
+    result["real"] = real(pages["page_plain"], world, renderer, start, size)
     rows = list(result["views"].values())
     for part in ("seen", "all"):
         result[part] = {
@@ -112,6 +116,25 @@ def measure(
                 key: round(max(row["cpu"][part] - row[key][part] for row in rows), 2) for key in pages
             },
         }
+    return result
+
+
+def real(
+    page: PageRenderer, world: Any, renderer: EquirectRenderer, start: tuple[float, float, float], size: tuple[int, int]
+) -> dict[str, dict[str, float]]:
+    """PSNR of the camera's image, shown where the robot is some centimetres later."""
+    poses = path_poses(world, start, "straight", [PHOTO_M, *(PHOTO_M + cm / 100 for cm in LATER_CM)])
+    photo = renderer.render(poses[0], 1920, 960).rgb[..., ::-1]
+    jpeg = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    result = {}
+    for cm, pose in zip(LATER_CM, poses[1:], strict=True):
+        for name, turn in (("ahead", 0.0), ("to the side", 0.9)):
+            looks = pose @ pose_matrix(yaw=turn)
+            truth = renderer.render_perspective(looks, *size, FOV, supersample=2).rgb
+            result[f"{cm} cm, {name}"] = {
+                key: round(psnr_db(page.render_photo(jpeg, poses[0], looks, FOV, moved), truth), 2)
+                for key, moved in (("as_taken", False), ("by_depth", True))
+            }
     return result
 
 

@@ -30,14 +30,21 @@ _SETUP = """async ([width, height, full]) => {
         await images.takeLayers(decodeFrame(await (await fetch("/layers")).arrayBuffer()));
         if (!loaded.pop()) throw new Error("the page refused the layers");
     };
-    window.view = (mapFromLook, position, tanHalf) => {
-        const scene = {tanHalf, mapFromLook, camera: {mapFromLook, position, tanHalf}, blend: 1, viewColour: plain};
+    const read = (scene) => {
         const start = performance.now(), gl = viewer.gl, rgba = new Uint8Array(4 * width * height);
         viewer.render(scene);
         gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, rgba);
         let text = "";
         for (let i = 0; i < rgba.length; i += 32768) text += String.fromCharCode(...rgba.subarray(i, i + 32768));
         return {rgba: btoa(text), ms: performance.now() - start};
+    };
+    window.view = (mapFromLook, position, tanHalf) =>
+        read({tanHalf, mapFromLook, camera: {mapFromLook, position, tanHalf}, blend: 1, viewColour: plain});
+    window.photo = async (mapFromLook, to, tanHalf, panoramaFromLook, from, moved) => {
+        const image = await (await fetch("/photo")).blob();
+        viewer.setPanorama(await createImageBitmap(image, {colorSpaceConversion: "none"}));
+        const glide = moved ? {from, to} : null;
+        return read({tanHalf, mapFromLook, panoramaFromLook, glide, blend: 0, panoramaColour: plain});
     };
 }"""
 
@@ -53,7 +60,7 @@ class PageRenderer:
 
     def __init__(self, browser: Any, width: int, height: int, full: bool = True) -> None:
         self.width, self.height = width, height
-        self._frame = b""
+        self._frame = self._photo = b""
         self._page = browser.new_page()
         self._page.set_default_timeout(_TIMEOUT_MS)
         self._page.route("**/*", self._answer)
@@ -68,13 +75,38 @@ class PageRenderer:
 
     def render(self, map_from_camera: NDArray[np.floating], fov_rad: float) -> NDArray[np.uint8]:
         """Return the view along the camera's x axis, (height, width, 3), with this horizontal field of view."""
+        return self._seen("view", *self._camera(map_from_camera, fov_rad))
+
+    def render_photo(
+        self,
+        jpeg: bytes,
+        taken: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        fov_rad: float,
+        moved: bool,
+    ) -> NDArray[np.uint8]:
+        """Return the camera's image as the page shows it in REAL, (height, width, 3).
+
+        Args:
+            jpeg: equirectangular image.
+            taken: map_from_camera of that.
+            map_from_camera: pose from which it is shown.
+            fov_rad: horizontal field of view.
+            moved: by the depth of the layers; else as it was taken.
+        """
+        self._photo = jpeg
+        camera = self._camera(map_from_camera, fov_rad)
+        relative = (taken[:3, :3].T @ map_from_camera[:3, :3]).ravel().tolist()
+        rotation, position = self._camera(taken, fov_rad)[:2]
+        return self._seen("photo", *camera, relative, {"mapFromCamera": rotation, "position": position}, moved)
+
+    def _camera(self, map_from_camera: NDArray[np.floating], fov_rad: float) -> list[list[float]]:
         tan = math.tan(fov_rad / 2)
-        scene = [
-            map_from_camera[:3, :3].ravel().tolist(),
-            map_from_camera[:3, 3].tolist(),
-            [tan, tan * self.height / self.width],
-        ]
-        seen = self._page.evaluate(f"view(...{json.dumps(scene)})")
+        rotation, position = map_from_camera[:3, :3].ravel().tolist(), map_from_camera[:3, 3].tolist()
+        return [rotation, position, [tan, tan * self.height / self.width]]
+
+    def _seen(self, function: str, *values: Any) -> NDArray[np.uint8]:
+        seen = self._page.evaluate(f"{function}(...{json.dumps(values)})")
         rgba = np.frombuffer(base64.b64decode(seen["rgba"]), np.uint8).reshape(self.height, self.width, 4)
         return np.ascontiguousarray(rgba[::-1, :, :3])
 
@@ -84,6 +116,8 @@ class PageRenderer:
             route.fulfill(body="<!doctype html><canvas></canvas>", content_type="text/html")
         elif name == "layers":
             route.fulfill(body=self._frame, content_type="application/octet-stream")
+        elif name == "photo":
+            route.fulfill(body=self._photo, content_type="image/jpeg")
         elif (_STATIC / name).is_file():
             route.fulfill(path=_STATIC / name)
         else:

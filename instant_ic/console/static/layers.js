@@ -159,7 +159,7 @@ export class LayerRenderer {
    * The alpha of what is rendered is 1 where the place was seen.
    * @param {Camera} camera @param {number} width @param {number} height
    * @param {Colour} tint gain and offset of the colours
-   * @param {Photo | null} photo takes the place of the layers' own colours, and of guesses
+   * @param {Photo | null} photo takes the place of the layers' own colours; a guess is one of the depth alone then
    * @param {boolean} mixed blending is on: each pixel is written once, the nearest surface found before
    */
   render(camera, width, height, tint, photo = null, mixed = false) {
@@ -177,7 +177,6 @@ export class LayerRenderer {
     gl.clear(gl.STENCIL_BUFFER_BIT);
     // Stencil bit k: layer k shows a surface here. A surface seen from behind hides, but shows the layers below.
     this._layers.forEach(({ vertices, count, image, confidence, surface, layer }, k) => {
-      if (photo && surface.confidence) return; // a guess
       const panoramaFromMap = transpose(layer.mapFromCamera), [x, y, z] = camera.position, [px, py, pz] = layer.position;
       // Transposed: row-major read by columns.
       gl.uniformMatrix3fv(at("lookFromPanorama"), false, multiply(panoramaFromMap, camera.mapFromLook));
@@ -196,7 +195,7 @@ export class LayerRenderer {
       const { mapFromCamera, position: [cx, cy, cz] } = photo ?? layer;
       gl.uniformMatrix3fv(at("imageFromPanorama"), true, photo ? multiply(transpose(mapFromCamera), layer.mapFromCamera) : identity);
       gl.uniform3fv(at("imagePosition"), rotate(panoramaFromMap, [cx - px, cy - py, cz - pz]));
-      gl.uniform1i(at("soft"), Number(surface.confidence !== null));
+      gl.uniform1i(at("soft"), Number(!photo && surface.confidence !== null));
       gl.bindVertexArray(vertices);
       if (mixed) {
         gl.colorMask(false, false, false, false);
