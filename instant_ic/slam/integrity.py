@@ -43,9 +43,9 @@ LEVEL_SHARE = 0.1
 """Weight of a new scan in the levels."""
 FLOOR = -6.0
 """Least log-odds of being lost. Higher makes false alarms, lower delays detection."""
-DOUBT = -5.5
-"""Log-odds above which scans are kept out of the map: a quarter of a scan's evidence is enough. A scan that both signs
-speak against stays out in any case: it would agree with its own copy."""
+DOUBT, SUSPICIOUS = -5.5, 0.5
+"""Log-odds, or evidence of the last scan, above which scans are kept out of the map: a quarter of a scan's evidence is
+enough, also at a high rate."""
 LOST = 0.0
 """Log-odds from which the robot is lost. Scans of one place agree or disagree with the map together, so later ones that
 fit do not restore the trust; only recognition does."""
@@ -210,14 +210,13 @@ class IntegrityMonitor:
         """
         self.contradiction = contradicted
         usual = score if self._score_level is None else self._usual_score
-        excess = _share(contradicted - self._usual_contradiction, FULL_CONTRADICTION)
-        drop = _share(usual - score, FULL_DROP)
+        excess = min(max(contradicted - self._usual_contradiction, 0.0) / FULL_CONTRADICTION, 1.0)
+        drop = min(max(usual - score, 0.0) / FULL_DROP, 1.0)
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
-        both_signs = math.sqrt(drop * excess)
-        share = max(both_signs, LONG_DROP_SHARE * _share(usual - score, LONG_DROP))
+        long_drop = min(max(usual - score, 0.0) / LONG_DROP, 1.0)
+        share = max(math.sqrt(excess * drop), LONG_DROP_SHARE * long_drop)
         evidence = EVIDENCE * (2.0 * share - 1.0)
-        self._suspicious = recovered or both_signs > 0.5
         if recovered:
             self._weigh(max(evidence, RECOVERED), EVIDENCE_S)
         else:
@@ -258,15 +257,12 @@ class IntegrityMonitor:
         return Integrity(lost, BOUND_SIGMAS * sigma_m, min(heading, math.pi))
 
     def _weigh(self, evidence: float, elapsed_s: float) -> None:
+        self._suspicious = evidence >= SUSPICIOUS
         self._log_odds += evidence * min(1.0, max(elapsed_s, 0.0) / EVIDENCE_S)
         self._log_odds = min(max(self._log_odds, FLOOR), LOST + EVIDENCE)
         self._doubtful_scans = self._doubtful_scans + 1 if self.doubts else 0
         if self._doubtful_scans > LONGEST_DOUBT and not self.lost:
             self._log_odds, self._doubtful_scans, self._suspicious = FLOOR, 0, False
-
-
-def _share(value: float, full: float) -> float:
-    return min(max(value / full, 0.0), 1.0)
 
 
 def mixture(covariance: FloatArray, lost_probability: float) -> FloatArray:
