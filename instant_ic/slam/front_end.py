@@ -98,7 +98,7 @@ class FrontEnd:
         self.config = config
         self.trajectory = Trajectory()
         self._field = LikelihoodField(config.field, config.match.recovery_translation_m + 0.5)
-        self._lost_sigma_m = self._lost_sigma_rad = 0.0
+        self._lost_sigma_m = 0.0
         self._usual_score = 0.0
         self._covariance = np.zeros((3, 3))
         self._known: FloatArray | None = None
@@ -194,7 +194,7 @@ class FrontEnd:
             return Track(guess.pose, self._grown_covariance(guess), match.score, SlamStatus.LOST, None)
 
         accepted = accept is None or accept(match.pose, match.score, status is SlamStatus.RECOVERED)
-        self._lost_sigma_m = self._lost_sigma_rad = 0.0
+        self._lost_sigma_m = 0.0
         self._usual_score += SCORE_MEMORY * (match.score - self._usual_score)
         self._covariance = match.covariance
         added: Keyframe | None = None
@@ -210,7 +210,7 @@ class FrontEnd:
         self._known = None
         self.trajectory = Trajectory()
         covariance = self._grown_covariance(guess)
-        self._lost_sigma_m = self._lost_sigma_rad = 0.0
+        self._lost_sigma_m = 0.0
         keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
         return Track(guess.pose, covariance, 0.0, SlamStatus.RESTARTED, keyframe)
 
@@ -247,16 +247,9 @@ class FrontEnd:
         sigma_m = float(guess.sigma[0]) + self._lost_sigma_m
         return min(self.config.match.recovery_translation_m + WIDE_SIGMAS * sigma_m, WIDE_REACH_M)
 
-    def jump_sigmas(self, guess: Guess, pose: FloatArray) -> float:
-        """Distance of a pose (3,) from the guess, in position or heading: standard deviations since the last match."""
-        step = relative2(guess.pose, pose)
-        translation = math.hypot(step[0], step[1]) / (float(guess.sigma[0]) + self._lost_sigma_m)
-        return max(translation, abs(float(step[2])) / (float(guess.sigma[2]) + self._lost_sigma_rad))
-
     def _grown_covariance(self, guess: Guess) -> FloatArray:
         # Odometry errs by its scale: the errors of the steps without a match add up.
         self._lost_sigma_m += float(guess.sigma[0])
-        self._lost_sigma_rad += float(guess.sigma[2])
         self._covariance = self._covariance + turned(np.diag(guess.sigma**2), float(guess.pose[2]))
         return self._covariance
 

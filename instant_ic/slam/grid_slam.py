@@ -329,7 +329,7 @@ class GridSlam:
 
         def accept(pose: FloatArray, score: float, recovered: bool) -> bool:
             contradicted = self._compared_map().contradiction(pose, points)
-            self.monitor.matched(contradicted, score, elapsed_s, recovered, self.front_end.jump_sigmas(guess, pose))
+            self.monitor.matched(contradicted, score, elapsed_s, recovered)
             return not self.monitor.doubts
 
         track = self.front_end.track(points, guess, stamp_ns, accept)

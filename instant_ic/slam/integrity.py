@@ -33,8 +33,6 @@ LEAST_KNOWN = 20
 """Fewer comparable rays count as so many: five of five are little evidence."""
 FULL_CONTRADICTION, FULL_DROP = 0.25, 0.2
 """Share of contradicted rays, and drop of the score, above their levels, which are full evidence together."""
-FIRST_JUMP, FULL_JUMP = 3.0, 6.0
-"""Distance of a match from its guess, in standard deviations of the guess, that is a sign, and a full one."""
 LONG_DROP, LONG_DROP_SHARE = 0.4, 0.6
 """A drop of the score this large is neutral to weak evidence without a contradiction: the place may be new."""
 EVIDENCE = 2.0
@@ -45,9 +43,9 @@ LEVEL_SHARE = 0.1
 """Weight of a new scan in the levels."""
 FLOOR = -6.0
 """Least log-odds of being lost. Higher makes false alarms, lower delays detection."""
-DOUBT = -5.5
-"""Log-odds above which scans are kept out of the map: a quarter of a scan's evidence is enough. A scan that two signs
-speak against stays out in any case: it would agree with its own copy."""
+DOUBT, SUSPICIOUS = -5.5, 0.5
+"""Log-odds, or evidence of the last scan, above which scans are kept out of the map: a quarter of a scan's evidence is
+enough, also at a high rate."""
 LOST = 0.0
 """Log-odds from which the robot is lost. Scans of one place agree or disagree with the map together, so later ones that
 fit do not restore the trust; only recognition does."""
@@ -185,7 +183,6 @@ class IntegrityMonitor:
         # drifted, is no sign of another place.
         self._usual_score = self._usual_contradiction = 0.0
         self._contradiction_level = 0.0
-        self._jump = 0.0  # 0..1; stays until a scan fits again
 
     @property
     def doubts(self) -> bool:
@@ -202,9 +199,7 @@ class IntegrityMonitor:
         """Probability of being lost, 0..1."""
         return 1.0 / (1.0 + math.exp(-self._log_odds))
 
-    def matched(
-        self, contradicted: float, score: float, elapsed_s: float, recovered: bool = False, jump_sigmas: float = 0.0
-    ) -> None:
+    def matched(self, contradicted: float, score: float, elapsed_s: float, recovered: bool = False) -> None:
         """Take in a scan that fits somewhere.
 
         Args:
@@ -212,19 +207,16 @@ class IntegrityMonitor:
             score: of the match, 0..1.
             elapsed_s: since the scan before.
             recovered: only the wide search has matched it.
-            jump_sigmas: distance of the match from its guess, in standard deviations of the guess.
         """
         self.contradiction = contradicted
         usual = score if self._score_level is None else self._usual_score
-        excess = _share(contradicted - self._usual_contradiction, FULL_CONTRADICTION)
-        drop = _share(usual - score, FULL_DROP)
-        self._jump = max(self._jump if drop > 0.0 else 0.0, _share(jump_sigmas - FIRST_JUMP, FULL_JUMP - FIRST_JUMP))
+        excess = min(max(contradicted - self._usual_contradiction, 0.0) / FULL_CONTRADICTION, 1.0)
+        drop = min(max(usual - score, 0.0) / FULL_DROP, 1.0)
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
-        two_signs = math.sqrt(drop * max(excess, self._jump))
-        share = max(two_signs, LONG_DROP_SHARE * _share(usual - score, LONG_DROP))
+        long_drop = min(max(usual - score, 0.0) / LONG_DROP, 1.0)
+        share = max(math.sqrt(excess * drop), LONG_DROP_SHARE * long_drop)
         evidence = EVIDENCE * (2.0 * share - 1.0)
-        self._suspicious = recovered or two_signs > 0.5
         if recovered:
             self._weigh(max(evidence, RECOVERED), EVIDENCE_S)
         else:
@@ -265,15 +257,12 @@ class IntegrityMonitor:
         return Integrity(lost, BOUND_SIGMAS * sigma_m, min(heading, math.pi))
 
     def _weigh(self, evidence: float, elapsed_s: float) -> None:
+        self._suspicious = evidence >= SUSPICIOUS
         self._log_odds += evidence * min(1.0, max(elapsed_s, 0.0) / EVIDENCE_S)
         self._log_odds = min(max(self._log_odds, FLOOR), LOST + EVIDENCE)
         self._doubtful_scans = self._doubtful_scans + 1 if self.doubts else 0
         if self._doubtful_scans > LONGEST_DOUBT and not self.lost:
             self._log_odds, self._doubtful_scans, self._suspicious = FLOOR, 0, False
-
-
-def _share(value: float, full: float) -> float:
-    return min(max(value / full, 0.0), 1.0)
 
 
 def mixture(covariance: FloatArray, lost_probability: float) -> FloatArray:

@@ -84,22 +84,6 @@ def test_evidence_counts_by_time() -> None:
     assert scans == 12
 
 
-def test_a_match_far_from_its_guess_counts_while_the_score_is_low() -> None:
-    # The jump of 6 σ is full evidence with the drop of the score, and remains until a scan fits: 2 a scan from -6.
-    monitor = steady()
-    for jump in (6.0, 0.0, 0.0):
-        assert not monitor.lost
-        monitor.matched(0.02, 0.6, 0.1, jump_sigmas=jump)
-    assert monitor.lost
-    slipped = steady()
-    for _ in range(50):  # the wheels slip, and every scan fits
-        slipped.matched(0.02, 0.9, 0.1, jump_sigmas=6.0)
-    assert not slipped.doubts
-    slipped.matched(0.02, 0.9, 0.1)
-    slipped.matched(0.02, 0.6, 0.1)  # later, at a door: the jump is forgotten
-    assert slipped.lost_probability < 0.01
-
-
 @pytest.mark.parametrize(("contradicted", "score"), [(0.5, 0.9), (0.02, 0.7)])
 def test_neither_alone_takes_the_trust(contradicted: float, score: float) -> None:
     # A map that has drifted contradicts at a good score; a new place lowers the score without contradiction.
@@ -165,6 +149,16 @@ def test_a_heading_that_jumps_leaves_no_turned_map(log: list[LogEntry]) -> None:
     report = evaluate_faults(log, places=2, seed=1, faults=("heading_jump_85deg",))
     assert report["heading_jump_85deg"]["trusted_wrong_scans_max"] <= 10
     assert report["heading_jump_85deg"]["right_at_end"] == 2
+
+
+def test_noise_seeds_and_relocalizations_are_counted(log: list[LogEntry]) -> None:
+    report = evaluate_faults(log[:300], places=2, noise_seeds=2, faults=("odometry_noise", "relocalization"))
+    runs = report["odometry_noise"]["runs"]
+    assert runs[0]["final_error_mean_m"] == 0.0  # the log's own odometry: the clean run once more
+    assert 0.0 < runs[1]["final_error_mean_m"] < 0.1
+    assert report["odometry_noise"]["median_m"] == runs[1]["final_error_mean_m"] / 2
+    assert report["relocalization"]["starts"] == report["relocalization"]["found"] == 2
+    assert report["relocalization"]["wrong"] == 0
 
 
 def test_an_unknown_fault_is_named(log: list[LogEntry]) -> None:
