@@ -255,12 +255,20 @@ def _count(text: str, what: str) -> int:
     return count
 
 
+_MOST_STAMP_S = 9_000_000_000
+"""In nanoseconds it still is a 64-bit number."""
+
+
 def _stamp_ns(text: str) -> int:
     """Convert decimal seconds exactly: an epoch time in float64 keeps only a tenth of a microsecond."""
     try:
-        return int(Decimal(text) * 1_000_000_000)
-    except (InvalidOperation, ValueError, OverflowError):
-        raise ValueError(f"time stamp {text!r} is not a decimal number") from None
+        seconds = Decimal(text)
+        # int() of 1e9999999 would take minutes.
+        if -_MOST_STAMP_S < seconds < _MOST_STAMP_S:
+            return int(seconds * 1_000_000_000)
+    except InvalidOperation:
+        pass
+    raise ValueError(f"time stamp {text[:40]!r} is not a decimal number below {_MOST_STAMP_S} s")
 
 
 def _second_stamp(fields: list[str]) -> float | None:
