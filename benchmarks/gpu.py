@@ -63,8 +63,8 @@ TARGETS = {
 }
 KEYFRAMES = {"one": (0.0,), "three": (-1.5, -0.75, 0.0), "three, one ahead": (-1.5, 3.0, 0.0)}
 """Places of the keyframes along x in metres, in order of arrival."""
-DEPTH_TRAINING = ("--network", "resnet50:512", "--batch-size", "16", "--minutes", "6", "--device", "cuda")
-"""Of ``ic depth train`` on a GPU; the preset for GPUs, once there is one."""
+DEPTH_TRAINING = ("--preset", "gpu", "--encoder", "none", "--minutes", "6", "--device", "cuda")
+"""Of ``ic depth train`` on a GPU. Random weights: the package with the pretrained ones may not be there."""
 DEPTH_ERRORS = (0.0, 0.04)
 """Standard deviation of the keyframes' depth, as a share of it."""
 TAUGHT_AT = 1.2
@@ -394,7 +394,18 @@ def depth(setup: Setup) -> dict[str, Any]:
         for index in range(6):
             cv2.imwrite(str(folder / "rgb" / f"{index}.png"), np.full((64, 128, 3), 40 * index, np.uint8))
             np.save(folder / "depth" / f"{index}.npy", np.full((64, 128), 1.0 + index, np.float32))
-        words = ["--data", f"plain:{folder}", "--network", "resnet18:64", "--epochs", "1", "--batch-size", "2"]
+        words = [
+            "--data",
+            f"plain:{folder}",
+            "--encoder",
+            "none",
+            "--height",
+            "64",
+            "--epochs",
+            "1",
+            "--batch-size",
+            "2",
+        ]
         words += ["--device", "cpu", "--workers", "1"]
     command = [sys.executable, "-m", "instant_ic.cli.main", "depth", "train", *words, "--checkpoint", str(checkpoint)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=580, check=False)

@@ -49,7 +49,9 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     """
 
     name = "depth_scaler"
-    live_parameters = tuple(one.name for one in fields(DepthScalerConfig))
+    live_parameters = tuple(
+        one.name for one in fields(DepthScalerConfig) if one.name not in ("completion", "provider", "threads")
+    )
 
     def setup(self) -> None:
         if self.config.source != "network":
@@ -75,6 +77,8 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.subscribe("/depth/raw", Image, self.on_depth, qos=SENSOR)
 
     def reconfigure(self, config: DepthScalerConfig) -> None:
+        if config.source == "completed" and self.completion is None:
+            raise ValueError("source completed needs its model from the start: start the node with it")
         super().reconfigure(config)
         self.source.config, self.selector.config = config.depth_source, config.keyframes
         self.metric.config = self.metric_config

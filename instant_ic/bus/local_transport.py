@@ -66,6 +66,7 @@ class LocalTransport:
         self.node = node
         self._driver: int | None = None  # the thread that waits
         self._set = self._written = False
+        self._quiet = False  # what the bus thread reads now wakes nobody
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._wake_poll = select.poll()
         self._wake_poll.register(self._wake, select.POLLIN)
@@ -95,6 +96,8 @@ class LocalTransport:
     def set(self) -> None:
         """End the present or the next wait; may be called from any thread."""
         if not self._set:
+            if self._quiet and threading.get_ident() == self._thread.ident:
+                return
             self._set = True
             if threading.get_ident() != self._driver:
                 self._written = True
@@ -272,8 +275,11 @@ class LocalTransport:
             with self._read_lock:
                 try:
                     if self._readers.get(subscription.fd) is subscription:  # not just closed
+                        self._quiet = self.patient
                         subscription.discover()
                 except OSError as error:
                     log.error("%s: %s", subscription.topic, error)
                     fine = False
+                finally:
+                    self._quiet = False
         return fine

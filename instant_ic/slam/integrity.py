@@ -6,7 +6,7 @@ contradiction counts together with a drop of the match score, both against the s
 contradicts new scans too, but gradually, and at a good score.
 
 `IntegrityMonitor` is a Bayes filter on one bit, lost or not. The log-likelihood ratio of a scan was chosen on the Intel
-log and a generated office, with robots put down elsewhere; docs/slam.md has the figures on other logs. While the
+log and a generated office, with robots put down elsewhere; docs/benchmarks.md has the figures on other logs. While the
 monitor doubts, the map must not grow: otherwise the scan agrees with its own copy.
 """
 

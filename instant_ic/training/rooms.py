@@ -77,7 +77,7 @@ def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> It
     make: Callable[[int], World] = interior_world if config.interiors == "wide" else random_world
     seeds = range(config.first_world, config.first_world + config.worlds) if worlds is None else worlds
     for seed in seeds:
-        rng = np.random.default_rng((7, seed))
+        rng, prior_rng = np.random.default_rng((7, seed)), np.random.default_rng((8, seed))
         world = make(seed)
         if config.textures:
             world = with_photographs(world, config.textures, rng)
@@ -91,5 +91,5 @@ def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> It
             height = rng.uniform(*config.camera_height_m)
             pose = pose_matrix(x, y, height, roll, pitch, math.remainder(yaw, math.tau))
             frame = renderer.render(pose, 2 * config.height, config.height)
-            prior = sample_prior(renderer, pose, rng, (config.height, 2 * config.height))
+            prior = sample_prior(renderer, pose, prior_rng, (config.height, 2 * config.height))
             yield Sample(frame.rgb, frame.depth_m, seed, prior.astype(np.float16))
