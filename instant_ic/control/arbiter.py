@@ -84,7 +84,7 @@ class Arbiter:
         self._hard = False  # the last command was a hard stop
         self._yaw_gap_before = 0.0  # in the previous step
         self._stopped_for_pose = False  # since the pose was last trusted
-        self._pose_before: NDArray[np.float64] | None = None  # the r-bot's, in the previous step
+        self._pose_before: tuple[NDArray[np.float64], int] | None = None  # the r-bot's, and when: the previous step
         self._stopped_by = Notice(Reason.STARTING, "waiting for the sensors")
         self._awaits_operator = False  # STOPPED because the operator's link was lost
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
@@ -233,7 +233,7 @@ class Arbiter:
             awaits_operator=self._awaits_operator,
             slow_s=self._since_s(self._slow_since_ns, now_ns, 0.0),
             pose_lost=lost >= trust.stop and not self._stopped_for_pose,
-            pose_jumped=self._pose_jumps(inputs.robot_pose),
+            pose_jumped=self._pose_jumps(inputs.robot_pose, now_ns),
         )
         self._no_view_fits = self._no_view_fits and not _may_enter_again(snapshot)
         self._leading_back = self._leads_back(snapshot)
@@ -245,16 +245,21 @@ class Arbiter:
         )
         return replace(snapshot, against_switch=self._against_switch(snapshot, now_ns))
 
-    def _pose_jumps(self, pose: NDArray[np.float64] | None) -> bool:
+    def _pose_jumps(self, pose: NDArray[np.float64] | None, now_ns: int) -> bool:
         """Whether the r-bot's pose has moved farther since the previous step than the robot can have driven."""
-        before, trust = self._pose_before, self.config.pose_trust
         if pose is None:
             return False
-        self._pose_before = pose
+        before, self._pose_before = self._pose_before, (pose, now_ns)
         if before is None:
             return False
-        far = math.dist(pose[:2], before[:2]) > trust.jump_m
-        return far or abs(wrap_angle(float(pose[2] - before[2]))) > math.radians(trust.jump_deg)
+        trust, limits = self.config.pose_trust, self.config.limits
+        elapsed_s = max(0, now_ns - before[1]) / 1e9
+        moved_m = math.dist(pose[:2], before[0][:2])
+        turned_rad = abs(wrap_angle(float(pose[2] - before[0][2])))
+        return (
+            moved_m > trust.jump_m + limits.max_linear_m_s * elapsed_s
+            or turned_rad > math.radians(trust.jump_deg) + limits.max_angular_rad_s * elapsed_s
+        )
 
     @staticmethod
     def _since_s(since_ns: int | None, now_ns: int, otherwise_s: float) -> float:

@@ -70,6 +70,21 @@ def test_a_pose_that_jumps_stops_the_robot_until_the_operator_lets_go(jump: tupl
     assert made.frames[-1].decision.mode == Mode.REAL
 
 
+def test_what_the_robot_can_have_driven_during_a_pause_is_no_jump() -> None:
+    made = loop()
+    drive(made, 2.0, FORWARD)
+
+    def mode_after_a_second_without_steps(moved: tuple[float, float, float]) -> Mode:
+        made.k += 20
+        made.cameras += made.cameras[-1:] * 20
+        made.views += made.views[-1:] * 20
+        made.base.pose = made.base.pose + np.array(moved)
+        return made.step(FORWARD).decision.mode
+
+    assert mode_after_a_second_without_steps((0.45, 0.0, 0.6)) == Mode.REAL
+    assert mode_after_a_second_without_steps((0.96, 0.0, 0.0)) == Mode.STOPPED  # over 0.4 m + 0.5 m/s * 1.05 s
+
+
 def test_no_switch_with_a_pose_in_doubt() -> None:
     made = loop()
     made.pose_lost = 0.2
