@@ -18,6 +18,12 @@ _COUNTED_SINCE_M = 0.2
 """Largest count, in metres of track, that a restarted controller can reach before the next reading."""
 
 
+_SURE_WITHIN_S = 0.025
+"""A reading that took longer may be as much older than its stamp: the process had to wait for the processor."""
+_UNSURE_AFTER_S = 0.2
+"""After this time without a surer reading it is taken all the same."""
+
+
 @dataclass(frozen=True)
 class Health:
     """Battery and status that the controller reported at one instant."""
@@ -91,6 +97,7 @@ class BaseController:
         self._stopped = False
         self._encoders: NDArray[np.int64] | None = None
         self._last_step_ns: int | None = None
+        self._placed_ns: int | None = None  # the last reading that the odometry took
         self._next_health_ns = 0
         self._next_connect_ns = 0
         self._backoff = Backoff(config.roboclaw.reconnect_min_s, config.roboclaw.reconnect_max_s)
@@ -132,6 +139,7 @@ class BaseController:
         stops, health = self.roboclaw.counters.stops, None
         try:
             v, w = self._drive(command, dt_s)
+            asked_ns = self._steady_ns()
             encoders = self.roboclaw.encoders()
             encoders_ns, stamp_ns = self._steady_ns(), self._now_ns()
             self._check_counts(encoders)
@@ -139,8 +147,9 @@ class BaseController:
                 self.roboclaw.check_watchdog()
                 health = Health(self._now_ns(), self.roboclaw.battery_v(), self.roboclaw.status())
                 self._next_health_ns = now_ns + int(self.config.health_period_s * 1e9)
-            rejected = self.odometry.rejected
-            estimate = self.odometry.update(encoders, encoders_ns)
+            rejected, estimate = self.odometry.rejected, None
+            if self._sure(asked_ns, encoders_ns):
+                estimate = self.odometry.update(encoders, encoders_ns)
             if self.odometry.rejected != rejected and self._near_zero(encoders):
                 raise ControllerRestarted(f"{self.config.roboclaw.port}: the encoder counts jumped to {encoders}")
         except LinkError as error:
@@ -161,6 +170,15 @@ class BaseController:
             v=v,
             w=w,
         )
+
+    def _sure(self, asked_ns: int, read_ns: int) -> bool:
+        """Whether the time of a reading is known well enough; a reading left out costs no motion, the next has it."""
+        before_ns = self._placed_ns
+        late = read_ns - asked_ns > _SURE_WITHIN_S * 1e9
+        if late and before_ns is not None and read_ns - before_ns < _UNSURE_AFTER_S * 1e9:
+            return False
+        self._placed_ns = read_ns
+        return True
 
     def _fresh_command(self) -> _Command | None:
         """Return the current command if it is fresh; discard a stale command, so that it never becomes fresh again."""

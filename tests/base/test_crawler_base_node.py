@@ -268,3 +268,50 @@ def test_clock_set_back_delays_neither_the_next_connection_nor_the_next_battery_
     assert state.connected
     steady[0] += int(config.health_period_s * 1000) * MILLISECOND
     assert controller.step().health is not None
+
+
+def test_an_encoder_reading_that_is_picked_up_late_costs_no_motion_and_gives_no_false_speed() -> None:
+    """At 0.4 m/s. The counts are right, but 120 ms old when the busy process takes them; the next ones are not."""
+    emulator = RoboclawEmulator()
+    port, now = EmulatorPort(emulator), [10**12]
+    config = ControllerConfig(roboclaw=RoboclawConfig(port="memory"))
+    controller = BaseController(config, lambda: now[0], lambda: now[0], opener(port))
+    controller.step()
+    controller.step()  # the first reading
+    read = controller.roboclaw.encoders
+    late_s = 0.0
+
+    def drive(seconds: float) -> None:
+        now[0] += round(seconds * 1e9)
+        emulator.encoder += 0.4 * seconds * config.geometry.pulses_per_metre
+
+    def encoders() -> np.ndarray:
+        counts = read()
+        drive(late_s)
+        return counts
+
+    controller.roboclaw.encoders = encoders  # type: ignore[method-assign]
+    estimates = []
+    for after_s, late_s in ((0.03, 0.0), (0.03, 0.12), (0.01, 0.0), (0.03, 0.0)):  # noqa: B007 - read by `encoders`
+        drive(after_s)
+        estimates.append(controller.step().odometry)
+    assert controller.odometry.rejected == 0
+    assert estimates[1] is None
+    taken = [one for one in estimates if one is not None]
+    assert [float(one.pose[0]) for one in taken] == pytest.approx([0.012, 0.076, 0.088], abs=1e-3)
+    assert [float(one.twist[0]) for one in taken] == pytest.approx([0.4, 0.4, 0.4], abs=0.01)
+
+
+def test_readings_that_are_all_late_are_taken_now_and_then() -> None:
+    now = [10**12]
+    config = ControllerConfig(roboclaw=RoboclawConfig(port="memory"))
+    controller = BaseController(config, lambda: now[0], lambda: now[0], opener(EmulatorPort(RoboclawEmulator())))
+    read = controller.roboclaw.encoders
+
+    def encoders() -> np.ndarray:
+        now[0] += 50 * MILLISECOND
+        return read()
+
+    controller.roboclaw.encoders = encoders  # type: ignore[method-assign]
+    taken = [controller.step().odometry is not None for _ in range(10)]
+    assert taken == [False, False, False, False, False, True, False, False, False, True]  # the first gives no estimate
