@@ -188,6 +188,8 @@ def load_manifest(path: str | Path) -> ModelManifest:
     lines: dict[str, int] = {}
     for key, _ in root.value:
         line = key.start_mark.line + 1
+        if key.tag != "tag:yaml.org,2002:str":
+            raise ManifestError(f"{path}:{line}: unknown key {key.value} (a key is a name)")
         if str(key.value) in lines:
             raise ManifestError(f"{path}:{line}: {key.value} stands here again (first in line {lines[key.value]})")
         lines[str(key.value)] = line
