@@ -294,8 +294,8 @@ class Renderers:
             try:
                 samples, error = self._given[which].get(timeout=1.0)
                 break
-            except (queue.Empty, EOFError) as none:
-                if isinstance(none, EOFError):
+            except (queue.Empty, EOFError, OSError) as none:
+                if not isinstance(none, queue.Empty):  # the pipe ends between two messages, or within one
                     self._processes[which].join(10)
                 if not self._processes[which].is_alive():
                     code = self._processes[which].exitcode
