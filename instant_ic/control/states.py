@@ -98,11 +98,6 @@ class Reason(IntEnum):
         """Whether nothing may move."""
         return self >= Reason.ESTOP
 
-    @property
-    def is_stale_source(self) -> bool:
-        """Whether a source that the state needs is stale."""
-        return self >= Reason.SCAN_STALE
-
 
 @dataclass(frozen=True)
 class State:

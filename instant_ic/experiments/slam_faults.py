@@ -322,8 +322,8 @@ def evaluate_faults(
     rng = np.random.default_rng(seed)
     first, last = max(WARM_UP_SCANS + 1, len(entries) // 5), len(entries) - LEAST_SCANS // 2
     at = np.sort(rng.choice(np.arange(first, last), size=min(places, last - first), replace=False))
-    tell = on_step or (lambda name: None)
-    tell("clean")
+    announce = on_step or (lambda name: None)
+    announce("clean")
     clean, before = _clean_run(entries, config, [int(k) for k in at])
     alarms = int((clean.trusted[:-1] & ~clean.trusted[1:]).sum())
     hours = max((entries[-1].scan.stamp_ns - entries[0].scan.stamp_ns) / 3.6e12, 1e-9)
@@ -337,7 +337,7 @@ def evaluate_faults(
     }
     saved = clean.slam.grid()
     for name in [name for name in faults if name in (*PLACE_FAULTS, *KIDNAPPINGS)]:
-        tell(name)
+        announce(name)
         runs = []
         for k, slam in before:
             own = np.random.default_rng([seed, k])
@@ -361,10 +361,10 @@ def evaluate_faults(
         report[name] = summary(runs)
     makers = whole_log_faults(entries, rng)
     for name in [name for name in faults if name in makers]:
-        tell(name)
+        announce(name)
         report[name] = _whole_log(makers[name](), config, clean, noise_seeds, relations)
     if RELOCALIZATION in faults:
-        tell(RELOCALIZATION)
+        announce(RELOCALIZATION)
         report[RELOCALIZATION] = relocalizations(entries, config, places, rng)
     return report
 

@@ -275,7 +275,7 @@ def test_the_robot_is_let_close_up_before_the_return_but_not_waited_for_when_it_
         made.until(Mode.VIRTUAL, FORWARD)
         made.drive(switch.min_virtual_s, FORWARD)
         made.map, waited = costmap([]), 0
-        for away_m in (0.3, *[gap_m] * 100):  # it stays so far off, whatever it is told
+        for away_m in (0.3, *[gap_m] * 100):  # it stays so far off, whatever its command
             made.robot = made.vbot.pose - [away_m, 0.0, 0.0]
             if made.step(NOTHING).mode == Mode.RETURNING:
                 break
