@@ -16,6 +16,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 from instant_ic.cli import commands
 from instant_ic.cli.errors import UserError
@@ -63,7 +64,11 @@ class _Terminated(KeyboardInterrupt):
 
 @contextmanager
 def _clean_end(launches: bool) -> Iterator[None]:
-    """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up."""
+    """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up.
+
+    A script's ``ic bag record &`` inherits SIGINT as ignored; it ends on ``kill -INT`` all the same. A hangup that
+    ``nohup`` ignores stays ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -71,8 +76,12 @@ def _clean_end(launches: bool) -> Iterator[None]:
     def end(signum: int, frame: FrameType | None) -> None:
         raise SystemExit(0) if launches else _Terminated
 
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if launches else (signal.SIGTERM, signal.SIGHUP)
-    before = [(number, signal.signal(number, end)) for number in numbers]
+    handlers: dict[int, Any] = dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), end)
+    if not launches:
+        handlers[signal.SIGINT] = signal.default_int_handler
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        del handlers[signal.SIGHUP]
+    before = [(number, signal.signal(number, handler)) for number, handler in handlers.items()]
     try:
         yield
     finally:

@@ -207,7 +207,7 @@ class Supervisor:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """Let SIGINT, SIGTERM and SIGHUP request the end; a second signal hurries it."""
+        """Let SIGINT, SIGTERM and SIGHUP, unless `nohup` ignores it, request the end; a second signal hurries it."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -215,7 +215,8 @@ class Supervisor:
         def on_signal(signum: int, frame: FrameType | None) -> None:
             self.request_stop(hurry=self._stop)
 
-        watched = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)
+        watched = (signal.SIGINT, signal.SIGTERM, *hangup)
         before = [(signum, signal.signal(signum, on_signal)) for signum in watched]
         try:
             yield
