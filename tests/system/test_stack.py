@@ -108,7 +108,7 @@ RECORDED_LOOPS = {
 def test_no_process_needs_half_again_as_much_cpu(outcome):
     measured = {name: round(value, 1) for name, value in sorted(outcome.loops.items())}
     assert measured.keys() - {"reaper.py"} == RECORDED_LOOPS.keys(), measured
-    # On a crowded machine (load 30 on two cores) all need up to twice as much: caches are cold, and the drive is longer.
+    # On a crowded machine (load 30 on two cores) all need up to twice as much: cold caches, and a longer drive.
     crowded = min(3.0, max(1.0, median(measured[name] / limit for name, limit in RECORDED_LOOPS.items())))
     # What a process of a few loops needs is mostly the machine's scheduling, which differs between machines.
     over = {
