@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 from instant_ic import msg
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.bus.transport import Received
-from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
-from instant_ic.control.costmap import CostmapConfig
 from instant_ic.control.estop import KeptEstop
 from instant_ic.control.operator_view import OperatorView
 from instant_ic.control.snapshot import ArbiterInputs
@@ -31,30 +28,7 @@ _REST_STEP_S = 0.1
 """Longest time between two steps while the robot rests: well below every receiver's time-out."""
 
 
-@dataclass(frozen=True)
-class ArbiterNodeConfig(ArbiterConfig):
-    """Parameters of the node ``arbiter``: the library's, and the node's own.
-
-    Attributes:
-        rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
-        wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
-        wall_period_s: s; walls are searched for in a changed /map at most this often, on a separate thread.
-        map_jump_m: m; a correction of map→odom larger than this makes the costmap forget its marks.
-        map_jump_deg: degrees; as map_jump_m, for the yaw.
-    """
-
-    rate_hz: Positive = 20.0
-    wall_min_length_m: Positive = 1.5
-    wall_period_s: Positive = 2.0
-    map_jump_m: Positive = 0.3
-    map_jump_deg: Positive = 5.0
-    costmap: CostmapConfig = field(default_factory=CostmapConfig)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
-
-class ArbiterNode(Node[ArbiterNodeConfig]):
+class ArbiterNode(Node[ArbiterConfig]):
     """Connects ``Arbiter`` and ``Surroundings`` to topics."""
 
     name = "arbiter"
@@ -112,7 +86,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.cancel_extra = lambda: None  # cancels a step between two timers
         self.timer(1.0 / c.rate_hz, self.on_timer)
 
-    def reconfigure(self, config: ArbiterNodeConfig) -> None:
+    def reconfigure(self, config: ArbiterConfig) -> None:
         super().reconfigure(config)
         self.arbiter.reconfigure(config)
         self.surroundings.jump_m, self.surroundings.jump_deg = config.map_jump_m, config.map_jump_deg
@@ -176,7 +150,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.costmap_ns = self.clock.steady_ns()
         scan = self.inbox.scan()
         costmap = self.surroundings.update_costmap(scan, self.inbox.cloud(), self.walls.map)
-        self.diagnose_surroundings()
+        self.show(*self.surroundings.findings.values())
         if costmap is None or scan is None:
             return
         if self.surroundings.map_jumped:
@@ -184,10 +158,6 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         if self.surroundings.publish_due(self.clock.steady_ns()):
             grid, (x, y) = costmap.occupancy(), costmap.origin.tolist()
             self.costmap_out.publish(msg.grid_message(grid, costmap.resolution, (x, y), "map", scan.stamp_ns))
-
-    def diagnose_surroundings(self) -> None:
-        for name, found in self.surroundings.findings.items():
-            self.diagnose(name, OK if found.ok else WARN, found.text, **found.values)
 
     def tick(self) -> None:
         self.stepped_ns = self.clock.steady_ns()
@@ -203,7 +173,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         frame = msg.HARD_STOP if decision.hard else "base_link"
         self.cmd_vel.publish(msg.twist_stamped(*decision.command, now_ns, frame))
         self.publish_decision(decision, inputs, now_ns)
-        self.diagnose_surroundings()
+        self.show(*self.surroundings.findings.values())
         # One more step if the next timer may be later than a time-out: time-outs are exact.
         self.cancel_extra()
         stale_in_s = self.arbiter.stale_in_s(inputs, self.clock.steady_ns())

@@ -11,15 +11,15 @@ from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.states import VbotAction
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallFinder, WallSearch
-from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
+from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import (
     ControlState,
     OccupancyGrid,
     Odometry,
     TwistStamped,
     grid_array,
-    matrix_from_pose,
     odometry_message,
+    pose2_from_message,
     stamp_ns,
     twist_values,
 )
@@ -111,13 +111,13 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
     def obey(self, state: ControlState, dt_s: float) -> None:
         """Act as the arbiter's state demands."""
         action, before, self.action = VbotAction(state.vbot_action), self.action, VbotAction(state.vbot_action)
-        robot_pose = pose2_from_matrix(matrix_from_pose(state.robot_pose))
+        robot_pose = pose2_from_message(state.robot_pose)
         robot_twist = twist_values(state.robot_twist)
         age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
         # The arbiter's message is up to a period old, and the r-bot moves on.
-        target = extrapolate(pose2_from_matrix(matrix_from_pose(state.vbot_target)), robot_twist, age_s)
+        target = extrapolate(pose2_from_message(state.vbot_target), robot_twist, age_s)
         if before is None and action != VbotAction.WITH_ROBOT:
-            self.robot.place(pose2_from_matrix(matrix_from_pose(state.vbot_pose)), (0.0, 0.0))  # the node was restarted
+            self.robot.place(pose2_from_message(state.vbot_pose), (0.0, 0.0))  # the node was restarted
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
