@@ -20,11 +20,6 @@ def _quiet(function: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
     return complete
 
 
-def offer(argument: Any, words: Callable[..., list[str]]) -> None:
-    """Attach one of the completers below to an argument of a parser."""
-    argument.completer = words
-
-
 @_quiet
 def topics(args: Any) -> Iterable[str]:
     """Topics that are published or subscribed."""

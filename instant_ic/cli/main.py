@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from instant_ic.cli import commands
+from instant_ic.cli.arguments import Parser
 from instant_ic.cli.errors import UserError
 
 _DESCRIPTION = "Instant IC: teleoperation that switches between a real robot and an instantly built virtual one."
@@ -36,7 +37,7 @@ _EPILOG = """examples:
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the parser with every verb."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="ic", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
@@ -111,6 +112,12 @@ def _call(args: argparse.Namespace) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
+        if isinstance(error, OSError) and error.filename:  # a file that cannot be read or written
+            print(f"ic: {error.filename}: {error.strerror}", file=sys.stderr)
+            return 1
+        if type(error) in (FileNotFoundError, FileExistsError):  # raised by us: by the system, it has a file name
+            print(f"ic: {error}", file=sys.stderr)
+            return 1
         # Our own error classes carry a message for the user; anything else is a bug and keeps its traceback.
         if not type(error).__module__.startswith("instant_ic."):
             raise

@@ -208,7 +208,7 @@ def test_plot_and_strip_are_written(report, tmp_path):
     [
         (["--world", "nowhere.glb"], "nowhere.glb"),
         (["--world", "corridor", "--path", "up"], "straight, curve"),
-        (["--world", "corridor", "--size", "big"], "WIDTHxHEIGHT"),
+        (["--world", "corridor", "--size", "big"], "640x360"),
         (["--world", "corridor", "--start", "1,2"], "x,y,yaw"),
         (["--world", "corridor", "--times", "1,x"], "--times"),
         (["--world", "corridor", "--json", "/nowhere/at/all.json"], "does not exist"),

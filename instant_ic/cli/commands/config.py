@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
-from instant_ic.cli.arguments import launch_values
+from instant_ic.cli.arguments import group, launch_values, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -17,44 +17,29 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
-    parser = subparsers.add_parser(
-        "config",
-        help="check configuration files, show the values of a node",
-        description="Check configuration files, and show the values that a node would start with.",
-        epilog="example: ic config show arbiter --changed",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
-    check = verbs.add_parser(
-        "check",
-        help="report all mistakes in launch and parameter files",
-        description="Report all mistakes in launch and parameter files, with file and line; status 1 if there are any.",
-        epilog="example: ic config check my_robot.yaml",
-    )
-    completion.offer(
-        check.add_argument(
-            "files", nargs="*", metavar="LAUNCH_OR_FILE",
-            help="launch file, shipped launch file by name, or parameter file (default: all shipped files)",
-        ),
-        completion.launch_files,
+    verbs = group(
+        subparsers, "config", "check configuration files, show the values of a node",
+        "Check configuration files, and show the values that a node would start with.",
+        "ic config show arbiter --changed",
     )  # fmt: skip
-    check.set_defaults(func=check_files)
-    show = verbs.add_parser(
-        "show",
-        help="effective value of each parameter of a node, and where it comes from",
-        description="Print the effective value of each parameter of a node, and where it comes from: the default, a "
+    check = verb(
+        verbs, "check", "report all mistakes in launch and parameter files", check_files,
+        "ic config check my_robot.yaml",
+        "Report all mistakes in launch and parameter files, with file and line; status 1 if there are any.",
+    )  # fmt: skip
+    text = "launch file, shipped launch file by name, or parameter file (default: all shipped files)"
+    check.add_argument("files", nargs="*", metavar="LAUNCH_OR_FILE", help=text, completer=completion.launch_files)
+    add = verb(
+        verbs, "show", "effective value of each parameter of a node, and where it comes from", show_node,
+        "ic config show vlp16_driver --launch robot lidar_port:=3000",
+        "Print the effective value of each parameter of a node, and where it comes from: the default, a "
         "parameter file, the launch file, or an argument of the launch file.",
-        epilog="example: ic config show vlp16_driver --launch robot lidar_port:=3000",
-    )
-    show.add_argument("node", metavar="NODE", help="name of the node in the launch file")
-    completion.offer(
-        show.add_argument(
-            "--launch", nargs="+", default=[], metavar=("FILE", "KEY:=VALUE"),
-            help="launch file and its arguments (default: the first of full, sim and replay with this node)",
-        ),
-        completion.launch_files,
-    )  # fmt: skip
-    show.add_argument("--changed", action="store_true", help="only values that differ from the default")
-    show.set_defaults(func=show_node)
+    ).add_argument  # fmt: skip
+    add("node", metavar="NODE", help="name of the node in the launch file")
+    text = "launch file and its arguments (default: the first of full, sim and replay with this node)"
+    form = ("FILE", "KEY:=VALUE")
+    add("--launch", nargs="+", default=[], metavar=form, help=text, completer=completion.launch_files)
+    add("--changed", action="store_true", help="only values that differ from the default")
 
 
 def check_files(args: argparse.Namespace) -> int:
