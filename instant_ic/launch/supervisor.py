@@ -17,6 +17,7 @@ from types import FrameType
 from typing import Protocol
 
 from instant_ic.launch.description import Announcement, NodeSpec, Shutdown
+from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, RespawnLimit, Schedule, State, describe_exit
 from instant_ic.launch.reaper import kill_marked
@@ -54,19 +55,6 @@ class Output(Protocol):
 
     def stopping(self) -> None:
         """Called once, when the end begins."""
-
-
-class Health(Protocol):
-    """The nodes' heartbeats."""
-
-    def poll(self) -> None:
-        """Process the messages that have arrived; never waits."""
-
-    def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
-        """Monotonic time of the newest heartbeat in which this process reported that it runs; None before the first."""
-
-    def close(self) -> None:
-        """Disconnect from the bus."""
 
 
 class _Silence:
@@ -116,7 +104,7 @@ class Supervisor:
         output: Output,
         make_limit: Callable[[NodeSpec], RespawnLimit] | None = None,
         stop_schedule: Schedule = STOP_SCHEDULE,
-        make_health: Callable[[], Health] | None = None,
+        make_health: Callable[[], HealthMonitor] | None = None,
         announcements: Sequence[Announcement] = (),
         shutdown: Shutdown | None = None,
     ) -> None:
@@ -133,7 +121,7 @@ class Supervisor:
             for node in nodes
         ]
         self._make_health = make_health
-        self._health: Health | None = None
+        self._health: HealthMonitor | None = None
         self._silences = {process: _Silence() for process in self.processes}
         self._announcements = sorted(announcements, key=lambda announcement: announcement.delay_s)
         self._shutdown = shutdown

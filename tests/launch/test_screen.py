@@ -9,11 +9,12 @@ import pytest
 from rich.console import Console
 
 from instant_ic.bus import RELIABLE
+from instant_ic.bus.heartbeat import Flow, Heartbeat
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.launch import NodeSpec
 from instant_ic.launch.app import _Output, _row
-from instant_ic.launch.health import HealthMonitor, NodeHealth, TopicFault, find_console
+from instant_ic.launch.health import HealthMonitor, TopicFault, find_console
 from instant_ic.launch.process import State
 from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.msg import NodeStatus, header, serialize
@@ -158,7 +159,7 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
                 break
             time.sleep(0.01)
         health = monitor.nodes["my_slam"]
-        assert (health.state, health.message, health.rates_hz) == ("running", "all well", {"/pose": 10.0})
+        assert (health.state, health.message, health.outputs["/pose"].rate_hz) == ("running", "all well", 10.0)
         assert monitor.nodes_missing() == ["other"] and monitor.waiting_for() == []
         assert not health.silent
         assert monitor.beat_s(nodes[0], 77) == health.seen_s
@@ -257,7 +258,8 @@ def test_row_of_a_node_from_its_process_its_heartbeat_and_its_topics() -> None:
     )
     now_s = time.monotonic()
     rates = {"/heartbeat": 2.0, "/unknown": 3.0, "/lidar/points": 10.0, "/scan": 5.0, "/lidar/packets": 0.0}
-    health = NodeHealth("running", "", 7.0, 180.0, rates, now_s)
+    outputs = {topic: Flow(rate_hz, 0.0) for topic, rate_hz in rates.items()}
+    health = Heartbeat("lidar", 1, "running", "", 7.0, 180.0, outputs=outputs, seen_s=now_s)
     monitor: Any = SimpleNamespace(nodes={"lidar": health})
     slow = TopicFault("lidar", "/scan", "5.0 of 10 Hz", stopped=False)
     row = _row(process, monitor, [slow, TopicFault("other", "/pose", "stopped 3.0 s ago", stopped=True)])

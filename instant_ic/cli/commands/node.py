@@ -54,7 +54,8 @@ def show(args: argparse.Namespace) -> int:
 
     from instant_ic import paths
     from instant_ic.bus.control import ControlError, NodeControl
-    from instant_ic.cli.heartbeats import Flow, hear
+    from instant_ic.bus.heartbeat import Flow
+    from instant_ic.cli.heartbeats import hear
     from instant_ic.cli.names import find_node
 
     node = find_node(args.node)
