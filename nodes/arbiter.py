@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from instant_ic import msg
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.bus.transport import Received
@@ -14,6 +12,7 @@ from instant_ic.control.operator_view import OperatorView
 from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.sources import STEP_AFTER_S
 from instant_ic.control.states import Mode
+from instant_ic.control.step_times import REST_COSTMAP_S, REST_STEP_S, StepTimes
 from instant_ic.control.surroundings import Surroundings
 from instant_ic.control.walls import WallFinder, WallSearch
 from instant_ic.control.warmup import warm_up
@@ -21,11 +20,6 @@ from instant_ic.control_messages import ArbiterInbox, control_state, page_report
 from instant_ic.estop_state import EstopStateError
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import ControlState, twist_values
-
-_REST_COSTMAP_S = 0.5
-"""Period of the costmap while the robot rests; the command that ends the rest updates it at once."""
-_REST_STEP_S = 0.1
-"""Longest time between two steps while the robot rests: well below every receiver's time-out."""
 
 
 class ArbiterNode(Node[ArbiterConfig]):
@@ -50,13 +44,9 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.latch = KeptEstop(self.run_dir, self.clock.now_ns())
         if self.latch.pressed:
             self.log.warning("emergency stop: %s", self.latch.why or "still pressed from before this start")
-        self.obeyed = (0.0, 0.0)  # operator's command of the last step
-        self.early = False  # a step was made ahead of its time since the last timer
+        self.times = StepTimes()
         self.was_gone = False  # a step was made for the loss of the driver
         self.ticks = 0
-        self.stepped_ns = 0  # last step, steady clock
-        self.rests = False  # the robot rested at the last step
-        self.costmap_ns = 0  # last update, steady clock
         self.cmd_vel = self.publisher("/cmd_vel", msg.TwistStamped, qos=SENSOR)
         self.state = self.publisher("/ic/state", ControlState, qos=LATCHED)
         self.subgoal = self.publisher("/ic/subgoal", msg.PoseStamped, qos=SENSOR)
@@ -74,13 +64,15 @@ class ArbiterNode(Node[ArbiterConfig]):
         shown = self.latest("/view/shown", msg.ShownPictures, 1.0, callback=self.on_shown)
         vspace = self.latest("/vspace/status", msg.VspaceStatus, 60.0, qos=LATCHED)
         # A doubt holds until the next report: silence is no trust. A SLAM that is gone is noticed by the age of /pose.
-        integrity = self.latest("/slam/integrity", msg.PoseIntegrity, math.inf)
+        integrity = self.latest("/slam/integrity", msg.PoseIntegrity, float("inf"))
         self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace, integrity)
         self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=msg.Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=msg.Bool)
         # Only its age matters: the image is never decoded here.
-        self.subscribe_raw("/camera/image/compressed", self.on_camera, qos=SENSOR)
+        self.subscribe_raw(
+            "/camera/image/compressed", lambda *_: self.view.camera_image(self.clock.steady_ns()), qos=SENSOR
+        )
         self.timer(c.wall_period_s, self.walls.update)
         self.timer(1.0 / c.costmap.update_frequency, self.update_costmap)
         self.cancel_extra = lambda: None  # cancels a step between two timers
@@ -119,20 +111,12 @@ class ArbiterNode(Node[ArbiterConfig]):
             self.diagnose("estop", ERROR, str(error))
 
     def on_command(self, message: msg.TwistStamped) -> None:
-        """Obey a changed command at once: the next timer is half a period away on average."""
-        if not self.early and twist_values(message) != self.obeyed:
-            self.early = True
+        if self.times.command_steps(twist_values(message)):
             self.tick()
 
     def on_timer(self) -> None:
-        self.early = False
-        since_s = (self.clock.steady_ns() - self.stepped_ns) / 1e9
-        # Timers jitter: at 20 Hz every second one is meant.
-        if not 0.0 <= since_s < 0.9 * _REST_STEP_S or not self.inbox.rests(self.arbiter.mode):
+        if self.times.timer_steps(self.clock.steady_ns(), self.inbox.rests(self.arbiter.mode)):
             self.tick()
-
-    def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
-        self.view.camera_image(self.clock.steady_ns())
 
     def on_shown(self, message: msg.ShownPictures) -> None:
         """Step at once if a switch waits for the new images, or the driver was lost."""
@@ -144,10 +128,8 @@ class ArbiterNode(Node[ArbiterConfig]):
             self.tick()
 
     def update_costmap(self) -> None:
-        since_s = (self.clock.steady_ns() - self.costmap_ns) / 1e9
-        if 0.0 <= since_s < _REST_COSTMAP_S and self.inbox.rests(self.arbiter.mode):
+        if not self.times.costmap_due(self.clock.steady_ns(), self.inbox.rests(self.arbiter.mode)):
             return
-        self.costmap_ns = self.clock.steady_ns()
         scan = self.inbox.scan()
         costmap = self.surroundings.update_costmap(scan, self.inbox.cloud(), self.walls.map)
         self.show(*self.surroundings.findings.values())
@@ -160,14 +142,13 @@ class ArbiterNode(Node[ArbiterConfig]):
             self.costmap_out.publish(msg.grid_message(grid, costmap.resolution, (x, y), "map", scan.stamp_ns))
 
     def tick(self) -> None:
-        self.stepped_ns = self.clock.steady_ns()
-        rested, self.rests = self.rests, self.inbox.rests(self.arbiter.mode)
-        if rested and not self.rests:
+        rests = self.inbox.rests(self.arbiter.mode)
+        if self.times.begin_step(self.clock.steady_ns(), rests):
             self.update_costmap()  # the first command of a drive is checked against what is there now
         now_ns = self.clock.now_ns()
-        points_every_s = _REST_COSTMAP_S if self.rests else 0.0
+        points_every_s = REST_COSTMAP_S if rests else 0.0
         inputs = self.inbox.inputs(self.latch, self.walls.found, self.config.timeouts, points_every_s)
-        self.obeyed = inputs.operator_command
+        self.times.obeyed = inputs.operator_command
         # Steady time: setting the clock back must not make a stale source look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
         frame = msg.HARD_STOP if decision.hard else "base_link"
@@ -177,7 +158,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         # One more step if the next timer may be later than a time-out: time-outs are exact.
         self.cancel_extra()
         stale_in_s = self.arbiter.stale_in_s(inputs, self.clock.steady_ns())
-        if stale_in_s < max(_REST_STEP_S, 1.0 / self.config.rate_hz):
+        if stale_in_s < max(REST_STEP_S, 1.0 / self.config.rate_hz):
             self.cancel_extra = self.timer(stale_in_s + STEP_AFTER_S, self.tick).cancel
 
     def publish_decision(self, decision: Decision, inputs: ArbiterInputs, now_ns: int) -> None:

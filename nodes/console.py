@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 from instant_ic import msg
@@ -25,6 +25,7 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     name = "console"
     live_parameters = ("view",)
+    feed: PageFeed
 
     def setup(self) -> None:
         config = self.config
@@ -47,12 +48,11 @@ class ConsoleNode(Node[ConsoleConfig]):
         except ConsoleError as error:
             raise NodeError(str(error)) from error
         self.recording = RecordingDesk(self.ask_recorder, lambda status: self.server.publish("recording", status))
+        self.on_record, self.on_snapshot = self.recording.record, self.recording.snapshot
         self.feed = feed = PageFeed(config, self.server, self.tf, inputs, self, self.clock, self.diagnose)
         self.subscribe("/camera/image/compressed", msg.CompressedImage, feed.take_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", msg.RenderedView, feed.take_view, qos=SENSOR)
-        self.mesher = self.background(
-            feed.layers_of, feed.take_layers
-        )  # 30 ms a keyframe: commands must not wait for it
+        self.mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms: commands must not wait for it
         self.layers: Subscription | None = None
         self.subscribe("/map", msg.OccupancyGrid, partial(feed.grids.take, FrameKind.MAP), qos=LATCHED)
         self.subscribe("/costmap", msg.OccupancyGrid, partial(feed.grids.take, FrameKind.COSTMAP), qos=SENSOR)
@@ -68,7 +68,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         if self.run_dir is not None:
             self.start_server(sign_in_file(self.run_dir, self.node_name))
 
-    def start_server(self, sign_in: FilePath) -> None:
+    def start_server(self, sign_in: Path) -> None:
         try:
             self.server.start()
             self.log.info("open %s in a browser", self.server.url)
@@ -127,12 +127,6 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_look(self, look: Look) -> None:
         self.feed.requests.look = look
-
-    def on_record(self, on: bool) -> None:
-        self.recording.record(on)
-
-    def on_snapshot(self) -> None:
-        self.recording.snapshot()
 
     def on_bookmark(self, name: str) -> None:
         self.bookmark_out.publish(msg.String(data=name))  # the topic puts it into every recording and snapshot
