@@ -6,9 +6,9 @@ import shutil
 import pytest
 from cli_helpers import talking, wait_until
 
+from instant_ic.bus.heartbeat import Flow, Heartbeat
 from instant_ic.bus.registry import NodeInfo
 from instant_ic.cli.graph import dot, make_graph, mermaid, rate_text, tree, write
-from instant_ic.cli.heartbeats import Flow, Heartbeat
 
 
 def infos():
