@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from instant_ic.bus import RELIABLE
-from instant_ic.bus.heartbeat import Flow, Heartbeat
+from instant_ic.bus.heartbeat import Flow, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.launch import NodeSpec
@@ -173,10 +173,12 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
 def test_one_message_reaches_a_milestone(tmp_path: Path) -> None:
     monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
     try:
-        monitor._take(beat("my_slam", rate_hz=0.0, age_s=float("inf")), "")
+        monitor.nodes["my_slam"] = from_message(beat("my_slam", rate_hz=0.0, age_s=float("inf")))
         monitor.poll()
         assert monitor.waiting_for() == ["map"]
-        monitor._take(beat("my_slam", rate_hz=0.0, age_s=40.0), "")  # a single message has no rate
+        monitor.nodes["my_slam"] = from_message(
+            beat("my_slam", rate_hz=0.0, age_s=40.0)
+        )  # a single message has no rate
         monitor.poll()
         assert monitor.waiting_for() == []
     finally:
@@ -193,7 +195,7 @@ def test_a_topic_that_flowed_and_slows_down_or_stops_is_a_fault_after_a_while(
 
     def faults_after(seconds: float, rate_hz: float, age_s: float) -> list[str]:
         now[0] += seconds
-        monitor._take(beat("my_slam", rate_hz=rate_hz, age_s=age_s), "")
+        monitor.nodes["my_slam"] = from_message(beat("my_slam", rate_hz=rate_hz, age_s=age_s))
         return [fault.words for fault in monitor.topic_faults()]
 
     try:

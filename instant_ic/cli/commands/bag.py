@@ -14,7 +14,6 @@ _VALUES = {"step": "count", "rate": "rate", "seek": "offset_s"}
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     verbs = group(
         subparsers, "bag", "record, play, inspect, compare, convert and recover bags",
         "Work with bags: rosbag2 folders (MCAP) that ROS 2, Foxglove and rosbags can open.", "ic bag record -o drive",

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``calibrate`` to the ``ic`` command."""
     text = "calibrate sensor mounts from a recording"
     verbs = group(subparsers, "calibrate", text, f"{text.capitalize()} (docs/calibration.md).")
     add = verb(
@@ -44,7 +43,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def camera_lidar(args: argparse.Namespace) -> int:
-    """Run ``ic calibrate camera-lidar``; return the exit status."""
     from instant_ic.calibration.bag import Selection, read_recording
     from instant_ic.calibration.mount import CalibrationConfig, calibrate
 

@@ -13,7 +13,6 @@ NODES = ("simulator", "vlp16_driver", "grid_slam", "arbiter", "navigator", "nerf
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     verb(
         subparsers, "compile", "compile the kernels ahead of the first start", run, "ic compile",
         "Compile the numba kernels of all nodes, which takes a minute on two cores after an installation "
@@ -22,7 +21,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace | None = None) -> int:
-    """Compile with progress; 1 if a part cannot be compiled."""
     from instant_ic.cli.kernels import are_compiled, compile_all
     from instant_ic.cli.progress import progress
 

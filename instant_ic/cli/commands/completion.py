@@ -15,7 +15,6 @@ _HINTS = {
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     text = "Print the code that enables completion of ic commands with TAB. Add one of these lines:\n\n  "
     parser = verb(
         subparsers, "completion", "set up shell completion", show, "ic completion bash",
@@ -25,7 +24,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the shell code."""
     import argcomplete
 
     print(argcomplete.shellcode(["ic"], shell=args.shell))

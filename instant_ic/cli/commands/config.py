@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     verbs = group(
         subparsers, "config", "check configuration files, show the values of a node",
         "Check configuration files, and show the values that a node would start with.",
@@ -43,7 +42,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def check_files(args: argparse.Namespace) -> int:
-    """Check files, all mistakes at once."""
     from instant_ic import paths
     from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
     from instant_ic.launch.parameters import check_parameter_file, check_parameters_quickly
@@ -93,7 +91,6 @@ def _is_launch_file(file: Path) -> bool:
 
 
 def show_node(args: argparse.Namespace) -> int:
-    """Print value and origin of each parameter."""
     from instant_ic.cli.commands.param import show_value
     from instant_ic.config.parameter_info import parameter_infos
     from instant_ic.config.params import ParameterError, configure

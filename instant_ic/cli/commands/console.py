@@ -17,7 +17,6 @@ LAYERS = "/vspace/layers"
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``console`` to the ``ic`` command."""
     text = "export what the operator's page shows"
     verbs = group(subparsers, "console", text, f"{text.capitalize()}.")
     add = verb(
@@ -32,7 +31,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def export_scene(args: argparse.Namespace) -> int:
-    """Run ``ic console export-scene``; return the exit status."""
     from instant_ic.console.export_scene import scene_html
     from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
     from instant_ic.msg import MessageError, deserialize

@@ -21,7 +21,6 @@ PROVIDERS = ("auto", "tensorrt", "cuda", "cpu")
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``depth`` with its own subcommands."""
     commands = group(
         subparsers, "depth", "train, convert, check and run 360° depth models",
         "Train, convert, check and run 360° depth models (docs/depth.md).",
@@ -79,7 +78,6 @@ def _add_model(add: Any) -> None:
 
 
 def textures(args: argparse.Namespace) -> int:
-    """``ic depth textures``."""
     from instant_ic.training.photographs import unpack
 
     print(f"wrote {unpack(args.wheel, args.output)} textures to {args.output}")
@@ -87,7 +85,6 @@ def textures(args: argparse.Namespace) -> int:
 
 
 def convert(args: argparse.Namespace) -> int:
-    """``ic depth convert``."""
     import torch
 
     from instant_ic.training.export import export_model
@@ -129,7 +126,6 @@ def _load(args: argparse.Namespace) -> DepthModel:
 
 
 def check(args: argparse.Namespace) -> int:
-    """``ic depth check``."""
     from dataclasses import asdict
 
     import numpy as np
@@ -171,7 +167,6 @@ def check(args: argparse.Namespace) -> int:
 
 
 def estimate(args: argparse.Namespace) -> int:
-    """``ic depth estimate``."""
     import cv2
     import numpy as np
 

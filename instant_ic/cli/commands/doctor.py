@@ -10,7 +10,6 @@ from instant_ic.cli.arguments import verb
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     add = verb(
         subparsers, "doctor", "check machine, devices, ports, models and configuration", run,
         "ic doctor --robot --serial-port /dev/ttyACM0", "Check this machine, its devices, ports, models and "
@@ -25,7 +24,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the checks and print a line for each."""
     from instant_ic import paths
     from instant_ic.cli.doctor import run_checks
     from instant_ic.cli.finding import FAIL, OK, WARN
@@ -45,7 +43,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _expectation(args: argparse.Namespace) -> Any:
-    """Addresses from the command line, else from the shipped configuration."""
     from instant_ic import paths
     from instant_ic.cli.doctor import Expectation
     from instant_ic.config.params import ParameterError, load_file

@@ -17,7 +17,6 @@ from instant_ic.cli.evaluations import print_figures
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``evaluate`` to the ``ic`` command."""
     kinds = group(
         subparsers, "evaluate", "measure parts of the stack on recordings or in simulation",
         "Run the stack or a part of it on recordings or in simulation, and measure the results.",
@@ -43,7 +42,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def evaluate_recordings(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate recordings``; return the exit status."""
     from rich.console import Console
 
     from instant_ic.experiments.recordings import evaluate_recordings as run

@@ -13,7 +13,6 @@ from instant_ic.cli.evaluations import print_figures
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``depth`` to ``ic evaluate``."""
     add = verb(
         kinds, "depth", "compare estimated depth of panoramas with the true depth", evaluate_depth,
         "ic evaluate depth rgb/ --depth depth/ --lidar --outliers 0.05 --json out.json --plot out.png",
@@ -48,7 +47,6 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_depth(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate depth``; return the exit status."""
     from instant_ic.cli.progress import progress
     from instant_ic.depth.files import DepthFileError, load_depth, load_picture
     from instant_ic.depth.manifest import InferenceError, ManifestError

@@ -13,7 +13,6 @@ from instant_ic.cli.evaluations import add_options, check_outputs, counted, erro
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``follow`` to ``ic evaluate``."""
     parser = verb(
         kinds, "follow", "simulate the r-bot following a v-bot through random rooms", run,
         "ic evaluate follow --episodes 50 --seed 0 --json follow.json --plot follow.png",
@@ -26,7 +25,6 @@ def add_kind(kinds: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate follow``; return the exit status."""
     from instant_ic.experiments import follow
 
     check_outputs(args)

@@ -20,7 +20,6 @@ from instant_ic.cli.evaluations import (
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``illusion`` to ``ic evaluate``."""
     parser = verb(
         kinds, "illusion", "compare the operator's view inside and behind obstacles with the truth", run,
         "ic evaluate illusion --episodes 4 --json illusion.json --strip strip.png --plot plot.png",
@@ -37,7 +36,6 @@ def add_kind(kinds: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate illusion``; return the exit status."""
     use_one_thread_for_matrices()
     check_outputs(args, strip=".png", plot=".png")
     try:

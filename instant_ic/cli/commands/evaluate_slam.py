@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``slam`` to ``ic evaluate``."""
     add = verb(
         kinds, "slam", "run SLAM on a 2D laser log", evaluate_slam,
         "ic evaluate slam intel.log.gz --relations intel.relations --stamps intel.exact_stamps",
@@ -62,7 +61,6 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_slam(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate slam``; return the exit status."""
     from rich.console import Console
 
     from instant_ic.bag.replay import make_node

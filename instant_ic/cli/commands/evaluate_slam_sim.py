@@ -12,7 +12,6 @@ from instant_ic.cli.progress import progress
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``slam-sim`` to ``ic evaluate``."""
     add = verb(
         kinds, "slam-sim", "run SLAM on round trips of the simulated crawler with slipping tracks", evaluate_slam_sim,
         "ic evaluate slam-sim --slip 0.2 --seeds 5",
@@ -32,7 +31,6 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_slam_sim(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate slam-sim``; return the exit status."""
     from instant_ic.experiments.particle_slam import ParticleConfig
     from instant_ic.experiments.pictures import save_map
     from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip

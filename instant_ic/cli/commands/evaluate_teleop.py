@@ -22,7 +22,6 @@ from instant_ic.cli.evaluations import (
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``teleop`` to ``ic evaluate``."""
     parser = verb(
         kinds, "teleop",
         "simulate an operator in corridors with hidden obstacles: illusory control, stopping, shared control", run,
@@ -54,7 +53,6 @@ def add_kind(kinds: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate teleop``; return the exit status."""
     use_one_thread_for_matrices()
     check_outputs(args, video=".mp4")
     if args.operator == "recorded" and args.log is None:

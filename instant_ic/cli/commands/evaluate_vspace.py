@@ -14,7 +14,6 @@ from instant_ic.cli.progress import progress
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``vspace`` to ``ic evaluate``."""
     add = verb(
         kinds, "vspace", "image quality of the virtual space by distance and training time", run,
         "ic evaluate vspace --world corridor --path straight --sources ours,panorama,depth-warp "
@@ -44,7 +43,6 @@ def add_kind(kinds: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate vspace``; return the exit status."""
     from rich.console import Console
     from rich.table import Table
 

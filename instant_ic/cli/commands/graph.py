@@ -12,7 +12,6 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     add = verb(
         subparsers, "graph", "nodes and topics as a tree, Graphviz or Mermaid text, or an image", show,
         "ic graph -o stack.mmd", "Show publishers and subscribers as a tree, or write them to a file with -o.",
@@ -27,7 +26,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the tree, or write the file."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.graph import make_graph, tree, write

@@ -11,7 +11,6 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     verbs = group(
         subparsers, "interface", "list and show message types",
         "List message types and show their fields with units and frames.",
@@ -31,7 +30,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def list_types(args: argparse.Namespace) -> int:
-    """Print all types."""
     from instant_ic.msg import typestore
 
     print("Messages:")
@@ -41,7 +39,6 @@ def list_types(args: argparse.Namespace) -> int:
 
 
 def list_package(args: argparse.Namespace) -> int:
-    """Print the types of a package."""
     from instant_ic.cli.names import near
     from instant_ic.msg import typestore
 
@@ -55,7 +52,6 @@ def list_package(args: argparse.Namespace) -> int:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the definition of a type."""
     from instant_ic.cli.names import find_type
     from instant_ic.msg.definition import expanded_definition
 

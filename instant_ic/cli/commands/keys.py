@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     verbs = group(
         subparsers, "keys", "manage keys of the link between robot and station",
         "Create this host's key, and set which other hosts may connect to it (docs/bridge.md).", "ic keys new",
@@ -59,7 +58,6 @@ def host_name() -> str:
 
 
 def make(args: argparse.Namespace) -> int:
-    """Create this host's key."""
     from instant_ic.bridge.host_keys import key_text
 
     store = _store(args)
@@ -70,7 +68,6 @@ def make(args: argparse.Namespace) -> int:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print this host's key and a line for each allowed host."""
     from instant_ic.bridge.host_keys import key_text
 
     store = _store(args)
@@ -108,7 +105,6 @@ def let_in(args: argparse.Namespace) -> int:
 
 
 def shut_out(args: argparse.Namespace) -> int:
-    """Remove a host from the list."""
     peer = _store(args).revoke(args.name)
     print(f"{peer.name} (fingerprint {peer.fingerprint}) is no longer allowed")
     return 0

@@ -14,7 +14,6 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     parser = verb(
         subparsers, "launch", "start a stack from a launch file", run,
         "ic launch sim console_port:=9000 record:=drive",
@@ -48,7 +47,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, check and run the launch file."""
     from instant_ic import paths
     from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
 

@@ -13,7 +13,6 @@ _POLL_S = 0.2
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     add = verb(
         subparsers, "log", "show log lines of the nodes, or set a log level", show,
         "ic log arbiter navigator --level warning -f", "Show log lines of the nodes, sorted by time.\n"
@@ -31,7 +30,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print log lines, or print or set a node's log level."""
     import sys
     import time
 

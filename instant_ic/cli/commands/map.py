@@ -19,7 +19,6 @@ SAVE, SAVED, LOCAL = "/slam/save", "/slam/saved", "/map/local"
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``map`` to the ``ic`` command."""
     verbs = group(subparsers, "map", "save the map", "Save the map or the local 3D model of the running stack.")
     text = "wait at most this long (default: %(default)g s)"
     add = verb(
@@ -43,7 +42,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def save_map(args: argparse.Namespace) -> int:
-    """Run ``ic map save``; return the exit status."""
     from instant_ic.bus import RELIABLE
     from instant_ic.bus.node import Publisher
     from instant_ic.cli.observer import Observer
@@ -76,7 +74,6 @@ def save_map(args: argparse.Namespace) -> int:
 
 
 def save_local(args: argparse.Namespace) -> int:
-    """Run ``ic map local``; return the exit status."""
     from instant_ic.mapping.ply import write_ply
 
     out = args.out.expanduser()

@@ -10,7 +10,6 @@ from instant_ic.cli.arguments import group, verb
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     verbs = group(subparsers, "node", "list running nodes", "List and describe running nodes.", "ic node list")
     add = verb(verbs, "list", "names of the running nodes", list_nodes, "ic node list -v").add_argument
     add("-c", "--count-nodes", action="store_true", help="print only their number")
@@ -23,7 +22,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def list_nodes(args: argparse.Namespace) -> int:
-    """Print a line per node."""
     import sys
     import time
 
@@ -49,7 +47,6 @@ def list_nodes(args: argparse.Namespace) -> int:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print one node."""
     import math
 
     from instant_ic import paths

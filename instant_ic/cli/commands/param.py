@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     text = "read and change parameters of running nodes"
     verbs = group(subparsers, "param", text, f"{text.capitalize()}.", "ic param set arbiter switch.yaw_deg 12")
     of = {"metavar": "NODE", "completer": completion.nodes}
@@ -54,7 +53,7 @@ def _control(node: str) -> NodeControl:
 
 
 def list_parameters(args: argparse.Namespace) -> int:
-    """Print names (and values) by node, from the registry: this also works for a hanging node."""
+    """Print parameters from the registry: this also works for a hanging node."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import find_node, nobody_runs
@@ -83,7 +82,6 @@ def _list_changed(nodes: Sequence[str]) -> int:
 
 
 def get_parameter(args: argparse.Namespace) -> int:
-    """Print one value, or the values of a group."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 
@@ -105,7 +103,6 @@ def _no_parameter(node: str, key: str, known: Any) -> UserError:
 
 
 def set_parameters(args: argparse.Namespace) -> int:
-    """Change several parameters in one step."""
     from instant_ic.config import params
 
     words = args.pairs
@@ -125,7 +122,6 @@ def _change(node: str, values: dict[str, Any]) -> int:
 
 
 def describe(args: argparse.Namespace) -> int:
-    """Print type, range, value, default and meaning of parameters."""
     infos = {info.name: info for info in _control(args.node).describe()}
     chosen: list[ParameterInfo] = []
     for key in args.keys or infos:
@@ -145,7 +141,6 @@ def describe(args: argparse.Namespace) -> int:
 
 
 def dump(args: argparse.Namespace) -> int:
-    """Write a ROS 2 parameter file."""
     import yaml
 
     from instant_ic.cli.names import find_node
@@ -168,7 +163,7 @@ def dump(args: argparse.Namespace) -> int:
 
 
 def load(args: argparse.Namespace) -> int:
-    """Set the parameters of a file. Parameters that already have the file's value need not be live."""
+    """Set the parameters of a file. Those that already have the file's value need not be live."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 

@@ -14,7 +14,6 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     parser = verb(
         subparsers, "replay", "replay a bag through nodes in lockstep and record their output", run,
         "ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again -p grid_slam.field.resolution_m:=0.1",
@@ -36,7 +35,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic replay``; return the exit status."""
     from instant_ic.paths import node_names
 
     names = [name for name in args.nodes.split(",") if name]
@@ -49,9 +47,6 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"-p {word}: expected NODE.KEY:=VALUE, NODE being one of {', '.join(names)}", 2)
     if Path(args.output).exists():
         raise UserError(f"{args.output} exists already: choose another name with -o")
-    if not Path(args.bag).exists():
-        raise UserError(f"bag {args.bag} does not exist")
-
     if args.compare and not Path(args.compare).exists():
         raise UserError(f"bag {args.compare} does not exist")
 

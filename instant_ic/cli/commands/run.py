@@ -12,7 +12,6 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     parser = verb(
         subparsers, "run", "run one node in the foreground", run,
         "ic run grid_slam --params-file config/slam.yaml -p use_sim_time:=true -r /scan:=/front/scan",
@@ -25,7 +24,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the node in this process."""
     import sys
 
     from instant_ic.bus.node_files import NodeFileError, load, node_class

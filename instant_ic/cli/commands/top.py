@@ -15,7 +15,6 @@ _SORT = ("cpu", "memory", "name", "lost")
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     add = verb(
         subparsers, "top", "CPU, memory, rates and losses of every node, live", show, "ic top --once",
         "Show CPU, memory, threads, rates (measured/nominal) and losses of every node, once a second.",
@@ -40,7 +39,6 @@ def _ask(row: NodeRow, run_dir: Path) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the table once, or show it until the user quits."""
     import json
     import sys
     import time

@@ -11,7 +11,6 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
     verbs = group(
         subparsers, "topic", "list, watch, measure and publish topics", "Inspect topics and publish to them.",
         "ic topic hz /scan",
@@ -84,7 +83,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def list_topics(args: argparse.Namespace) -> int:
-    """Print a line per topic."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import topic_types
@@ -110,7 +108,6 @@ def list_topics(args: argparse.Namespace) -> int:
 
 
 def show_type(args: argparse.Namespace) -> int:
-    """Print the type of a topic."""
     from instant_ic.cli.names import absolute, near, topic_types
 
     types = topic_types()
@@ -121,7 +118,6 @@ def show_type(args: argparse.Namespace) -> int:
 
 
 def find(args: argparse.Namespace) -> int:
-    """Print the topics of one type."""
     from instant_ic.cli.names import topic_types
 
     package, _, short = args.type.rpartition("/")

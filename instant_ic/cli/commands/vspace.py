@@ -51,7 +51,6 @@ def degrees(text: str) -> float:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``vspace`` to the ``ic`` command."""
     verbs = group(
         subparsers, "vspace", "train and render a virtual space from one panorama",
         "Train a virtual space from one panorama and render it (docs/nerf.md). Poses are relative to the "
@@ -150,7 +149,6 @@ def _add_render(verbs: Any) -> None:
 
 
 def train(args: argparse.Namespace) -> int:
-    """``ic vspace train``."""
     from instant_ic.cli.progress import progress
     from instant_ic.depth.files import load_depth, load_picture
     from instant_ic.vspace import KeyframeError, VirtualSpaceConfig
@@ -295,7 +293,6 @@ def placed(space: VirtualSpace, pose: list[float]) -> NDArray[np.float64]:
 
 
 def render(args: argparse.Namespace) -> int:
-    """``ic vspace render``."""
     import numpy as np
 
     space = open_space(args)
@@ -342,7 +339,6 @@ def _warn_of_the_unknown(view: View, space: VirtualSpace, pose: list[float]) -> 
 
 
 def export(args: argparse.Namespace) -> int:
-    """``ic vspace export``."""
     from instant_ic.vspace.export import surface, write_ply
 
     space, out = open_space(args), args.points or args.mesh
@@ -357,7 +353,6 @@ def export(args: argparse.Namespace) -> int:
 
 
 def video(args: argparse.Namespace) -> int:
-    """``ic vspace video``."""
     import cv2
 
     from instant_ic.cli.progress import progress
@@ -396,7 +391,6 @@ def video(args: argparse.Namespace) -> int:
 
 
 def info_(args: argparse.Namespace) -> int:
-    """``ic vspace info``."""
     from instant_ic.vspace.saved import read, space_file
 
     saved = read(args.space)
