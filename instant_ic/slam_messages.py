@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from instant_ic.geometry.poses import matrix_from_pose2, planar_covariance
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import (
     LaserScan,
     OccupancyGridUpdate,
@@ -20,13 +21,25 @@ from instant_ic.msg import pose_message as _pose
 from instant_ic.slam import Scan
 from instant_ic.slam.grid_slam import SlamResult
 from instant_ic.slam.map_updates import MapPart
+from instant_ic.slam.scan import FloatArray
+from instant_ic.slam.scan_queue import ScanError, level_mount
 
 
-def scan_of(message: LaserScan) -> Scan:
-    """The scan of a LaserScan; ValueError if it cannot be used."""
+def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> tuple[Scan, FloatArray]:
+    """The scan of a LaserScan, and the laser's planar mount (3,) on the robot.
+
+    Raises:
+        ScanError: the mount is not known yet, or the scan cannot be used.
+    """
     angles = (float(message.angle_min), float(message.angle_increment))
     limits = (float(message.range_min), float(message.range_max))
-    return Scan(np.asarray(message.ranges), *angles, *limits, stamp_ns(message))
+    try:
+        mount = level_mount(mounts.lookup(base_frame, message.header.frame_id))
+        return Scan(np.asarray(message.ranges), *angles, *limits, stamp_ns(message)), mount
+    except TransformError as error:
+        raise ScanError(f"where the laser stands is not known yet: {error}") from None
+    except ValueError as error:
+        raise ScanError(f"the scan cannot be used: {error}") from None
 
 
 def integrity_message(result: SlamResult, map_frame: str, stamp: int) -> Any:

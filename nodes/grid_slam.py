@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +10,15 @@ import numpy as np
 from instant_ic import msg
 from instant_ic.bus import ERROR, LATCHED, RELIABLE, SENSOR, WARN, Node, NodeError, QoS, main
 from instant_ic.geometry.poses import matrix_from_pose2
-from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.slam import GridSlam
 from instant_ic.slam.config import GridSlamConfig
-from instant_ic.slam.grid_slam import make_slam, warm_up
+from instant_ic.slam.grid_slam import make_slam, run_job, warm_up
 from instant_ic.slam.map_updates import MapUpdates
 from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.report import diagnoses
-from instant_ic.slam.scan_queue import QueuedScan, ScanError, ScanQueue, level_mount
-from instant_ic.slam_messages import integrity_message, part_message, pose_message, scan_of
+from instant_ic.slam.scan_queue import QueuedScan, ScanError, ScanQueue
+from instant_ic.slam_messages import integrity_message, part_message, pose_message, read_scan
 
 ODOMETRY_QUEUE = QoS("sensor", depth=100)
 """Deep, because scans are placed between two odometry messages."""
@@ -37,7 +36,7 @@ class GridSlamNode(Node[GridSlamConfig]):
     def setup(self) -> None:
         warm_up(self.config)
         self.poll: Any = None  # timer while scans wait for odometry, which may have gone silent
-        self.worker = self.background(work, self.take_over)
+        self.worker = self.background(run_job, self.take_over)
         self.queue = ScanQueue(self.config)
         self.limiter = CorrectionLimiter(self.config.correction_speed_mps, self.config.correction_yaw_rate_radps)
         self.map_out = self.publisher("/map", msg.OccupancyGrid, qos=LATCHED)
@@ -87,22 +86,16 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.diagnose("odometry", WARN, "dropped a message that is not finite, or not newer than the last")
 
     def on_scan(self, message: Any) -> None:
-        stamp, now_ns = msg.stamp_ns(message), self.clock.now_ns()
+        now_ns = self.clock.now_ns()
         try:
-            back_s = self.queue.check_stamp(stamp, now_ns)
+            back_s = self.queue.check_stamp(msg.stamp_ns(message), now_ns)
             if back_s > 0:
                 self.diagnose("time", WARN, f"time went back by {back_s:.1f} s: a new map begins")
                 self.restart()
-            mount = level_mount(self.mounts.lookup(self.config.base_frame, message.header.frame_id))
-            scan = scan_of(message)
-        except TransformError as error:
-            self.queue.drop(f"where the laser stands is not known yet: {error}")
+            scan, mount = read_scan(message, self.mounts, self.config.base_frame)
+            self.queue.add(scan, mount, now_ns, self.clock.steady_ns())
         except ScanError as error:
             self.queue.drop(str(error))
-        except ValueError as error:
-            self.queue.drop(f"the scan cannot be used: {error}")
-        else:
-            self.queue.add(scan, mount, now_ns, self.clock.steady_ns())
         self.show(self.queue.state)
         self.place_ready()
 
@@ -176,15 +169,6 @@ class GridSlamNode(Node[GridSlamConfig]):
         if whole is not None:
             origin = (float(whole.origin[0]), float(whole.origin[1]))
             self.map_out.publish(msg.grid_message(whole.values, whole.resolution, origin, frame, stamp))
-
-
-def work(item: tuple[GridSlam, Callable[[], Any]]) -> tuple[GridSlam, Any, str]:
-    """Run a background job of the SLAM, on the worker's thread."""
-    slam, job = item
-    try:
-        return slam, job(), ""
-    except Exception as error:  # noqa: BLE001 - reported on the node's thread; scans go on
-        return slam, None, f"{type(error).__name__}: {error}"
 
 
 if __name__ == "__main__":

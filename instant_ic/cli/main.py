@@ -117,7 +117,7 @@ def _call(args: argparse.Namespace) -> int:
             return 1
         if type(error) in (FileNotFoundError, FileExistsError):  # raised by us: by the system, it has a file name
             print(f"ic: {error}", file=sys.stderr)
-            return 1
+            return 2
         # Our own error classes carry a message for the user; anything else is a bug and keeps its traceback.
         if not type(error).__module__.startswith("instant_ic."):
             raise

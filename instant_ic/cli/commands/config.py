@@ -71,12 +71,7 @@ def check_files(args: argparse.Namespace) -> int:
 def _found(text: str) -> Path:
     from instant_ic.launch import find_launch_file
 
-    if Path(text).is_file():
-        return Path(text)
-    try:
-        return find_launch_file(text)
-    except FileNotFoundError as error:
-        raise UserError(str(error), 2) from None
+    return Path(text) if Path(text).is_file() else find_launch_file(text)
 
 
 def _is_launch_file(file: Path) -> bool:
@@ -93,18 +88,14 @@ def _is_launch_file(file: Path) -> bool:
 def show_node(args: argparse.Namespace) -> int:
     from instant_ic.cli.commands.param import show_value
     from instant_ic.config.parameter_info import parameter_infos
-    from instant_ic.config.params import ParameterError, configure
+    from instant_ic.config.params import configure
     from instant_ic.launch.parameters import given_values
 
     spec = _node(args.node, args.launch[:1], launch_values(args.launch[1:]))
     config_class, values = given_values(spec)
-    try:
-        configurations = configure(config_class, values)
-    except ParameterError as error:
-        raise UserError(str(error)) from error
     infos = [
         info
-        for config in configurations
+        for config in configure(config_class, values)
         for info in parameter_infos(type(config), config)
         if not args.changed or info.value != info.default
     ]
@@ -125,11 +116,7 @@ def _node(name: str, launch_files: list[str], arguments: dict[str, str]) -> Node
     known: list[str] = []
     for file in launch_files or ["full", "sim", "replay"]:
         needed = {} if launch_files else {"replay": {"bag": "BAG"}}.get(file, {})
-        try:
-            path = find_launch_file(file)
-        except FileNotFoundError as error:
-            raise UserError(str(error), 2) from None
-        for spec in read_launch_file(path, {**needed, **arguments}, paths.run_dir()).nodes:
+        for spec in read_launch_file(find_launch_file(file), {**needed, **arguments}, paths.run_dir()).nodes:
             if name in (spec.label, spec.name):
                 if str(paths.node_file(spec.exec)) not in spec.command:
                     raise UserError(f"{name} is not a node of instant_ic: its parameters are not known")

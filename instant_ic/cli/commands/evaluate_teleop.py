@@ -93,10 +93,13 @@ def _evaluate(args: argparse.Namespace) -> int:
     print_figures(figures)
     for row in each:
         if row["contacts"] or not row["completed"]:
-            how = "completed" if row["completed"] else f"not completed: {row['reason'] or 'given up'}"
-            line = f"episode {row['index']}, {row['method']}: {row['contacts']} contacts, {how}"
-            print(line, file=sys.stderr)
+            how = _how(row["completed"], row["reason"])
+            print(f"episode {row['index']}, {row['method']}: {row['contacts']} contacts, {how}", file=sys.stderr)
     return status
+
+
+def _how(completed: bool, reason: str) -> str:
+    return "completed" if completed else f"not completed: {reason or 'given up'}"
 
 
 def _drive_all(args: argparse.Namespace, settings: Any, drives: list[Any]) -> int:
@@ -111,8 +114,8 @@ def _drive_all(args: argparse.Namespace, settings: Any, drives: list[Any]) -> in
             drives.append(drive)
             if args.json:
                 teleop_results.save(args.json, teleop_results.in_order(drives), settings)
-            how = "completed" if drive.completed else f"not completed: {drive.reason or 'given up'}"
             contacts = sum(drive.contacts for drive in drives)
+            how = _how(drive.completed, drive.reason)
             advance(f"driving, {contacts} contacts", f"episode {drive.index}, {drive.method}: {how}")
 
         try:

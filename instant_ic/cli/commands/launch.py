@@ -10,7 +10,6 @@ from typing import Any
 
 from instant_ic.cli import completion
 from instant_ic.cli.arguments import launch_values, verb
-from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
@@ -50,10 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from instant_ic import paths
     from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
 
-    try:
-        file = find_launch_file(args.file)
-    except FileNotFoundError as error:
-        raise UserError(str(error), 2) from None
+    file = find_launch_file(args.file)
     if args.show_args:
         _show(file.name, read_arguments(file), read_arguments(file, included=True))
         return 0
