@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import TypeVar
 
 import numpy as np
@@ -19,6 +19,7 @@ from instant_ic.limits import decode_rgb
 Result = TypeVar("Result")
 Floats = NDArray[np.float32]
 
+_CANCELLATIONS = 20
 _GIVE_UP_S = 10.0  # an inference still running this long after its cancellation hangs in a driver
 logger = logging.getLogger("instant_ic.depth")
 
@@ -94,10 +95,12 @@ class Inference:
         try:
             return future.result(timeout_s)
         except TimeoutError:
-            model.cancel()
-        try:
-            future.exception(_GIVE_UP_S)
-        except TimeoutError:
+            pass
+        for _ in range(_CANCELLATIONS):
+            model.cancel()  # again and again: between two layers, or before the first, it is not heard
+            if wait([future], _GIVE_UP_S / _CANCELLATIONS).done:
+                break
+        else:
             logger.error("the inference on %s hangs: the node ends for a restart", model.provider)
             self._on_hang()
         raise InferenceError(f"the inference took longer than {timeout_s:g} s on {model.provider} and was cancelled")

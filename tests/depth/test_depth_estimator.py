@@ -146,7 +146,7 @@ def test_a_hanging_inference_ends_the_process(
         node.inference.model = hanging = Hanging(node.inference.model.manifest, obeys=False)
         with caplog.at_level(logging.ERROR):
             bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
-        assert node.stopping and hanging.cancelled == 1 and "hangs: the node ends for a restart" in caplog.text
+        assert node.stopping and hanging.cancelled > 1 and "hangs: the node ends for a restart" in caplog.text
         hanging.go_on.set()
 
 
