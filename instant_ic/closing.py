@@ -1,9 +1,13 @@
-"""Objects to close, as context managers."""
+"""Things that end with a ``with`` block: objects to close, signal handlers."""
 
 from __future__ import annotations
 
+import signal
+import threading
 from abc import ABC, abstractmethod
-from typing import Self
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Self
 
 
 class Closing(ABC):
@@ -17,3 +21,17 @@ class Closing(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextmanager
+def on_signals(handler: Callable[..., Any], *numbers: signal.Signals) -> Iterator[None]:
+    """Handle signals inside the block; outside the main thread, where Python has no handlers, do nothing."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = [(number, signal.signal(number, handler)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, earlier in before:
+            signal.signal(number, earlier)

@@ -11,15 +11,14 @@ import os
 import shlex
 import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli.arguments import not_negative, positive, positive_int
 from instant_ic.cli.errors import UserError
+from instant_ic.closing import on_signals
 
 if TYPE_CHECKING:
     from instant_ic.training.completion import CompletionConfig, CompletionNet
@@ -306,21 +305,12 @@ def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, repo
     return data
 
 
-@contextlib.contextmanager
-def _ends_early(trainer: Trainer) -> Iterator[None]:
+def _ends_early(trainer: Trainer) -> contextlib.AbstractContextManager[None]:
     """End the training cleanly on Ctrl-C or SIGTERM, as at the end of its schedule; a second signal aborts it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def end(number: int, frame: FrameType | None) -> None:
         if trainer.stop:
             raise KeyboardInterrupt
         trainer.stop = True
 
-    before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
-    try:
-        yield
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+    return on_signals(end, signal.SIGINT, signal.SIGTERM)

@@ -13,8 +13,7 @@ from typing import Any
 
 from instant_ic.cli.arguments import check_files
 from instant_ic.cli.errors import UserError
-
-_DAY_S = 86400.0
+from instant_ic.cli.progress import progress
 
 
 def add_options(parser: argparse.ArgumentParser, episodes: int, jobs: int, timeout_s: float, plot: str) -> None:
@@ -75,25 +74,15 @@ def errors_for_the_user() -> Iterator[None]:
 @contextmanager
 def counted(what: str, total: int) -> Iterator[Callable[[str, str], None]]:
     """Yield a function for each finished drive: it takes the text of the bar, and a line for a log without one."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    # A drive takes minutes on a slow core: the remaining time follows from all drives, not from the last 30 s.
-    with Progress(*columns, TimeRemainingColumn(), console=console, speed_estimate_period=_DAY_S) as bar:
-        task = bar.add_task(what, total=total)
+    done = 0
+    with progress(what) as show:
 
         def advance(text: str, line: str) -> None:
-            bar.update(task, advance=1, description=text)
-            if not console.is_terminal:
-                console.print(line, markup=False)
+            nonlocal done
+            done += 1
+            if sys.stderr.isatty():
+                show(done / total, text)
+            else:
+                print(line, file=sys.stderr, flush=True)
 
         yield advance

@@ -12,14 +12,14 @@ import os
 import pkgutil
 import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from types import FrameType
 
 from instant_ic.cli import commands
 from instant_ic.cli.arguments import Parser
 from instant_ic.cli.errors import UserError
+from instant_ic.closing import on_signals
 
 _DESCRIPTION = "Instant IC: teleoperation that switches between a real robot and an instantly built virtual one."
 _EPILOG = """examples:
@@ -62,23 +62,13 @@ class _Terminated(KeyboardInterrupt):
     """SIGTERM or SIGHUP, which end a command as Ctrl-C does: it stops what it started and removes its scratch files."""
 
 
-@contextmanager
-def _clean_end(launches: bool) -> Iterator[None]:
+def _clean_end(launches: bool) -> AbstractContextManager[None]:
     """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def end(signum: int, frame: FrameType | None) -> None:
         raise SystemExit(0) if launches else _Terminated
 
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if launches else (signal.SIGTERM, signal.SIGHUP)
-    before = [(number, signal.signal(number, end)) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+    return on_signals(end, signal.SIGTERM, signal.SIGHUP, *([signal.SIGINT] if launches else []))
 
 
 def _main(argv: Sequence[str] | None) -> int:

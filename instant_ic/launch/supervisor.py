@@ -6,16 +6,16 @@ import selectors
 import signal
 import subprocess
 import sys
-import threading
 import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
+from instant_ic.closing import on_signals
 from instant_ic.launch.description import Announcement, NodeSpec, Shutdown
 from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.outlet import Outlet
@@ -193,23 +193,13 @@ class Supervisor:
             for line in left.decode(errors="replace").splitlines():
                 self._output.event(f"killed a process that a node left behind: {line}", bad=True)
 
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
+    def _signals(self) -> AbstractContextManager[None]:
         """Let SIGINT, SIGTERM and SIGHUP request the end; a second signal hurries it."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
 
         def on_signal(signum: int, frame: FrameType | None) -> None:
             self.request_stop(hurry=self._stop)
 
-        watched = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        before = [(signum, signal.signal(signum, on_signal)) for signum in watched]
-        try:
-            yield
-        finally:
-            for signum, handler in before:
-                signal.signal(signum, handler)
+        return on_signals(on_signal, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
     # -- one round -------------------------------------------------------------------------------
 
