@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -91,6 +92,21 @@ def not_negative(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"must be >= 0 (got {text})")
     return value
+
+
+def numbers(form: str) -> Callable[[str], list[float]]:
+    """Type of an argument such as ``x,y,z,yaw``: so many finite numbers."""
+
+    def parse(text: str) -> list[float]:
+        try:
+            values = [float(word) for word in text.split(",")]
+        except ValueError:
+            values = []
+        if len(values) != len(form.split(",")) or not all(map(math.isfinite, values)):
+            raise argparse.ArgumentTypeError(f"must be {form}: {len(form.split(','))} numbers (got {text!r})")
+        return values
+
+    return parse
 
 
 def size(text: str) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
-from instant_ic.cli.arguments import check_files, group, verb
+from instant_ic.cli.arguments import check_files, group, numbers, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ def add_parser(subparsers: Any) -> None:
     add("--points", default="", metavar="TOPIC", help="LiDAR points (default: /lidar/points, else /lidar/packets)")
     add("--frames", type=int, default=24, metavar="N", help="maximum number of images (%(default)s)")
     text = "initial camera pose in the LiDAR frame (m, degrees) if /tf_static lacks it"
-    add("--guess", metavar="X,Y,Z,ROLL,PITCH,YAW", help=text)
+    form = "X,Y,Z,ROLL,PITCH,YAW"
+    add("--guess", type=numbers(form), metavar=form, help=text)
     text = "the initial yaw is right within a few degrees: skip the full-circle search"
     add("--near", action="store_true", help=text)
 
@@ -81,18 +82,12 @@ def camera_lidar(args: argparse.Namespace) -> int:
     return 0
 
 
-def _guess(text: str) -> Matrix:
-    """``camera_from_lidar`` from the camera's pose in the LiDAR frame."""
+def _guess(values: list[float]) -> Matrix:
+    """``camera_from_lidar`` from the camera's pose in the LiDAR frame: metres and degrees."""
     import numpy as np
 
     from instant_ic.geometry.poses import inverse, pose_matrix
 
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 6 or not np.isfinite(values).all():
-        raise UserError(f"--guess must be six numbers X,Y,Z,ROLL,PITCH,YAW (got {text!r})", 2)
     return inverse(pose_matrix(*values[:3], *np.radians(values[3:])))
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import Any
 
-from instant_ic.cli.arguments import check_files, size, verb
+from instant_ic.cli.arguments import check_files, numbers, size, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user, print_figures
 from instant_ic.cli.progress import progress
@@ -28,7 +29,7 @@ def add_kind(kinds: Any) -> None:
     add("--world", required=True, metavar="W", help="corridor, random:SEED, or a mesh file (.glb, ...)")
     add("--path", default="straight,curve", help="straight, curve, or both (default: %(default)s)")
     add("--sources", default="ours,no-depth,no-scale,panorama,depth-warp,mesh", help="default: %(default)s")
-    add("--start", metavar="X,Y,YAW", help="position of the last panorama, metres and degrees")
+    add("--start", type=numbers("X,Y,YAW"), metavar="X,Y,YAW", help="position of the last panorama, metres and degrees")
     add("--seconds", type=float, default=8.0, metavar="S", help="training time, CPU seconds (default: 8)")
     add("--times", metavar="S,S,...", help="training times at which ours and field are measured")
     add("--size", type=size, default=(640, 360), metavar="WxH", help="size of the images (default: 640x360)")
@@ -64,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
             reach_m=args.reach,
             seed=args.seed,
         )
-        start = _start(args.start) if args.start else None
+        x, y, yaw_deg = args.start or (0.0, 0.0, 0.0)
+        start = (x, y, math.radians(yaw_deg)) if args.start else None
         with progress("evaluating") as advance:
             report = vspace.evaluate(args.world, settings, start, lambda _, done, total: advance(done / max(total, 1)))
     except ValueError as error:
@@ -97,12 +99,3 @@ def _numbers(text: str, option: str) -> list[float]:
         return [float(word) for word in text.split(",")]
     except ValueError as error:
         raise ValueError(f"{option} must be numbers separated by commas (got {text!r})") from error
-
-
-def _start(text: str) -> tuple[float, float, float]:
-    import math
-
-    numbers = _numbers(text, "--start")
-    if len(numbers) != 3:
-        raise ValueError(f"--start must be x,y,yaw in metres and degrees (got {text!r})")
-    return numbers[0], numbers[1], math.radians(numbers[2])

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli.arguments import group, positive, positive_int, size, verb
+from instant_ic.cli.arguments import group, numbers, positive, positive_int, size, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -29,17 +29,6 @@ _SIZES = {"perspective": (640, 360), "equirect": (1024, 512), "cube": (512, 512)
 _TRUE_SIGMA, _MODEL_SIGMA = 0.02, 0.1
 _LITTLE = 0.1
 """Below this share of known pixels an image is little more than a guess."""
-
-
-def numbers(text: str) -> list[float]:
-    """``x,y,z,yaw``: metres and degrees."""
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 4 or not all(map(math.isfinite, values)):
-        raise argparse.ArgumentTypeError(f"must be x,y,z,yaw: four numbers, metres and degrees (got {text!r})")
-    return values
 
 
 def degrees(text: str) -> float:
@@ -74,7 +63,7 @@ def add_parser(subparsers: Any) -> None:
         "Write a flight through a saved space as MP4, along a smooth curve through the waypoints.",
     )  # fmt: skip
     text = "two waypoints or more; the heading turns by the difference of the yaws (default: ahead, back, and one turn)"
-    flight.add_argument("--path", type=numbers, nargs="+", metavar="x,y,z,yaw", help=text)
+    flight.add_argument("--path", type=numbers("x,y,z,yaw"), nargs="+", metavar="x,y,z,yaw", help=text)
     flight.add_argument("--seconds", type=positive, default=8.0, metavar="S", help="(%(default)g)")
     flight.add_argument("--fps", type=positive, default=25.0, help="frames per second (%(default)g)")
     _add_picture(flight)
@@ -137,7 +126,7 @@ def _add_render(verbs: Any) -> None:
     )  # fmt: skip
     _add_picture(parser)
     add = parser.add_argument
-    add("--pose", type=numbers, default=[0.0, 0.0, 0.0, 0.0], metavar="x,y,z,yaw", help="(0,0,0,0)")
+    add("--pose", type=numbers("x,y,z,yaw"), default=[0.0, 0.0, 0.0, 0.0], metavar="x,y,z,yaw", help="(0,0,0,0)")
     add("--projection", choices=tuple(_SIZES), default="perspective", help="(%(default)s)")
     add("-o", "--out", type=Path, required=True, metavar="PNG", help="image to write")
     add("--depth", type=Path, metavar="FILE", help="also write the depth: .png (16-bit, mm) or .npy (m)")
