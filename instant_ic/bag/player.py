@@ -57,7 +57,6 @@ class BagPlayer:
     """Paces the messages of a bag, independent of the bus. Its controls may be called from any thread.
 
     Args:
-        path: the bag.
         options: how to play it.
 
     Raises:

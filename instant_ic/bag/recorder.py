@@ -116,7 +116,6 @@ class Snapshot:
     """One snapshot.
 
     Attributes:
-        path: its bag.
         state: ``waiting``, ``writing``, ``done`` or ``failed``.
         words: content of the bag, or why it failed.
         due_s: time at which it is written, by the monotonic clock.

@@ -43,7 +43,6 @@ def verb(
         run: its function, or MODULE.FUNCTION in ``instant_ic.cli``, which is then imported when it runs.
         example: a command line.
         description: the first paragraph of its help.
-        options: of the parser.
     """
 
     def imported(args: argparse.Namespace) -> int:

@@ -53,7 +53,6 @@ class HealthMonitor:
     """Subscribes to ``/heartbeat`` (and ``/vspace/status`` if the stack has a ``nerf``) without a node of its own.
 
     Args:
-        nodes: the nodes of the stack.
         run_dir: prepared run directory; those of groups lie in it, also prepared.
     """
 
