@@ -52,9 +52,8 @@ from instant_ic.control.states import Reason
 from instant_ic.experiments.drive import pump
 from instant_ic.experiments.impaired_link import ImpairedLink
 from instant_ic.experiments.stack import Stack, StackError, free_port
-from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.launch.pacing import machine_pace
-from instant_ic.msg import ControlState, matrix_from_pose, message_type, stamp_ns, twist_values
+from instant_ic.msg import ControlState, message_type, pose2_from_message, stamp_ns, twist_values
 from instant_ic.paths import share_dir
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
@@ -230,7 +229,7 @@ class Rig:
         observer.subscribe("/ic/state", ControlState, self._on_state, LATCHED)
 
     def _on_truth(self, message: Any) -> None:
-        x, y, yaw = pose2_from_matrix(matrix_from_pose(message))
+        x, y, yaw = pose2_from_message(message)
         linear = message.twist.twist.linear
         self.truth.append(Truth(stamp_ns(message), x, y, yaw, math.hypot(linear.x, linear.y)))
 

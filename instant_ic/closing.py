@@ -1,9 +1,13 @@
-"""Objects to close, as context managers."""
+"""Things that end with a ``with`` block: objects to close, signal handlers."""
 
 from __future__ import annotations
 
+import signal
+import threading
 from abc import ABC, abstractmethod
-from typing import Self
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Self
 
 
 class Closing(ABC):
@@ -17,3 +21,22 @@ class Closing(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextmanager
+def on_end_signal(handler: Callable[..., Any]) -> Iterator[None]:
+    """Handle SIGINT, SIGTERM and SIGHUP inside the block.
+
+    A script's ``COMMAND &`` inherits SIGINT as ignored; it is handled all the same. A SIGHUP that ``nohup`` ignores stays
+    ignored. Outside the main thread, where Python has no handlers, nothing is done.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)
+    before = [(number, signal.signal(number, handler)) for number in (signal.SIGINT, signal.SIGTERM, *hangup)]
+    try:
+        yield
+    finally:
+        for number, earlier in before:
+            signal.signal(number, earlier)

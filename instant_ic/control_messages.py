@@ -19,7 +19,6 @@ from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Vspace
 from instant_ic.control.states import Mode
 from instant_ic.control.surroundings import Cloud, Scan, Surroundings
 from instant_ic.control.walls import WallMap
-from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import (
     ControlState,
     MessageError,
@@ -29,6 +28,7 @@ from instant_ic.msg import (
     cloud_array,
     header,
     matrix_from_pose,
+    pose2_from_message,
     pose2_message,
     stamp_ns,
     twist_message,
@@ -195,7 +195,7 @@ def _age_s(latest: Latest) -> float:
 
 def _present_pose(odometry: Odometry, now_ns: int) -> NDArray[np.float64]:
     """Pose (3,) extrapolated to now: the message is up to a period old."""
-    pose = pose2_from_matrix(matrix_from_pose(odometry))
+    pose = pose2_from_message(odometry)
     return extrapolate(pose, twist_values(odometry), (now_ns - stamp_ns(odometry)) / 1e9)
 
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-
 from instant_ic import msg
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.bus.transport import Received
-from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
-from instant_ic.control.costmap import CostmapConfig
 from instant_ic.control.estop import KeptEstop
 from instant_ic.control.operator_view import OperatorView
 from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.sources import STEP_AFTER_S
 from instant_ic.control.states import Mode
+from instant_ic.control.step_times import REST_COSTMAP_S, REST_STEP_S, StepTimes
 from instant_ic.control.surroundings import Surroundings
 from instant_ic.control.walls import WallFinder, WallSearch
 from instant_ic.control.warmup import warm_up
@@ -25,36 +21,8 @@ from instant_ic.estop_state import EstopStateError
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import ControlState, twist_values
 
-_REST_COSTMAP_S = 0.5
-"""Period of the costmap while the robot rests; the command that ends the rest updates it at once."""
-_REST_STEP_S = 0.1
-"""Longest time between two steps while the robot rests: well below every receiver's time-out."""
 
-
-@dataclass(frozen=True)
-class ArbiterNodeConfig(ArbiterConfig):
-    """Parameters of the node ``arbiter``: the library's, and the node's own.
-
-    Attributes:
-        rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
-        wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
-        wall_period_s: s; walls are searched for in a changed /map at most this often, on a separate thread.
-        map_jump_m: m; a correction of map→odom larger than this makes the costmap forget its marks.
-        map_jump_deg: degrees; as map_jump_m, for the yaw.
-    """
-
-    rate_hz: Positive = 20.0
-    wall_min_length_m: Positive = 1.5
-    wall_period_s: Positive = 2.0
-    map_jump_m: Positive = 0.3
-    map_jump_deg: Positive = 5.0
-    costmap: CostmapConfig = field(default_factory=CostmapConfig)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
-
-class ArbiterNode(Node[ArbiterNodeConfig]):
+class ArbiterNode(Node[ArbiterConfig]):
     """Connects ``Arbiter`` and ``Surroundings`` to topics."""
 
     name = "arbiter"
@@ -76,13 +44,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.latch = KeptEstop(self.run_dir, self.clock.now_ns())
         if self.latch.pressed:
             self.log.warning("emergency stop: %s", self.latch.why or "still pressed from before this start")
-        self.obeyed = (0.0, 0.0)  # operator's command of the last step
-        self.early = False  # a step was made ahead of its time since the last timer
+        self.times = StepTimes()
         self.was_gone = False  # a step was made for the loss of the driver
         self.ticks = 0
-        self.stepped_ns = 0  # last step, steady clock
-        self.rests = False  # the robot rested at the last step
-        self.costmap_ns = 0  # last update, steady clock
         self.cmd_vel = self.publisher("/cmd_vel", msg.TwistStamped, qos=SENSOR)
         self.state = self.publisher("/ic/state", ControlState, qos=LATCHED)
         self.subgoal = self.publisher("/ic/subgoal", msg.PoseStamped, qos=SENSOR)
@@ -100,19 +64,21 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         shown = self.latest("/view/shown", msg.ShownPictures, 1.0, callback=self.on_shown)
         vspace = self.latest("/vspace/status", msg.VspaceStatus, 60.0, qos=LATCHED)
         # A doubt holds until the next report: silence is no trust. A SLAM that is gone is noticed by the age of /pose.
-        integrity = self.latest("/slam/integrity", msg.PoseIntegrity, math.inf)
+        integrity = self.latest("/slam/integrity", msg.PoseIntegrity, float("inf"))
         self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace, integrity)
         self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=msg.Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=msg.Bool)
         # Only its age matters: the image is never decoded here.
-        self.subscribe_raw("/camera/image/compressed", self.on_camera, qos=SENSOR)
+        self.subscribe_raw(
+            "/camera/image/compressed", lambda *_: self.view.camera_image(self.clock.steady_ns()), qos=SENSOR
+        )
         self.timer(c.wall_period_s, self.walls.update)
         self.timer(1.0 / c.costmap.update_frequency, self.update_costmap)
         self.cancel_extra = lambda: None  # cancels a step between two timers
         self.timer(1.0 / c.rate_hz, self.on_timer)
 
-    def reconfigure(self, config: ArbiterNodeConfig) -> None:
+    def reconfigure(self, config: ArbiterConfig) -> None:
         super().reconfigure(config)
         self.arbiter.reconfigure(config)
         self.surroundings.jump_m, self.surroundings.jump_deg = config.map_jump_m, config.map_jump_deg
@@ -145,20 +111,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.diagnose("estop", ERROR, str(error))
 
     def on_command(self, message: msg.TwistStamped) -> None:
-        """Obey a changed command at once: the next timer is half a period away on average."""
-        if not self.early and twist_values(message) != self.obeyed:
-            self.early = True
+        if self.times.command_steps(twist_values(message)):
             self.tick()
 
     def on_timer(self) -> None:
-        self.early = False
-        since_s = (self.clock.steady_ns() - self.stepped_ns) / 1e9
-        # Timers jitter: at 20 Hz every second one is meant.
-        if not 0.0 <= since_s < 0.9 * _REST_STEP_S or not self.inbox.rests(self.arbiter.mode):
+        if self.times.timer_steps(self.clock.steady_ns(), self.inbox.rests(self.arbiter.mode)):
             self.tick()
-
-    def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
-        self.view.camera_image(self.clock.steady_ns())
 
     def on_shown(self, message: msg.ShownPictures) -> None:
         """Step at once if a switch waits for the new images, or the driver was lost."""
@@ -170,13 +128,11 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.tick()
 
     def update_costmap(self) -> None:
-        since_s = (self.clock.steady_ns() - self.costmap_ns) / 1e9
-        if 0.0 <= since_s < _REST_COSTMAP_S and self.inbox.rests(self.arbiter.mode):
+        if not self.times.costmap_due(self.clock.steady_ns(), self.inbox.rests(self.arbiter.mode)):
             return
-        self.costmap_ns = self.clock.steady_ns()
         scan = self.inbox.scan()
         costmap = self.surroundings.update_costmap(scan, self.inbox.cloud(), self.walls.map)
-        self.diagnose_surroundings()
+        self.show(*self.surroundings.findings.values())
         if costmap is None or scan is None:
             return
         if self.surroundings.map_jumped:
@@ -185,29 +141,24 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             grid, (x, y) = costmap.occupancy(), costmap.origin.tolist()
             self.costmap_out.publish(msg.grid_message(grid, costmap.resolution, (x, y), "map", scan.stamp_ns))
 
-    def diagnose_surroundings(self) -> None:
-        for name, found in self.surroundings.findings.items():
-            self.diagnose(name, OK if found.ok else WARN, found.text, **found.values)
-
     def tick(self) -> None:
-        self.stepped_ns = self.clock.steady_ns()
-        rested, self.rests = self.rests, self.inbox.rests(self.arbiter.mode)
-        if rested and not self.rests:
+        rests = self.inbox.rests(self.arbiter.mode)
+        if self.times.begin_step(self.clock.steady_ns(), rests):
             self.update_costmap()  # the first command of a drive is checked against what is there now
         now_ns = self.clock.now_ns()
-        points_every_s = _REST_COSTMAP_S if self.rests else 0.0
+        points_every_s = REST_COSTMAP_S if rests else 0.0
         inputs = self.inbox.inputs(self.latch, self.walls.found, self.config.timeouts, points_every_s)
-        self.obeyed = inputs.operator_command
+        self.times.obeyed = inputs.operator_command
         # Steady time: setting the clock back must not make a stale source look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
         frame = msg.HARD_STOP if decision.hard else "base_link"
         self.cmd_vel.publish(msg.twist_stamped(*decision.command, now_ns, frame))
         self.publish_decision(decision, inputs, now_ns)
-        self.diagnose_surroundings()
+        self.show(*self.surroundings.findings.values())
         # One more step if the next timer may be later than a time-out: time-outs are exact.
         self.cancel_extra()
         stale_in_s = self.arbiter.stale_in_s(inputs, self.clock.steady_ns())
-        if stale_in_s < max(_REST_STEP_S, 1.0 / self.config.rate_hz):
+        if stale_in_s < max(REST_STEP_S, 1.0 / self.config.rate_hz):
             self.cancel_extra = self.timer(stale_in_s + STEP_AFTER_S, self.tick).cancel
 
     def publish_decision(self, decision: Decision, inputs: ArbiterInputs, now_ns: int) -> None:

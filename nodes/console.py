@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
+from instant_ic import msg
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node, NodeError, main
 from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
 from instant_ic.bus.node import Subscription, Timer
@@ -14,26 +15,6 @@ from instant_ic.console.access import AccessError, offer_sign_in
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.feed import Inputs, PageFeed
 from instant_ic.console.recording import RecorderError, RecordingDesk
-from instant_ic.msg import (
-    BatteryState,
-    Bool,
-    CompressedImage,
-    ControlState,
-    DiagnosticArray,
-    NodeStatus,
-    OccupancyGrid,
-    Odometry,
-    Path,
-    PoseStamped,
-    RenderedView,
-    ShownPictures,
-    String,
-    TwistStamped,
-    ViewRequest,
-    VspaceLayers,
-    VspaceStatus,
-    twist_stamped,
-)
 from instant_ic.paths import sign_in_file
 
 RECORDER_TIMEOUT_S = 3.0
@@ -44,39 +25,39 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     name = "console"
     live_parameters = ("view",)
+    feed: PageFeed
 
     def setup(self) -> None:
         config = self.config
-        self.command_out = self.publisher("/operator/cmd_vel", TwistStamped, qos=SENSOR)
-        self.estop_out = self.publisher("/operator/estop", Bool, qos=LATCHED)
-        self.bookmark_out = self.publisher("/operator/bookmark", String, qos=RELIABLE)
-        self.request_view = self.publisher("/view/request", ViewRequest, qos=SENSOR).publish
-        self.report_shown = self.publisher("/view/shown", ShownPictures, qos=SENSOR).publish
+        self.command_out = self.publisher("/operator/cmd_vel", msg.TwistStamped, qos=SENSOR)
+        self.estop_out = self.publisher("/operator/estop", msg.Bool, qos=LATCHED)
+        self.bookmark_out = self.publisher("/operator/bookmark", msg.String, qos=RELIABLE)
+        self.request_view = self.publisher("/view/request", msg.ViewRequest, qos=SENSOR).publish
+        self.report_shown = self.publisher("/view/shown", msg.ShownPictures, qos=SENSOR).publish
         inputs = Inputs(
-            control=self.latest("/ic/state", ControlState, 1.0, LATCHED, lambda m: self.feed.take_control(m)),
-            vbot=self.latest("/vbot/odom", Odometry, 0.5, SENSOR, lambda m: self.feed.take_vbot(m)),
-            trajectory=self.latest("/ic/trajectory", Path, max_age_s=0.5),
-            path=self.latest("/nav/path", Path, max_age_s=5.0),
-            subgoal=self.latest("/ic/subgoal", PoseStamped, max_age_s=1.0),
-            vspace=self.latest("/vspace/status", VspaceStatus, max_age_s=5.0, qos=LATCHED),
-            battery=self.latest("/battery", BatteryState, max_age_s=5.0),
+            control=self.latest("/ic/state", msg.ControlState, 1.0, LATCHED, lambda m: self.feed.take_control(m)),
+            vbot=self.latest("/vbot/odom", msg.Odometry, 0.5, SENSOR, lambda m: self.feed.take_vbot(m)),
+            trajectory=self.latest("/ic/trajectory", msg.Path, max_age_s=0.5),
+            path=self.latest("/nav/path", msg.Path, max_age_s=5.0),
+            subgoal=self.latest("/ic/subgoal", msg.PoseStamped, max_age_s=1.0),
+            vspace=self.latest("/vspace/status", msg.VspaceStatus, max_age_s=5.0, qos=LATCHED),
+            battery=self.latest("/battery", msg.BatteryState, max_age_s=5.0),
         )
         try:
             self.server = ConsoleServer(self, config.server, config.page())
         except ConsoleError as error:
             raise NodeError(str(error)) from error
         self.recording = RecordingDesk(self.ask_recorder, lambda status: self.server.publish("recording", status))
+        self.on_record, self.on_snapshot = self.recording.record, self.recording.snapshot
         self.feed = feed = PageFeed(config, self.server, self.tf, inputs, self, self.clock, self.diagnose)
-        self.subscribe("/camera/image/compressed", CompressedImage, feed.take_panorama, qos=SENSOR)
-        self.subscribe("/vspace/view", RenderedView, feed.take_view, qos=SENSOR)
-        self.mesher = self.background(
-            feed.layers_of, feed.take_layers
-        )  # 30 ms a keyframe: commands must not wait for it
+        self.subscribe("/camera/image/compressed", msg.CompressedImage, feed.take_panorama, qos=SENSOR)
+        self.subscribe("/vspace/view", msg.RenderedView, feed.take_view, qos=SENSOR)
+        self.mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms: commands must not wait for it
         self.layers: Subscription | None = None
-        self.subscribe("/map", OccupancyGrid, partial(feed.grids.take, FrameKind.MAP), qos=LATCHED)
-        self.subscribe("/costmap", OccupancyGrid, partial(feed.grids.take, FrameKind.COSTMAP), qos=SENSOR)
-        self.subscribe("/diagnostics", DiagnosticArray, feed.take_diagnostics, qos=RELIABLE)
-        self.subscribe("/heartbeat", NodeStatus, feed.take_heartbeat, qos=RELIABLE)
+        self.subscribe("/map", msg.OccupancyGrid, partial(feed.grids.take, FrameKind.MAP), qos=LATCHED)
+        self.subscribe("/costmap", msg.OccupancyGrid, partial(feed.grids.take, FrameKind.COSTMAP), qos=SENSOR)
+        self.subscribe("/diagnostics", msg.DiagnosticArray, feed.take_diagnostics, qos=RELIABLE)
+        self.subscribe("/heartbeat", msg.NodeStatus, feed.take_heartbeat, qos=RELIABLE)
         self.timer(1.0, feed.send_health)
         self.page_timers: list[Timer] = []
         self.server.on_renders = lambda: self.call_soon(self.feed_layers, True)
@@ -87,7 +68,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         if self.run_dir is not None:
             self.start_server(sign_in_file(self.run_dir, self.node_name))
 
-    def start_server(self, sign_in: FilePath) -> None:
+    def start_server(self, sign_in: Path) -> None:
         try:
             self.server.start()
             self.log.info("open %s in a browser", self.server.url)
@@ -114,7 +95,7 @@ class ConsoleNode(Node[ConsoleConfig]):
     def feed_layers(self, wanted: bool) -> None:
         """Take the layers of the virtual space while a page can render them: they cost `nerf` CPU too."""
         if wanted and self.layers is None:
-            self.layers = self.subscribe("/vspace/layers", VspaceLayers, self.mesher.submit, qos=LATCHED)
+            self.layers = self.subscribe("/vspace/layers", msg.VspaceLayers, self.mesher.submit, qos=LATCHED)
         elif not wanted and self.layers is not None:
             self.drop(self.layers)
             self.layers = None
@@ -135,26 +116,20 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_drive(self, linear: float, angular: float) -> None:
         # At once: a detour through the node's thread would add latency.
-        self.command_out.publish(twist_stamped(linear, angular, self.clock.now_ns()))
+        self.command_out.publish(msg.twist_stamped(linear, angular, self.clock.now_ns()))
 
     def on_operator(self, there: bool) -> None:
         if not there:
             self.feed.lose_driver()
 
     def on_estop(self, stop: bool) -> None:
-        self.estop_out.publish(Bool(data=stop))
+        self.estop_out.publish(msg.Bool(data=stop))
 
     def on_look(self, look: Look) -> None:
         self.feed.requests.look = look
 
-    def on_record(self, on: bool) -> None:
-        self.recording.record(on)
-
-    def on_snapshot(self) -> None:
-        self.recording.snapshot()
-
     def on_bookmark(self, name: str) -> None:
-        self.bookmark_out.publish(String(data=name))  # the topic puts it into every recording and snapshot
+        self.bookmark_out.publish(msg.String(data=name))  # the topic puts it into every recording and snapshot
         self.recording.bookmark(name)
 
     def export_map(self) -> dict[str, bytes]:

@@ -15,7 +15,6 @@ from instant_ic.base.roboclaw import SerialPort, open_serial
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.estop import EstopLatch
-from instant_ic.diagnosis import Diagnosis
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import (
     HARD_STOP,
@@ -193,11 +192,6 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         now_ns = self.clock.steady_ns()
         self.gate.update(now_ns)
         self.show(*self.report.recent(now_ns), self.gate.publishers, self.gate.command)
-
-    def show(self, *states: Diagnosis | None) -> None:
-        for state in states:
-            if state is not None:
-                self.diagnose(state.name, state.level, state.text, **state.values)
 
     def on_end(self, fault: BaseException | None, unstopped: str) -> None:
         """Report why the serial thread ended, and end the node unless it is ending anyway."""

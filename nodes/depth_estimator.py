@@ -11,15 +11,11 @@ from numpy.typing import NDArray
 
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.config.ranges import Positive, PositiveInt, check_ranges
+from instant_ic.depth.inference import Inference
 from instant_ic.depth.manifest import InferenceError, ManifestError
-from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+from instant_ic.depth.model import DEFAULT_MODEL
 from instant_ic.depth.providers import CHOICES
-from instant_ic.jpeg import JpegError
-from instant_ic.limits import decode_rgb
 from instant_ic.msg import CompressedImage, DepthModelInfo, Header, Image, header, image_message, stamp_ns
-
-_WATCH_S = 0.5
-_GIVE_UP_S = 10.0  # an inference still running this long after its cancellation hangs in a driver
 
 
 @dataclass(frozen=True)
@@ -58,11 +54,14 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
     live_parameters = ("max_rate_hz", "max_age_s", "timeout_s")
 
     def setup(self) -> None:
-        self.load(self.config.provider)
+        config = self.config
+        try:
+            self.inference = Inference(config.model, config.provider, config.threads, self.stop, config.timeout_s)
+        except (ManifestError, FileNotFoundError) as error:
+            raise NodeError(str(error)) from error
         self.newest: Any = None  # image
         self.last_ns: int | None = None
         self.wanted_ns = -math.inf  # images from this stamp on: all before the first request, then none without one
-        self.began_ns = 0  # start of the running inference on the steady clock; 0 while none runs
         self.failures = 0
         self.depth = self.publisher("/depth/raw", Image, qos=SENSOR)
         self.info = self.publisher("/depth/model", DepthModelInfo, qos=LATCHED)
@@ -70,30 +69,18 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.worker = self.background(self.estimate, self.on_result)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_image, qos=SENSOR)
         self.subscribe("/depth/request", Header, self.on_request, qos=LATCHED)
-        self.timer(_WATCH_S, self.watch)
 
-    def load(self, provider: str) -> None:
-        """Load the model; report its provider and why a faster one is not used."""
-        try:
-            self.model = DepthModel.find(self.config.model, self.config.threads, provider)
-        except (ManifestError, FileNotFoundError) as error:
-            raise NodeError(str(error)) from error
-        manifest = self.model.manifest
-        why = f" ({'; '.join(self.model.notes)})" if self.model.notes else ""
-        self.log.info(
-            "%s (%s, %dx%d) on %s%s", manifest.name, manifest.output_kind, manifest.input_width, manifest.input_height,
-            self.model.provider, why,
-        )  # fmt: skip
-        if provider not in ("auto", self.model.provider):
-            self.log.warning("provider %s was requested, the model runs on %s%s", provider, self.model.provider, why)
+    def reconfigure(self, config: DepthEstimatorConfig) -> None:
+        super().reconfigure(config)
+        self.inference.timeout_s = config.timeout_s
 
     def publish_model(self) -> None:
         """Publish which kind of values ``/depth/raw`` carries, for the node that scales them."""
-        manifest = self.model.manifest
-        self.published_provider = self.model.provider
+        manifest = self.inference.model.manifest
+        self.published_provider = provider = self.inference.model.provider
         info = DepthModelInfo(
             header=header("", self.clock.now_ns()), name=manifest.name, licence=manifest.licence,
-            output_kind=manifest.output_kind, provider=self.model.provider,
+            output_kind=manifest.output_kind, provider=provider,
         )  # fmt: skip
         self.info.publish(info)
 
@@ -122,46 +109,19 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
 
     def estimate(self, message: Any) -> tuple[Any, NDArray[np.float32] | None, str]:
         """Run on the worker's thread; return header, depth, and an error text if there is no depth."""
-        manifest = self.model.manifest
-        self.began_ns = self.clock.steady_ns()
         try:
-            # Twice the network's input, so that the remaining reduction is by area averaging.
-            rgb = decode_rgb(message.data, 2 * manifest.input_width, 2 * manifest.input_height)
-            return message.header, self.model.estimate(rgb), ""
-        except JpegError as error:
-            return message.header, None, f"the image {error}"
-        except ValueError as error:  # not a panorama, or (ManifestError) outputs that show only in a run
+            return message.header, self.inference.estimate(message.data), ""
+        except (InferenceError, ValueError) as error:
             return message.header, None, str(error)
-        except InferenceError as error:
-            if self.model.provider == "cpu":
-                return message.header, None, str(error)
-            self.load("cpu")
-            return message.header, None, f"{error}; going on with the CPU"
-        finally:
-            self.began_ns = 0
-
-    def watch(self) -> None:
-        """Cancel an inference that takes too long; if it does not end, end the process for a restart."""
-        if not (began_ns := self.began_ns):
-            return
-        took_s = (self.clock.steady_ns() - began_ns) / 1e9
-        if took_s <= self.config.timeout_s:
-            return
-        self.diagnose(
-            "depth", ERROR, f"the inference has run for {took_s:.1f} s on {self.model.provider}; it is cancelled"
-        )
-        self.model.cancel()
-        if took_s > self.config.timeout_s + _GIVE_UP_S:
-            self.log.error("the inference on %s hangs: the node ends for a restart", self.model.provider)
-            self.stop()
 
     def on_result(self, result: tuple[Any, NDArray[np.float32] | None, str]) -> None:
         header, depth, reason = result
-        if self.model.provider != self.published_provider:
+        provider = self.inference.model.provider
+        if provider != self.published_provider:
             self.publish_model()
         if depth is None:
             self.failures += 1
-            self.diagnose("depth", ERROR, reason, provider=self.model.provider, failures=self.failures)
+            self.diagnose("depth", ERROR, reason, provider=provider, failures=self.failures)
             return
         stamp = stamp_ns(header)
         self.depth.publish(image_message(depth, "32FC1", header.frame_id, stamp))
@@ -169,7 +129,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         level = WARN if age_s > self.config.max_age_s else OK
         self.diagnose(
             "depth", level, f"depth is {age_s:.2f} s old when it is published", age_s=round(age_s, 3),
-            provider=self.model.provider, skipped=self.worker.skipped, failures=self.failures,
+            provider=provider, skipped=self.worker.skipped, failures=self.failures,
         )  # fmt: skip
 
 

@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from instant_ic import msg
 from instant_ic.bus import ERROR, LATCHED, RELIABLE, SENSOR, WARN, Node, NodeError, QoS, main
-from instant_ic.diagnosis import Diagnosis
-from instant_ic.geometry.poses import matrix_from_pose2, planar_covariance, pose2_from_matrix
-from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.msg import (
-    LaserScan,
-    OccupancyGrid,
-    OccupancyGridUpdate,
-    Odometry,
-    PoseIntegrity,
-    PoseWithCovariance,
-    PoseWithCovarianceStamped,
-    String,
-    TFMessage,
-    grid_message,
-    header,
-    matrix_from_pose,
-    pose_message,
-    stamp_ns,
-    transform_matrix,
-)
-from instant_ic.slam import GridSlam, Scan
+from instant_ic.geometry.poses import matrix_from_pose2
+from instant_ic.geometry.transforms import TransformBuffer
+from instant_ic.slam import GridSlam
 from instant_ic.slam.config import GridSlamConfig
-from instant_ic.slam.grid_slam import make_slam, warm_up
+from instant_ic.slam.grid_slam import make_slam, run_job, warm_up
 from instant_ic.slam.map_updates import MapUpdates
 from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.report import diagnoses
-from instant_ic.slam.scan_queue import QueuedScan, ScanError, ScanQueue, level_mount
+from instant_ic.slam.scan_queue import QueuedScan, ScanError, ScanQueue
+from instant_ic.slam_messages import integrity_message, part_message, pose_message, read_scan
 
 ODOMETRY_QUEUE = QoS("sensor", depth=100)
 """Deep, because scans are placed between two odometry messages."""
@@ -53,25 +36,25 @@ class GridSlamNode(Node[GridSlamConfig]):
     def setup(self) -> None:
         warm_up(self.config)
         self.poll: Any = None  # timer while scans wait for odometry, which may have gone silent
-        self.worker = self.background(work, self.take_over)
+        self.worker = self.background(run_job, self.take_over)
         self.queue = ScanQueue(self.config)
         self.limiter = CorrectionLimiter(self.config.correction_speed_mps, self.config.correction_yaw_rate_radps)
-        self.map_out = self.publisher("/map", OccupancyGrid, qos=LATCHED)
-        self.update_out = self.publisher("/map_updates", OccupancyGridUpdate, qos=RELIABLE)
-        self.saved_out = self.publisher("/slam/saved", String, qos=RELIABLE)
-        self.pose_out = self.publisher("/pose", PoseWithCovarianceStamped, qos=SENSOR)
-        self.integrity_out = self.publisher("/slam/integrity", PoseIntegrity, qos=SENSOR)
+        self.map_out = self.publisher("/map", msg.OccupancyGrid, qos=LATCHED)
+        self.update_out = self.publisher("/map_updates", msg.OccupancyGridUpdate, qos=RELIABLE)
+        self.saved_out = self.publisher("/slam/saved", msg.String, qos=RELIABLE)
+        self.pose_out = self.publisher("/pose", msg.PoseWithCovarianceStamped, qos=SENSOR)
+        self.integrity_out = self.publisher("/slam/integrity", msg.PoseIntegrity, qos=SENSOR)
         self.restart()
         # The laser's mount is fixed: /tf, which carries a message per odometry, is not needed.
         self.mounts = TransformBuffer()
-        self.subscribe("/tf_static", TFMessage, self.on_mounts, qos=LATCHED)
+        self.subscribe("/tf_static", msg.TFMessage, self.on_mounts, qos=LATCHED)
         if self.config.use_wheel_odom:
-            self.subscribe("/wheel/odom", Odometry, self.on_odometry, qos=ODOMETRY_QUEUE)
-        self.subscribe("/scan", LaserScan, self.on_scan, qos=SENSOR)
-        self.subscribe("/slam/save", String, self.on_save, qos=RELIABLE)
-        self.subscribe("/initialpose", PoseWithCovarianceStamped, self.on_initial_pose, qos=RELIABLE)
+            self.subscribe("/wheel/odom", msg.Odometry, self.on_odometry, qos=ODOMETRY_QUEUE)
+        self.subscribe("/scan", msg.LaserScan, self.on_scan, qos=SENSOR)
+        self.subscribe("/slam/save", msg.String, self.on_save, qos=RELIABLE)
+        self.subscribe("/initialpose", msg.PoseWithCovarianceStamped, self.on_initial_pose, qos=RELIABLE)
         self.timer(self.config.map_period_s, self.publish_map)
-        self.timer(1.0, self.watch)
+        self.timer(1.0, lambda: self.show(self.queue.watch(self.clock.steady_ns())))
 
     def reconfigure(self, config: GridSlamConfig) -> None:
         super().reconfigure(config)
@@ -94,33 +77,25 @@ class GridSlamNode(Node[GridSlamConfig]):
     def on_mounts(self, message: Any) -> None:
         for mount in message.transforms:
             parent, child = mount.header.frame_id, mount.child_frame_id
-            self.mounts.set(parent, child, stamp_ns(mount), transform_matrix(mount), static=True)
+            self.mounts.set(parent, child, msg.stamp_ns(mount), msg.transform_matrix(mount), static=True)
 
     def on_odometry(self, message: Any) -> None:
-        if self.queue.add_odometry(stamp_ns(message), pose2_from_matrix(matrix_from_pose(message))):
+        if self.queue.add_odometry(msg.stamp_ns(message), msg.pose2_from_message(message)):
             self.place_ready()
         else:
             self.diagnose("odometry", WARN, "dropped a message that is not finite, or not newer than the last")
 
     def on_scan(self, message: Any) -> None:
-        stamp, now_ns = stamp_ns(message), self.clock.now_ns()
+        now_ns = self.clock.now_ns()
         try:
-            back_s = self.queue.check_stamp(stamp, now_ns)
+            back_s = self.queue.check_stamp(msg.stamp_ns(message), now_ns)
             if back_s > 0:
                 self.diagnose("time", WARN, f"time went back by {back_s:.1f} s: a new map begins")
                 self.restart()
-            mount = level_mount(self.mounts.lookup(self.config.base_frame, message.header.frame_id))
-            angles = (float(message.angle_min), float(message.angle_increment))
-            limits = (float(message.range_min), float(message.range_max))
-            scan = Scan(np.asarray(message.ranges), *angles, *limits, stamp)
-        except TransformError as error:
-            self.queue.drop(f"where the laser stands is not known yet: {error}")
+            scan, mount = read_scan(message, self.mounts, self.config.base_frame)
+            self.queue.add(scan, mount, now_ns, self.clock.steady_ns())
         except ScanError as error:
             self.queue.drop(str(error))
-        except ValueError as error:
-            self.queue.drop(f"the scan cannot be used: {error}")
-        else:
-            self.queue.add(scan, mount, now_ns, self.clock.steady_ns())
         self.show(self.queue.state)
         self.place_ready()
 
@@ -138,30 +113,16 @@ class GridSlamNode(Node[GridSlamConfig]):
         """Call the library for one scan and publish the result."""
         config, slam, stamp = self.config, self.slam, queued.scan.stamp_ns
         result = slam.process(queued.scan, odometry, queued.base_from_laser)
-        for state in diagnoses(slam, result, odometry is not None, config.use_wheel_odom):
-            self.show(state)
+        self.show(*diagnoses(slam, result, odometry is not None, config.use_wheel_odom))
         self.placed_ns = stamp
         if odometry is None:
             self.tf_broadcast(config.odom_frame, config.base_frame, matrix_from_pose2(slam.odom_from_base), stamp)
-        integrity = result.integrity
-        self.integrity_out.publish(
-            PoseIntegrity(
-                header=header(config.map_frame, stamp),
-                lost_probability=integrity.lost_probability,
-                position_bound_m=integrity.position_bound_m,
-                heading_bound_rad=integrity.heading_bound_rad,
-                localized=result.localized,
-                status=result.status.value,
-            )
-        )
+        self.integrity_out.publish(integrity_message(result, config.map_frame, stamp))
         # A robot that is lost keeps the frames that it had: it may drive on, slowly, until its place is recognized.
         if slam.in_map_frame:
             map_from_odom = self.limiter.follow(slam.map_from_odom, slam.odom_from_base, stamp)
             self.tf_broadcast(config.map_frame, config.odom_frame, matrix_from_pose2(map_from_odom), stamp)
-            pose = pose_message(matrix_from_pose2(result.map_from_base))
-            covariance = planar_covariance(result.covariance).reshape(36)
-            stamped = PoseWithCovariance(pose=pose, covariance=covariance)
-            self.pose_out.publish(PoseWithCovarianceStamped(header=header(config.map_frame, stamp), pose=stamped))
+            self.pose_out.publish(pose_message(result, config.map_frame, stamp))
             if self.updates.grid is None:
                 self.publish_map()
         else:
@@ -183,7 +144,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         try:
             if message.header.frame_id not in ("", self.config.map_frame):
                 raise ValueError(f"it is in frame {message.header.frame_id!r}, not {self.config.map_frame!r}")
-            self.slam.set_pose(pose2_from_matrix(matrix_from_pose(message)))
+            self.slam.set_pose(msg.pose2_from_message(message))
             self.limiter.reset()
         except ValueError as error:
             self.log.warning("/initialpose is not used: %s", error)
@@ -195,7 +156,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         except ValueError as error:
             answer = f"error: {error}"
         self.log.info("%s", answer)
-        self.saved_out.publish(String(data=answer))
+        self.saved_out.publish(msg.String(data=answer))
 
     def publish_map(self) -> None:
         """Publish a changed map: in parts on /map_updates, whole at most every ``map_full_period_s``."""
@@ -204,27 +165,10 @@ class GridSlamNode(Node[GridSlamConfig]):
             return
         part, whole = self.updates.update(self.slam.map_version, self.slam.grid, self.clock.steady_ns())
         if part is not None:
-            (height, width), data = part.values.shape, np.ascontiguousarray(part.values).reshape(-1)
-            place = {"x": part.x, "y": part.y, "width": width, "height": height}
-            self.update_out.publish(OccupancyGridUpdate(header=header(frame, stamp), data=data, **place))
+            self.update_out.publish(part_message(part, frame, stamp))
         if whole is not None:
             origin = (float(whole.origin[0]), float(whole.origin[1]))
-            self.map_out.publish(grid_message(whole.values, whole.resolution, origin, frame, stamp))
-
-    def watch(self) -> None:
-        self.show(self.queue.watch(self.clock.steady_ns()))
-
-    def show(self, state: Diagnosis) -> None:
-        self.diagnose(state.name, state.level, state.text, **state.values)
-
-
-def work(item: tuple[GridSlam, Callable[[], Any]]) -> tuple[GridSlam, Any, str]:
-    """Run a background job of the SLAM, on the worker's thread."""
-    slam, job = item
-    try:
-        return slam, job(), ""
-    except Exception as error:  # noqa: BLE001 - reported on the node's thread; scans go on
-        return slam, None, f"{type(error).__name__}: {error}"
+            self.map_out.publish(msg.grid_message(whole.values, whole.resolution, origin, frame, stamp))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ from instant_ic.control.navigator import Navigator, RecoveryConfig, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
-from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import (
     ControlState,
     OccupancyGrid,
@@ -27,8 +26,8 @@ from instant_ic.msg import (
     PoseStamped,
     TwistStamped,
     grid_array,
-    matrix_from_pose,
     path_message,
+    pose2_from_message,
     stamp_ns,
     twist_stamped,
     twist_values,
@@ -122,15 +121,14 @@ class NavigatorNode(Node[NavigatorConfig]):
         grid, goal = self.costmap.message, self.subgoal.message
         if grid is None or goal is None:
             missing = "costmap" if grid is None else "subgoal"
-            return self.stand(f"no {missing} within its time-out")
+            self.diagnose("follow", WARN, f"robot stands: no {missing} within its time-out")
+            return 0.0, 0.0
         age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
-        pose = extrapolate(
-            pose2_from_matrix(matrix_from_pose(state.robot_pose)), twist_values(state.robot_twist), age_s
-        )
+        pose = extrapolate(pose2_from_message(state.robot_pose), twist_values(state.robot_twist), age_s)
         if self.grid[0] is not grid:
             occupancy, resolution, origin = grid_array(grid)
             self.grid = grid, Costmap.from_occupancy(occupancy, resolution, np.array(origin))
-        subgoal, velocity = self.moving(pose2_from_matrix(matrix_from_pose(goal)), state)
+        subgoal, velocity = self.moving(pose2_from_message(goal), state)
         step = self.navigator.step(pose, self.speed, subgoal, self.grid[1], self.clock.steady_ns(), velocity)
         if step.replanned and (self.path.subscriber_count or self.lockstep):
             self.path.publish(path_message(step.plan.poses, "map", self.clock.now_ns()))
@@ -143,17 +141,11 @@ class NavigatorNode(Node[NavigatorConfig]):
         """Subgoal and its velocity; if it is the v-bot, the v-bot's own newer pose and twist."""
         vbot = self.vbot.message
         if vbot is not None:
-            pose = pose2_from_matrix(matrix_from_pose(vbot))
+            pose = pose2_from_message(vbot)
             if float(np.linalg.norm(pose[:2] - subgoal[:2])) < 0.15:
-                shown, robot = (
-                    pose2_from_matrix(matrix_from_pose(one)) for one in (state.vbot_target, state.robot_pose)
-                )
+                shown, robot = (pose2_from_message(one) for one in (state.vbot_target, state.robot_pose))
                 return meeting_pose(pose, shown, robot), twist_values(vbot)
         return subgoal, (0.0, 0.0)
-
-    def stand(self, reason: str) -> tuple[float, float]:
-        self.diagnose("follow", WARN, f"robot stands: {reason}")
-        return 0.0, 0.0
 
 
 if __name__ == "__main__":

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
-from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.capture import CaptureError
-from instant_ic.msg import Bool, Float32, Odometry, PoseStamped, matrix_from_pose, odometry_message
+from instant_ic.msg import Bool, Float32, Odometry, PoseStamped, odometry_message, pose2_from_message
 from instant_ic.pace import current
 from instant_ic.paths import run_dir
 from instant_ic.sim.capture_replay import CaptureReplay
@@ -69,7 +68,7 @@ class SimulatorNode(Node[SimulatorConfig]):
     def _put_down(self, message: PoseStamped) -> None:
         """Lift the robot and put it down elsewhere in the world."""
         try:
-            x, y, yaw = (float(v) for v in pose2_from_matrix(matrix_from_pose(message)))
+            x, y, yaw = (float(v) for v in pose2_from_message(message))
             self.simulation.put_down((x, y, yaw))
         except ValueError as error:
             self.log.warning("/simulation/put_down is not used: %s", error)

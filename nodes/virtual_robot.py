@@ -9,17 +9,18 @@ from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.states import VbotAction
+from instant_ic.control.step_times import StepTimes
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallFinder, WallSearch
-from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
+from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import (
     ControlState,
     OccupancyGrid,
     Odometry,
     TwistStamped,
     grid_array,
-    matrix_from_pose,
     odometry_message,
+    pose2_from_message,
     stamp_ns,
     twist_values,
 )
@@ -65,8 +66,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
         self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
-        self.obeyed = (0.0, 0.0)  # operator's command of the last step
-        self.early = False  # a step was made ahead of its time since the last timer
+        self.times = StepTimes()
         self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
         if self.config.walls_block:
@@ -82,14 +82,12 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.command.max_age_s, self.state.max_age_s = config.command_timeout_s, config.state_timeout_s
 
     def on_command(self, message: TwistStamped) -> None:
-        """Obey a changed command at once: the next timer is half a period away on average."""
-        if self.action == VbotAction.DRIVEN and not self.early and twist_values(message) != self.obeyed:
-            self.early = True
+        if self.action == VbotAction.DRIVEN and self.times.command_steps(twist_values(message)):
             self.tick()
 
     def on_timer(self) -> None:
-        self.early = False
-        self.tick()
+        if self.times.timer_steps(self.clock.steady_ns()):
+            self.tick()
 
     def tick(self) -> None:
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
@@ -111,18 +109,18 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
     def obey(self, state: ControlState, dt_s: float) -> None:
         """Act as the arbiter's state demands."""
         action, before, self.action = VbotAction(state.vbot_action), self.action, VbotAction(state.vbot_action)
-        robot_pose = pose2_from_matrix(matrix_from_pose(state.robot_pose))
+        robot_pose = pose2_from_message(state.robot_pose)
         robot_twist = twist_values(state.robot_twist)
         age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
         # The arbiter's message is up to a period old, and the r-bot moves on.
-        target = extrapolate(pose2_from_matrix(matrix_from_pose(state.vbot_target)), robot_twist, age_s)
+        target = extrapolate(pose2_from_message(state.vbot_target), robot_twist, age_s)
         if before is None and action != VbotAction.WITH_ROBOT:
-            self.robot.place(pose2_from_matrix(matrix_from_pose(state.vbot_pose)), (0.0, 0.0))  # the node was restarted
+            self.robot.place(pose2_from_message(state.vbot_pose), (0.0, 0.0))  # the node was restarted
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
-            self.obeyed = self.operator()
-            self.robot.step(self.obeyed, robot_pose, dt_s, self.walls.found, float(state.vbot_limit_m_s))
+            self.times.obeyed = self.operator()
+            self.robot.step(self.times.obeyed, robot_pose, dt_s, self.walls.found, float(state.vbot_limit_m_s))
         elif action == VbotAction.HELD:
             self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls.found)
         elif action == VbotAction.EASED:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from instant_ic.bus import OK, SENSOR, WARN, Node, NodeError, main
-from instant_ic.diagnosis import Diagnosis
 from instant_ic.geometry.poses import pose2_from_matrix, pose_matrix
 from instant_ic.geometry.transforms import TransformError
 from instant_ic.lidar.capture import CaptureError
@@ -194,9 +193,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         where = f"{config.host}:{self.receiver.port}" if config.source == "udp" else config.pcap
         for state in self.report.check(self.clock.steady_ns(), config.silence_s, config.source, where):
             self.show(state)
-
-    def show(self, state: Diagnosis) -> None:
-        self.diagnose(state.name, state.level, state.text, **state.values)
 
     def teardown(self) -> None:
         if hasattr(self, "ending"):

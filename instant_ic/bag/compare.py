@@ -89,7 +89,6 @@ class TopicDifference:
     """How one topic of two bags differs.
 
     Attributes:
-        topic: its name.
         count_a: messages in the first bag.
         count_b: messages in the second bag.
         first: text of the first difference; empty where the topic is the same in both bags, within the tolerance.

@@ -16,8 +16,6 @@ class LatchedValue:
     """A message of a latched topic that is still valid.
 
     Attributes:
-        topic: its topic.
-        type_name: its type.
         payload: CDR bytes.
         publish_ns: time of publication.
     """

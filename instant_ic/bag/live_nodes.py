@@ -5,14 +5,15 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Collection, Mapping
 
+from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.bus.registry import NodeInfo
 
 _BASE = "crawler_base"
 _COMMAND = "/cmd_vel"
 _ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
 """Topics that a robot's nodes act on, in the namespace of its base."""
-_HARMLESS = {"/clock", "/rosout", "/diagnostics", "/heartbeat", "/parameter_events"}
-"""Topics that every node publishes. On any other topic a second publisher would mix the bag with the live robot."""
+_HARMLESS = {"/clock", *EVERY_NODES}
+"""On any other topic a second publisher would mix the bag with the live robot."""
 
 
 def reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tuple[str, list[str]] | None:

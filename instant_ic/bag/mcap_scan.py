@@ -26,7 +26,6 @@ class ScannedMessage:
     """A message in an MCAP file.
 
     Attributes:
-        topic: its topic.
         schema: definition of its type.
         encoding: encoding of the payload; ``cdr`` in ROS 2 bags.
         metadata: metadata of its topic, where rosbag2 stores the QoS.
@@ -46,9 +45,6 @@ class ScannedMessage:
 
 class McapScan:
     """One pass over a file. The attributes are complete once :meth:`messages` is exhausted.
-
-    Args:
-        path: the file.
 
     Raises:
         BagError: the file cannot be opened, or is not an MCAP file.

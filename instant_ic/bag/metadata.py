@@ -77,7 +77,6 @@ def write_metadata(
     """Write ``metadata.yaml`` (rosbag2, version 9) atomically: readers see either the old or the new file.
 
     Args:
-        folder: the bag.
         parts: its files, in order.
         topics: QoS and definition of each topic.
         custom: ``custom_data``.

@@ -15,9 +15,10 @@ from instant_ic.bag.files import BagMessage, BagReader, TopicSummary
 from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.upgrade import upgrade_of
+from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.config.ranges import NotNegative, Range, check_ranges
 
-NEVER_PLAYED = ("/clock", "/rosout", "/heartbeat", "/diagnostics", "/parameter_events")
+NEVER_PLAYED = ("/clock", *EVERY_NODES)
 """The time itself, and what nodes report about themselves: the running nodes publish their own."""
 
 RATES = (0.01, 100.0)
@@ -56,7 +57,6 @@ class BagPlayer:
     """Paces the messages of a bag, independent of the bus. Its controls may be called from any thread.
 
     Args:
-        path: the bag.
         options: how to play it.
 
     Raises:

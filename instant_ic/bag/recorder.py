@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.errors import BagError, DiskFullError
@@ -26,6 +26,7 @@ from instant_ic.bag.snapshot import Entry, SnapshotCache
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
+from instant_ic.bus.transport import Stats
 from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, check_ranges
 
 FOREIGN_CLOCK_NS = 10_000_000_000
@@ -43,27 +44,9 @@ _ROOM_AGAIN = 64_000_000  # free space above the reserve before recording restar
 log = logging.getLogger(__name__)
 
 
-class LossCounter(Protocol):
-    """Loss counts of a subscription."""
-
-    @property
-    def lost(self) -> int:
-        """Missing messages, from gaps in the sequence."""
-
-    @property
-    def lost_by(self) -> dict[str, int]:
-        """Missing messages by publisher."""
-
-
-class TakeMessage(Protocol):
-    """Accepts ``(topic, type_name, payload, publish_ns, publisher)``."""
-
-    def __call__(
-        self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int, publisher: str = ""
-    ) -> None: ...
-
-
-Subscribe = Callable[[str, TakeMessage], LossCounter]
+TakeMessage = Callable[..., None]
+"""Accepts ``(topic, type_name, payload, publish_ns, publisher)``; see :meth:`Recorder.take`."""
+Subscribe = Callable[[str, TakeMessage], Stats]
 
 
 @dataclass(frozen=True)
@@ -133,7 +116,6 @@ class Snapshot:
     """One snapshot.
 
     Attributes:
-        path: its bag.
         state: ``waiting``, ``writing``, ``done`` or ``failed``.
         words: content of the bag, or why it failed.
         due_s: time at which it is written, by the monotonic clock.
@@ -200,7 +182,7 @@ class Recorder:
         self._held: list[tuple[str, str, bytes, int, str]] = []
         self._missed = LatchedValues()
         self._not_written: deque[Entry] = deque()
-        self._losses: dict[str, LossCounter] = {}
+        self._losses: dict[str, Stats] = {}
         self._qos: dict[str, QoS] = {}
         self._parameters: dict[str, object] = {}
         self._writer: BagWriter | None = None

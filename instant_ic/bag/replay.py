@@ -51,8 +51,6 @@ class ReplayNode:
 
     Attributes:
         name: name of a shipped node.
-        node_class: its class.
-        config: its parameters.
     """
 
     name: str

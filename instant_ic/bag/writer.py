@@ -111,8 +111,6 @@ class BagWriter(Closing):
         """Append one message.
 
         Args:
-            topic: its topic.
-            type_name: its type.
             payload: CDR bytes, which must not change until they are on the disk.
             stamp_ns: nanoseconds since the epoch.
             qos: QoS of the topic; used the first time that the topic appears.

@@ -15,11 +15,7 @@ _TIMEOUT_S = 1.0
 
 
 class Parameters:
-    """Parameters of all nodes of a run directory, as ``/node.key``; read from the nodes themselves.
-
-    Args:
-        run_dir: the run directory.
-    """
+    """Parameters of all nodes of a run directory, as ``/node.key``; read from the nodes themselves."""
 
     def __init__(self, run_dir: Path) -> None:
         self._run_dir = run_dir

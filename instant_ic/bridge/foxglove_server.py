@@ -110,7 +110,6 @@ class FoxgloveServer:
 
     Args:
         node: the bridge's node, on whose bus the server subscribes.
-        run_dir: its run directory.
         config: see :class:`ServerConfig`.
         takes: whether to offer a topic.
         gate: checks the clients' commands.

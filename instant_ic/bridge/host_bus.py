@@ -35,7 +35,6 @@ class ExportedTopics:
     """Exports topics of this host's nodes to the link, except messages republished by a bridge.
 
     Args:
-        node: the bridge's node.
         rules: topics to export, by name without namespace.
         link: their destination.
         on_trouble: called with topic and error text when a topic cannot be exported.
@@ -120,7 +119,6 @@ class ImportedTopics:
     """Publishes the messages of the link on this host, as on the other host.
 
     Args:
-        node: the bridge's node.
         rules: topics to import, by name without namespace.
         on_trouble: called with topic and error text when a topic cannot be published here.
     """

@@ -69,7 +69,6 @@ class Channel:
     last: Item | None = None
 
     def announce(self) -> Announce:
-        """Return the message that announces it."""
         return Announce(self.number, self.rule.topic, self.origin, self.type_name, self.digest, self.qos)
 
 

@@ -62,7 +62,6 @@ class LinkEvent:
 
     Attributes:
         peer: name of the other host in this host's allow-list; empty for the link as a whole.
-        event: the event.
     """
 
     peer: str
@@ -104,7 +103,6 @@ class HostLink(ABC):
     Args:
         side: this host's name and the topics that it imports.
         exports: topics that it exports, by name.
-        store: the keys.
         on_event: called on the link's thread with every event.
         times: ping period and timeouts.
 
@@ -177,7 +175,6 @@ class HostLink(ABC):
         Args:
             topic: one of ``exports``.
             origin: node that published it.
-            type_name: its type.
             qos: name of the preset, whether latched, whether reliable.
             payload: CDR bytes; copied if a host takes them.
             publish_ns: time of publication.

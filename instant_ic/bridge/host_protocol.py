@@ -150,7 +150,6 @@ class Notice(_Json):
 
     Attributes:
         name: subject.
-        text: the information.
     """
 
     KIND: ClassVar[int] = 6
@@ -235,7 +234,6 @@ class Data:
         sent_ns: time at which this chunk leaves, by the same clock.
         total: bytes of the message.
         offset: position of this chunk in the message.
-        chunk: the bytes.
         lane: the sender's lane, as an index of :data:`LANES`; the messages of a lane do not overlap.
         wall_time: whether ``publish_ns`` is the machine's time (a simulated clock is the same on both hosts).
     """

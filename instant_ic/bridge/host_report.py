@@ -21,7 +21,6 @@ class LinkReport:
     """Turns the state of a link into diagnoses.
 
     Args:
-        link: the link.
         diagnose: sets a diagnosis, as :meth:`Node.diagnose`.
         listed: topics of this host's lists.
 

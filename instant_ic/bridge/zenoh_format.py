@@ -165,7 +165,6 @@ class Token:
         session: id of the Zenoh session, in hex.
         node_id, entity_id: numbers within the session; equal for a node.
         namespace: the node's namespace, ``/robot1``; ``/`` is the root.
-        node: the node's name.
         topic, type_name, type_hash, qos: empty for a node.
     """
 

@@ -67,7 +67,6 @@ class Incoming:
     """Imports topics of the ROS graph unchanged, with their original time of publication.
 
     Args:
-        node: the gateway's node.
         namespace: namespace of the topics in the ROS graph.
         own: the gateway itself in the ROS graph.
         subscribe: ``TOPIC``, ``PATTERN`` or ``TOPIC TYPE``, by local names. With a type the topic exists immediately,

@@ -33,7 +33,6 @@ class Outgoing:
     all kept for late subscribers, and ``ros2 node list`` shows the nodes themselves.
 
     Args:
-        node: the gateway's node.
         session: the Zenoh session.
         namespace: namespace of the topics in the ROS graph.
         own: the gateway itself in the ROS graph.

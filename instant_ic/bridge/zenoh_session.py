@@ -236,7 +236,6 @@ class RosNode:
     Args:
         session: session of the node.
         namespace: ``/robot1``, or ``/``.
-        name: the node's name.
     """
 
     def __init__(self, session: RosSession, namespace: str, name: str) -> None:

@@ -22,6 +22,7 @@ from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.bus.transport import Payload, RawPublisher, RawSubscription, Received, Transport
 from instant_ic.config import params
 from instant_ic.config.parameter_info import ParameterInfo, is_live, parameter_infos, plain
+from instant_ic.diagnosis import Diagnosis
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import (
@@ -411,6 +412,12 @@ class Node(Generic[ConfigT]):
             self._waiting.discard(name)
             if before is not None and before[0] >= WARN:
                 self.log.info("%s: %s", name, message or "fine again")
+
+    def show(self, *diagnoses: Diagnosis | None) -> None:
+        """Set the diagnoses of a library object."""
+        for one in diagnoses:
+            if one is not None:
+                self.diagnose(one.name, one.level, one.text, **one.values)
 
     def _log_diagnosis(self, name: str, level: int, message: str) -> None:
         """Log a diagnosis; one that was never OK is logged once, as information, while other nodes still start."""

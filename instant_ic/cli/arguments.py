@@ -1,12 +1,72 @@
-"""Argument types: numbers and durations on the command line."""
+"""Parsers of the commands, and the types of their arguments."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 from instant_ic.cli.errors import UserError
+
+
+class Parser(argparse.ArgumentParser):
+    """Takes the completer of an argument (``cli.completion``) with its other options."""
+
+    def add_argument(self, *names: Any, completer: Any = None, **options: Any) -> argparse.Action:
+        action = super().add_argument(*names, **options)
+        if completer is not None:
+            action.completer = completer  # type: ignore[attr-defined]
+        return action
+
+
+def group(subparsers: Any, name: str, words: str, description: str, example: str = "") -> Any:
+    """Add a command that has verbs; returns what :func:`verb` adds them to."""
+    epilog = f"example: {example}" if example else None
+    parser = subparsers.add_parser(name, help=words, description=description, epilog=epilog)
+    return parser.add_subparsers(metavar="VERB", required=True)
+
+
+def verb(
+    verbs: Any, name: str, words: str, run: str | Callable[[argparse.Namespace], int], example: str,
+    description: str = "", **options: Any,
+) -> Any:  # fmt: skip
+    """Add a command or a verb, and return its parser.
+
+    Args:
+        verbs: the subparsers, or the result of :func:`group`.
+        name: on the command line.
+        words: its line in the list of commands; also its description where there is no other.
+        run: its function, or MODULE.FUNCTION in ``instant_ic.cli``, which is then imported when it runs.
+        example: a command line.
+        description: the first paragraph of its help.
+    """
+
+    def imported(args: argparse.Namespace) -> int:
+        module, _, function = str(run).rpartition(".")
+        status: int = getattr(importlib.import_module(f"instant_ic.cli.{module}"), function)(args)
+        return status
+
+    description = description or f"{words[0].upper()}{words[1:]}."
+    parser = verbs.add_parser(name, help=words, description=description, epilog=f"example: {example}", **options)
+    parser.set_defaults(func=run if callable(run) else imported)
+    return parser
+
+
+def check_files(*files: Path | None, suffix: str = "") -> None:
+    """Check the files to write before long work.
+
+    Raises:
+        UserError: a folder is missing, or a name has another suffix.
+    """
+    for file in files:
+        if file is not None and not file.expanduser().absolute().parent.is_dir():
+            raise UserError(f"{file}: the folder {file.parent} does not exist", 2)
+        if file is not None and suffix and file.suffix.lower() != suffix:
+            raise UserError(f"{file}: the name must end in {suffix}", 2)
 
 
 def positive(text: str) -> float:
@@ -31,6 +91,29 @@ def not_negative(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"must be >= 0 (got {text})")
     return value
+
+
+def numbers(form: str) -> Callable[[str], list[float]]:
+    """Type of an argument such as ``x,y,z,yaw``: so many finite numbers."""
+
+    def parse(text: str) -> list[float]:
+        try:
+            values = [float(word) for word in text.split(",")]
+        except ValueError:
+            values = []
+        if len(values) != len(form.split(",")) or not all(map(math.isfinite, values)):
+            raise argparse.ArgumentTypeError(f"must be {form}: {len(form.split(','))} numbers (got {text!r})")
+        return values
+
+    return parse
+
+
+def size(text: str) -> tuple[int, int]:
+    """``640x360``."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"must look like 640x360 (got {text!r})")
+    return int(match[1]), int(match[2])
 
 
 def seconds(text: str) -> float:

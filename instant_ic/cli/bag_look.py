@@ -34,7 +34,6 @@ _LEFT_OUT = {
 
 
 def info(args: argparse.Namespace) -> int:
-    """Print the contents of a bag: size, times, topics, losses, bookmarks."""
     with BagReader(Path(args.bag)) as reader:
         summary = _info(reader)
     if args.json:
@@ -132,7 +131,6 @@ def _info(reader: BagReader) -> dict[str, Any]:
 
 
 def diff(args: argparse.Namespace) -> int:
-    """Compare two bags topic by topic."""
     found = compare(Path(args.a), Path(args.b), tuple(topic_names(args.ignore)), args.common, tolerance_of(args))
     if not found:
         raise UserError("there are no topics to compare")
@@ -183,7 +181,6 @@ def _plain(topic: TopicDifference) -> dict[str, Any]:
 
 
 def convert(args: argparse.Namespace) -> int:
-    """Write a new bag from one or several others."""
     options = ConvertOptions(
         choice=TopicChoice(tuple(topic_names(args.topics)), tuple(topic_names(args.exclude))),
         start_s=args.start,
@@ -204,7 +201,6 @@ def convert(args: argparse.Namespace) -> int:
 
 
 def recover(args: argparse.Namespace) -> int:
-    """Copy every readable message into a new bag."""
     source = Path(args.bag)
     target = Path(args.output) if args.output else source.with_name(f"{source.stem}_recovered")
     result = recover_bag(source, target)
@@ -219,7 +215,6 @@ def recover(args: argparse.Namespace) -> int:
 
 
 def reindex(args: argparse.Namespace) -> int:
-    """Rewrite metadata.yaml."""
     files, messages = reindex_bag(Path(args.bag))
     print(f"{args.bag}/metadata.yaml: {messages} messages in {files} files")
     return 0

@@ -83,7 +83,6 @@ def _player_terminal(node: Node[Any]) -> Terminal:
 
 
 def record(args: argparse.Namespace) -> int:
-    """Run the recorder node in this process."""
     if args.output and Path(args.output).exists() and not args.snapshot:
         raise UserError(f"{args.output} exists already: choose another name with -o")
     words = ["--name", f"bag_recorder_{os.getpid()}"]
@@ -108,7 +107,6 @@ def record(args: argparse.Namespace) -> int:
 
 
 def play(args: argparse.Namespace) -> int:
-    """Run the player node in this process."""
     if not Path(args.bag).exists():
         raise UserError(f"bag {args.bag} does not exist")
     words = ["--name", f"bag_player_{os.getpid()}"]
@@ -133,7 +131,6 @@ def play(args: argparse.Namespace) -> int:
 
 
 def snapshot(args: argparse.Namespace) -> int:
-    """Make a recorder write the last seconds; wait until they are on disk."""
     node = _node(("bag_recorder",), args.node, keeps_snapshots=True)
     recorder = NodeControl(run_dir(), node.name)
     path = _call(recorder, "snapshot", reason=args.reason)["path"]
@@ -150,7 +147,6 @@ def snapshot(args: argparse.Namespace) -> int:
 
 
 def control(args: argparse.Namespace) -> int:
-    """Send a command to a running recorder or player."""
     arguments = argument_of(args.command, args.value)
     on_request = args.command in ("record", "stop")
     kinds = ("bag_player",) if arguments else ("bag_recorder",) if on_request or args.command == "split" else _STEERED

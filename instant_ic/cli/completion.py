@@ -20,14 +20,8 @@ def _quiet(function: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
     return complete
 
 
-def offer(argument: Any, words: Callable[..., list[str]]) -> None:
-    """Attach one of the completers below to an argument of a parser."""
-    argument.completer = words
-
-
 @_quiet
 def topics(args: Any) -> Iterable[str]:
-    """Topics that are published or subscribed."""
     from instant_ic.cli.names import topic_types
 
     return topic_types()
@@ -35,7 +29,6 @@ def topics(args: Any) -> Iterable[str]:
 
 @_quiet
 def nodes(args: Any) -> Iterable[str]:
-    """Running nodes."""
     from instant_ic import paths
     from instant_ic.bus import registry
 
@@ -44,7 +37,6 @@ def nodes(args: Any) -> Iterable[str]:
 
 @_quiet
 def parameters(args: Any) -> Iterable[str]:
-    """Parameters of the node named earlier on the command line."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.config import params
@@ -57,7 +49,6 @@ def parameters(args: Any) -> Iterable[str]:
 
 @_quiet
 def types(args: Any) -> Iterable[str]:
-    """Message types of ROS 2 and of this project."""
     from instant_ic.msg import typestore
 
     return sorted(typestore().types)
@@ -65,7 +56,6 @@ def types(args: Any) -> Iterable[str]:
 
 @_quiet
 def packages(args: Any) -> Iterable[str]:
-    """Packages of message types."""
     from instant_ic.msg import typestore
 
     return sorted({name.split("/")[0] for name in typestore().types})
@@ -73,7 +63,6 @@ def packages(args: Any) -> Iterable[str]:
 
 @_quiet
 def programs(args: Any) -> Iterable[str]:
-    """Nodes that can be started."""
     from instant_ic import paths
 
     return paths.node_names()
@@ -81,7 +70,6 @@ def programs(args: Any) -> Iterable[str]:
 
 @_quiet
 def launch_files(args: Any) -> Iterable[str]:
-    """Shipped launch files by name, and those in the working directory."""
     from instant_ic import paths
 
     shipped = [path.stem for path in paths.share_dir("launch").glob("*.yaml")]
@@ -90,7 +78,6 @@ def launch_files(args: Any) -> Iterable[str]:
 
 @_quiet
 def launch_arguments(args: Any) -> Iterable[str]:
-    """``key:=`` arguments of the launch file named earlier on the command line."""
     from instant_ic.launch.description import find_launch_file
     from instant_ic.launch.reader import read_arguments
 
@@ -99,6 +86,5 @@ def launch_arguments(args: Any) -> Iterable[str]:
 
 @_quiet
 def bags(args: Any) -> Iterable[str]:
-    """Bags in the working directory and its direct subfolders."""
     found = [path.parent for pattern in ("*/metadata.yaml", "*/*/metadata.yaml") for path in Path().glob(pattern)]
     return sorted(str(path) for path in [*found, *Path().glob("*.mcap"), *Path().glob("*.bag")])

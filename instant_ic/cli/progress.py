@@ -1,4 +1,4 @@
-"""Progress of a long command: a bar in a terminal, a line per 10 % elsewhere."""
+"""Progress of a long command: a bar in a terminal, lines elsewhere."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 _QUIET_S = 5.0  # a command that ends within this time prints no lines
+_DAY_S = 86400.0
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """Yield a function that takes the completed share, 0 to 1, and shows it on standard error."""
+def progress(what: str) -> Iterator[Callable[..., None]]:
+    """Yield a function that shows the completed share, 0 to 1, on standard error; optionally with another text."""
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import Progress
 
-        with Progress(console=Console(stderr=True)) as bar:
-            task = bar.add_task(what, total=1.0)
-            shown = [0.0]
+        # A drive takes minutes on a slow core: the remaining time follows from all drives, not from the last 30 s.
+        with Progress(console=Console(stderr=True), speed_estimate_period=_DAY_S) as bar:
+            task, shown = bar.add_task(what, total=1.0), 0.0
 
-            def draw(share: float) -> None:
-                if share >= 1.0 or share - shown[0] >= 0.001:
-                    shown[0] = share
-                    bar.update(task, completed=share)
+            def show(share: float, text: str = what) -> None:
+                nonlocal shown
+                if share >= 1.0 or share - shown >= 0.001:  # not for each of a million messages
+                    shown = share
+                    bar.update(task, completed=share, description=text)
 
-            yield draw
+            yield show
         return
-    began_s = time.monotonic()
-    printed = [0]
+    began_s, printed = time.monotonic(), 0
 
-    def print_share(share: float) -> None:
-        tenth = int(share * 10)
-        if tenth > printed[0] and time.monotonic() - began_s > _QUIET_S:
-            printed[0] = tenth
-            print(f"{what}: {10 * tenth} % after {time.monotonic() - began_s:.0f} s", file=sys.stderr, flush=True)
+    def print_share(share: float, text: str = what) -> None:
+        nonlocal printed
+        if int(share * 10) > printed and time.monotonic() - began_s > _QUIET_S:
+            printed = int(share * 10)
+            print(f"{text}: {10 * printed} % after {time.monotonic() - began_s:.0f} s", file=sys.stderr, flush=True)
 
     yield print_share

@@ -8,14 +8,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli.heartbeats import Flow, Heartbeat
+from instant_ic.bus.heartbeat import EVERY_NODES, Flow, Heartbeat
 from instant_ic.config.cpu_budget import cpu_budget
 
 if TYPE_CHECKING:
     from instant_ic.launch.topics import TopicRate
-
-EVERYBODYS = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events")
-"""Topics that every node has; excluded from the rates."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +20,6 @@ class TopicRow:
     """An input or output topic of a node.
 
     Attributes:
-        topic: its name.
-        rate_hz: messages per second.
         age_s: time since the newest message; inf before the first.
         nominal_hz: expected rate; None where unknown.
         fault: text of the fault; empty where there is none.
@@ -42,18 +37,10 @@ class NodeRow:
     """One node.
 
     Attributes:
-        node: its name.
-        pid: process id.
         state: from its heartbeat; ``silent`` or ``busy`` where there is none.
         message: its worst diagnosis, else the faults of its rates.
         cpu_percent: percent of one core since the last measurement.
         budget_percent: CPU budget, percent of one core; None where there is none.
-        rss_mb: resident memory.
-        threads: number of threads.
-        outputs: published topics.
-        inputs: subscribed topics.
-        lost: messages that the node has lost.
-        up_s: time since its start.
     """
 
     node: str
@@ -157,7 +144,7 @@ def make_rows(
 def _topics(flows: Mapping[str, Flow], nominal: Callable[[str], TopicRate | None]) -> list[TopicRow]:
     rows = []
     for topic, flow in sorted(flows.items()):
-        if topic.endswith(EVERYBODYS):
+        if topic.endswith(EVERY_NODES):
             continue
         expected = nominal(topic)
         fault = expected.fault(flow.rate_hz, flow.age_s) if expected is not None else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import math
 
 from instant_ic import paths
@@ -10,14 +11,14 @@ from instant_ic.cli.errors import UserError
 from instant_ic.cli.names import absolute, near, topic_types
 
 
-def show(name: str, verbose: bool) -> int:
+def info(args: argparse.Namespace) -> int:
     """Print one topic.
 
     Raises:
         UserError: the topic has neither publisher nor subscriber.
     """
     run_dir = paths.run_dir()
-    topic = absolute(name)
+    topic = absolute(args.topic)
     found = next((entry for entry in registry.list_topics(run_dir) if entry.topic == topic), None)
     publishers = found.publishers if found else []
     readers = [node for node in registry.list_nodes(run_dir) if topic in node.subscribes]
@@ -27,7 +28,7 @@ def show(name: str, verbose: bool) -> int:
         )
     kind = found.type_name if found else readers[0].subscribes[topic]
     print(f"Type: {kind}")
-    if verbose:
+    if args.verbose:
         _show_verbose(topic, kind, publishers, readers)
         return 0
     print(f"Publisher count: {len(publishers)}")

@@ -48,7 +48,6 @@ def echo(args: argparse.Namespace) -> int:
 
 
 def rate(args: argparse.Namespace) -> int:
-    """Print the rate of each topic once a second."""
     with Observer(args.topic, args.use_sim_time) as observer:
         rates = {topic: Rate(args.window) for topic in observer.topics}
         _watch(
@@ -85,7 +84,6 @@ class _Bandwidth:
 
 
 def bandwidth(args: argparse.Namespace) -> int:
-    """Print the bandwidth of each topic once a second."""
     with Observer(args.topic) as observer:
         flows = {topic: _Bandwidth(args.window) for topic in observer.topics}
         _watch(

@@ -277,7 +277,6 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
 
     Args:
         config_class: dataclass of the configuration.
-        values: the given values.
         base: source of all other values; None uses the defaults.
 
     Raises:
@@ -436,7 +435,6 @@ def change(
     """Apply new values to a configuration and check it as a whole; returns it with what differs (flat).
 
     Args:
-        config: the present configuration.
         values: flat or nested keys; unchanged values are allowed.
         is_live: whether a key may be changed while the node runs.
         where: prefix of the error messages.

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, TypeAlias
 
 from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.control.costmap import CostmapConfig
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import MotionLimits
@@ -106,13 +107,18 @@ class PoseTrustConfig:
 
 @dataclass(frozen=True)
 class ArbiterConfig:
-    """Configuration of the arbiter's library part.
+    """Parameters of the node ``arbiter``.
 
     Attributes:
         collision_monitor: last step before /cmd_vel; the most restrictive polygon wins.
         planner: finds out whether there is a way round the obstacle; the navigator has its own.
         timeouts: s; with an older message the command is zero. Images (camera, view): late_s after their usual arrival,
             if longer.
+        rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
+        wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
+        wall_period_s: s; walls are searched for in a changed /map at most this often, on a separate thread.
+        map_jump_m: m; a correction of map→odom larger than this makes the costmap forget its marks.
+        map_jump_deg: degrees; as map_jump_m, for the yaw.
     """
 
     limits: MotionLimits = field(default_factory=MotionLimits)
@@ -125,3 +131,12 @@ class ArbiterConfig:
     switch: SwitchConfig = field(default_factory=SwitchConfig)
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     pose_trust: PoseTrustConfig = field(default_factory=PoseTrustConfig)
+    rate_hz: Positive = 20.0
+    wall_min_length_m: Positive = 1.5
+    wall_period_s: Positive = 2.0
+    map_jump_m: Positive = 0.3
+    map_jump_deg: Positive = 5.0
+    costmap: CostmapConfig = field(default_factory=CostmapConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import SortedPoints, sort_points
 from instant_ic.control.moving import NOTHING_MOVES, MovingPoints, MovingThings
 from instant_ic.control.static_map import StaticMap
+from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 
@@ -54,15 +55,6 @@ class Cloud:
     """(N,) structured: x, y, z in metres; optionally time in seconds since the first point."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """State of one input, for a diagnosis."""
-
-    ok: bool
-    text: str
-    values: dict[str, Any] = field(default_factory=dict)
-
-
 class Surroundings:
     """Places scans and 3D points by the transforms, and updates the costmap with them.
 
@@ -79,7 +71,7 @@ class Surroundings:
         self.points_seen = False
         self.map_jumped = False
         """At the last update."""
-        self.findings: dict[str, Finding] = {}
+        self.findings: dict[str, Diagnosis] = {}
         """By input: scan, points, costmap, pose."""
         if not config.points.enabled:
             self._find("points", True, "not used (costmap.points.enabled is false)")
@@ -193,7 +185,7 @@ class Surroundings:
         return True
 
     def _find(self, name: str, ok: bool, text: str, **values: Any) -> None:
-        self.findings[name] = Finding(ok, text, values)
+        self.findings[name] = Diagnosis(name, Level.OK if ok else Level.WARN, text, values)
 
     def _place(self, scan: Scan) -> None:
         try:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from instant_ic.bus import LATCHED
 from instant_ic.console.client import ConsoleClient
 from instant_ic.experiments.stack import Stack, StackError
-from instant_ic.geometry.poses import pose2_from_matrix
-from instant_ic.msg import matrix_from_pose, message_type
+from instant_ic.msg import message_type, pose2_from_message
 
 
 @dataclass
@@ -60,13 +59,13 @@ class DriveRecorder:
             self.record.reasons.append(message.reason)
 
     def _on_truth(self, message: Any) -> None:
-        self.record.truth.append(pose2_from_matrix(matrix_from_pose(message)))
+        self.record.truth.append(pose2_from_message(message))
 
     def _on_contact(self, message: Any) -> None:
         self.record.contact |= bool(message.data)
 
     def _on_vbot(self, message: Any) -> None:
-        self.vbot_pose = pose2_from_matrix(matrix_from_pose(message))
+        self.vbot_pose = pose2_from_message(message)
         if self.mode == self._virtual:
             self.record.vbot.append(self.vbot_pose)
 

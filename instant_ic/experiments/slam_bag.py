@@ -10,7 +10,7 @@ import numpy as np
 from instant_ic.bag import BagError, BagReader
 from instant_ic.geometry.poses import Pose2, pose2_from_matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.msg import deserialize, matrix_from_pose, stamp_ns, transform_matrix
+from instant_ic.msg import deserialize, pose2_from_message, stamp_ns, transform_matrix
 from instant_ic.slam import Scan
 from instant_ic.slam.logs import LogEntry, LogError
 from instant_ic.slam.odometry import OdometryBuffer
@@ -51,7 +51,7 @@ def read_bag(path: Path, scan_topic: str | None = None, base_frame: str = "base_
             for message in bag.messages(wanted):
                 value = deserialize(message.payload, message.type_name)
                 if message.topic == wheels:
-                    odometry.add(stamp_ns(value), pose2_from_matrix(matrix_from_pose(value)))
+                    odometry.add(stamp_ns(value), pose2_from_message(value))
                     continue
                 for transform in value.transforms:
                     if message.topic == "/tf_static":

@@ -40,7 +40,7 @@ from instant_ic.msg import (
     compressed_image_message,
     deserialize,
     header,
-    matrix_from_pose,
+    pose2_from_message,
     stamp_ns,
     to_time,
 )
@@ -329,7 +329,7 @@ class SimulatedStack:
             self.state = deserialize(record.payload, record.type_name)
         elif topic == "/vbot/odom":
             message = deserialize(record.payload, record.type_name)
-            self.vbot = self._in_world(pose2_from_matrix(matrix_from_pose(message)))
+            self.vbot = self._in_world(pose2_from_message(message))
             truth = self.simulation.poses_at([(stamp_ns(message) - START_NS) / 1e9])[0]
             self.yaw_gap_rad = wrap_angle(float(self.vbot[2] - truth[2]))
         elif topic == "/keyframe":
@@ -496,7 +496,7 @@ class SimulatedStack:
         log.mode.append(int(state.mode))
         log.virtual.append(self.page.virtual)
         log.robot.append(self.robot)
-        log.estimate.append(self._in_world(pose2_from_matrix(matrix_from_pose(state.robot_pose))))
+        log.estimate.append(self._in_world(pose2_from_message(state.robot_pose)))
         log.vbot.append(self.vbot.copy())
         log.yaw_gap_rad.append(self.yaw_gap_rad)
         log.known_yaw_gap_rad.append(float(state.yaw_gap_rad))

@@ -10,9 +10,10 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from instant_ic.bus import registry
+from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.estop_state import RunMark
 from instant_ic.launch.description import LaunchDescription
-from instant_ic.launch.health import EVERY_NODES, HealthMonitor, TopicFault
+from instant_ic.launch.health import HealthMonitor, TopicFault
 from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.pacing import Pacing
 from instant_ic.launch.process import ManagedProcess, State
@@ -181,9 +182,9 @@ def _row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequenc
         state = "slow"
     text = health.message or ", ".join(f"{f.topic.lstrip('/')} {f.words}" for f in own.values() if f.stopped)
     sends = tuple(
-        (topic, rate_hz, topic not in own)
-        for topic, rate_hz in health.rates_hz.items()
-        if rate_hz > 0 and topic.rpartition("/")[2] not in EVERY_NODES
+        (topic, flow.rate_hz, topic not in own)
+        for topic, flow in health.outputs.items()
+        if flow.rate_hz > 0 and not topic.endswith(EVERY_NODES)
     )
     # Faulty topics first, then those with a nominal rate: the least important ones may not fit into the line.
     order = sorted(sends, key=lambda send: (send[2], nominal_rate(send[0], process.spec.namespace) is None))

@@ -17,7 +17,6 @@ class LaunchArgument:
     """An ``arg`` of a launch file.
 
     Attributes:
-        name: its name.
         default: default value; None if a value must be given.
         description: text for ``--show-args``.
         line: line in the file.
@@ -112,7 +111,6 @@ class LaunchDescription:
     """Everything that a launch file starts and does, with its arguments applied.
 
     Attributes:
-        file: the launch file.
         arguments: arguments that it declares.
         values: values of its variables.
         nodes: processes to start.

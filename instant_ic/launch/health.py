@@ -6,11 +6,12 @@ import math
 import os
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from instant_ic.bus import RELIABLE, SENSOR, registry
+from instant_ic.bus.heartbeat import EVERY_NODES, TYPE, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import ERROR, OK, WARN
 from instant_ic.launch.description import NodeSpec
@@ -18,17 +19,9 @@ from instant_ic.launch.topics import nominal_rate
 from instant_ic.msg import deserialize, header, message_type, serialize
 from instant_ic.paths import sign_in_file
 
-SILENT_AFTER_S = 3.0
-"""A node without a heartbeat for longer than this is shown as silent."""
-
 FAULT_HOLDS_S = 3.0
 """A wrong rate is reported once it has lasted this long."""
 
-EVERY_NODES = ("heartbeat", "diagnostics", "rosout", "parameter_events")
-"""Topics that every node publishes, by the last part of the name. A node that stops them is silent, not slow."""
-
-_STATES = ("starting", "running", "degraded", "failed", "stopping")
-_UP = ("running", "degraded")
 _VSPACE_READY = 2
 _DIAGNOSTICS_S = 1.0
 
@@ -43,36 +36,6 @@ MILESTONES: tuple[tuple[str, str, str], ...] = (
     ("first depth image", "depth_scaler", "/depth/scaled"),
 )
 """What an operator waits for at start-up: label, node, and the topic whose messages show that it works."""
-
-
-@dataclass
-class NodeHealth:
-    """The newest heartbeat of a node.
-
-    Attributes:
-        state: as in NodeStatus.msg, in lower case.
-        message: text of the worst diagnosis.
-        cpu_percent: of one core.
-        rss_mb: resident memory.
-        rates_hz: published topic → messages per second.
-        seen_s: monotonic time of its arrival.
-        pid: process that sent it.
-        ages_s: published topic → seconds since the newest message; inf before the first.
-    """
-
-    state: str
-    message: str
-    cpu_percent: float
-    rss_mb: float
-    rates_hz: dict[str, float] = field(default_factory=dict)
-    seen_s: float = 0.0
-    pid: int = 0
-    ages_s: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def silent(self) -> bool:
-        """Whether the last heartbeat is too old."""
-        return time.monotonic() - self.seen_s > SILENT_AFTER_S
 
 
 @dataclass(frozen=True)
@@ -90,12 +53,11 @@ class HealthMonitor:
     """Subscribes to ``/heartbeat`` (and ``/vspace/status`` if the stack has a ``nerf``) without a node of its own.
 
     Args:
-        nodes: the nodes of the stack.
         run_dir: prepared run directory; those of groups lie in it, also prepared.
     """
 
     def __init__(self, nodes: Sequence[NodeSpec], run_dir: Path) -> None:
-        self.nodes: dict[str, NodeHealth] = {}
+        self.nodes: dict[str, Heartbeat] = {}
         """By label."""
         self._specs = [spec for spec in nodes if spec.heartbeat]
         self._run_dir = run_dir
@@ -105,7 +67,7 @@ class HealthMonitor:
         for transport in self._transports.values():
             transport.patient = True
         self._folders = groups
-        self._beats = [(spec_group, beat) for spec_group, beat in self._subscribe_beats()]
+        self._beats = list(self._subscribe_beats())
         self._vspace = [
             (
                 _labelled(spec, "virtual space"),
@@ -138,10 +100,9 @@ class HealthMonitor:
         return self._transports[spec.group].subscribe(name, type_name, SENSOR, lambda: None)
 
     def _subscribe_beats(self) -> Iterable[tuple[str, Any]]:
-        status = "instant_ic_msgs/msg/NodeStatus"
         for group, namespace in sorted({(spec.group, spec.namespace.strip("/")) for spec in self._specs}):
             topic = f"/{namespace}/heartbeat" if namespace else "/heartbeat"
-            yield group, self._transports[group].subscribe(topic, status, RELIABLE, lambda: None)
+            yield group, self._transports[group].subscribe(topic, TYPE, RELIABLE, lambda: None)
 
     def poll(self) -> None:
         """Process the messages that have arrived; never waits."""
@@ -149,7 +110,8 @@ class HealthMonitor:
             transport.wait(0.0)
         for group, subscription in self._beats:
             for received in subscription.take():
-                self._take(deserialize(received.payload, received.type_name), group)
+                beat = from_message(deserialize(received.payload, received.type_name))
+                self.nodes[f"{group}/{beat.node}" if group else beat.node] = beat
         for label, subscription in self._vspace:
             for received in subscription.take():
                 status = deserialize(received.payload, received.type_name)
@@ -159,23 +121,9 @@ class HealthMonitor:
         for word, program, topic in MILESTONES:
             for spec in self._specs:
                 health = self.nodes.get(spec.label)
-                if spec.exec == program and health is not None and health.ages_s.get(topic, math.inf) < math.inf:
+                flow = health.outputs.get(topic) if health is not None and spec.exec == program else None
+                if flow is not None and flow.age_s < math.inf:
                     self._reached.add(_labelled(spec, word))
-
-    def _take(self, message: Any, group: str) -> None:
-        state = _STATES[message.state] if message.state < len(_STATES) else "unknown"
-        label = f"{group}/{message.node}" if group else message.node
-        outputs = list(message.outputs)
-        self.nodes[label] = NodeHealth(
-            state,
-            message.message,
-            float(message.cpu_percent),
-            float(message.rss_mb),
-            dict(zip(outputs, map(float, message.output_rates_hz), strict=False)),
-            time.monotonic(),
-            int(message.pid),
-            dict(zip(outputs, map(float, message.output_ages_s), strict=False)),
-        )
 
     @property
     def cpu_cores(self) -> float:
@@ -194,16 +142,16 @@ class HealthMonitor:
     def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
         """Monotonic time of the newest heartbeat in which this process reported that it runs; None before the first."""
         health = self.nodes.get(spec.label)
-        return health.seen_s if health is not None and health.pid == pid and health.state in _UP else None
+        return health.seen_s if health is not None and health.pid == pid and health.up else None
 
     @property
     def reached(self) -> int:
         """Steps of the start so far: nodes that run, and what :meth:`waiting_for` no longer lists."""
-        return len(self._reached) + sum(health.state in _UP for health in self.nodes.values())
+        return len(self._reached) + sum(health.up for health in self.nodes.values())
 
     def nodes_missing(self) -> list[str]:
         """Nodes that have not reported yet that they run."""
-        return [s.label for s in self._specs if s.label not in self.nodes or self.nodes[s.label].state not in _UP]
+        return [s.label for s in self._specs if s.label not in self.nodes or not self.nodes[s.label].up]
 
     def waiting_for(self) -> list[str]:
         """``MILESTONES`` (and the v-space) of this stack's nodes that have not been reached yet."""
@@ -226,14 +174,14 @@ class HealthMonitor:
         faults: list[TopicFault] = []
         for spec in self._specs:
             health = self.nodes.get(spec.label)
-            if health is None or health.silent or health.state not in _UP:
+            if health is None or health.silent or not health.up:
                 continue
-            for topic, rate_hz in health.rates_hz.items():
+            for topic, flow in health.outputs.items():
                 expected = nominal_rate(topic, spec.namespace)
-                if expected is None or topic.rpartition("/")[2] in EVERY_NODES:
+                if expected is None or topic.endswith(EVERY_NODES):
                     continue
-                key, age_s = (spec.label, topic), health.ages_s.get(topic, float("inf"))
-                words = expected.fault(rate_hz, age_s)
+                key, age_s = (spec.label, topic), flow.age_s
+                words = expected.fault(flow.rate_hz, age_s)
                 if not words:
                     self._flowed.add(key)
                     self._wrong_since.pop(key, None)
@@ -270,7 +218,7 @@ class HealthMonitor:
         """
         for spec in self._specs:
             health = self.nodes.get(spec.label)
-            if spec.exec != "console" or health is None or health.state not in _UP:
+            if spec.exec != "console" or health is None or not health.up:
                 continue
             folder = self._folders[spec.group]
             address = find_console(registry.list_nodes(folder), [spec.name])

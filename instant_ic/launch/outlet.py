@@ -24,7 +24,6 @@ class Outlet:
     """Runs calls one after another on a thread of its own.
 
     Args:
-        name: of the thread.
         limit: how much may wait, in the unit of ``put``'s ``size``.
     """
 
@@ -46,7 +45,6 @@ class Outlet:
 
         Args:
             function: runs on the outlet's thread.
-            args: its arguments.
             size: size of the call.
             always: queue it even then; for the few calls that matter.
         """

@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
+from instant_ic.launch.health import HealthMonitor
 from instant_ic.pace import SLOWEST_CHOSEN as SLOWEST
 from instant_ic.pace import PaceFiles, describe
 
@@ -169,19 +169,6 @@ class CoreLoad:
         return time.monotonic(), int(fields[4]) + int(fields[5])  # idle, and waiting for a disk
 
 
-class Lateness(Protocol):
-    """The stack as :class:`Pacing` sees it."""
-
-    @property
-    def cpu_cores(self) -> float:
-        """Cores that the stack uses."""
-        ...
-
-    def take_late(self) -> tuple[float | None, bool]:
-        """``late`` and ``stale`` of :class:`Sample`, since the last call."""
-        ...
-
-
 class Pacing:
     """Adapts the pace of a running stack, and reports changes that an operator notices.
 
@@ -207,7 +194,7 @@ class Pacing:
         """The present pace for the operator; empty in real time."""
         return describe(self._files.factor, adapts=True)
 
-    def step(self, stack: Lateness) -> None:
+    def step(self, stack: HealthMonitor) -> None:
         """Adapt the pace, at most four times a second."""
         now_s = time.monotonic()
         if now_s - self._sample_s < _PERIOD_S:

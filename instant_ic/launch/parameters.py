@@ -145,7 +145,6 @@ def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = Non
     """Like :func:`check_parameters`, but in a separate process, and only for nodes not cached as valid.
 
     Args:
-        nodes: the nodes.
         cache: file of valid nodes; default ``$XDG_CACHE_HOME/instant_ic/launch_check.json``. If it cannot be read or
             written, the check only takes longer.
 

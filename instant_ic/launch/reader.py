@@ -94,7 +94,6 @@ class Reader:
         """Read an included file.
 
         Args:
-            file: the file.
             scope: scope of the include.
             given: the arguments that the include sets.
             place: place of the include.
@@ -405,7 +404,6 @@ def read_launch_file(
     """Read and check a launch file with everything that it includes.
 
     Args:
-        file: the launch file.
         arguments: values for its ``arg`` entries.
         run_dir: value of ``$(run-dir)``; default: ``paths.run_dir()``.
 
@@ -441,7 +439,6 @@ def read_arguments(file: Path, included: bool = False) -> tuple[LaunchArgument, 
     """The ``arg`` entries of a launch file, whatever else it contains.
 
     Args:
-        file: the launch file.
         included: return those of the included files instead, as far as this file leaves them at their defaults.
 
     Raises:

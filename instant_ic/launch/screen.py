@@ -36,7 +36,6 @@ class Row:
     """A node in the table.
 
     Attributes:
-        label: its name.
         state: in one or two words.
         cpu_percent: of one core; None if unknown.
         rss_mb: resident memory; None if unknown.

@@ -39,7 +39,6 @@ class Value:
     """A place in a YAML file (scalar, mapping or list), with accessors that note problems instead of raising.
 
     Attributes:
-        file: the file.
         node: PyYAML's node.
         problems: list where mistakes are noted; shared by the whole launch description.
     """
@@ -131,7 +130,6 @@ def load(file: Path, problems: list[Problem]) -> Value | None:
     """Read a YAML file; None, with the problem noted, if it cannot be read.
 
     Args:
-        file: its path.
         problems: list where mistakes are noted.
     """
     try:

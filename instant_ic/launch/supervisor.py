@@ -6,17 +6,18 @@ import selectors
 import signal
 import subprocess
 import sys
-import threading
 import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
+from instant_ic.closing import on_end_signal
 from instant_ic.launch.description import Announcement, NodeSpec, Shutdown
+from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, RespawnLimit, Schedule, State, describe_exit
 from instant_ic.launch.reaper import kill_marked
@@ -54,19 +55,6 @@ class Output(Protocol):
 
     def stopping(self) -> None:
         """Called once, when the end begins."""
-
-
-class Health(Protocol):
-    """The nodes' heartbeats."""
-
-    def poll(self) -> None:
-        """Process the messages that have arrived; never waits."""
-
-    def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
-        """Monotonic time of the newest heartbeat in which this process reported that it runs; None before the first."""
-
-    def close(self) -> None:
-        """Disconnect from the bus."""
 
 
 class _Silence:
@@ -116,7 +104,7 @@ class Supervisor:
         output: Output,
         make_limit: Callable[[NodeSpec], RespawnLimit] | None = None,
         stop_schedule: Schedule = STOP_SCHEDULE,
-        make_health: Callable[[], Health] | None = None,
+        make_health: Callable[[], HealthMonitor] | None = None,
         announcements: Sequence[Announcement] = (),
         shutdown: Shutdown | None = None,
     ) -> None:
@@ -133,7 +121,7 @@ class Supervisor:
             for node in nodes
         ]
         self._make_health = make_health
-        self._health: Health | None = None
+        self._health: HealthMonitor | None = None
         self._silences = {process: _Silence() for process in self.processes}
         self._announcements = sorted(announcements, key=lambda announcement: announcement.delay_s)
         self._shutdown = shutdown
@@ -205,24 +193,13 @@ class Supervisor:
             for line in left.decode(errors="replace").splitlines():
                 self._output.event(f"killed a process that a node left behind: {line}", bad=True)
 
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        """Let SIGINT, SIGTERM and SIGHUP, unless `nohup` ignores it, request the end; a second signal hurries it."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
+    def _signals(self) -> AbstractContextManager[None]:
+        """Let SIGINT, SIGTERM and SIGHUP request the end; a second signal hurries it."""
 
         def on_signal(signum: int, frame: FrameType | None) -> None:
             self.request_stop(hurry=self._stop)
 
-        hangup = () if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else (signal.SIGHUP,)
-        watched = (signal.SIGINT, signal.SIGTERM, *hangup)
-        before = [(signum, signal.signal(signum, on_signal)) for signum in watched]
-        try:
-            yield
-        finally:
-            for signum, handler in before:
-                signal.signal(signum, handler)
+        return on_end_signal(on_signal)
 
     # -- one round -------------------------------------------------------------------------------
 

@@ -69,7 +69,6 @@ def seconds_of(value: Value | None, context: Context) -> float | None:
 
 
 def integer_of(value: Value | None, context: Context, default: int) -> int:
-    """An integer."""
     text = text_of(value, context)
     if value is None or text is None:
         return default
@@ -100,7 +99,6 @@ def pair_of(entry: Value, first: str, second: str, context: Context) -> tuple[st
 
 
 def pairs_of(value: Value | None, first: str, second: str, context: Context) -> list[tuple[str, str]]:
-    """All pairs of a list."""
     found = [pair_of(entry, first, second, context) for entry in value.items()] if value is not None else []
     return [pair for pair in found if pair is not None]
 

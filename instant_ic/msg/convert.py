@@ -265,6 +265,11 @@ def pose_message(matrix: Matrix) -> Any:
     )
 
 
+def pose2_from_message(message: Any) -> NDArray[np.float64]:
+    """Planar pose (3,) of a Pose, PoseStamped, PoseWithCovariance, Odometry, ...; errors as `matrix_from_pose`."""
+    return pose2_from_matrix(matrix_from_pose(message))
+
+
 def pose2_message(pose: ArrayLike) -> Any:
     """geometry_msgs/Pose from a planar pose (x, y, yaw)."""
     x, y, yaw = np.asarray(pose, np.float64).tolist()
@@ -403,4 +408,4 @@ def path_message(poses: ArrayLike, frame_id: str, stamp: int) -> Any:
 
 def path_array(message: Any) -> NDArray[np.float64]:
     """Planar poses (N, 3) from a nav_msgs/Path."""
-    return np.array([pose2_from_matrix(matrix_from_pose(p)) for p in message.poses]).reshape(-1, 3)
+    return np.array([pose2_from_message(p) for p in message.poses]).reshape(-1, 3)

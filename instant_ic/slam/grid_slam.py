@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -470,3 +470,12 @@ def warm_up(config: SlamConfig | None = None) -> None:
     for index in range(2):
         slam.process(Scan(ranges, -math.pi, 2 * math.pi / 180, 0.1, 30.0, index + 1))
     slam.grid()
+
+
+def run_job(item: tuple[GridSlam, Callable[[], Any]]) -> tuple[GridSlam, Any, str]:
+    """Run a ``background_job``, on any thread; returns the SLAM, the outcome, and the text of an error."""
+    slam, job = item
+    try:
+        return slam, job(), ""
+    except Exception as error:  # noqa: BLE001 - scans go on
+        return slam, None, f"{type(error).__name__}: {error}"

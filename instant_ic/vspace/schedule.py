@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.jobs import Incoming, Job, JobKind, Outcome, ViewOrder
 from instant_ic.vspace.space import State, Status
@@ -18,18 +19,6 @@ _LASTING = (JobKind.WARM_UP, JobKind.LEARN, JobKind.TRAIN)
 """Jobs that would fail again at once: after an error nothing is trained until the next keyframe."""
 _NOTHING_SEEN = 0.98
 """A view with a larger share of unseen pixels shows nothing that is known."""
-OK, WARN, ERROR = range(3)
-"""Levels of a finding, as in DiagnosticStatus."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A diagnosis: name, level, text for people, and the id of the keyframe or request (None: of neither)."""
-
-    name: str
-    level: int
-    text: str
-    id: int | None = None
 
 
 @dataclass(frozen=True)
@@ -271,31 +260,35 @@ class JobSchedule:
             text += f" (older keyframes by the field: {status.gain_db:+.1f} dB against the warp)"
         return text
 
-    def findings(self, outcome: Outcome) -> list[Finding]:
+    def findings(self, outcome: Outcome) -> list[Diagnosis]:
         """Diagnoses that follow from a job's outcome, after it was taken."""
         kind, status, keyframe, view = outcome.job.kind, outcome.status, outcome.job.keyframe, outcome.job.view
         found = []
         if status is not None and (status.warning or self._warned):
             self._warned = bool(status.warning)
-            found.append(Finding("device", WARN if self._warned else OK, status.warning or status.device))
+            found.append(Diagnosis("device", Level.WARN if self._warned else Level.OK, status.warning or status.device))
         if outcome.error is not None:
             name = "vspace" if kind in _LASTING else "keyframe" if view is None else "view"
             text = f"{kind.value}: {type(outcome.error).__name__}: {outcome.error}"
-            found.append(Finding(name, ERROR, text))
+            found.append(Diagnosis(name, Level.ERROR, text))
         elif keyframe is not None and outcome.refused:
             text = f"keyframe {keyframe.id} refused: {outcome.refused}"
-            found.append(Finding("keyframe", ERROR, text, keyframe.id))
+            found.append(Diagnosis("keyframe", Level.ERROR, text, {"id": keyframe.id}))
         elif keyframe is not None and kind is JobKind.SHOW:
-            found.append(Finding("keyframe", OK, f"keyframe {keyframe.id} in use", keyframe.id))
+            found.append(Diagnosis("keyframe", Level.OK, f"keyframe {keyframe.id} in use", {"id": keyframe.id}))
         elif view is not None and outcome.refused:
-            found.append(Finding("view", WARN, f"request {view.id} refused: {outcome.refused}", view.id))
+            found.append(
+                Diagnosis("view", Level.WARN, f"request {view.id} refused: {outcome.refused}", {"id": view.id})
+            )
         elif view is not None:
             text = f"{view.width} x {view.height} in {self._render_ms:.0f} ms"
             if self._unseen_share > _NOTHING_SEEN:
                 text += ": no keyframe shows anything from that pose; is it far away?"
-            found.append(Finding("view", WARN if self._unseen_share > _NOTHING_SEEN else OK, text, view.id))
+            found.append(
+                Diagnosis("view", Level.WARN if self._unseen_share > _NOTHING_SEEN else Level.OK, text, {"id": view.id})
+            )
         elif kind is JobKind.TRAIN:
-            found.append(Finding("vspace", OK, self.text()))
+            found.append(Diagnosis("vspace", Level.OK, self.text()))
         return found
 
     def figures(self, now_ns: int) -> Figures:

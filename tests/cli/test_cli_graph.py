@@ -6,9 +6,9 @@ import shutil
 import pytest
 from cli_helpers import talking, wait_until
 
+from instant_ic.bus.heartbeat import Flow, Heartbeat
 from instant_ic.bus.registry import NodeInfo
 from instant_ic.cli.graph import dot, make_graph, mermaid, rate_text, tree, write
-from instant_ic.cli.heartbeats import Flow, Heartbeat
 
 
 def infos():
@@ -108,5 +108,5 @@ def test_verb(ic, tmp_path_factory, monkeypatch):
         status, out, _ = ic("graph", "-o", str(run_dir / "g.dot"))
         assert status == 0 and "1 nodes, 0 topics" in out
         assert ic("graph", "-o", str(run_dir / "g.gif"))[0] == 2
-        assert "cannot be written" in ic("graph", "-o", str(run_dir / "none" / "g.dot"))[2]
+        assert "No such file" in ic("graph", "-o", str(run_dir / "none" / "g.dot"))[2]
         assert ic("graph", "nobody")[0] == 1

@@ -17,8 +17,8 @@ from cli_helpers import talking, wait_until
 from rich.console import Console
 
 from instant_ic.bus.control import NodeControl
+from instant_ic.bus.heartbeat import Flow, Heartbeat
 from instant_ic.bus.registry import NodeInfo
-from instant_ic.cli.heartbeats import Flow, Heartbeat
 from instant_ic.cli.top import SORT_KEYS, Processes, as_json, expected_rate, make_rows, plain_table
 from instant_ic.cli.top_screen import table
 

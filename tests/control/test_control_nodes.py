@@ -16,6 +16,7 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.transport import Received
 from instant_ic.config import params
 from instant_ic.console.drive import DriveConfig, DriveGate
+from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import LETHAL
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.states import Reason
@@ -46,7 +47,7 @@ from instant_ic.msg import (
     twist_stamped,
     twist_values,
 )
-from nodes.arbiter import ArbiterNode, ArbiterNodeConfig
+from nodes.arbiter import ArbiterNode
 from nodes.navigator import NavigatorConfig, NavigatorNode
 from nodes.virtual_robot import VirtualRobotConfig, VirtualRobotNode
 
@@ -56,7 +57,7 @@ STEP_NS = 50_000_000
 
 @pytest.mark.parametrize(
     ("name", "config_class"),
-    [("arbiter", ArbiterNodeConfig), ("virtual_robot", VirtualRobotConfig), ("navigator", NavigatorConfig)],
+    [("arbiter", ArbiterConfig), ("virtual_robot", VirtualRobotConfig), ("navigator", NavigatorConfig)],
 )
 def test_shipped_parameters_are_the_defaults(name: str, config_class: type) -> None:
     assert params.build(config_class, params.load_file(CONFIG, name)) == config_class()
@@ -254,7 +255,7 @@ def test_a_doubt_about_the_pose_holds_until_the_next_report() -> None:
         return twist_values(stack.drive(seconds, (0.4, 0.0))[-1].applied_command)[0]
 
     report(0.2)
-    assert speed_m_s(4.0) == pytest.approx(ArbiterNodeConfig().pose_trust.speed_m_s)  # poses go on, reports do not
+    assert speed_m_s(4.0) == pytest.approx(ArbiterConfig().pose_trust.speed_m_s)  # poses go on, reports do not
     report(0.0)
     assert speed_m_s(1.0) == pytest.approx(0.4)
 

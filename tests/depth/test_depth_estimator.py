@@ -1,6 +1,8 @@
 """The depth_estimator node: what it says of its model, and what it does when an inference fails or hangs."""
 
 import logging
+import threading
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -83,7 +85,7 @@ def test_what_is_no_panorama_is_told(config: DepthEstimatorConfig) -> None:
 def test_failing_gpu_is_left_for_the_cpu(config: DepthEstimatorConfig) -> None:
     with LockstepBus(START) as bus:
         node = bus.add(DepthEstimatorNode, config)
-        node.model, node.published_provider = Failing(node.model.manifest), "cuda"
+        node.inference.model, node.published_provider = Failing(node.inference.model.manifest), "cuda"
         bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
         level, message, values = node.diagnoses()["depth"]
         assert (level, values["failures"]) == (2, 1)
@@ -97,32 +99,55 @@ def test_failing_gpu_is_left_for_the_cpu(config: DepthEstimatorConfig) -> None:
 def test_failing_cpu_is_told_and_the_next_picture_tried(config: DepthEstimatorConfig) -> None:
     with LockstepBus(START) as bus:
         node = bus.add(DepthEstimatorNode, config)
-        working, failing = node.model, Failing(node.model.manifest)
+        working, failing = node.inference.model, Failing(node.inference.model.manifest)
         failing.provider = "cpu"
-        node.model = failing
+        node.inference.model = failing
         bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
         assert node.diagnoses()["depth"][:2] == (2, "tiny on cuda: out of memory")
-        node.model = working
+        node.inference.model = working
         bus.publish(TOPIC, compressed_image_message(picture(), "camera", START + S), stamp_ns=START + S)
         assert node.diagnoses()["depth"][0] == 0 and len(bus.messages("/depth/raw")) == 1
 
 
-def test_hanging_inference_is_ended_and_then_the_process(
-    config: DepthEstimatorConfig, caplog: pytest.LogCaptureFixture
-) -> None:
+class Hanging(Failing):
+    """An inference that ends by its cancellation, or by nothing until ``go_on``."""
+
+    provider = "cpu"
+
+    def __init__(self, manifest: ModelManifest, obeys: bool) -> None:
+        super().__init__(manifest)
+        self.go_on, self.obeys = threading.Event(), obeys
+
+    def estimate(self, rgb: np.ndarray) -> np.ndarray:
+        assert self.go_on.wait(60)
+        raise InferenceError("tiny on cpu: terminated")
+
+    def cancel(self) -> None:
+        super().cancel()
+        if self.obeys:
+            self.go_on.set()
+
+
+def test_a_slow_inference_is_cancelled_and_reported(config: DepthEstimatorConfig) -> None:
     with LockstepBus(START) as bus:
-        node = bus.add(DepthEstimatorNode, config)
-        node.model = hanging = Failing(node.model.manifest)
-        node.began_ns = node.clock.steady_ns()  # as the worker's thread leaves it while it computes
-        bus.advance_to(START + 4 * S)
-        assert "depth" not in node.diagnoses() and not hanging.cancelled
-        bus.advance_to(START + 6 * S)
-        level, message, _ = node.diagnoses()["depth"]
-        assert level == 2 and "has run for" in message and hanging.cancelled
-        assert not node.stopping
+        node = bus.add(DepthEstimatorNode, replace(config, timeout_s=0.05))
+        node.inference.model = hanging = Hanging(node.inference.model.manifest, obeys=True)
+        bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
+        assert node.diagnoses()["depth"][:2] == (2, "the inference took longer than 0.05 s on cpu and was cancelled")
+        assert hanging.cancelled == 1 and not node.stopping
+
+
+def test_a_hanging_inference_ends_the_process(
+    config: DepthEstimatorConfig, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("instant_ic.depth.inference._GIVE_UP_S", 0.05)
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthEstimatorNode, replace(config, timeout_s=0.05))
+        node.inference.model = hanging = Hanging(node.inference.model.manifest, obeys=False)
         with caplog.at_level(logging.ERROR):
-            bus.advance_to(START + 16 * S)
-        assert node.stopping and "hangs: the node ends for a restart" in caplog.text
+            bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
+        assert node.stopping and hanging.cancelled > 1 and "hangs: the node ends for a restart" in caplog.text
+        hanging.go_on.set()
 
 
 def test_unknown_provider_is_refused() -> None:

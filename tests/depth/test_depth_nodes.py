@@ -1,5 +1,6 @@
 """The depth nodes in lockstep: a robot in a box-shaped room."""
 
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -182,7 +183,7 @@ def test_the_local_model_grows_is_published_on_demand_and_starts_again() -> None
         node = bus.add(DepthScalerNode)
         drive(bus, 3.0)
         assert not bus.messages("/map/local")  # nobody subscribes
-        grown = node.metric.mapper.model.revolutions
+        grown = node.chain.metric.mapper.model.revolutions
         assert 5 <= grown <= 9  # 1.2 m, one in 0.15 m
         assert level(node, "local model") == (0, "growing")
         bus.add(Viewer)
@@ -196,7 +197,7 @@ def test_the_local_model_grows_is_published_on_demand_and_starts_again() -> None
         assert level(node, "points") == (1, "/lidar/points cannot be used: no field of name time")
         node.on_cloud(cloud_message(np.zeros(5, POINT_DTYPE), "velodyne", START))
         assert level(node, "local model")[0] == 1 and "time went back" in level(node, "local model")[1]
-        assert node.metric.mapper.model.revolutions == 0
+        assert node.chain.metric.mapper.model.revolutions == 0
 
 
 def test_scaler_scales_and_makes_keyframes() -> None:
@@ -273,6 +274,26 @@ def test_completion_runs_in_the_node_and_needs_no_estimator(tmp_path: Path) -> N
     assert keyframes[0].fit and keyframes[0].source == "completed"
     sigma = decode_sigma(image_array(keyframes[0].sigma))
     assert np.isfinite(sigma).all() and np.median(sigma) < 0.01  # exp(-6), the smallest, not the structure's
+
+
+def test_a_completion_that_fails_or_takes_too_long_leaves_the_lidar_alone(tmp_path: Path) -> None:
+    model = CompletionNet(CompletionConfig(64, (8, 8, 8, 8), 2))
+    export_model(model.eval(), tmp_path / "c.onnx", "c", "Apache-2.0", 40.0)
+    config = DepthScalerConfig(source="completed", completion=str(tmp_path / "c.onnx"), provider="cpu",
+                               lidar=LidarDepthConfig(ceiling_height_m=2.6), max_rate_hz=1.0)  # fmt: skip
+    cancelled = threading.Event()
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthScalerNode, config)
+        inference = node.chain._completion
+        inference.timeout_s = 0.05
+        inference.model.complete = lambda rgb, prior: cancelled.wait(60)
+        inference.model.cancel = cancelled.set
+        drive(bus, 0.5, network=False)
+        severity, text = level(node, "scale")
+        assert severity == 0 and text.startswith(
+            "LiDAR alone, no completion (the inference took longer than 0.05 s on cpu and was cancelled)"
+        )
+        assert len(bus.messages("/depth/scaled")) == 1 and not node.stopping
 
 
 def test_completion_without_a_model_is_refused(tmp_path: Path) -> None:
@@ -415,7 +436,7 @@ def test_motion_is_compensated() -> None:
         node = bus.add(DepthScalerNode)
         drive(bus, 1.0)
         stamp = START + S // 5
-        points = node.metric.points_in_camera("camera", stamp)
+        points = node.chain.metric.points_in_camera("camera", stamp)
     assert points is not None
     in_map = transform_points(base_at(stamp) @ BASE_FROM_CAMERA, points)
     # Every point lies on a wall, floor or ceiling of the room again.
@@ -510,7 +531,7 @@ def test_estimator_keeps_stamp_frame_and_rate(model_file: Path) -> None:
     assert all(d.header.frame_id == "camera" and d.encoding == "32FC1" for d in depths)
     assert image_array(depths[0]).shape == (64, 128)
     picture = cv2.imdecode(np.frombuffer(jpeg(5, 128), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    np.testing.assert_array_equal(image_array(depths[1]), node.model.estimate(np.ascontiguousarray(picture)))
+    np.testing.assert_array_equal(image_array(depths[1]), node.inference.model.estimate(np.ascontiguousarray(picture)))
 
 
 def test_estimator_takes_what_is_requested(model_file: Path) -> None:

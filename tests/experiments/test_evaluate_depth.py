@@ -377,7 +377,7 @@ def test_command_without_truth_draws_only(folder):
         (("--camera-height", "-1"), "above 0"),
         (("--png-unit", "0"), "must be > 0"),
         (("--plot", "o.gif"), "must end in .png"),
-        (("--json", "."), ". cannot be written"),
+        (("--json", "."), ".: Is a directory"),
         (("--depth", "{}/a.png", "--lidar", "--outliers", "2"), "outliers must lie"),
         (("--depth", "{}/a.png", "--lidar", "--lidar-height", "-1"), "height must be above 0"),
         (("--depth", "{}/a.png", "--lidar", "--method", "guess"), "method must be one of"),

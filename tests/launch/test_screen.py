@@ -9,11 +9,12 @@ import pytest
 from rich.console import Console
 
 from instant_ic.bus import RELIABLE
+from instant_ic.bus.heartbeat import Flow, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.launch import NodeSpec
 from instant_ic.launch.app import _Output, _row
-from instant_ic.launch.health import HealthMonitor, NodeHealth, TopicFault, find_console
+from instant_ic.launch.health import HealthMonitor, TopicFault, find_console
 from instant_ic.launch.process import State
 from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.msg import NodeStatus, header, serialize
@@ -158,7 +159,7 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
                 break
             time.sleep(0.01)
         health = monitor.nodes["my_slam"]
-        assert (health.state, health.message, health.rates_hz) == ("running", "all well", {"/pose": 10.0})
+        assert (health.state, health.message, health.outputs["/pose"].rate_hz) == ("running", "all well", 10.0)
         assert monitor.nodes_missing() == ["other"] and monitor.waiting_for() == []
         assert not health.silent
         assert monitor.beat_s(nodes[0], 77) == health.seen_s
@@ -172,10 +173,12 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
 def test_one_message_reaches_a_milestone(tmp_path: Path) -> None:
     monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
     try:
-        monitor._take(beat("my_slam", rate_hz=0.0, age_s=float("inf")), "")
+        monitor.nodes["my_slam"] = from_message(beat("my_slam", rate_hz=0.0, age_s=float("inf")))
         monitor.poll()
         assert monitor.waiting_for() == ["map"]
-        monitor._take(beat("my_slam", rate_hz=0.0, age_s=40.0), "")  # a single message has no rate
+        monitor.nodes["my_slam"] = from_message(
+            beat("my_slam", rate_hz=0.0, age_s=40.0)
+        )  # a single message has no rate
         monitor.poll()
         assert monitor.waiting_for() == []
     finally:
@@ -192,7 +195,7 @@ def test_a_topic_that_flowed_and_slows_down_or_stops_is_a_fault_after_a_while(
 
     def faults_after(seconds: float, rate_hz: float, age_s: float) -> list[str]:
         now[0] += seconds
-        monitor._take(beat("my_slam", rate_hz=rate_hz, age_s=age_s), "")
+        monitor.nodes["my_slam"] = from_message(beat("my_slam", rate_hz=rate_hz, age_s=age_s))
         return [fault.words for fault in monitor.topic_faults()]
 
     try:
@@ -257,7 +260,8 @@ def test_row_of_a_node_from_its_process_its_heartbeat_and_its_topics() -> None:
     )
     now_s = time.monotonic()
     rates = {"/heartbeat": 2.0, "/unknown": 3.0, "/lidar/points": 10.0, "/scan": 5.0, "/lidar/packets": 0.0}
-    health = NodeHealth("running", "", 7.0, 180.0, rates, now_s)
+    outputs = {topic: Flow(rate_hz, 0.0) for topic, rate_hz in rates.items()}
+    health = Heartbeat("lidar", 1, "running", "", 7.0, 180.0, outputs=outputs, seen_s=now_s)
     monitor: Any = SimpleNamespace(nodes={"lidar": health})
     slow = TopicFault("lidar", "/scan", "5.0 of 10 Hz", stopped=False)
     row = _row(process, monitor, [slow, TopicFault("other", "/pose", "stopped 3.0 s ago", stopped=True)])

@@ -102,4 +102,4 @@ def test_nothing_runs_and_nowhere_to_write(tmp_path: Path, capsys: pytest.Captur
     assert main(["map", "local", "-o", str(tmp_path / "cloud.ply"), "--timeout", "0.3"]) == 1
     assert "no local model on /map/local within 0.3 s: depth_scaler is not running" in capsys.readouterr().err
     assert main(["map", "local", "-o", str(tmp_path / "none" / "cloud.ply")]) == 2
-    assert "its folder does not exist" in capsys.readouterr().err
+    assert "none does not exist" in capsys.readouterr().err

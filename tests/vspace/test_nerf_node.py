@@ -19,9 +19,10 @@ from instant_ic.msg import (
     image_message,
     pose_message,
 )
+from instant_ic.nerf_messages import decode_keyframe
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
 from instant_ic.vspace.jobs import Incoming, Job, JobKind, load_robot_mask
-from nodes.nerf import NerfConfig, NerfNode, decode_keyframe
+from nodes.nerf import NerfConfig, NerfNode
 
 EMPTY, TRAINING, READY = 0, 1, 2
 S = 1_000_000_000

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import group, verb
 from instant_ic.cli.errors import UserError
 
 COMMANDS = ("pause", "resume", "toggle", "step", "rate", "seek", "split", "record", "stop", "status")
@@ -13,183 +14,95 @@ _VALUES = {"step": "count", "rate": "rate", "seek": "offset_s"}
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "bag",
-        help="record, play, inspect, compare, convert and recover bags",
-        description="Work with bags: rosbag2 folders (MCAP) that ROS 2, Foxglove and rosbags can open.",
-        epilog="example: ic bag record -o drive",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
+    verbs = group(
+        subparsers, "bag", "record, play, inspect, compare, convert and recover bags",
+        "Work with bags: rosbag2 folders (MCAP) that ROS 2, Foxglove and rosbags can open.", "ic bag record -o drive",
+    )  # fmt: skip
+    span: dict[str, Any] = {"type": _seconds, "metavar": "S"}
+    many: dict[str, Any] = {"action": "append", "default": []}
 
-    def verb(name: str, words: str, function: str, example: str) -> argparse.ArgumentParser:
-        added: argparse.ArgumentParser = verbs.add_parser(
-            name, help=words, description=f"{words[0].upper()}{words[1:]}.", epilog=f"example: {example}"
-        )
-
-        def run(args: argparse.Namespace) -> int:
-            import importlib
-
-            module, _, name = function.partition(".")
-            status: int = getattr(importlib.import_module(f"instant_ic.cli.{module}"), name)(args)
-            return status
-
-        added.set_defaults(func=run)
-        return added
-
-    recording = verb(
-        "record",
-        "record topics until Ctrl-C; space pauses",
-        "bag_run.record",
-        "ic bag record -o drive /scan '/camera/*' -x /camera/raw --max-bag-size 2GB",
-    )
+    example = "ic bag record -o drive /scan '/camera/*' -x /camera/raw --max-bag-size 2GB"
+    recording = verb(verbs, "record", "record topics until Ctrl-C; space pauses", "bag_run.record", example)
     _topics(recording)
-    recording.add_argument("-o", "--output", default="", metavar="DIR", help="default: runs/bag_DATE_TIME")
-    recording.add_argument("--duration", type=_seconds, default=0.0, metavar="S", help="stop after this time")
+    add = recording.add_argument
+    add("-o", "--output", default="", metavar="DIR", help="default: runs/bag_DATE_TIME")
+    add("--duration", **span, default=0.0, help="stop after this time")
     _files(recording)
-    recording.add_argument(
-        "--max-queue",
-        type=size,
-        default=256_000_000,
-        metavar="SIZE",
-        help="size of the queue for the disk (default: 256MB); messages beyond it are dropped and counted",
-    )
-    recording.add_argument(
-        "--min-free",
-        type=size,
-        default=100_000_000,
-        metavar="SIZE",
-        help="pause writing below this free disk space (default: 100MB)",
-    )
-    recording.add_argument(
-        "--snapshot",
-        action="store_true",
-        help="keep the last seconds in memory and write them on ic bag snapshot or an emergency stop",
-    )
-    recording.add_argument(
-        "--snapshot-seconds", type=_seconds, default=30.0, metavar="S", help="seconds kept in memory (default: 30)"
-    )
-    recording.add_argument(
-        "--snapshot-after",
-        type=_seconds,
-        default=2.0,
-        metavar="S",
-        help="seconds to include after the snapshot (default: 2)",
-    )
-    recording.add_argument(
-        "--max-cache-size",
-        type=size,
-        default=256_000_000,
-        metavar="SIZE",
-        help="memory limit for a snapshot (default: 256MB)",
-    )
-    recording.add_argument("--start-paused", action="store_true", help="wait for resume before recording")
-    recording.add_argument(
-        "--use-sim-time", action="store_true", help="stamp messages with /clock, for example from a playing bag"
-    )
+    text = "size of the queue for the disk (default: 256MB); messages beyond it are dropped and counted"
+    add("--max-queue", type=size, default=256_000_000, metavar="SIZE", help=text)
+    text = "pause writing below this free disk space (default: 100MB)"
+    add("--min-free", type=size, default=100_000_000, metavar="SIZE", help=text)
+    text = "keep the last seconds in memory and write them on ic bag snapshot or an emergency stop"
+    add("--snapshot", action="store_true", help=text)
+    add("--snapshot-seconds", **span, default=30.0, help="seconds kept in memory (default: 30)")
+    add("--snapshot-after", **span, default=2.0, help="seconds to include after the snapshot (default: 2)")
+    text = "memory limit for a snapshot (default: 256MB)"
+    add("--max-cache-size", type=size, default=256_000_000, metavar="SIZE", help=text)
+    add("--start-paused", action="store_true", help="wait for resume before recording")
+    add("--use-sim-time", action="store_true", help="stamp messages with /clock, for example from a playing bag")
 
-    playing = verb(
-        "play",
-        "play a bag with /clock; space pauses, → steps, ↑ ↓ change the rate",
-        "bag_run.play",
-        "ic bag play drive --rate 2 --start 10",
-    )
-    completion.offer(
-        playing.add_argument("bag", metavar="BAG", help="folder, .mcap, .db3 or ROS 1 .bag file"), completion.bags
-    )
+    text, example = "play a bag with /clock; space pauses, → steps, ↑ ↓ change the rate", "ic bag play drive --rate 2"
+    playing = verb(verbs, "play", text, "bag_run.play", f"{example} --start 10")
+    add = playing.add_argument
+    add("bag", metavar="BAG", help="folder, .mcap, .db3 or ROS 1 .bag file", completer=completion.bags)
     _topics(playing)
-    playing.add_argument("-r", "--rate", type=float, default=1.0, help="speed factor (default: %(default)s)")
-    playing.add_argument("--start", type=_seconds, default=0.0, metavar="S", help="start at this offset")
-    playing.add_argument("--duration", type=_seconds, default=0.0, metavar="S", help="play this many seconds")
-    playing.add_argument("--loop", action="store_true", help="restart at the end")
-    playing.add_argument("--start-paused", action="store_true", help="wait for space, → or ic bag control resume")
-    playing.add_argument("--remap", action="append", default=[], metavar="FROM:=TO", help="rename a topic; repeatable")
-    playing.add_argument(
-        "--force",
-        action="store_true",
-        help="publish commands and states even though a base is running: the robot may move",
-    )
-    playing.add_argument("--no-clock", action="store_true", help="do not publish /clock")
-    playing.add_argument(
-        "--delay", type=_seconds, default=0.5, metavar="S", help="wait for subscribers to connect (default: 0.5)"
-    )
-    playing.add_argument(
-        "--wait-for", action="append", default=[], metavar="NODE", help="start once this node subscribes; repeatable"
-    )
+    add("-r", "--rate", type=float, default=1.0, help="speed factor (default: %(default)s)")
+    add("--start", **span, default=0.0, help="start at this offset")
+    add("--duration", **span, default=0.0, help="play this many seconds")
+    add("--loop", action="store_true", help="restart at the end")
+    add("--start-paused", action="store_true", help="wait for space, → or ic bag control resume")
+    add("--remap", **many, metavar="FROM:=TO", help="rename a topic; repeatable")
+    text = "publish commands and states even though a base is running: the robot may move"
+    add("--force", action="store_true", help=text)
+    add("--no-clock", action="store_true", help="do not publish /clock")
+    add("--delay", **span, default=0.5, help="wait for subscribers to connect (default: 0.5)")
+    add("--wait-for", **many, metavar="NODE", help="start once this node subscribes; repeatable")
 
-    looking = verb("info", "topics, types, counts, files and losses of a bag", "bag_look.info", "ic bag info drive")
-    completion.offer(looking.add_argument("bag", metavar="BAG"), completion.bags)
+    looking = verb(
+        verbs, "info", "topics, types, counts, files and losses of a bag", "bag_look.info", "ic bag info drive"
+    )
+    looking.add_argument("bag", metavar="BAG", completer=completion.bags)
     looking.add_argument("--json", action="store_true", help="print JSON")
 
-    comparing = verb(
-        "diff",
-        "compare two bags; exit status 1 if they differ",
-        "bag_look.diff",
-        "ic bag diff first second --stamp-tolerance 0.01 --tolerance 'ranges=0.01' --ignore-field header.stamp",
-    )
-    completion.offer(comparing.add_argument("a", metavar="A"), completion.bags)
-    comparing.add_argument("b", metavar="B")
+    example = "ic bag diff first second --stamp-tolerance 0.01 --tolerance 'ranges=0.01' --ignore-field header.stamp"
+    comparing = verb(verbs, "diff", "compare two bags; exit status 1 if they differ", "bag_look.diff", example)
+    comparing.add_argument("a", metavar="A", completer=completion.bags)
+    comparing.add_argument("b", metavar="B", completer=completion.bags)
     comparing.add_argument("--common", action="store_true", help="compare only topics that both bags have")
     tolerances(comparing)
     comparing.add_argument("--json", action="store_true", help="print JSON")
 
-    converting = verb(
-        "convert",
-        "convert ROS 1 bags, SQLite bags and bare files to a bag; filter, merge, split, compress",
-        "bag_look.convert",
-        "ic bag convert old.bag -o drive",
-    )
-    converting.add_argument("bags", nargs="+", metavar="BAG", help="several bags are merged by stamp")
-    converting.add_argument("-o", "--output", required=True, metavar="DIR")
-    converting.add_argument(
-        "-t",
-        "--topic",
-        dest="topics",
-        action="append",
-        default=[],
-        metavar="TOPIC",
-        help="name or pattern; repeatable; default: everything",
-    )
-    converting.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="topics to leave out")
-    converting.add_argument("--start", type=_seconds, default=0.0, metavar="S", help="start at this offset")
-    converting.add_argument("--end", type=_seconds, default=0.0, metavar="S", help="end at this offset")
-    converting.add_argument(
-        "--remap", action="append", default=[], metavar="FROM:=TO", help="rename a topic; repeatable"
-    )
-    converting.add_argument("--skip-unknown", action="store_true", help="leave out topics of unknown types")
+    text = "convert ROS 1 bags, SQLite bags and bare files to a bag; filter, merge, split, compress"
+    converting = verb(verbs, "convert", text, "bag_look.convert", "ic bag convert old.bag -o drive")
+    add = converting.add_argument
+    add("bags", nargs="+", metavar="BAG", help="several bags are merged by stamp")
+    add("-o", "--output", required=True, metavar="DIR")
+    text = "name or pattern; repeatable; default: everything"
+    add("-t", "--topic", dest="topics", **many, metavar="TOPIC", help=text)
+    add("-x", "--exclude", **many, metavar="TOPIC", help="topics to leave out")
+    add("--start", **span, default=0.0, help="start at this offset")
+    add("--end", **span, default=0.0, help="end at this offset")
+    add("--remap", **many, metavar="FROM:=TO", help="rename a topic; repeatable")
+    add("--skip-unknown", action="store_true", help="leave out topics of unknown types")
     _files(converting)
 
-    rescuing = verb(
-        "recover",
-        "recover a readable bag from one that was cut short or damaged",
-        "bag_look.recover",
-        "ic bag recover broken -o saved",
-    )
-    completion.offer(rescuing.add_argument("bag", metavar="BAG"), completion.bags)
+    text, example = "recover a readable bag from one that was cut short or damaged", "ic bag recover broken -o saved"
+    rescuing = verb(verbs, "recover", text, "bag_look.recover", example)
+    rescuing.add_argument("bag", metavar="BAG", completer=completion.bags)
     rescuing.add_argument("-o", "--output", default="", metavar="DIR", help="default: BAG_recovered")
 
-    indexing = verb(
-        "reindex", "rebuild a bag's metadata.yaml from its complete files", "bag_look.reindex", "ic bag reindex drive"
-    )
-    completion.offer(indexing.add_argument("bag", metavar="BAG"), completion.bags)
+    text = "rebuild a bag's metadata.yaml from its complete files"
+    indexing = verb(verbs, "reindex", text, "bag_look.reindex", "ic bag reindex drive")
+    indexing.add_argument("bag", metavar="BAG", completer=completion.bags)
 
-    snapping = verb(
-        "snapshot",
-        "make a recorder write the last seconds (ic bag record --snapshot)",
-        "bag_run.snapshot",
-        "ic bag snapshot 'door stuck'",
-    )
+    text = "make a recorder write the last seconds (ic bag record --snapshot)"
+    snapping = verb(verbs, "snapshot", text, "bag_run.snapshot", "ic bag snapshot 'door stuck'")
     snapping.add_argument("reason", nargs="?", default="", help="added to the folder's name")
     snapping.add_argument("--node", default="", help="recorder to use if several are running")
-    snapping.add_argument(
-        "--timeout", type=_seconds, default=60.0, metavar="S", help="wait at most this long (default: 60)"
-    )
+    snapping.add_argument("--timeout", **span, default=60.0, help="wait at most this long (default: 60)")
 
     steering = verb(
-        "control",
-        "control a running recorder or player",
-        "bag_run.control",
-        "ic bag control rate 0.5",
+        verbs, "control", "control a running recorder or player", "bag_run.control", "ic bag control rate 0.5"
     )
     steering.add_argument("command", choices=COMMANDS)
     steering.add_argument("value", nargs="?", type=float, help="for step (messages), rate, seek (seconds)")
@@ -198,28 +111,16 @@ def add_parser(subparsers: Any) -> None:
 
 def tolerances(parser: argparse.ArgumentParser) -> None:
     """Add the tolerance options of a comparison."""
-    parser.add_argument(
-        "--ignore", action="append", default=[], metavar="TOPIC", help="topics to ignore: name or pattern"
-    )
-    parser.add_argument("--atol", type=_seconds, default=0.0, metavar="X", help="absolute tolerance of numbers")
-    parser.add_argument("--rtol", type=_seconds, default=0.0, metavar="X", help="relative tolerance of numbers")
-    parser.add_argument(
-        "--tolerance",
-        action="append",
-        default=[],
-        metavar="FIELD=X",
-        help="absolute tolerance of a field: ranges=0.01, /pose:pose.covariance=1e-6; repeatable",
-    )
-    parser.add_argument(
-        "--ignore-field", action="append", default=[], metavar="FIELD", help="for example header.stamp; repeatable"
-    )
-    parser.add_argument(
-        "--stamp-tolerance",
-        type=_seconds,
-        default=None,
-        metavar="S",
-        help="match messages by stamps that differ by at most this (default: match by order)",
-    )
+    add: Any = parser.add_argument
+    many: dict[str, Any] = {"action": "append", "default": []}
+    add("--ignore", **many, metavar="TOPIC", help="topics to ignore: name or pattern")
+    add("--atol", type=_seconds, default=0.0, metavar="X", help="absolute tolerance of numbers")
+    add("--rtol", type=_seconds, default=0.0, metavar="X", help="relative tolerance of numbers")
+    text = "absolute tolerance of a field: ranges=0.01, /pose:pose.covariance=1e-6; repeatable"
+    add("--tolerance", **many, metavar="FIELD=X", help=text)
+    add("--ignore-field", **many, metavar="FIELD", help="for example header.stamp; repeatable")
+    text = "match messages by stamps that differ by at most this (default: match by order)"
+    add("--stamp-tolerance", type=_seconds, metavar="S", help=text)
 
 
 def _topics(parser: argparse.ArgumentParser) -> None:
@@ -228,13 +129,10 @@ def _topics(parser: argparse.ArgumentParser) -> None:
 
 
 def _files(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "-b", "--max-bag-size", type=size, default=0, metavar="SIZE", help="split files at 500MB, 2GB, ..."
-    )
-    parser.add_argument(
-        "-d", "--max-bag-duration", type=_seconds, default=0.0, metavar="S", help="split files at this time"
-    )
-    parser.add_argument("--compression", action="store_true", help="compress with zstd")
+    add = parser.add_argument
+    add("-b", "--max-bag-size", type=size, default=0, metavar="SIZE", help="split files at 500MB, 2GB, ...")
+    add("-d", "--max-bag-duration", type=_seconds, default=0.0, metavar="S", help="split files at this time")
+    add("--compression", action="store_true", help="compress with zstd")
 
 
 def size(text: str) -> int:

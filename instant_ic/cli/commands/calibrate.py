@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import check_files, group, numbers, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -17,52 +18,39 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``calibrate`` to the ``ic`` command."""
-    parser = subparsers.add_parser(
-        "calibrate",
-        help="calibrate sensor mounts from a recording",
-        description="Calibrate sensor mounts from a recording (docs/calibration.md).",
-    )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    camera = verbs.add_parser(
-        "camera-lidar",
-        help="calibrate the camera's pose relative to the LiDAR",
-        description=(
-            "Estimate the camera's pose relative to the LiDAR from the edges that both see in a recording, report "
-            "which degrees of freedom the recording constrains, and write the camera's mount as a parameter file. "
-            "Record a minute of slow driving in a furnished room (docs/calibration.md)."
-        ),
-        epilog="example: ic calibrate camera-lidar drive -o config/mount.yaml --plot overlay.png; "
+    text = "calibrate sensor mounts from a recording"
+    verbs = group(subparsers, "calibrate", text, f"{text.capitalize()} (docs/calibration.md).")
+    add = verb(
+        verbs, "camera-lidar", "calibrate the camera's pose relative to the LiDAR", camera_lidar,
+        "ic calibrate camera-lidar drive -o config/mount.yaml --plot overlay.png; "
         "ic launch robot params:=config/mount.yaml",
-    )
-    completion.offer(camera.add_argument("bag", type=Path, metavar="BAG"), completion.bags)
-    camera.add_argument("-o", "--out", type=Path, default=Path("camera_mount.yaml"), metavar="FILE",
-                        help="parameter file to write (%(default)s)")  # fmt: skip
-    camera.add_argument("--plot", type=Path, metavar="PNG", help="LiDAR points over the images, before and after")
-    camera.add_argument("--json", type=Path, metavar="FILE", help="write the figures here")
-    camera.add_argument("--images", default="", metavar="TOPIC", help="images (default: /camera/image/compressed)")
-    camera.add_argument("--points", default="", metavar="TOPIC",
-                        help="LiDAR points (default: /lidar/points, else /lidar/packets)")  # fmt: skip
-    camera.add_argument("--frames", type=int, default=24, metavar="N", help="maximum number of images (%(default)s)")
-    camera.add_argument("--guess", metavar="X,Y,Z,ROLL,PITCH,YAW",
-                        help="initial camera pose in the LiDAR frame (m, degrees) if /tf_static lacks it")  # fmt: skip
-    camera.add_argument(
-        "--near", action="store_true", help="the initial yaw is right within a few degrees: skip the full-circle search"
-    )
-    camera.set_defaults(func=camera_lidar)
+        "Estimate the camera's pose relative to the LiDAR from the edges that both see in a recording, report "
+        "which degrees of freedom the recording constrains, and write the camera's mount as a parameter file. "
+        "Record a minute of slow driving in a furnished room (docs/calibration.md).",
+    ).add_argument  # fmt: skip
+    add("bag", type=Path, metavar="BAG", completer=completion.bags)
+    text = "parameter file to write (%(default)s)"
+    add("-o", "--out", type=Path, default=Path("camera_mount.yaml"), metavar="FILE", help=text)
+    add("--plot", type=Path, metavar="PNG", help="LiDAR points over the images, before and after")
+    add("--json", type=Path, metavar="FILE", help="write the figures here")
+    add("--images", default="", metavar="TOPIC", help="images (default: /camera/image/compressed)")
+    add("--points", default="", metavar="TOPIC", help="LiDAR points (default: /lidar/points, else /lidar/packets)")
+    add("--frames", type=int, default=24, metavar="N", help="maximum number of images (%(default)s)")
+    text = "initial camera pose in the LiDAR frame (m, degrees) if /tf_static lacks it"
+    form = "X,Y,Z,ROLL,PITCH,YAW"
+    add("--guess", type=numbers(form), metavar=form, help=text)
+    text = "the initial yaw is right within a few degrees: skip the full-circle search"
+    add("--near", action="store_true", help=text)
 
 
 def camera_lidar(args: argparse.Namespace) -> int:
-    """Run ``ic calibrate camera-lidar``; return the exit status."""
     from instant_ic.calibration.bag import Selection, read_recording
     from instant_ic.calibration.mount import CalibrationConfig, calibrate
 
     if args.frames < 1:
         raise UserError(f"--frames must be at least 1 (got {args.frames})", 2)
     guess = _guess(args.guess) if args.guess else None
-    for path in (args.out, args.plot, args.json):
-        if path is not None and not path.expanduser().absolute().parent.is_dir():
-            raise UserError(f"{path}: its folder does not exist", 2)
+    check_files(args.out, args.plot, args.json)
     print(f"reading {args.bag}", flush=True)
     recording = read_recording(args.bag, Selection(args.images, args.points, most_frames=args.frames))
     given = guess if guess is not None else recording.camera_from_lidar
@@ -94,18 +82,12 @@ def camera_lidar(args: argparse.Namespace) -> int:
     return 0
 
 
-def _guess(text: str) -> Matrix:
-    """``camera_from_lidar`` from the camera's pose in the LiDAR frame."""
+def _guess(values: list[float]) -> Matrix:
+    """``camera_from_lidar`` from the camera's pose in the LiDAR frame: metres and degrees."""
     import numpy as np
 
     from instant_ic.geometry.poses import inverse, pose_matrix
 
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 6 or not np.isfinite(values).all():
-        raise UserError(f"--guess must be six numbers X,Y,Z,ROLL,PITCH,YAW (got {text!r})", 2)
     return inverse(pose_matrix(*values[:3], *np.radians(values[3:])))
 
 

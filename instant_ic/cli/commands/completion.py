@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from instant_ic.cli.arguments import verb
+
 _HINTS = {
     "bash": 'eval "$(ic completion bash)"    in ~/.bashrc',
     "zsh": 'eval "$(ic completion zsh)"    in ~/.zshrc, after compinit',
@@ -13,21 +15,15 @@ _HINTS = {
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "completion",
-        help="set up shell completion",
-        description="Print the code that enables completion of ic commands with TAB. Add one of these lines:\n\n  "
-        + "\n  ".join(_HINTS.values()),
-        epilog="example: ic completion bash",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    text = "Print the code that enables completion of ic commands with TAB. Add one of these lines:\n\n  "
+    parser = verb(
+        subparsers, "completion", "set up shell completion", show, "ic completion bash",
+        text + "\n  ".join(_HINTS.values()), formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
     parser.add_argument("shell", choices=sorted(_HINTS))
-    parser.set_defaults(func=show)
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the shell code."""
     import argcomplete
 
     print(argcomplete.shellcode(["ic"], shell=args.shell))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
-from instant_ic.cli.arguments import launch_values
+from instant_ic.cli.arguments import group, launch_values, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -16,49 +16,32 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "config",
-        help="check configuration files, show the values of a node",
-        description="Check configuration files, and show the values that a node would start with.",
-        epilog="example: ic config show arbiter --changed",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
-    check = verbs.add_parser(
-        "check",
-        help="report all mistakes in launch and parameter files",
-        description="Report all mistakes in launch and parameter files, with file and line; status 1 if there are any.",
-        epilog="example: ic config check my_robot.yaml",
-    )
-    completion.offer(
-        check.add_argument(
-            "files", nargs="*", metavar="LAUNCH_OR_FILE",
-            help="launch file, shipped launch file by name, or parameter file (default: all shipped files)",
-        ),
-        completion.launch_files,
+    verbs = group(
+        subparsers, "config", "check configuration files, show the values of a node",
+        "Check configuration files, and show the values that a node would start with.",
+        "ic config show arbiter --changed",
     )  # fmt: skip
-    check.set_defaults(func=check_files)
-    show = verbs.add_parser(
-        "show",
-        help="effective value of each parameter of a node, and where it comes from",
-        description="Print the effective value of each parameter of a node, and where it comes from: the default, a "
+    check = verb(
+        verbs, "check", "report all mistakes in launch and parameter files", check_files,
+        "ic config check my_robot.yaml",
+        "Report all mistakes in launch and parameter files, with file and line; status 1 if there are any.",
+    )  # fmt: skip
+    text = "launch file, shipped launch file by name, or parameter file (default: all shipped files)"
+    check.add_argument("files", nargs="*", metavar="LAUNCH_OR_FILE", help=text, completer=completion.launch_files)
+    add = verb(
+        verbs, "show", "effective value of each parameter of a node, and where it comes from", show_node,
+        "ic config show vlp16_driver --launch robot lidar_port:=3000",
+        "Print the effective value of each parameter of a node, and where it comes from: the default, a "
         "parameter file, the launch file, or an argument of the launch file.",
-        epilog="example: ic config show vlp16_driver --launch robot lidar_port:=3000",
-    )
-    show.add_argument("node", metavar="NODE", help="name of the node in the launch file")
-    completion.offer(
-        show.add_argument(
-            "--launch", nargs="+", default=[], metavar=("FILE", "KEY:=VALUE"),
-            help="launch file and its arguments (default: the first of full, sim and replay with this node)",
-        ),
-        completion.launch_files,
-    )  # fmt: skip
-    show.add_argument("--changed", action="store_true", help="only values that differ from the default")
-    show.set_defaults(func=show_node)
+    ).add_argument  # fmt: skip
+    add("node", metavar="NODE", help="name of the node in the launch file")
+    text = "launch file and its arguments (default: the first of full, sim and replay with this node)"
+    form = ("FILE", "KEY:=VALUE")
+    add("--launch", nargs="+", default=[], metavar=form, help=text, completer=completion.launch_files)
+    add("--changed", action="store_true", help="only values that differ from the default")
 
 
 def check_files(args: argparse.Namespace) -> int:
-    """Check files, all mistakes at once."""
     from instant_ic import paths
     from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
     from instant_ic.launch.parameters import check_parameter_file, check_parameters_quickly
@@ -88,12 +71,7 @@ def check_files(args: argparse.Namespace) -> int:
 def _found(text: str) -> Path:
     from instant_ic.launch import find_launch_file
 
-    if Path(text).is_file():
-        return Path(text)
-    try:
-        return find_launch_file(text)
-    except FileNotFoundError as error:
-        raise UserError(str(error), 2) from None
+    return Path(text) if Path(text).is_file() else find_launch_file(text)
 
 
 def _is_launch_file(file: Path) -> bool:
@@ -108,21 +86,16 @@ def _is_launch_file(file: Path) -> bool:
 
 
 def show_node(args: argparse.Namespace) -> int:
-    """Print value and origin of each parameter."""
     from instant_ic.cli.commands.param import show_value
     from instant_ic.config.parameter_info import parameter_infos
-    from instant_ic.config.params import ParameterError, configure
+    from instant_ic.config.params import configure
     from instant_ic.launch.parameters import given_values
 
     spec = _node(args.node, args.launch[:1], launch_values(args.launch[1:]))
     config_class, values = given_values(spec)
-    try:
-        configurations = configure(config_class, values)
-    except ParameterError as error:
-        raise UserError(str(error)) from error
     infos = [
         info
-        for config in configurations
+        for config in configure(config_class, values)
         for info in parameter_infos(type(config), config)
         if not args.changed or info.value != info.default
     ]
@@ -143,11 +116,7 @@ def _node(name: str, launch_files: list[str], arguments: dict[str, str]) -> Node
     known: list[str] = []
     for file in launch_files or ["full", "sim", "replay"]:
         needed = {} if launch_files else {"replay": {"bag": "BAG"}}.get(file, {})
-        try:
-            path = find_launch_file(file)
-        except FileNotFoundError as error:
-            raise UserError(str(error), 2) from None
-        for spec in read_launch_file(path, {**needed, **arguments}, paths.run_dir()).nodes:
+        for spec in read_launch_file(find_launch_file(file), {**needed, **arguments}, paths.run_dir()).nodes:
             if name in (spec.label, spec.name):
                 if str(paths.node_file(spec.exec)) not in spec.command:
                     raise UserError(f"{name} is not a node of instant_ic: its parameters are not known")

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli.arguments import positive
+from instant_ic.cli.arguments import check_files, group, positive, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -17,37 +17,26 @@ LAYERS = "/vspace/layers"
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``console`` to the ``ic`` command."""
-    parser = subparsers.add_parser(
-        "console", help="export what the operator's page shows", description="Export what the operator's page shows."
-    )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    export = verbs.add_parser(
-        "export-scene",
-        help="save the virtual space as one HTML file",
-        description=(
-            "Save the present virtual space of the running stack, or the newest one of a bag, as one HTML file to look "
-            "round in and walk through. It needs no server and no network, only a browser with WebGL 2."
-        ),
-        epilog="example: ic console export-scene -o scene.html",
-    )
-    export.add_argument("bag", type=Path, nargs="?", metavar="BAG", help="a recording (default: the running stack)")
-    export.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.html", help="file to write")
-    export.add_argument(
-        "--timeout", type=positive, default=10.0, metavar="S", help="wait at most this long (%(default)g s)"
-    )
-    export.set_defaults(func=export_scene)
+    text = "export what the operator's page shows"
+    verbs = group(subparsers, "console", text, f"{text.capitalize()}.")
+    add = verb(
+        verbs, "export-scene", "save the virtual space as one HTML file", export_scene,
+        "ic console export-scene -o scene.html",
+        "Save the present virtual space of the running stack, or the newest one of a bag, as one HTML file to look "
+        "round in and walk through. It needs no server and no network, only a browser with WebGL 2.",
+    ).add_argument  # fmt: skip
+    add("bag", type=Path, nargs="?", metavar="BAG", help="a recording (default: the running stack)")
+    add("-o", "--output", type=Path, required=True, metavar="FILE.html", help="file to write")
+    add("--timeout", type=positive, default=10.0, metavar="S", help="wait at most this long (%(default)g s)")
 
 
 def export_scene(args: argparse.Namespace) -> int:
-    """Run ``ic console export-scene``; return the exit status."""
     from instant_ic.console.export_scene import scene_html
     from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
     from instant_ic.msg import MessageError, deserialize
     from instant_ic.vspace_messages import layers_of
 
-    if not args.output.parent.is_dir():
-        raise UserError(f"{args.output}: the folder {args.output.parent} does not exist", 2)
+    check_files(args.output)
     received = newest_of_bag(args.bag) if args.bag else newest_of_stack(args.timeout)
     try:
         message = deserialize(received.payload, received.type_name)
@@ -57,10 +46,7 @@ def export_scene(args: argparse.Namespace) -> int:
         raise UserError(f"{LAYERS}: {error}") from error
     newest = version.layers[0].keyframe_id
     made = time.strftime("%Y-%m-%d %H:%M", time.localtime(message.header.stamp.sec))
-    try:
-        args.output.write_text(scene_html(f"Keyframe {newest}, {made}", layers), encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{args.output} cannot be written: {error.strerror}") from error
+    args.output.write_text(scene_html(f"Keyframe {newest}, {made}", layers), encoding="utf-8")
     triangles = sum(len(layer.triangles) for layer in layers)
     print(f"wrote {args.output}: keyframe {newest}, {triangles} triangles")
     return 0
@@ -81,13 +67,12 @@ def newest_of_bag(path: Path) -> Any:
 
 def newest_of_stack(timeout_s: float) -> Received:
     """The newest message of the layers in the running stack."""
-    from instant_ic.cli.observer import Observer
+    from instant_ic.cli.observer import newest
 
-    with Observer([LAYERS]) as observer:
-        for batch in observer.batches(timeout_s, 0.1):
-            for received in batch:
-                return received
-    raise UserError(
-        f"no virtual space on {LAYERS} within {timeout_s:g} s: nerf is not running, or there is no keyframe yet "
-        "(ic topic echo /vspace/status)"
-    )
+    received = newest(LAYERS, timeout_s)
+    if received is None:
+        raise UserError(
+            f"no virtual space on {LAYERS} within {timeout_s:g} s: nerf is not running, or there is no keyframe yet "
+            "(ic topic echo /vspace/status)"
+        )
+    return received

@@ -6,28 +6,24 @@ import argparse
 import sys
 from typing import Any
 
+from instant_ic.cli.arguments import verb
+
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "doctor",
-        help="check machine, devices, ports, models and configuration",
-        description="Check this machine, its devices, ports, models and configuration, and advise what to do. "
-        "The exit status is 1 if a check fails.",
-        epilog="example: ic doctor --robot --serial-port /dev/ttyACM0",
-    )
-    parser.add_argument("--robot", action="store_true", help="missing devices are failures, not warnings")
-    parser.add_argument("--serial-port", metavar="PORT", help="port of the RoboClaw (default: from config/robot.yaml)")
-    parser.add_argument("--camera-url", metavar="URL", help="URL of the Theta (default: from config/robot.yaml)")
-    parser.add_argument("--lidar-port", type=int, metavar="PORT", help="UDP port of the VLP-16's data")
-    parser.add_argument(
-        "--listen", type=float, default=1.0, metavar="S", help="time to wait for LiDAR packets (default: %(default)g s)"
-    )
-    parser.set_defaults(func=run)
+    add = verb(
+        subparsers, "doctor", "check machine, devices, ports, models and configuration", run,
+        "ic doctor --robot --serial-port /dev/ttyACM0", "Check this machine, its devices, ports, models and "
+        "configuration, and advise what to do. The exit status is 1 if a check fails.",
+    ).add_argument  # fmt: skip
+    add("--robot", action="store_true", help="missing devices are failures, not warnings")
+    add("--serial-port", metavar="PORT", help="port of the RoboClaw (default: from config/robot.yaml)")
+    add("--camera-url", metavar="URL", help="URL of the Theta (default: from config/robot.yaml)")
+    add("--lidar-port", type=int, metavar="PORT", help="UDP port of the VLP-16's data")
+    text = "time to wait for LiDAR packets (default: %(default)g s)"
+    add("--listen", type=float, default=1.0, metavar="S", help=text)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the checks and print a line for each."""
     from instant_ic import paths
     from instant_ic.cli.doctor import run_checks
     from instant_ic.cli.finding import FAIL, OK, WARN
@@ -47,7 +43,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _expectation(args: argparse.Namespace) -> Any:
-    """Addresses from the command line, else from the shipped configuration."""
     from instant_ic import paths
     from instant_ic.cli.doctor import Expectation
     from instant_ic.config.params import ParameterError, load_file

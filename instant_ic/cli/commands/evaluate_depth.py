@@ -3,66 +3,50 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from instant_ic.cli.arguments import check_files, verb
 from instant_ic.cli.errors import UserError
+from instant_ic.cli.evaluations import print_figures
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``depth`` to ``ic evaluate``."""
-    parser = kinds.add_parser(
-        "depth",
-        help="compare estimated depth of panoramas with the true depth",
-        description=(
-            "Estimate the depth of level 360° panoramas as the robot does and compare it with the true depth: MRE, "
-            "MAE, RMSE, δ1 to δ3, scale error and time, for each image and on average, before and after scaling. "
-            "Prints JSON. Without --depth there is no comparison: use --plot and --side to see the estimate."
-        ),
-        epilog="example: ic evaluate depth rgb/ --depth depth/ --lidar --outliers 0.05 --json out.json --plot out.png",
-    )
-    parser.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="panoramas (2:1): files or folders")
-    parser.add_argument("--depth", type=Path, nargs="+", default=[], metavar="GT",
-                        help="true radial depth: files or a folder, same stems as the images; 16-bit PNG in "
-                        "millimetres, .npy, .npz (key depth) or .exr in metres; 0 = unknown")  # fmt: skip
-    parser.add_argument(
-        "--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)"
-    )
-    parser.add_argument("--source", choices=("network", "lidar", "fused", "completed"),
-                        help="depth source (default: fused with --lidar, else network)")  # fmt: skip
-    parser.add_argument(
-        "--lidar", action="store_true", help="scale the depth by a simulated VLP-16 that measures the true depth"
-    )
-    parser.add_argument("--lidar-height", type=float, default=0.6, metavar="M",
-                        help="height of the LiDAR above the floor (default: %(default)g m)")  # fmt: skip
-    parser.add_argument("--camera-height", type=float, default=1.2, metavar="M",
-                        help="height of the camera above the floor (default: %(default)g m)")  # fmt: skip
-    parser.add_argument("--noise", type=float, default=0.02, metavar="M",
-                        help="noise of a LiDAR range (default: %(default)g m)")  # fmt: skip
-    parser.add_argument("--outliers", type=float, default=0.0, metavar="SHARE",
-                        help="share of LiDAR outliers, 0 to 1 (default: %(default)g)")  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="seed of noise and outliers (default: %(default)s)")
-    parser.add_argument("--method", default="", metavar="RULE",
-                        help="scaling: median_ratio, max_ratio, ransac, sector (default: the scaler's)")  # fmt: skip
-    parser.add_argument("--png-unit", type=float, default=1e-3, metavar="M",
-                        help="metres per unit of a depth PNG (default: %(default)g)")  # fmt: skip
-    parser.add_argument("--threads", type=int, default=2, help="CPU threads of the model (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
-    parser.add_argument(
-        "--plot", type=Path, metavar="OUT.png", help="write images, estimates, true depth and errors here"
-    )
-    parser.add_argument(
-        "--side", type=Path, metavar="OUT.png", help="write the point clouds here, from the side and from above"
-    )
-    parser.set_defaults(func=evaluate_depth)
+    add = verb(
+        kinds, "depth", "compare estimated depth of panoramas with the true depth", evaluate_depth,
+        "ic evaluate depth rgb/ --depth depth/ --lidar --outliers 0.05 --json out.json --plot out.png",
+        "Estimate the depth of level 360° panoramas as the robot does and compare it with the true depth: MRE, "
+        "MAE, RMSE, δ1 to δ3, scale error and time, for each image and on average, before and after scaling. "
+        "Prints JSON. Without --depth there is no comparison: use --plot and --side to see the estimate.",
+    ).add_argument  # fmt: skip
+    add("images", type=Path, nargs="+", metavar="IMAGES", help="panoramas (2:1): files or folders")
+    text = "true radial depth: files or a folder, same stems as the images; 16-bit PNG in millimetres, .npy, .npz "
+    text += "(key depth) or .exr in metres; 0 = unknown"
+    add("--depth", type=Path, nargs="+", default=[], metavar="GT", help=text)
+    add("--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)")
+    text = "depth source (default: fused with --lidar, else network)"
+    add("--source", choices=("network", "lidar", "fused", "completed"), help=text)
+    text = "scale the depth by a simulated VLP-16 that measures the true depth"
+    add("--lidar", action="store_true", help=text)
+    metres, default = {"type": float, "metavar": "M"}, "(default: %(default)g m)"
+    add("--lidar-height", **metres, default=0.6, help=f"height of the LiDAR above the floor {default}")
+    add("--camera-height", **metres, default=1.2, help=f"height of the camera above the floor {default}")
+    add("--noise", **metres, default=0.02, help=f"noise of a LiDAR range {default}")
+    text = "share of LiDAR outliers, 0 to 1 (default: %(default)g)"
+    add("--outliers", type=float, default=0.0, metavar="SHARE", help=text)
+    add("--seed", type=int, default=0, help="seed of noise and outliers (default: %(default)s)")
+    text = "scaling: median_ratio, max_ratio, ransac, sector (default: the scaler's)"
+    add("--method", default="", metavar="RULE", help=text)
+    add("--png-unit", **metres, default=1e-3, help="metres per unit of a depth PNG (default: %(default)g)")
+    add("--threads", type=int, default=2, help="CPU threads of the model (default: %(default)s)")
+    add("--json", type=Path, metavar="OUT", help="also write the figures here")
+    add("--plot", type=Path, metavar="OUT.png", help="write images, estimates, true depth and errors here")
+    text = "write the point clouds here, from the side and from above"
+    add("--side", type=Path, metavar="OUT.png", help=text)
 
 
 def evaluate_depth(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate depth``; return the exit status."""
     from instant_ic.cli.progress import progress
     from instant_ic.depth.files import DepthFileError, load_depth, load_picture
     from instant_ic.depth.manifest import InferenceError, ManifestError
@@ -72,12 +56,8 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     from instant_ic.experiments.depth_pictures import Sheets
     from instant_ic.paths import shipped_file
 
-    for file in (args.json, args.plot, args.side):
-        if file is not None and not file.parent.is_dir():
-            raise UserError(f"{file}: the folder {file.parent} does not exist", 2)
-    for file in (args.plot, args.side):
-        if file is not None and file.suffix.lower() != ".png":
-            raise UserError(f"{file}: the name must end in .png", 2)
+    check_files(args.json)
+    check_files(args.plot, args.side, suffix=".png")
     if not args.png_unit > 0:
         raise UserError(f"--png-unit must be > 0 (got {args.png_unit:g})", 2)
     if args.lidar and not args.depth:
@@ -116,34 +96,20 @@ def evaluate_depth(args: argparse.Namespace) -> int:
                 errors.append({"name": image.name, "error": str(error)})
                 continue
             rows.append(scored.as_dict() | {"image": str(image), "truth": str(truth) if truth else None})
-            with _written():
-                for sheet in sheets:
-                    sheet.add(scored)
+            for sheet in sheets:
+                sheet.add(scored)
         advance(1.0)
-    with _written():
-        for sheet in sheets:
-            sheet.close()
+    for sheet in sheets:
+        sheet.close()
     figures = report(rows, settings, evaluator.model)
     if unfit := [row["name"] for row in rows if row["fit"] and not row["fit"]["ok"]]:
         warnings.append(
             f"{len(unfit)} of {len(rows)} scale fits are not reliable, and neither is their depth: {unfit[0]} ..."
         )
     figures |= {"errors": errors, "warnings": warnings, "pictures": [str(p) for sheet in sheets for p in sheet.written]}
-    text = json.dumps(figures, indent=2)
-    if args.json:
-        with _written():
-            args.json.write_text(text + "\n")
-    sys.stdout.write(text + "\n")
+    print_figures(figures, args.json)
     for line in warnings:
         print(f"ic evaluate depth: warning: {line}", file=sys.stderr)
     for entry in errors:
         print(f"ic evaluate depth: {entry['error']}", file=sys.stderr)
     return 1 if errors else 0
-
-
-@contextmanager
-def _written() -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise UserError(f"evaluate depth: {error.filename} cannot be written: {error.strerror}") from None

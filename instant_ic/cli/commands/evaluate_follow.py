@@ -8,28 +8,23 @@ import os
 import sys
 from typing import Any
 
-from instant_ic.cli.evaluations import add_options, check_outputs, counted, errors_for_the_user
+from instant_ic.cli.arguments import verb
+from instant_ic.cli.evaluations import add_options, check_outputs, counted, errors_for_the_user, print_figures
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``follow`` to ``ic evaluate``."""
-    parser = kinds.add_parser(
-        "follow",
-        help="simulate the r-bot following a v-bot through random rooms",
-        description=(
-            "Drive a v-bot to a goal through random rooms with walls, boxes, low and hanging obstacles, and people in "
-            "a fifth of them. The r-bot follows with the robot's own costmap, planner, follower and collision monitor, "
-            "under slip, command delay, sensor noise and pose drift. Reports contacts, goals reached, path length "
-            "relative to the shortest path, and CPU time of each part. The same seed gives the same drives."
-        ),
-        epilog="example: ic evaluate follow --episodes 50 --seed 0 --json follow.json --plot follow.png",
-    )
+    parser = verb(
+        kinds, "follow", "simulate the r-bot following a v-bot through random rooms", run,
+        "ic evaluate follow --episodes 50 --seed 0 --json follow.json --plot follow.png",
+        "Drive a v-bot to a goal through random rooms with walls, boxes, low and hanging obstacles, and people in "
+        "a fifth of them. The r-bot follows with the robot's own costmap, planner, follower and collision monitor, "
+        "under slip, command delay, sensor noise and pose drift. Reports contacts, goals reached, path length "
+        "relative to the shortest path, and CPU time of each part. The same seed gives the same drives.",
+    )  # fmt: skip
     add_options(parser, 50, os.cpu_count() or 1, 3600.0, "the drives, the worst first,")
-    parser.set_defaults(func=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate follow``; return the exit status."""
     from instant_ic.experiments import follow
 
     check_outputs(args)
@@ -49,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plot:
         follow.plot(episodes, args.seed, args.plot)
     each = figures.pop("each")
-    sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+    print_figures(figures)
     for row in each:
         if row["contacts"] or row["people_contacts"] or (row["reachable"] and not row["reached"]):
             how = "reached" if row["reached"] else f"not reached: {row['reason']}"

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
+from instant_ic.cli.arguments import verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import (
     add_options,
@@ -15,33 +14,28 @@ from instant_ic.cli.evaluations import (
     check_outputs,
     counted,
     errors_for_the_user,
+    print_figures,
     use_one_thread_for_matrices,
 )
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``illusion`` to ``ic evaluate``."""
-    parser = kinds.add_parser(
-        "illusion",
-        help="compare the operator's view inside and behind obstacles with the truth",
-        description=(
-            "The drive of ic evaluate teleop with illusory control. Every frame in which the page shows the virtual "
-            "space is composed as on the page and compared with the simulator's image from the same pose: with the "
-            "obstacle before its near face, without it from there on. The same frames are also composed with true "
-            "depth, and with true depth and exact fill of unseen places. Reports PSNR, SSIM, unseen share, floor shown "
-            "as fog, and the error of the expected PSNR. The same seed gives the same figures."
-        ),
-        epilog="example: ic evaluate illusion --episodes 4 --json illusion.json --strip strip.png --plot plot.png",
-    )
+    parser = verb(
+        kinds, "illusion", "compare the operator's view inside and behind obstacles with the truth", run,
+        "ic evaluate illusion --episodes 4 --json illusion.json --strip strip.png --plot plot.png",
+        "The drive of ic evaluate teleop with illusory control. Every frame in which the page shows the virtual "
+        "space is composed as on the page and compared with the simulator's image from the same pose: with the "
+        "obstacle before its near face, without it from there on. The same frames are also composed with true "
+        "depth, and with true depth and exact fill of unseen places. Reports PSNR, SSIM, unseen share, floor shown "
+        "as fog, and the error of the expected PSNR. The same seed gives the same figures.",
+    )  # fmt: skip
     add_options(parser, 20, 1, 7200.0, "PSNR by distance, and expected PSNR,")
     worlds = "as ic evaluate teleop: corridors (random), corridor, random:SEED, or a mesh file"
     add_stack_options(parser, worlds, "nerf.space.keyframes:=1")
     parser.add_argument("--strip", type=Path, metavar="OUT.png", help="write rows of frames by distance here")
-    parser.set_defaults(func=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate illusion``; return the exit status."""
     use_one_thread_for_matrices()
     check_outputs(args, strip=".png", plot=".png")
     try:
@@ -69,7 +63,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.plot:
         illusion_plot.save_plot(args.plot, figures)
     figures.pop("each")
-    sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+    print_figures(figures)
     if args.strip:  # last: without an obstacle there is none
         illusion_plot.save_strip(args.strip, films)
     return 0

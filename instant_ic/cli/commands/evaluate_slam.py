@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from instant_ic.cli.arguments import check_files, positive, positive_int, verb
 from instant_ic.cli.errors import UserError
+from instant_ic.cli.evaluations import errors_for_the_user, print_figures
+from instant_ic.cli.progress import progress
 
 if TYPE_CHECKING:
     from instant_ic.experiments.slam import LogResult
@@ -17,66 +19,49 @@ if TYPE_CHECKING:
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``slam`` to ``ic evaluate``."""
-    parser = kinds.add_parser(
-        "slam",
-        help="run SLAM on a 2D laser log",
-        description=(
-            "Run the grid SLAM on a log as fast as possible. LOG is a CARMEN log (FLASER or ROBOTLASER1 lines, gzip or "
-            "plain), a BreezySLAM exp*.dat, or a bag with LaserScan. Writes a folder with the final trajectory "
-            "(trajectory.txt, one line 't x y yaw' per scan), the map (map.png) and the figures (figures.json), and "
-            "prints the figures; with relations also the error against them."
-        ),
-        epilog="example: ic evaluate slam intel.log.gz --relations intel.relations --stamps intel.exact_stamps",
+    add = verb(
+        kinds, "slam", "run SLAM on a 2D laser log", evaluate_slam,
+        "ic evaluate slam intel.log.gz --relations intel.relations --stamps intel.exact_stamps",
+        "Run the grid SLAM on a log as fast as possible. LOG is a CARMEN log (FLASER or ROBOTLASER1 lines, gzip or "
+        "plain), a BreezySLAM exp*.dat, or a bag with LaserScan. Writes a folder with the final trajectory "
+        "(trajectory.txt, one line 't x y yaw' per scan), the map (map.png) and the figures (figures.json), and "
+        "prints the figures; with relations also the error against them.",
+    ).add_argument  # fmt: skip
+    count: dict[str, Any] = {"type": positive_int, "metavar": "N"}
+    add("log", type=Path, metavar="LOG")
+    add("--relations", type=Path, metavar="REL", help="reference relations: t1 t2 x y z roll pitch yaw")
+    add("--stamps", type=Path, metavar="FILE", help="use only relations whose ends match these times")
+    add(
+        "--tolerance",
+        type=positive,
+        default=0.006,
+        metavar="S",
+        help="tolerance of that match (default: %(default)g s)",
     )
-    parser.add_argument("log", type=Path, metavar="LOG")
-    parser.add_argument("--relations", type=Path, metavar="REL", help="reference relations: t1 t2 x y z roll pitch yaw")
-    parser.add_argument("--stamps", type=Path, metavar="FILE", help="use only relations whose ends match these times")
-    parser.add_argument(
-        "--tolerance", type=float, default=0.006, metavar="S", help="tolerance of that match (default: %(default)g s)"
-    )
-    parser.add_argument(
-        "--backend", choices=("graph", "rbpf"), default="graph", help="graph: grid SLAM; rbpf: particle filter"
-    )
-    parser.add_argument("--particles", type=int, default=30, metavar="N", help="of rbpf (default: %(default)d)")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="default: runs/slam_LOG_DATE_TIME")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="also write the map here")
-    parser.add_argument("--trajectory", type=Path, metavar="FILE", help="also write the trajectory here")
-    parser.add_argument("--strict", action="store_true", help="refuse a log with a line that cannot be read")
-    parser.add_argument("--scan-topic", metavar="TOPIC", help="scan topic, for a bag with several")
-    parser.add_argument("--params-file", type=Path, action="append", metavar="F", help="parameters of grid_slam")
-    parser.add_argument(
-        "-p", "--param", action="append", default=[], metavar="KEY:=VALUE", help="one parameter of grid_slam"
-    )
-    parser.add_argument("--no-odometry", action="store_true", help="ignore the log's odometry")
-    parser.add_argument(
-        "--perturb-odometry", type=int, metavar="SEED", help="degrade the odometry: 5 %% noise, 2 %% scale"
-    )
-    parser.add_argument(
-        "--faults",
-        nargs="?",
-        const="all",
-        metavar="NAME,...",
-        help="put faults into the log instead (all, or the named ones): detection, recovery and false alarms by fault",
-    )
-    parser.add_argument(
-        "--places", type=int, default=5, metavar="N", help="of --faults: places for each (default: %(default)d)"
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, metavar="N", help="of --faults: chooses the places (default: %(default)d)"
-    )
-    parser.add_argument(
-        "--noise-seeds", type=int, default=1, metavar="N",
-        help="of --faults: runs of each fault over the whole log, the first without noise (default: %(default)d)",
-    )  # fmt: skip
-    parser.set_defaults(func=evaluate_slam)
+    text = "graph: grid SLAM; rbpf: particle filter"
+    add("--backend", choices=("graph", "rbpf"), default="graph", help=text)
+    add("--particles", **count, default=30, help="of rbpf (default: %(default)d)")
+    add("-o", "--output", type=Path, metavar="DIR", help="default: runs/slam_LOG_DATE_TIME")
+    add("--json", type=Path, metavar="OUT", help="also write the figures here")
+    add("--plot", type=Path, metavar="OUT.png", help="also write the map here")
+    add("--strict", action="store_true", help="refuse a log with a line that cannot be read")
+    add("--scan-topic", metavar="TOPIC", help="scan topic, for a bag with several")
+    add("--params-file", type=Path, action="append", metavar="F", help="parameters of grid_slam")
+    text = "one parameter of grid_slam"
+    add("-p", "--param", action="append", default=[], metavar="KEY:=VALUE", help=text)
+    add("--no-odometry", action="store_true", help="ignore the log's odometry")
+    text = "degrade the odometry: 5 %% noise, 2 %% scale"
+    add("--perturb-odometry", type=int, metavar="SEED", help=text)
+    text = "put faults into the log instead (all, or the named ones): detection, recovery and false alarms by fault"
+    add("--faults", nargs="?", const="all", metavar="NAME,...", help=text)
+    add("--places", **count, default=5, help="of --faults: places for each (default: %(default)d)")
+    add("--seed", type=int, default=0, metavar="N", help="of --faults: chooses the places (default: %(default)d)")
+    text = "of --faults: runs of each fault over the whole log, the first without noise (default: %(default)d)"
+    add("--noise-seeds", **count, default=1, help=text)
 
 
 def evaluate_slam(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate slam``; return the exit status."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from instant_ic.bag.replay import make_node
     from instant_ic.experiments.particle_slam import ParticleConfig
@@ -93,92 +78,52 @@ def evaluate_slam(args: argparse.Namespace) -> int:
 
     if args.stamps and not args.relations:
         raise UserError("--stamps selects relations: give --relations too", 2)
-    if not args.tolerance > 0:
-        raise UserError(f"--tolerance must be > 0 (got {args.tolerance:g})", 2)
     if args.faults and args.backend != "graph":
         raise UserError("--faults needs --backend graph", 2)
-    for name in ("places", "noise_seeds"):
-        if getattr(args, name) < 1:
-            raise UserError(f"--{name.replace('_', '-')} must be at least 1 (got {getattr(args, name)})", 2)
-    if args.particles < 1:
-        raise UserError(f"--particles must be at least 1 (got {args.particles})", 2)
     overrides = [f"grid_slam.{override}" for override in args.param]
     config = make_node("grid_slam", args.params_file or [], overrides).config
     particles = ParticleConfig(particles=args.particles) if args.backend == "rbpf" else None
     folder = args.output or Path(f"runs/slam_{_stem(args.log)}_{time.strftime('%Y%m%d_%H%M%S')}")
-    for file in (args.json, args.plot, args.trajectory):
-        if file is not None and not file.parent.is_dir():
-            raise UserError(f"{file}: the folder {file.parent} does not exist", 2)
-    console = Console(stderr=True)
+    check_files(args.json, args.plot)
     bad = None if args.strict else BadLines()
-    try:
+    with errors_for_the_user():
         relations = read_relations(args.relations) if args.relations else None
         if relations is not None and args.stamps:
             relations = relations.at_stamps(read_stamps(args.stamps), args.tolerance)
             if len(relations) == 0:
                 raise LogError(f"no relation in {args.relations} has both ends at a time in {args.stamps}")
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("scans"),
-            TimeElapsedColumn(),
+        entries: list[LogEntry] = list(
+            read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log, bad)
         )
-        with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-            task = progress.add_task(f"reading {args.log.name}", total=None)
-            read = read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log, bad)
-            entries: list[LogEntry] = list(read)
-            progress.update(task, description=args.log.name, total=len(entries))
-            if args.faults:
-                faults = FAULTS if args.faults == "all" else tuple(args.faults.split(","))
+        folder.mkdir(parents=True, exist_ok=True)
+        if args.faults:
+            faults = FAULTS if args.faults == "all" else tuple(args.faults.split(","))
+            with Console(stderr=True).status("") as status:
                 report = evaluate_faults(
                     entries, config, places=args.places, seed=args.seed, noise_seeds=args.noise_seeds,
-                    relations=relations, faults=faults,
-                    on_step=lambda name: progress.update(task, description=name),
+                    relations=relations, faults=faults, on_step=status.update,
                 )  # fmt: skip
-                return _write_faults(folder, {"log": args.log.name, "seed": args.seed, **report}, args.json)
-            source = entries if args.perturb_odometry is None else perturb_odometry(entries, args.perturb_odometry)
+            report = {"log": args.log.name, "seed": args.seed, **report, "output": str(folder)}
+            print_figures(report, folder / "faults.json", args.json)
+            return 0
+        source = entries if args.perturb_odometry is None else perturb_odometry(entries, args.perturb_odometry)
+        with progress(args.log.name) as advance:
             report, run = evaluate_log(
                 source, relations, config, particles=particles, use_wheel_odom=not args.no_odometry,
-                tolerance_s=args.tolerance, on_scan=lambda done: progress.update(task, completed=done),
+                tolerance_s=args.tolerance, on_scan=lambda done: advance(done / len(entries)),
             )  # fmt: skip
-    except (LogError, OSError, ValueError) as error:
-        raise UserError(f"evaluate slam: {error}") from None
     report = {"log": args.log.name, "backend": args.backend, **report, "output": str(folder)}
     if bad is not None:
         report["bad_lines"] = bad.count
         for line in bad.errors:
-            console.print(f"left out: {line}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+            print(f"left out: {line}", file=sys.stderr)
         if bad.count > len(bad.errors):
-            console.print(f"left out: {bad.count - len(bad.errors)} more lines", style="yellow", highlight=False)
-    text = json.dumps(report, indent=2) + "\n"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for file in (folder / "trajectory.txt", args.trajectory):
-            if file is not None:
-                write_trajectory(file, run.trajectory)
-        for file in (folder / "map.png", args.plot):
-            if file is not None:
-                _plot(file, run)
-        for file in (folder / "figures.json", args.json):
-            if file is not None:
-                file.write_text(text)
-    except OSError as error:
-        raise UserError(f"evaluate slam: {error}") from None
-    sys.stdout.write(text)
-    return 0
-
-
-def _write_faults(folder: Path, report: dict[str, object], json_file: Path | None) -> int:
-    text = json.dumps({**report, "output": str(folder)}, indent=2) + "\n"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for file in (folder / "faults.json", json_file):
-            if file is not None:
-                file.write_text(text)
-    except OSError as error:
-        raise UserError(f"evaluate slam: {error}") from None
-    sys.stdout.write(text)
+            print(f"left out: {bad.count - len(bad.errors)} more lines", file=sys.stderr)
+    write_trajectory(folder / "trajectory.txt", run.trajectory)
+    for file in (folder / "map.png", args.plot):
+        if file is not None:
+            _plot(file, run)
+    print_figures(report, folder / "figures.json", args.json)
     return 0
 
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from pathlib import Path
 from typing import Any
 
+from instant_ic.cli.arguments import verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import (
     add_options,
@@ -16,58 +16,43 @@ from instant_ic.cli.evaluations import (
     check_outputs,
     counted,
     errors_for_the_user,
+    print_figures,
     use_one_thread_for_matrices,
 )
 
 
 def add_kind(kinds: Any) -> None:
-    """Add ``teleop`` to ``ic evaluate``."""
-    parser = kinds.add_parser(
-        "teleop",
-        help="simulate an operator in corridors with hidden obstacles: illusory control, stopping, shared control",
-        description=(
-            "A scripted operator who only sees goals drives a simulated robot through random corridors with boxes, "
-            "posts and low obstacles. All nodes run in one process in simulated time, with their parameters and "
-            "messages. Each course is driven with illusory control (ic), with a robot that stops at obstacles until "
-            "the operator looks and steers around them (stop), and with shared control that avoids them by itself "
-            "(shared). Reports contacts, obedience, switches, image jumps at switches, and lost time. "
-            "The same seed gives the same drives."
-        ),
-        epilog="example: ic evaluate teleop --episodes 50 --seed 0 --json teleop.json --plot teleop.png",
-    )
+    parser = verb(
+        kinds, "teleop",
+        "simulate an operator in corridors with hidden obstacles: illusory control, stopping, shared control", run,
+        "ic evaluate teleop --episodes 50 --seed 0 --json teleop.json --plot teleop.png",
+        "A scripted operator who only sees goals drives a simulated robot through random corridors with boxes, "
+        "posts and low obstacles. All nodes run in one process in simulated time, with their parameters and "
+        "messages. Each course is driven with illusory control (ic), with a robot that stops at obstacles until "
+        "the operator looks and steers around them (stop), and with shared control that avoids them by itself "
+        "(shared). Reports contacts, obedience, switches, image jumps at switches, and lost time. "
+        "The same seed gives the same drives.",
+    )  # fmt: skip
     add_options(parser, 50, os.cpu_count() or 1, 7200.0, "paths, and bars by method,")
     worlds = (
         "corridors (random), or a world of the simulator: corridor, where the operator drives straight on, "
         "random:SEED or a mesh file, where the operator drives to random visible places"
     )
     add_stack_options(parser, worlds, "virtual_robot.vbot.ease_m_s:=0.05")
-    parser.add_argument(
-        "--methods", default="ic,stop,shared", metavar="M,M", help="ic, stop, shared (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--operator",
-        choices=("scripted", "recorded"),
-        default="scripted",
-        help="recorded replays the commands of --log regardless of their effect (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--log", type=Path, metavar="FILE", help="bag with /operator/cmd_vel, or CSV: time_s,linear_m_s,angular_rad_s"
-    )
-    parser.add_argument(
-        "--depth",
-        choices=("fused", "lidar"),
-        default="fused",
-        help="depth source of the virtual space: network and LiDAR, or LiDAR only (default: %(default)s)",
-    )
-    parser.add_argument("--resume", action="store_true", help="keep the drives in --json and run only the missing ones")
-    parser.add_argument(
-        "--video", type=Path, metavar="OUT.mp4", help="write a split-view video of the first course and method here"
-    )
-    parser.set_defaults(func=run)
+    add = parser.add_argument
+    add("--methods", default="ic,stop,shared", metavar="M,M", help="ic, stop, shared (default: %(default)s)")
+    text = "recorded replays the commands of --log regardless of their effect (default: %(default)s)"
+    add("--operator", choices=("scripted", "recorded"), default="scripted", help=text)
+    text = "bag with /operator/cmd_vel, or CSV: time_s,linear_m_s,angular_rad_s"
+    add("--log", type=Path, metavar="FILE", help=text)
+    text = "depth source of the virtual space: network and LiDAR, or LiDAR only (default: %(default)s)"
+    add("--depth", choices=("fused", "lidar"), default="fused", help=text)
+    add("--resume", action="store_true", help="keep the drives in --json and run only the missing ones")
+    text = "write a split-view video of the first course and method here"
+    add("--video", type=Path, metavar="OUT.mp4", help=text)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic evaluate teleop``; return the exit status."""
     use_one_thread_for_matrices()
     check_outputs(args, video=".mp4")
     if args.operator == "recorded" and args.log is None:
@@ -105,13 +90,16 @@ def _evaluate(args: argparse.Namespace) -> int:
         with Video(args.video) as video:
             teleop.run_episode(settings, 0, video.on_step, methods[:1])
     each = figures.pop("each")
-    sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+    print_figures(figures)
     for row in each:
         if row["contacts"] or not row["completed"]:
-            how = "completed" if row["completed"] else f"not completed: {row['reason'] or 'given up'}"
-            line = f"episode {row['index']}, {row['method']}: {row['contacts']} contacts, {how}"
-            print(line, file=sys.stderr)
+            how = _how(row["completed"], row["reason"])
+            print(f"episode {row['index']}, {row['method']}: {row['contacts']} contacts, {how}", file=sys.stderr)
     return status
+
+
+def _how(completed: bool, reason: str) -> str:
+    return "completed" if completed else f"not completed: {reason or 'given up'}"
 
 
 def _drive_all(args: argparse.Namespace, settings: Any, drives: list[Any]) -> int:
@@ -126,8 +114,8 @@ def _drive_all(args: argparse.Namespace, settings: Any, drives: list[Any]) -> in
             drives.append(drive)
             if args.json:
                 teleop_results.save(args.json, teleop_results.in_order(drives), settings)
-            how = "completed" if drive.completed else f"not completed: {drive.reason or 'given up'}"
             contacts = sum(drive.contacts for drive in drives)
+            how = _how(drive.completed, drive.reason)
             advance(f"driving, {contacts} contacts", f"episode {drive.index}, {drive.method}: {how}")
 
         try:

@@ -7,40 +7,25 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import verb
 from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "graph",
-        help="nodes and topics as a tree, Graphviz or Mermaid text, or an image",
-        description="Show publishers and subscribers as a tree, or write them to a file with -o.",
-        epilog="example: ic graph -o stack.mmd",
-    )
-    completion.offer(
-        parser.add_argument("nodes", metavar="NODE", nargs="*", help="only these and their neighbours (default: all)"),
-        completion.nodes,
-    )
-    parser.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="FILE",
-        help=".mmd (Mermaid), .dot (Graphviz), or .svg, .png, .pdf, which need Graphviz",
-    )
-    parser.add_argument(
-        "-a",
-        "--all",
-        action="store_true",
-        help="also topics that every node has, and topics without a subscriber or publisher",
-    )
-    parser.add_argument("--tf", action="store_true", help="also /tf and /tf_static")
-    parser.set_defaults(func=show)
+    add = verb(
+        subparsers, "graph", "nodes and topics as a tree, Graphviz or Mermaid text, or an image", show,
+        "ic graph -o stack.mmd", "Show publishers and subscribers as a tree, or write them to a file with -o.",
+    ).add_argument  # fmt: skip
+    text = "only these and their neighbours (default: all)"
+    add("nodes", metavar="NODE", nargs="*", help=text, completer=completion.nodes)
+    text = ".mmd (Mermaid), .dot (Graphviz), or .svg, .png, .pdf, which need Graphviz"
+    add("-o", "--output", type=Path, metavar="FILE", help=text)
+    text = "also topics that every node has, and topics without a subscriber or publisher"
+    add("-a", "--all", action="store_true", help=text)
+    add("--tf", action="store_true", help="also /tf and /tf_static")
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the tree, or write the file."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.graph import make_graph, tree, write
@@ -61,7 +46,5 @@ def show(args: argparse.Namespace) -> int:
         write(graph, args.output)
     except ValueError as error:
         raise UserError(str(error), 2) from error
-    except OSError as error:
-        raise UserError(f"{args.output} cannot be written: {error.strerror}") from error
     print(f"{args.output}: {len(graph.nodes)} nodes, {len(graph.topics)} topics")
     return 0

@@ -6,46 +6,30 @@ import argparse
 from typing import Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import group, verb
 from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "interface",
-        help="list and show message types",
-        description="List message types and show their fields with units and frames.",
-        epilog="example: ic interface show instant_ic_msgs/msg/Keyframe",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
-    added = verbs.add_parser(
-        "list",
-        help="all message types",
-        description="List the message types of ROS 2 and of this project.",
-        epilog="example: ic interface list",
-    )
-    added.set_defaults(func=list_types)
-    added = verbs.add_parser(
-        "package",
-        help="message types of one package",
-        description="List the message types of one package.",
-        epilog="example: ic interface package instant_ic_msgs",
-    )
-    completion.offer(added.add_argument("package", metavar="NAME"), completion.packages)
-    added.set_defaults(func=list_package)
-    added = verbs.add_parser(
-        "show",
-        help="definition of a message type",
-        description="Show the definition of a message type, with the fields of nested types.",
-        epilog="example: ic interface show sensor_msgs/msg/LaserScan",
-    )
-    completion.offer(added.add_argument("type", metavar="TYPE", help="full or short name"), completion.types)
-    added.add_argument("--all-comments", action="store_true", help="also show the comments of nested types")
-    added.set_defaults(func=show)
+    verbs = group(
+        subparsers, "interface", "list and show message types",
+        "List message types and show their fields with units and frames.",
+        "ic interface show instant_ic_msgs/msg/Keyframe",
+    )  # fmt: skip
+    text = "List the message types of ROS 2 and of this project."
+    verb(verbs, "list", "all message types", list_types, "ic interface list", text)
+    text = "message types of one package"
+    package = verb(verbs, "package", text, list_package, "ic interface package instant_ic_msgs")
+    package.add_argument("package", metavar="NAME", completer=completion.packages)
+    shown = verb(
+        verbs, "show", "definition of a message type", show, "ic interface show sensor_msgs/msg/LaserScan",
+        "Show the definition of a message type, with the fields of nested types.",
+    )  # fmt: skip
+    shown.add_argument("type", metavar="TYPE", help="full or short name", completer=completion.types)
+    shown.add_argument("--all-comments", action="store_true", help="also show the comments of nested types")
 
 
 def list_types(args: argparse.Namespace) -> int:
-    """Print all types."""
     from instant_ic.msg import typestore
 
     print("Messages:")
@@ -55,7 +39,6 @@ def list_types(args: argparse.Namespace) -> int:
 
 
 def list_package(args: argparse.Namespace) -> int:
-    """Print the types of a package."""
     from instant_ic.cli.names import near
     from instant_ic.msg import typestore
 
@@ -69,7 +52,6 @@ def list_package(args: argparse.Namespace) -> int:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the definition of a type."""
     from instant_ic.cli.names import find_type
     from instant_ic.msg.definition import expanded_definition
 

@@ -6,58 +6,40 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from instant_ic.cli.arguments import group, verb
+
 if TYPE_CHECKING:
     from instant_ic.bridge.host_keys import KeyStore
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "keys",
-        help="manage keys of the link between robot and station",
-        description="Create this host's key, and set which other hosts may connect to it (docs/bridge.md).",
-        epilog="example: ic keys new",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
-    new = _verb(
-        verbs, "new", make, "create this host's key",
-        "Create this host's key and print the command that allows it on the other host.",
-        "example: ic keys new robot",
+    verbs = group(
+        subparsers, "keys", "manage keys of the link between robot and station",
+        "Create this host's key, and set which other hosts may connect to it (docs/bridge.md).", "ic keys new",
     )  # fmt: skip
-    new.add_argument("name", metavar="NAME", nargs="?", help="name of this host (default: its host name)")
-    new.add_argument(
-        "--force", action="store_true", help="replace an existing key; every other host must then allow the new one"
-    )
-    _verb(
-        verbs, "list", show, "list this host's key and the allowed hosts",
-        "List this host's public key and the allowed hosts.",
-        "example: ic keys list",
-    )  # fmt: skip
-    allow = _verb(
-        verbs, "allow", let_in, "allow another host",
-        "Allow another host. A running bridge applies this at once. An existing name gets the new key or role.",
-        "example: ic keys allow station ick_...",
-    )  # fmt: skip
-    allow.add_argument("name", metavar="NAME", help="name for the other host")
-    allow.add_argument("key", metavar="KEY", help="its public key, from `ic keys list` on that host")
-    allow.add_argument(
-        "--role", choices=("driver", "viewer"), default="driver", help="viewer receives only (default: driver)"
-    )
-    revoke = _verb(
-        verbs, "revoke", shut_out, "no longer allow another host",
-        "Remove a host from the list. A running bridge disconnects it at once.",
-        "example: ic keys revoke station",
-    )  # fmt: skip
-    revoke.add_argument("name", metavar="NAME", help="name given to ic keys allow")
 
+    def with_folder(name: str, words: str, run: Any, example: str, description: str) -> Any:
+        parser = verb(verbs, name, words, run, f"ic keys {example}", description)
+        text = "folder of keys (default: ~/.config/instant_ic/keys)"
+        parser.add_argument("--dir", type=Path, metavar="FOLDER", help=text)
+        return parser.add_argument
 
-def _verb(verbs: Any, name: str, function: Any, help_: str, description: str, epilog: str) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = verbs.add_parser(name, help=help_, description=description, epilog=epilog)
-    parser.add_argument(
-        "--dir", type=Path, default=None, metavar="FOLDER", help="folder of keys (default: ~/.config/instant_ic/keys)"
-    )
-    parser.set_defaults(func=function)
-    return parser
+    text = "Create this host's key and print the command that allows it on the other host."
+    add = with_folder("new", "create this host's key", make, "new robot", text)
+    add("name", metavar="NAME", nargs="?", help="name of this host (default: its host name)")
+    text = "replace an existing key; every other host must then allow the new one"
+    add("--force", action="store_true", help=text)
+    text = "List this host's public key and the allowed hosts."
+    with_folder("list", "list this host's key and the allowed hosts", show, "list", text)
+    text = "Allow another host. A running bridge applies this at once. An existing name gets the new key or role."
+    add = with_folder("allow", "allow another host", let_in, "allow station ick_...", text)
+    add("name", metavar="NAME", help="name for the other host")
+    add("key", metavar="KEY", help="its public key, from `ic keys list` on that host")
+    text = "viewer receives only (default: driver)"
+    add("--role", choices=("driver", "viewer"), default="driver", help=text)
+    text = "Remove a host from the list. A running bridge disconnects it at once."
+    add = with_folder("revoke", "no longer allow another host", shut_out, "revoke station", text)
+    add("name", metavar="NAME", help="name given to ic keys allow")
 
 
 def _store(args: argparse.Namespace) -> KeyStore:
@@ -76,7 +58,6 @@ def host_name() -> str:
 
 
 def make(args: argparse.Namespace) -> int:
-    """Create this host's key."""
     from instant_ic.bridge.host_keys import key_text
 
     store = _store(args)
@@ -87,7 +68,6 @@ def make(args: argparse.Namespace) -> int:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print this host's key and a line for each allowed host."""
     from instant_ic.bridge.host_keys import key_text
 
     store = _store(args)
@@ -125,7 +105,6 @@ def let_in(args: argparse.Namespace) -> int:
 
 
 def shut_out(args: argparse.Namespace) -> int:
-    """Remove a host from the list."""
     peer = _store(args).revoke(args.name)
     print(f"{peer.name} (fingerprint {peer.fingerprint}) is no longer allowed")
     return 0

@@ -9,52 +9,29 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.cli import completion
-from instant_ic.cli.arguments import launch_values
-from instant_ic.cli.errors import UserError
+from instant_ic.cli.arguments import launch_values, verb
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "launch",
-        help="start a stack from a launch file",
-        description="Start the nodes of a launch file, show their state, and stop them all on Ctrl-C.",
-        epilog="example: ic launch sim console_port:=9000 record:=drive",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    completion.offer(
-        parser.add_argument(
-            "file", metavar="FILE", help="path, or a shipped file: sim, robot, station, full, fleet, replay"
-        ),
-        completion.launch_files,
-    )
-    completion.offer(
-        parser.add_argument("arguments", nargs="*", metavar="KEY:=VALUE", help="arguments of the launch file"),
-        completion.launch_arguments,
-    )
-    parser.add_argument(
-        "-s", "--show-args", "--show-arguments", action="store_true", help="list the file's arguments and exit"
-    )
-    parser.add_argument(
-        "--check", action="store_true", help="check file, arguments and every node's parameters without starting"
-    )
-    parser.add_argument(
-        "--no-check",
-        action="store_true",
-        help="skip the check of node parameters before the start (each node checks its own)",
-    )
-    parser.add_argument("-v", "--verbose", action="store_true", help="show every line that the nodes log")
-    parser.add_argument("--plain", action="store_true", help="plain log lines even in a terminal")
-    parser.add_argument(
-        "--pace",
-        type=_pace,
-        default=None,
-        metavar="X",
-        help="speed of simulated time relative to real time, such as 0.5; default: auto, as fast as the machine can "
-        "run simulated devices (with real devices: 1)",
-    )
-    parser.add_argument("--run-dir", type=Path, default=None, metavar="DIR", help="default: $INSTANT_IC_RUN_DIR")
-    parser.set_defaults(func=run)
+    parser = verb(
+        subparsers, "launch", "start a stack from a launch file", run,
+        "ic launch sim console_port:=9000 record:=drive",
+        "Start the nodes of a launch file, show their state, and stop them all on Ctrl-C.",
+    )  # fmt: skip
+    add = parser.add_argument
+    text = "path, or a shipped file: sim, robot, station, full, fleet, replay"
+    add("file", metavar="FILE", help=text, completer=completion.launch_files)
+    text = "arguments of the launch file"
+    add("arguments", nargs="*", metavar="KEY:=VALUE", help=text, completer=completion.launch_arguments)
+    add("-s", "--show-args", "--show-arguments", action="store_true", help="list the file's arguments and exit")
+    add("--check", action="store_true", help="check file, arguments and every node's parameters without starting")
+    text = "skip the check of node parameters before the start (each node checks its own)"
+    add("--no-check", action="store_true", help=text)
+    add("-v", "--verbose", action="store_true", help="show every line that the nodes log")
+    add("--plain", action="store_true", help="plain log lines even in a terminal")
+    text = "speed of simulated time relative to real time, such as 0.5; default: auto, as fast as the machine can "
+    add("--pace", type=_pace, metavar="X", help=text + "run simulated devices (with real devices: 1)")
+    add("--run-dir", type=Path, metavar="DIR", help="default: $INSTANT_IC_RUN_DIR")
     parse = parser.parse_known_args
 
     def pairs_beside_the_file(words: Any = None, namespace: Any = None) -> Any:
@@ -69,14 +46,10 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, check and run the launch file."""
     from instant_ic import paths
     from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
 
-    try:
-        file = find_launch_file(args.file)
-    except FileNotFoundError as error:
-        raise UserError(str(error), 2) from None
+    file = find_launch_file(args.file)
     if args.show_args:
         _show(file.name, read_arguments(file), read_arguments(file, included=True))
         return 0

@@ -6,37 +6,30 @@ import argparse
 from typing import Any
 
 from instant_ic.cli import completion
-from instant_ic.cli.arguments import not_negative, seconds
+from instant_ic.cli.arguments import not_negative, seconds, verb
 from instant_ic.cli.errors import UserError
 
 _POLL_S = 0.2
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "log",
-        help="show log lines of the nodes, or set a log level",
-        description="Show log lines of the nodes, sorted by time.\n"
+    add = verb(
+        subparsers, "log", "show log lines of the nodes, or set a log level", show,
+        "ic log arbiter navigator --level warning -f", "Show log lines of the nodes, sorted by time.\n"
         "ic log level NODE [LEVEL] prints or sets the log level of a running node: debug, info, warning, error.",
-        epilog="example: ic log arbiter navigator --level warning -f",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    completion.offer(parser.add_argument("nodes", metavar="NODE", nargs="*", help="default: all"), completion.nodes)
-    parser.add_argument(
-        "-l", "--level", default="debug", metavar="LEVEL", help="lowest level to show: debug, info, warn, error"
-    )
-    parser.add_argument("-f", "--follow", action="store_true", help="follow: print new lines as they arrive")
-    parser.add_argument(
-        "-n", "--lines", type=not_negative, metavar="N", help="the last N (default: 30, or all since --since)"
-    )
-    parser.add_argument("--since", type=seconds, metavar="TIME", help="lines of the last 30s, 10m, 2h, 1d")
-    parser.add_argument("--color", choices=("auto", "always", "never"), default="auto", help="default: auto")
-    parser.set_defaults(func=show)
+    ).add_argument  # fmt: skip
+    add("nodes", metavar="NODE", nargs="*", help="default: all", completer=completion.nodes)
+    text = "lowest level to show: debug, info, warn, error"
+    add("-l", "--level", default="debug", metavar="LEVEL", help=text)
+    add("-f", "--follow", action="store_true", help="follow: print new lines as they arrive")
+    text = "the last N (default: 30, or all since --since)"
+    add("-n", "--lines", type=not_negative, metavar="N", help=text)
+    add("--since", type=seconds, metavar="TIME", help="lines of the last 30s, 10m, 2h, 1d")
+    add("--color", choices=("auto", "always", "never"), default="auto", help="default: auto")
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print log lines, or print or set a node's log level."""
     import sys
     import time
 

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from instant_ic.cli.arguments import check_files, group, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -18,46 +19,29 @@ SAVE, SAVED, LOCAL = "/slam/save", "/slam/saved", "/map/local"
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``map`` to the ``ic`` command."""
-    parser = subparsers.add_parser(
-        "map", help="save the map", description="Save the map or the local 3D model of the running stack."
-    )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    save = verbs.add_parser(
-        "save",
-        help="save the map in ROS format",
-        description=(
-            "Make grid_slam write NAME.yaml and NAME.pgm for ROS's map_server, and NAME.graph.npz, from which "
-            "mapping can continue (grid_slam's map_file)."
-        ),
-        epilog="example: ic map save ~/maps/floor3",
-    )
-    save.add_argument("name", type=Path, metavar="NAME", help="path without suffix; missing folders are created")
-    save.add_argument(
-        "--timeout", type=float, default=20.0, metavar="S", help="wait at most this long (default: %(default)g s)"
-    )
-    save.set_defaults(func=save_map)
-    local = verbs.add_parser(
-        "local",
-        help="save the local 3D model as a point cloud",
-        description=(
-            "Save the local 3D model (what the LiDAR has measured over the last 10 m of the way) as a PLY file, in the "
-            "map frame: that of the running stack (topic /map/local), or that at the end of a bag."
-        ),
-        epilog="examples: ic map local -o cloud.ply; ic map local runs/drive -o cloud.ply",
-    )
-    local.add_argument("bag", type=Path, nargs="?", metavar="BAG", help="a recording (default: the running stack)")
-    local.add_argument("-o", "--out", type=Path, required=True, metavar="FILE.ply", help="point cloud to write")
-    local.add_argument("--points", default="", metavar="TOPIC",
-                       help="LiDAR points in the bag (default: /lidar/points, else /lidar/packets)")  # fmt: skip
-    local.add_argument(
-        "--timeout", type=float, default=10.0, metavar="S", help="wait at most this long (default: %(default)g s)"
-    )
-    local.set_defaults(func=save_local)
+    verbs = group(subparsers, "map", "save the map", "Save the map or the local 3D model of the running stack.")
+    text = "wait at most this long (default: %(default)g s)"
+    add = verb(
+        verbs, "save", "save the map in ROS format", save_map, "ic map save ~/maps/floor3",
+        "Make grid_slam write NAME.yaml and NAME.pgm for ROS's map_server, and NAME.graph.npz, from which "
+        "mapping can continue (grid_slam's map_file).",
+    ).add_argument  # fmt: skip
+    add("name", type=Path, metavar="NAME", help="path without suffix; missing folders are created")
+    add("--timeout", type=float, default=20.0, metavar="S", help=text)
+    add = verb(
+        verbs, "local", "save the local 3D model as a point cloud", save_local,
+        "ic map local -o cloud.ply; ic map local runs/drive -o cloud.ply",
+        "Save the local 3D model (what the LiDAR has measured over the last 10 m of the way) as a PLY file, in the "
+        "map frame: that of the running stack (topic /map/local), or that at the end of a bag.",
+    ).add_argument  # fmt: skip
+    add("bag", type=Path, nargs="?", metavar="BAG", help="a recording (default: the running stack)")
+    add("-o", "--out", type=Path, required=True, metavar="FILE.ply", help="point cloud to write")
+    add("--timeout", type=float, default=10.0, metavar="S", help=text)
+    text = "LiDAR points in the bag (default: /lidar/points, else /lidar/packets)"
+    add("--points", default="", metavar="TOPIC", help=text)
 
 
 def save_map(args: argparse.Namespace) -> int:
-    """Run ``ic map save``; return the exit status."""
     from instant_ic.bus import RELIABLE
     from instant_ic.bus.node import Publisher
     from instant_ic.cli.observer import Observer
@@ -90,12 +74,10 @@ def save_map(args: argparse.Namespace) -> int:
 
 
 def save_local(args: argparse.Namespace) -> int:
-    """Run ``ic map local``; return the exit status."""
     from instant_ic.mapping.ply import write_ply
 
     out = args.out.expanduser()
-    if not out.absolute().parent.is_dir():
-        raise UserError(f"{out}: its folder does not exist", 2)
+    check_files(out)
     if not args.timeout > 0:
         raise UserError(f"--timeout must be > 0 (got {args.timeout:g})", 2)
     points = _local_of_bag(args.bag, args.points) if args.bag else _local_of_stack(args.timeout)
@@ -107,26 +89,21 @@ def save_local(args: argparse.Namespace) -> int:
 def _local_of_bag(path: Path, topic: str) -> NDArray[np.float32]:
     from instant_ic.bag.files import BagReader
     from instant_ic.calibration.bag import read_clouds
-    from instant_ic.calibration.mount import CalibrationError
     from instant_ic.geometry.transforms import TransformError
-    from instant_ic.mapping.mapper import CloudError, LocalMapper
+    from instant_ic.mapping.mapper import LocalMapper
     from instant_ic.msg import cloud_points
 
-    try:
-        with BagReader(path) as bag:
-            transforms, clouds = read_clouds(bag, topic)
-            mapper, problem, count = LocalMapper(transforms), "", 0
-            for cloud in clouds:
-                count += 1
-                try:
-                    points = cloud.points
-                    mapper.revolution(
-                        cloud.frame_id, cloud.stamp_ns, points["time"], functools.partial(cloud_points, points)
-                    )
-                except (CloudError, TransformError, ValueError) as error:
-                    problem = str(error)
-    except CalibrationError as error:
-        raise UserError(str(error)) from None
+    with BagReader(path) as bag:
+        transforms, clouds = read_clouds(bag, topic)
+        mapper, problem, count = LocalMapper(transforms), "", 0
+        for cloud in clouds:
+            count += 1
+            try:
+                points = cloud.points
+                xyz = functools.partial(cloud_points, points)
+                mapper.revolution(cloud.frame_id, cloud.stamp_ns, points["time"], xyz)
+            except (TransformError, ValueError) as error:
+                problem = str(error)
     if mapper.model.revolutions == 0:
         why = f": {problem}" if problem else " (two are needed)"
         raise UserError(f"{path}: none of {count} LiDAR revolutions can be placed{why}")
@@ -134,14 +111,13 @@ def _local_of_bag(path: Path, topic: str) -> NDArray[np.float32]:
 
 
 def _local_of_stack(timeout_s: float) -> NDArray[np.float32]:
-    from instant_ic.cli.observer import Observer
+    from instant_ic.cli.observer import newest
     from instant_ic.msg import cloud_xyz, deserialize
 
-    with Observer([LOCAL]) as observer:
-        for batch in observer.batches(timeout_s, 0.1):
-            for received in batch:
-                return cloud_xyz(deserialize(received.payload, received.type_name))
-    raise UserError(
-        f"no local model on {LOCAL} within {timeout_s:g} s: depth_scaler is not running, or the LiDAR or odometry is "
-        "missing (ic node list, ic topic hz /lidar/points)"
-    )
+    received = newest(LOCAL, timeout_s)
+    if received is None:
+        raise UserError(
+            f"no local model on {LOCAL} within {timeout_s:g} s: depth_scaler is not running, or the LiDAR or odometry "
+            "is missing (ic node list, ic topic hz /lidar/points)"
+        )
+    return cloud_xyz(deserialize(received.payload, received.type_name))

@@ -6,38 +6,22 @@ import argparse
 from typing import Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import group, verb
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "node",
-        help="list running nodes",
-        description="List and describe running nodes.",
-        epilog="example: ic node list",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
-    listing = verbs.add_parser(
-        "list",
-        help="names of the running nodes",
-        description="List the running nodes.",
-        epilog="example: ic node list -v",
-    )
-    listing.add_argument("-c", "--count-nodes", action="store_true", help="print only their number")
-    listing.add_argument("-v", "--verbose", action="store_true", help="also process id, uptime, executable")
-    listing.set_defaults(func=list_nodes)
-    info = verbs.add_parser(
-        "info",
-        help="state, process and topics of a node",
-        description="Show a node's state and process, its publishers and subscriptions, and their rates.",
-        epilog="example: ic node info grid_slam",
-    )
-    completion.offer(info.add_argument("node", metavar="NODE"), completion.nodes)
-    info.set_defaults(func=show)
+    verbs = group(subparsers, "node", "list running nodes", "List and describe running nodes.", "ic node list")
+    add = verb(verbs, "list", "names of the running nodes", list_nodes, "ic node list -v").add_argument
+    add("-c", "--count-nodes", action="store_true", help="print only their number")
+    add("-v", "--verbose", action="store_true", help="also process id, uptime, executable")
+    info = verb(
+        verbs, "info", "state, process and topics of a node", show, "ic node info grid_slam",
+        "Show a node's state and process, its publishers and subscriptions, and their rates.",
+    )  # fmt: skip
+    info.add_argument("node", metavar="NODE", completer=completion.nodes)
 
 
 def list_nodes(args: argparse.Namespace) -> int:
-    """Print a line per node."""
     import sys
     import time
 
@@ -63,12 +47,12 @@ def list_nodes(args: argparse.Namespace) -> int:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print one node."""
     import math
 
     from instant_ic import paths
     from instant_ic.bus.control import ControlError, NodeControl
-    from instant_ic.cli.heartbeats import Flow, hear
+    from instant_ic.bus.heartbeat import Flow
+    from instant_ic.cli.heartbeats import hear
     from instant_ic.cli.names import find_node
 
     node = find_node(args.node)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import group, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -16,49 +17,31 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "param",
-        help="read and change parameters of running nodes",
-        description="Read and change parameters of running nodes.",
-        epilog="example: ic param set arbiter switch.yaw_deg 12",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
+    text = "read and change parameters of running nodes"
+    verbs = group(subparsers, "param", text, f"{text.capitalize()}.", "ic param set arbiter switch.yaw_deg 12")
+    of = {"metavar": "NODE", "completer": completion.nodes}
 
-    def verb(name: str, words: str, function: Any, example: str) -> argparse.ArgumentParser:
-        added: argparse.ArgumentParser = verbs.add_parser(
-            name, help=words, description=f"{words[0].upper()}{words[1:]}.", epilog=f"example: ic param {example}"
-        )
-        added.set_defaults(func=function)
-        return added
+    def with_node(name: str, words: str, function: Any, example: str) -> Any:
+        parser = verb(verbs, name, words, function, f"ic param {example}")
+        parser.add_argument("node", **of)
+        return parser.add_argument
 
-    def argument(added: argparse.ArgumentParser, *names: str, completer: Any = None, **options: Any) -> None:
-        made = added.add_argument(*names, **options)
-        if completer is not None:
-            completion.offer(made, completer)
-
-    added = verb("list", "names of the parameters of one node, or of all", list_parameters, "list grid_slam")
-    argument(added, "node", nargs="?", metavar="NODE", help="default: every node", completer=completion.nodes)
-    added.add_argument("-v", "--values", action="store_true", help="also print their values")
-    added.add_argument("--changed", action="store_true", help="only values that differ from the default, with both")
-    added = verb("get", "value of one parameter", get_parameter, "get grid_slam field.resolution_m")
-    argument(added, "node", metavar="NODE", completer=completion.nodes)
-    argument(added, "key", metavar="KEY", help="a nested key is separated by dots", completer=completion.parameters)
-    added = verb("set", "change parameters while the node runs", set_parameters, "set depth_estimator max_rate_hz 1")
-    argument(added, "node", metavar="NODE", completer=completion.nodes)
-    argument(
-        added, "pairs", metavar="KEY VALUE", nargs="+", completer=completion.parameters,
-        help="several pairs are changed together, or none; values are YAML",
-    )  # fmt: skip
-    added = verb("describe", "type, range, default and meaning", describe, "describe arbiter switch.yaw_deg")
-    argument(added, "node", metavar="NODE", completer=completion.nodes)
-    argument(added, "keys", metavar="KEY", nargs="*", help="default: all", completer=completion.parameters)
-    added = verb("dump", "all parameters of a node as a parameter file", dump, "dump arbiter > arbiter.yaml")
-    argument(added, "node", metavar="NODE", completer=completion.nodes)
-    added.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
-    added = verb("load", "set parameters from a file", load, "load arbiter arbiter.yaml")
-    argument(added, "node", metavar="NODE", completer=completion.nodes)
-    added.add_argument("file", metavar="FILE", type=Path, help="file in the format of ic param dump")
+    text = "names of the parameters of one node, or of all"
+    add = verb(verbs, "list", text, list_parameters, "ic param list grid_slam").add_argument
+    add("node", nargs="?", help="default: every node", **of)
+    add("-v", "--values", action="store_true", help="also print their values")
+    add("--changed", action="store_true", help="only values that differ from the default, with both")
+    add = with_node("get", "value of one parameter", get_parameter, "get grid_slam field.resolution_m")
+    add("key", metavar="KEY", help="a nested key is separated by dots", completer=completion.parameters)
+    add = with_node("set", "change parameters while the node runs", set_parameters, "set depth_estimator max_rate_hz 1")
+    text = "several pairs are changed together, or none; values are YAML"
+    add("pairs", metavar="KEY VALUE", nargs="+", completer=completion.parameters, help=text)
+    add = with_node("describe", "type, range, default and meaning", describe, "describe arbiter switch.yaw_deg")
+    add("keys", metavar="KEY", nargs="*", help="default: all", completer=completion.parameters)
+    add = with_node("dump", "all parameters of a node as a parameter file", dump, "dump arbiter > arbiter.yaml")
+    add("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
+    add = with_node("load", "set parameters from a file", load, "load arbiter arbiter.yaml")
+    add("file", metavar="FILE", type=Path, help="file in the format of ic param dump")
 
 
 def _control(node: str) -> NodeControl:
@@ -70,7 +53,7 @@ def _control(node: str) -> NodeControl:
 
 
 def list_parameters(args: argparse.Namespace) -> int:
-    """Print names (and values) by node, from the registry: this also works for a hanging node."""
+    """Print parameters from the registry: this also works for a hanging node."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import find_node, nobody_runs
@@ -99,7 +82,6 @@ def _list_changed(nodes: Sequence[str]) -> int:
 
 
 def get_parameter(args: argparse.Namespace) -> int:
-    """Print one value, or the values of a group."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 
@@ -121,7 +103,6 @@ def _no_parameter(node: str, key: str, known: Any) -> UserError:
 
 
 def set_parameters(args: argparse.Namespace) -> int:
-    """Change several parameters in one step."""
     from instant_ic.config import params
 
     words = args.pairs
@@ -141,7 +122,6 @@ def _change(node: str, values: dict[str, Any]) -> int:
 
 
 def describe(args: argparse.Namespace) -> int:
-    """Print type, range, value, default and meaning of parameters."""
     infos = {info.name: info for info in _control(args.node).describe()}
     chosen: list[ParameterInfo] = []
     for key in args.keys or infos:
@@ -161,7 +141,6 @@ def describe(args: argparse.Namespace) -> int:
 
 
 def dump(args: argparse.Namespace) -> int:
-    """Write a ROS 2 parameter file."""
     import yaml
 
     from instant_ic.cli.names import find_node
@@ -171,23 +150,20 @@ def dump(args: argparse.Namespace) -> int:
     for key, value in _control(node.name).get().items():
         *groups, last = key.split(".")
         place = nested
-        for group in groups:
-            place = place.setdefault(group, {})
+        for key_group in groups:
+            place = place.setdefault(key_group, {})
         place[last] = value
     text = yaml.safe_dump({node.name: {"ros__parameters": nested}}, sort_keys=False, default_flow_style=None, width=100)
     if args.output is None:
         print(text, end="")
         return 0
-    try:
-        args.output.write_text(text)
-    except OSError as error:
-        raise UserError(f"{args.output} cannot be written: {error.strerror}") from error
+    args.output.write_text(text)
     print(f"{args.output}: {len(nested)} parameters of {node.name}")
     return 0
 
 
 def load(args: argparse.Namespace) -> int:
-    """Set the parameters of a file. Parameters that already have the file's value need not be live."""
+    """Set the parameters of a file. Those that already have the file's value need not be live."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 

@@ -8,56 +8,33 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import verb
 from instant_ic.cli.commands.bag import tolerances, topic_names
 from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "replay",
-        help="replay a bag through nodes in lockstep and record their output",
-        description=(
-            "Run nodes in one process on the clock of a bag, message by message, and record what they publish. "
-            "The result does not depend on the speed of the machine: repeating a command gives the same bytes."
-        ),
-        epilog="example: ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again "
-        "-p grid_slam.field.resolution_m:=0.1",
-    )
-    completion.offer(parser.add_argument("bag", metavar="BAG"), completion.bags)
-    parser.add_argument("--nodes", required=True, metavar="A,B,...", help="nodes, in the order in which they run")
-    parser.add_argument("-o", "--output", required=True, metavar="DIR", help="new bag")
-    parser.add_argument(
-        "--params-file",
-        action="append",
-        type=Path,
-        default=None,
-        metavar="FILE",
-        help="parameter file; repeatable; default: the nodes' files in config/",
-    )
-    parser.add_argument(
-        "-p", "--param", action="append", default=[], metavar="NODE.KEY:=VALUE", help="one parameter; repeatable"
-    )
-    parser.add_argument(
-        "--drop-tf",
-        action="append",
-        default=[],
-        metavar="FRAME",
-        help="leave out transforms with this child frame; repeatable",
-    )
-    parser.add_argument("--compression", action="store_true", help="compress the new bag with zstd")
-    parser.add_argument(
-        "--compare",
-        default="",
-        metavar="BAG",
-        help="compare the result with this bag; exit status 1 if a topic differs",
-    )
+    parser = verb(
+        subparsers, "replay", "replay a bag through nodes in lockstep and record their output", run,
+        "ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again -p grid_slam.field.resolution_m:=0.1",
+        "Run nodes in one process on the clock of a bag, message by message, and record what they publish. "
+        "The result does not depend on the speed of the machine: repeating a command gives the same bytes.",
+    )  # fmt: skip
+    add, many = parser.add_argument, {"action": "append", "default": []}
+    add("bag", metavar="BAG", completer=completion.bags)
+    add("--nodes", required=True, metavar="A,B,...", help="nodes, in the order in which they run")
+    add("-o", "--output", required=True, metavar="DIR", help="new bag")
+    text = "parameter file; repeatable; default: the nodes' files in config/"
+    add("--params-file", action="append", type=Path, metavar="FILE", help=text)
+    add("-p", "--param", **many, metavar="NODE.KEY:=VALUE", help="one parameter; repeatable")
+    add("--drop-tf", **many, metavar="FRAME", help="leave out transforms with this child frame; repeatable")
+    add("--compression", action="store_true", help="compress the new bag with zstd")
+    text = "compare the result with this bag; exit status 1 if a topic differs"
+    add("--compare", default="", metavar="BAG", help=text)
     tolerances(parser)
-    parser.set_defaults(func=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic replay``; return the exit status."""
     from instant_ic.paths import node_names
 
     names = [name for name in args.nodes.split(",") if name]
@@ -70,9 +47,6 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"-p {word}: expected NODE.KEY:=VALUE, NODE being one of {', '.join(names)}", 2)
     if Path(args.output).exists():
         raise UserError(f"{args.output} exists already: choose another name with -o")
-    if not Path(args.bag).exists():
-        raise UserError(f"bag {args.bag} does not exist")
-
     if args.compare and not Path(args.compare).exists():
         raise UserError(f"bag {args.compare} does not exist")
 

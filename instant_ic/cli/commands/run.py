@@ -7,30 +7,23 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import verb
 from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "run",
-        help="run one node in the foreground",
-        description="Run one node until Ctrl-C. Arguments after its name go to the node: ic run NODE --help",
-        epilog="example: ic run grid_slam --params-file config/slam.yaml -p use_sim_time:=true -r /scan:=/front/scan",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    completion.offer(
-        parser.add_argument(
-            "node", metavar="NODE", help="name of a node (an unknown name lists all), or a Python file with a node"
-        ),
-        completion.programs,
-    )
+    parser = verb(
+        subparsers, "run", "run one node in the foreground", run,
+        "ic run grid_slam --params-file config/slam.yaml -p use_sim_time:=true -r /scan:=/front/scan",
+        "Run one node until Ctrl-C. Arguments after its name go to the node: ic run NODE --help",
+    )  # fmt: skip
+    text = "name of a node (an unknown name lists all), or a Python file with a node"
+    parser.add_argument("node", metavar="NODE", help=text, completer=completion.programs)
     parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGUMENTS", help="arguments for the node")
-    parser.set_defaults(func=run, leaves=True)
+    parser.set_defaults(leaves=True)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the node in this process."""
     import sys
 
     from instant_ic.bus.node_files import NodeFileError, load, node_class

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli.arguments import positive
+from instant_ic.cli.arguments import positive, verb
 
 if TYPE_CHECKING:
     from instant_ic.cli.top import NodeRow
@@ -15,18 +15,14 @@ _SORT = ("cpu", "memory", "name", "lost")
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "top",
-        help="CPU, memory, rates and losses of every node, live",
-        description="Show CPU, memory, threads, rates (measured/nominal) and losses of every node, once a second.",
-        epilog="example: ic top --once",
-    )
-    parser.add_argument("--once", action="store_true", help="print one table and exit (default without a terminal)")
-    parser.add_argument("--json", action="store_true", help="print one table as JSON and exit")
-    parser.add_argument("--sort", choices=_SORT, default="cpu", help="default: %(default)s")
-    parser.add_argument("-d", "--delay", type=positive, default=1.0, metavar="S", help="update period (default: 1)")
-    parser.set_defaults(func=show)
+    add = verb(
+        subparsers, "top", "CPU, memory, rates and losses of every node, live", show, "ic top --once",
+        "Show CPU, memory, threads, rates (measured/nominal) and losses of every node, once a second.",
+    ).add_argument  # fmt: skip
+    add("--once", action="store_true", help="print one table and exit (default without a terminal)")
+    add("--json", action="store_true", help="print one table as JSON and exit")
+    add("--sort", choices=_SORT, default="cpu", help="default: %(default)s")
+    add("-d", "--delay", type=positive, default=1.0, metavar="S", help="update period (default: 1)")
 
 
 def _ask(row: NodeRow, run_dir: Path) -> None:
@@ -43,7 +39,6 @@ def _ask(row: NodeRow, run_dir: Path) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the table once, or show it until the user quits."""
     import json
     import sys
     import time

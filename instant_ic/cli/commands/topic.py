@@ -6,125 +6,83 @@ import argparse
 from typing import Any
 
 from instant_ic.cli import completion
-from instant_ic.cli.arguments import not_negative, positive, positive_int
+from instant_ic.cli.arguments import group, not_negative, positive, positive_int, verb
 from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add the verb."""
-    parser = subparsers.add_parser(
-        "topic",
-        help="list, watch, measure and publish topics",
-        description="Inspect topics and publish to them.",
-        epilog="example: ic topic hz /scan",
-    )
-    verbs = parser.add_subparsers(metavar="VERB", required=True)
-
-    def verb(name: str, words: str, function: Any, example: str) -> argparse.ArgumentParser:
-        added: argparse.ArgumentParser = verbs.add_parser(
-            name, help=words, description=f"{words[0].upper()}{words[1:]}.", epilog=f"example: {example}"
-        )
-        added.set_defaults(func=function)
-        return added
-
-    def topic(added: argparse.ArgumentParser, nargs: str | None = None) -> None:
-        argument = added.add_argument("topic", metavar="TOPIC", nargs=nargs)
-        completion.offer(argument, completion.topics)
-
-    added = verb("list", "list published and subscribed topics", list_topics, "ic topic list -t")
-    added.add_argument("-t", "--show-types", action="store_true", help="also print the type of each")
-    added.add_argument("-c", "--count-topics", action="store_true", help="print only their number")
-    added.add_argument("-v", "--verbose", action="store_true", help="also print type, QoS, publishers and subscribers")
-
-    added = verb("type", "type of a topic", show_type, "ic topic type /scan")
-    topic(added)
-
-    added = verb("find", "topics of a type", find, "ic topic find sensor_msgs/msg/Image")
-    argument = added.add_argument("type", metavar="TYPE", help="full or short name")
-    completion.offer(argument, completion.types)
-
-    added = verb("info", "type, publishers and subscribers of a topic", info, "ic topic info -v /scan")
-    topic(added)
-    added.add_argument(
-        "-v",
-        "--verbose",
-        action="store_true",
-        help="also print QoS, rates, and losses from each publisher to each subscriber",
-    )
-
-    added = verb("echo", "print messages as they arrive", echo, "ic topic echo /pose --once --field pose.pose")
-    topic(added)
-    added.add_argument("--once", action="store_true", help="stop after the first message")
-    added.add_argument("-n", type=positive_int, default=0, metavar="COUNT", help="stop after this many messages")
-    added.add_argument("--field", default="", metavar="PATH", help="only this field, for example pose.pose")
-    added.add_argument(
-        "-f", "--full-length", "--full", action="store_true", help="print long arrays and strings in full"
-    )
-    added.add_argument(
-        "-l", "--truncate-length", type=positive_int, default=12, metavar="N",
-        help="shorten arrays above N values and strings above 10 N characters (default: %(default)s)",
+    verbs = group(
+        subparsers, "topic", "list, watch, measure and publish topics", "Inspect topics and publish to them.",
+        "ic topic hz /scan",
     )  # fmt: skip
-    added.add_argument("--no-arr", action="store_true", help="leave out the values of arrays")
-    added.add_argument("--no-str", action="store_true", help="leave out strings")
-    added.add_argument("--csv", action="store_true", help="one line of comma-separated values for each message")
-    added.add_argument("--json", action="store_true", help="one line of JSON for each message, in full")
-    added.add_argument(
-        "--timeout",
-        type=positive,
-        default=float("inf"),
-        metavar="S",
-        help="stop after this time; fail if messages are missing",
-    )
+
+    def topic(parser: Any, nargs: str | None = None) -> Any:
+        parser.add_argument("topic", metavar="TOPIC", nargs=nargs, completer=completion.topics)
+        return parser.add_argument
+
+    add = verb(verbs, "list", "list published and subscribed topics", list_topics, "ic topic list -t").add_argument
+    add("-t", "--show-types", action="store_true", help="also print the type of each")
+    add("-c", "--count-topics", action="store_true", help="print only their number")
+    add("-v", "--verbose", action="store_true", help="also print type, QoS, publishers and subscribers")
+
+    topic(verb(verbs, "type", "type of a topic", show_type, "ic topic type /scan"))
+
+    add = verb(verbs, "find", "topics of a type", find, "ic topic find sensor_msgs/msg/Image").add_argument
+    add("type", metavar="TYPE", help="full or short name", completer=completion.types)
+
+    text = "type, publishers and subscribers of a topic"
+    add = topic(verb(verbs, "info", text, "topic_info.info", "ic topic info -v /scan"))
+    text = "also print QoS, rates, and losses from each publisher to each subscriber"
+    add("-v", "--verbose", action="store_true", help=text)
+
+    example = "ic topic echo /pose --once --field pose.pose"
+    add = topic(verb(verbs, "echo", "print messages as they arrive", "topic_watch.echo", example))
+    add("--once", action="store_true", help="stop after the first message")
+    add("-n", type=positive_int, default=0, metavar="COUNT", help="stop after this many messages")
+    add("--field", default="", metavar="PATH", help="only this field, for example pose.pose")
+    add("-f", "--full-length", "--full", action="store_true", help="print long arrays and strings in full")
+    text = "shorten arrays above N values and strings above 10 N characters (default: %(default)s)"
+    add("-l", "--truncate-length", type=positive_int, default=12, metavar="N", help=text)
+    add("--no-arr", action="store_true", help="leave out the values of arrays")
+    add("--no-str", action="store_true", help="leave out strings")
+    add("--csv", action="store_true", help="one line of comma-separated values for each message")
+    add("--json", action="store_true", help="one line of JSON for each message, in full")
+    text = "stop after this time; fail if messages are missing"
+    add("--timeout", type=positive, default=float("inf"), metavar="S", help=text)
 
     for name, words, function in (
-        ("hz", "print rate, jitter and losses of topics once a second", rate),
-        ("bw", "print the bandwidth of topics once a second", bandwidth),
-        ("delay", "print the age of messages on arrival, by their stamp, once a second", delay),
+        ("hz", "print rate, jitter and losses of topics once a second", "rate"),
+        ("bw", "print the bandwidth of topics once a second", "bandwidth"),
+        ("delay", "print the age of messages on arrival, by their stamp, once a second", "delay"),
     ):
-        added = verb(name, words, function, f"ic topic {name} /scan")
-        topic(added, "+")
-        added.add_argument(
-            "-w", "--window", type=positive_int, default=10_000 if name == "hz" else 100, metavar="N",
-            help="number of messages in the window (default: %(default)s)",
-        )  # fmt: skip
-        added.add_argument(
-            "--duration", type=positive, default=float("inf"), metavar="S", help="stop after this time (default: never)"
-        )
+        add = topic(verb(verbs, name, words, f"topic_watch.{function}", f"ic topic {name} /scan"), "+")
+        text, window = "number of messages in the window (default: %(default)s)", 10_000 if name == "hz" else 100
+        add("-w", "--window", type=positive_int, default=window, metavar="N", help=text)
+        text = "stop after this time (default: never)"
+        add("--duration", type=positive, default=float("inf"), metavar="S", help=text)
         if name != "bw":
-            added.add_argument("--use-sim-time", action="store_true", help="measure in the time of /clock")
+            add("--use-sim-time", action="store_true", help="measure in the time of /clock")
 
-    added = verb("pub", "publish messages", publish, "ic topic pub --once /flag std_msgs/msg/Bool '{data: true}'")
-    topic(added)
-    argument = added.add_argument("type", metavar="TYPE", help="full or short name, for example TwistStamped")
-    completion.offer(argument, completion.types)
-    added.add_argument(
-        "values", metavar="YAML", nargs="?", default="{}",
-        help="values of its fields; others are zero; 'header: auto' and 'stamp: now' take the current time",
-    )  # fmt: skip
-    added.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ", help="rate (default: %(default)s)")
-    added.add_argument("-1", "--once", action="store_true", help="publish one message")
-    added.add_argument("-n", "--times", type=positive_int, default=0, metavar="N", help="publish this many messages")
-    added.add_argument(
-        "-w", "--wait-matching-subscriptions", type=not_negative, metavar="N", dest="readers",
-        help="wait for this many subscribers first (default: 1 with --once or -n, else 0)",
-    )  # fmt: skip
-    added.add_argument(
-        "--max-wait-time-secs",
-        type=positive,
-        default=10.0,
-        metavar="S",
-        help="longest wait for subscribers (default: %(default)s)",
-    )
-    added.add_argument("--qos", choices=("sensor", "reliable", "latched"), default="reliable", help="default: reliable")
-    added.add_argument("--use-sim-time", action="store_true", help="stamp messages with the time of /clock")
-    added.add_argument("-p", "--print", type=positive_int, default=1, metavar="N", help="print every Nth message")
-    added.add_argument(
-        "--force", action="store_true", help="publish even where a node commands the robot on this topic"
-    )
+    example = "ic topic pub --once /flag std_msgs/msg/Bool '{data: true}'"
+    add = topic(verb(verbs, "pub", "publish messages", "topic_pub.publish", example))
+    text = "full or short name, for example TwistStamped"
+    add("type", metavar="TYPE", help=text, completer=completion.types)
+    text = "values of its fields; others are zero; 'header: auto' and 'stamp: now' take the current time"
+    add("values", metavar="YAML", nargs="?", default="{}", help=text)
+    add("-r", "--rate", type=positive, default=1.0, metavar="HZ", help="rate (default: %(default)s)")
+    add("-1", "--once", action="store_true", help="publish one message")
+    add("-n", "--times", type=positive_int, default=0, metavar="N", help="publish this many messages")
+    text = "wait for this many subscribers first (default: 1 with --once or -n, else 0)"
+    add("-w", "--wait-matching-subscriptions", type=not_negative, metavar="N", dest="readers", help=text)
+    text = "longest wait for subscribers (default: %(default)s)"
+    add("--max-wait-time-secs", type=positive, default=10.0, metavar="S", help=text)
+    add("--qos", choices=("sensor", "reliable", "latched"), default="reliable", help="default: reliable")
+    add("--use-sim-time", action="store_true", help="stamp messages with the time of /clock")
+    add("-p", "--print", type=positive_int, default=1, metavar="N", help="print every Nth message")
+    add("--force", action="store_true", help="publish even where a node commands the robot on this topic")
 
 
 def list_topics(args: argparse.Namespace) -> int:
-    """Print a line per topic."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import topic_types
@@ -150,7 +108,6 @@ def list_topics(args: argparse.Namespace) -> int:
 
 
 def show_type(args: argparse.Namespace) -> int:
-    """Print the type of a topic."""
     from instant_ic.cli.names import absolute, near, topic_types
 
     types = topic_types()
@@ -161,7 +118,6 @@ def show_type(args: argparse.Namespace) -> int:
 
 
 def find(args: argparse.Namespace) -> int:
-    """Print the topics of one type."""
     from instant_ic.cli.names import topic_types
 
     package, _, short = args.type.rpartition("/")
@@ -170,45 +126,3 @@ def find(args: argparse.Namespace) -> int:
         if parts[-1] == short and package.split("/")[0] in ("", parts[0]):
             print(topic)
     return 0
-
-
-def info(args: argparse.Namespace) -> int:
-    """Print one topic."""
-    from instant_ic.cli.topic_info import show
-
-    return show(args.topic, args.verbose)
-
-
-def echo(args: argparse.Namespace) -> int:
-    """Print messages."""
-    from instant_ic.cli.topic_watch import echo
-
-    return echo(args)
-
-
-def rate(args: argparse.Namespace) -> int:
-    """Print rates."""
-    from instant_ic.cli.topic_watch import rate
-
-    return rate(args)
-
-
-def bandwidth(args: argparse.Namespace) -> int:
-    """Print bandwidths."""
-    from instant_ic.cli.topic_watch import bandwidth
-
-    return bandwidth(args)
-
-
-def delay(args: argparse.Namespace) -> int:
-    """Print the age of messages on arrival."""
-    from instant_ic.cli.topic_watch import delay
-
-    return delay(args)
-
-
-def publish(args: argparse.Namespace) -> int:
-    """Publish messages."""
-    from instant_ic.cli.topic_pub import publish
-
-    return publish(args)

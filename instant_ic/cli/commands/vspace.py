@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli.arguments import positive, positive_int
+from instant_ic.cli.arguments import group, numbers, positive, positive_int, size, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -31,25 +31,6 @@ _LITTLE = 0.1
 """Below this share of known pixels an image is little more than a guess."""
 
 
-def numbers(text: str) -> list[float]:
-    """``x,y,z,yaw``: metres and degrees."""
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 4 or not all(map(math.isfinite, values)):
-        raise argparse.ArgumentTypeError(f"must be x,y,z,yaw: four numbers, metres and degrees (got {text!r})")
-    return values
-
-
-def size(text: str) -> tuple[int, int]:
-    """``640x360``."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if not match:
-        raise argparse.ArgumentTypeError(f"must look like 640x360 (got {text!r})")
-    return int(match[1]), int(match[2])
-
-
 def degrees(text: str) -> float:
     """A field of view."""
     value = float(text)
@@ -59,135 +40,104 @@ def degrees(text: str) -> float:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``vspace`` to the ``ic`` command."""
-    parser = subparsers.add_parser(
-        "vspace",
-        help="train and render a virtual space from one panorama",
-        description="Train a virtual space from one panorama and render it (docs/nerf.md). Poses are relative to the "
+    verbs = group(
+        subparsers, "vspace", "train and render a virtual space from one panorama",
+        "Train a virtual space from one panorama and render it (docs/nerf.md). Poses are relative to the "
         "panorama's camera, in metres: x forward (the centre column of the panorama), y left, z up; yaw in degrees, "
         "counter-clockwise.",
-        epilog="example: ic vspace train room.jpg -o room && ic vspace render room --pose 0.5,0,0,30 -o view.png",
-    )
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+        "ic vspace train room.jpg -o room && ic vspace render room --pose 0.5,0,0,30 -o view.png",
+    )  # fmt: skip
     _add_train(verbs)
     _add_render(verbs)
-    _add_export(verbs)
-    _add_video(verbs)
-    info = verbs.add_parser(
-        "info", help="print the content of a saved space", description="Print the content of a saved space."
-    )
-    _folder(info)
-    info.set_defaults(func=info_)
-    for verb in verbs.choices.values():
+    kind = _of_space(
+        verbs, "export", "export the surfaces as PLY", export, "export room --mesh room.ply",
+        "Export the surfaces that the panorama has seen as binary PLY, in the frame of the space.",
+    )  # fmt: skip
+    kind.add_argument("--width", type=positive_int, default=1024, help="points around the horizon (%(default)s)")
+    kind = kind.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--points", type=Path, metavar="OUT.ply", help="coloured points")
+    kind.add_argument("--mesh", type=Path, metavar="OUT.ply", help="coloured triangles, split at depth edges")
+    flight = _of_space(
+        verbs, "video", "record a flight through a space", video,
+        "video room --path 0,0,0,0 1,0,0,0 1,0.3,0,90 -o flight.mp4",
+        "Write a flight through a saved space as MP4, along a smooth curve through the waypoints.",
+    )  # fmt: skip
+    text = "two waypoints or more; the heading turns by the difference of the yaws (default: ahead, back, and one turn)"
+    flight.add_argument("--path", type=numbers("x,y,z,yaw"), nargs="+", metavar="x,y,z,yaw", help=text)
+    flight.add_argument("--seconds", type=positive, default=8.0, metavar="S", help="(%(default)g)")
+    flight.add_argument("--fps", type=positive, default=25.0, help="frames per second (%(default)g)")
+    _add_picture(flight)
+    flight.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.mp4", help="video to write")
+    _of_space(verbs, "info", "print the content of a saved space", info_, "info room")
+    for parser in verbs.choices.values():
         # Makes "--pose -1,0,0,90" a value: argparse on its own only recognises single negative numbers.
-        verb._negative_number_matcher = re.compile(r"-[\d.]")
+        parser._negative_number_matcher = re.compile(r"-[\d.]")
 
 
-def _folder(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("space", type=Path, metavar="DIR", help="folder written by ic vspace train; to render or "
-                        f"export, also a bag with {_LAYERS}, of which the newest counts")  # fmt: skip
+def _of_space(verbs: Any, name: str, words: str, run: Any, example: str, description: str = "") -> Any:
+    """Add a verb for a saved space."""
+    parser = verb(verbs, name, words, run, f"ic vspace {example}", description)
+    text = f"folder written by ic vspace train; to render or export, also a bag with {_LAYERS}, of which the newest "
+    parser.add_argument("space", type=Path, metavar="DIR", help=f"{text}counts")
     parser.add_argument("--device", choices=DEVICES, help="(default: as in training)")
+    return parser
 
 
 def _add_train(verbs: Any) -> None:
-    parser = verbs.add_parser(
-        "train",
-        help="train on a panorama",
-        description="Train on one panorama and save the space in a folder. A preview from 0.5 m ahead in that folder "
+    parser = verb(
+        verbs, "train", "train on a panorama", train,
+        "ic vspace train room.jpg --depth room_depth.png --seconds 10 -o room",
+        "Train on one panorama and save the space in a folder. A preview from 0.5 m ahead in that folder "
         f"({PREVIEW}) is updated every second. Ctrl-C ends the training early and saves the result.",
-        epilog="example: ic vspace train room.jpg --depth room_depth.png --seconds 10 -o room",
-    )
-    parser.add_argument("panorama", type=Path, help="equirectangular image, twice as wide as high")
+    )  # fmt: skip
+    add = parser.add_argument
+    add("panorama", type=Path, help="equirectangular image, twice as wide as high")
     depth = parser.add_mutually_exclusive_group()
-    depth.add_argument("--depth", type=Path, metavar="D", help="its radial depth: 16-bit PNG in mm; .npy, .npz "
-                       "(key depth) or .exr in m; 0 or non-finite is unknown")  # fmt: skip
-    depth.add_argument("--model", type=Path, metavar="M", help="depth model, ONNX or manifest (default: the shipped "
-                       "one; its metres are an estimate, not scaled by a LiDAR)")  # fmt: skip
-    parser.add_argument("--depth-sigma", type=positive, metavar="SHARE", help="relative standard deviation of depth "
-                        f"(default: {_TRUE_SIGMA:g} with --depth, {_MODEL_SIGMA:g} without)")  # fmt: skip
-    parser.add_argument("--camera-height", type=positive, metavar="M", help="height of the camera above the floor; the "
-                        "estimate is scaled to it (default: the model's metres)")  # fmt: skip
-    parser.add_argument("--as-estimated", action="store_true", help="use the model's depth unchanged; otherwise "
-                        "nearly level floors and ceilings and nearly upright walls are straightened")  # fmt: skip
+    text = "its radial depth: 16-bit PNG in mm; .npy, .npz (key depth) or .exr in m; 0 or non-finite is unknown"
+    depth.add_argument("--depth", type=Path, metavar="D", help=text)
+    text = "depth model, ONNX or manifest (default: the shipped one; its metres are an estimate, not scaled by a LiDAR)"
+    depth.add_argument("--model", type=Path, metavar="M", help=text)
+    text = f"(default: {_TRUE_SIGMA:g} with --depth, {_MODEL_SIGMA:g} without)"
+    add("--depth-sigma", type=positive, metavar="SHARE", help=f"relative standard deviation of depth {text}")
+    text = "height of the camera above the floor; the estimate is scaled to it (default: the model's metres)"
+    add("--camera-height", type=positive, metavar="M", help=text)
+    text = "use the model's depth unchanged; otherwise nearly level floors and ceilings and nearly upright walls are "
+    add("--as-estimated", action="store_true", help=f"{text}straightened")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--seconds", type=positive, metavar="S", help="train for about this time")
-    length.add_argument(
-        "--iterations", type=positive_int, metavar="N", help="train this many iterations (default: 600)"
-    )
-    parser.add_argument("--device", default="auto", choices=DEVICES, help="(%(default)s)")
-    parser.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="DIR", help="output folder, created if missing"
-    )
-    parser.set_defaults(func=train)
+    text = "train this many iterations (default: 600)"
+    length.add_argument("--iterations", type=positive_int, metavar="N", help=text)
+    add("--device", default="auto", choices=DEVICES, help="(%(default)s)")
+    add("-o", "--out", type=Path, required=True, metavar="DIR", help="output folder, created if missing")
 
 
 def _add_picture(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--fov", type=degrees, default=90.0, metavar="DEG", help="horizontal field of view (%(default)g degrees)"
-    )
-    parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: " +
-                        ", ".join(f"{name} {w}x{h}" for name, (w, h) in _SIZES.items()) + ")")  # fmt: skip
+    text = "horizontal field of view (%(default)g degrees)"
+    parser.add_argument("--fov", type=degrees, default=90.0, metavar="DEG", help=text)
+    sizes = ", ".join(f"{name} {w}x{h}" for name, (w, h) in _SIZES.items())
+    parser.add_argument("--size", type=size, metavar="WxH", help=f"pixels (default: {sizes})")
 
 
 def _add_render(verbs: Any) -> None:
-    parser = verbs.add_parser(
-        "render",
-        help="render an image of a space",
-        description="Render an image of a saved space. A cube map is one row of faces: front, left, back, right, up, "
-        "down.",
-        epilog="example: ic vspace render room --pose 0.5,-0.2,0,30 --fov 90 --size 640x360 -o view.png",
-    )
-    _folder(parser)
-    parser.add_argument("--pose", type=numbers, default=[0.0, 0.0, 0.0, 0.0], metavar="x,y,z,yaw", help="(0,0,0,0)")
-    parser.add_argument("--projection", choices=tuple(_SIZES), default="perspective", help="(%(default)s)")
+    parser = _of_space(
+        verbs, "render", "render an image of a space", render,
+        "render room --pose 0.5,-0.2,0,30 --fov 90 --size 640x360 -o view.png",
+        "Render an image of a saved space. A cube map is one row of faces: front, left, back, right, up, down.",
+    )  # fmt: skip
     _add_picture(parser)
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="PNG", help="image to write")
-    parser.add_argument(
-        "--depth", type=Path, metavar="FILE", help="also write the depth: .png (16-bit, mm) or .npy (m)"
-    )
-    parser.add_argument(
-        "--confidence", type=Path, metavar="PNG", help="also write the confidence: white is seen, black is not"
-    )
-    parser.set_defaults(func=render)
-
-
-def _add_export(verbs: Any) -> None:
-    parser = verbs.add_parser(
-        "export",
-        help="export the surfaces as PLY",
-        description="Export the surfaces that the panorama has seen as binary PLY, in the frame of the space.",
-        epilog="example: ic vspace export room --mesh room.ply",
-    )
-    _folder(parser)
-    kind = parser.add_mutually_exclusive_group(required=True)
-    kind.add_argument("--points", type=Path, metavar="OUT.ply", help="coloured points")
-    kind.add_argument("--mesh", type=Path, metavar="OUT.ply", help="coloured triangles, split at depth edges")
-    parser.add_argument("--width", type=positive_int, default=1024, help="points around the horizon (%(default)s)")
-    parser.set_defaults(func=export)
-
-
-def _add_video(verbs: Any) -> None:
-    parser = verbs.add_parser(
-        "video",
-        help="record a flight through a space",
-        description="Write a flight through a saved space as MP4, along a smooth curve through the waypoints.",
-        epilog="example: ic vspace video room --path 0,0,0,0 1,0,0,0 1,0.3,0,90 -o flight.mp4",
-    )
-    _folder(parser)
-    parser.add_argument("--path", type=numbers, nargs="+", metavar="x,y,z,yaw", help="two waypoints or more; the "
-                        "heading turns by the difference of the yaws (default: ahead, back, and one turn)")  # fmt: skip
-    parser.add_argument("--seconds", type=positive, default=8.0, metavar="S", help="(%(default)g)")
-    parser.add_argument("--fps", type=positive, default=25.0, help="frames per second (%(default)g)")
-    _add_picture(parser)
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.mp4", help="video to write")
-    parser.set_defaults(func=video)
+    add = parser.add_argument
+    add("--pose", type=numbers("x,y,z,yaw"), default=[0.0, 0.0, 0.0, 0.0], metavar="x,y,z,yaw", help="(0,0,0,0)")
+    add("--projection", choices=tuple(_SIZES), default="perspective", help="(%(default)s)")
+    add("-o", "--out", type=Path, required=True, metavar="PNG", help="image to write")
+    add("--depth", type=Path, metavar="FILE", help="also write the depth: .png (16-bit, mm) or .npy (m)")
+    text = "also write the confidence: white is seen, black is not"
+    add("--confidence", type=Path, metavar="PNG", help=text)
 
 
 # -- the commands --------------------------------------------------------------------------------------
 
 
 def train(args: argparse.Namespace) -> int:
-    """``ic vspace train``."""
     from instant_ic.cli.progress import progress
     from instant_ic.depth.files import load_depth, load_picture
     from instant_ic.vspace import KeyframeError, VirtualSpaceConfig
@@ -205,10 +155,7 @@ def train(args: argparse.Namespace) -> int:
         depth, sigma = estimated_depth(args.model, rgb), args.depth_sigma or _MODEL_SIGMA
         if not args.as_estimated:
             depth = _tidied(depth, args.camera_height, args.panorama)
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{args.out}: cannot make the folder: {error.strerror}") from error
+    args.out.mkdir(parents=True, exist_ok=True)
     config = VirtualSpaceConfig(device=args.device)
     began = time.monotonic()
     warm_up(config)
@@ -335,7 +282,6 @@ def placed(space: VirtualSpace, pose: list[float]) -> NDArray[np.float64]:
 
 
 def render(args: argparse.Namespace) -> int:
-    """``ic vspace render``."""
     import numpy as np
 
     space = open_space(args)
@@ -382,7 +328,6 @@ def _warn_of_the_unknown(view: View, space: VirtualSpace, pose: list[float]) -> 
 
 
 def export(args: argparse.Namespace) -> int:
-    """``ic vspace export``."""
     from instant_ic.vspace.export import surface, write_ply
 
     space, out = open_space(args), args.points or args.mesh
@@ -390,14 +335,13 @@ def export(args: argparse.Namespace) -> int:
         found = surface(space, args.width)
     except ValueError as error:
         raise UserError(f"--width: {error}", 2) from error
-    _write(out, lambda: write_ply(out, found, mesh=args.mesh is not None))
+    write_ply(out, found, mesh=args.mesh is not None)
     triangles = f" and {len(found.triangles)} triangles" if args.mesh else ""
     print(f"wrote {out}: {len(found.points)} points{triangles}")
     return 0
 
 
 def video(args: argparse.Namespace) -> int:
-    """``ic vspace video``."""
     import cv2
 
     from instant_ic.cli.progress import progress
@@ -436,7 +380,6 @@ def video(args: argparse.Namespace) -> int:
 
 
 def info_(args: argparse.Namespace) -> int:
-    """``ic vspace info``."""
     from instant_ic.vspace.saved import read, space_file
 
     saved = read(args.space)
@@ -468,7 +411,8 @@ def write_picture(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -
     if not done:
         raise UserError(f"{path}: the name of an image must end in .png or .jpg", 2)
     part = path.with_name(f".{path.name}.part")
-    _write(path, lambda: (part.write_bytes(content.tobytes()), part.replace(path)))
+    part.write_bytes(content.tobytes())
+    part.replace(path)
 
 
 def write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
@@ -476,15 +420,8 @@ def write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
     import numpy as np
 
     if path.suffix == ".npy":
-        _write(path, lambda: np.save(path, depth_m))
+        np.save(path, depth_m)
     elif path.suffix == ".png":
         write_picture(path, np.rint(np.clip(1000 * depth_m, 0, 65535)).astype(np.uint16))
     else:
         raise UserError(f"{path}: the name of a depth file must end in .png (16-bit, mm) or .npy (m)", 2)
-
-
-def _write(path: Path, write: Any) -> None:
-    try:
-        write()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error

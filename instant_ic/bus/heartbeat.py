@@ -1,0 +1,77 @@
+"""The heartbeat of a node (NodeStatus), as the launcher and the commands read it."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+TYPE = "instant_ic_msgs/msg/NodeStatus"
+STATES = ("starting", "running", "degraded", "failed", "stopping")
+SILENT_AFTER_S = 3.0
+"""A node without a heartbeat for longer than this is stale (state ``silent``)."""
+EVERY_NODES = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events")
+"""Ends of the names of the topics that every node publishes. A node that stops them is silent, not slow."""
+
+
+@dataclass(frozen=True)
+class Flow:
+    """One topic in or out of a node; ``age_s``: since the newest message, inf before the first."""
+
+    rate_hz: float
+    age_s: float = math.inf
+
+
+@dataclass
+class Heartbeat:
+    """Newest status of a node.
+
+    Attributes:
+        state: one of ``STATES``.
+        message: text of its worst diagnosis; empty when all is well.
+        cpu_percent: of one core.
+        inputs, outputs: by topic.
+        lost: (topic, publisher) → messages that this node has lost.
+        seen_s: monotonic time at which the heartbeat arrived.
+    """
+
+    node: str
+    pid: int
+    state: str
+    message: str
+    cpu_percent: float
+    rss_mb: float
+    inputs: dict[str, Flow] = field(default_factory=dict)
+    outputs: dict[str, Flow] = field(default_factory=dict)
+    lost: dict[tuple[str, str], int] = field(default_factory=dict)
+    seen_s: float = 0.0
+
+    @property
+    def silent(self) -> bool:
+        """Whether the next heartbeat is overdue."""
+        return time.monotonic() - self.seen_s > SILENT_AFTER_S
+
+    @property
+    def up(self) -> bool:
+        """Whether the node reports that it runs."""
+        return self.state in ("running", "degraded")
+
+
+def from_message(message: Any) -> Heartbeat:
+    """Heartbeat from a NodeStatus message."""
+    flows = zip(message.inputs, message.input_rates_hz, message.input_ages_s, strict=True)
+    sent = zip(message.outputs, message.output_rates_hz, message.output_ages_s, strict=True)
+    lost = zip(message.lost_topics, message.lost_publishers, message.lost_counts, strict=True)
+    return Heartbeat(
+        message.node,
+        int(message.pid),
+        STATES[message.state] if message.state < len(STATES) else "unknown",
+        message.message,
+        float(message.cpu_percent),
+        float(message.rss_mb),
+        {topic: Flow(float(rate), float(age)) for topic, rate, age in flows},
+        {topic: Flow(float(rate), float(age)) for topic, rate, age in sent},
+        {(topic, publisher): int(count) for topic, publisher, count in lost},
+        time.monotonic(),
+    )

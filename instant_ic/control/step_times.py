@@ -1,0 +1,48 @@
+"""When a controller steps between two timers, and which timers it skips while the robot rests."""
+
+from __future__ import annotations
+
+REST_COSTMAP_S = 0.5
+"""Period of the costmap while the robot rests; the command that ends the rest updates it at once."""
+REST_STEP_S = 0.1
+"""Longest time between two steps while the robot rests: well below every receiver's time-out."""
+
+
+class StepTimes:
+    """Times of the last step and costmap, by a steady clock; ``rests``: the robot stands and nobody wants it to move.
+
+    Attributes:
+        obeyed: the operator's command of the last step.
+    """
+
+    def __init__(self) -> None:
+        self.obeyed = (0.0, 0.0)
+        self._early = False  # a step was made ahead of its time since the last timer
+        self._rests = False  # at the last step
+        self._stepped_ns = self._costmap_ns = 0
+
+    def timer_steps(self, now_ns: int, rests: bool = False) -> bool:
+        """Whether this timer steps."""
+        self._early = False
+        since_s = (now_ns - self._stepped_ns) / 1e9
+        # Timers jitter: at 20 Hz every second one is meant.
+        return not 0.0 <= since_s < 0.9 * REST_STEP_S or not rests
+
+    def command_steps(self, command: tuple[float, float]) -> bool:
+        """Whether to obey a command at once: a changed one, since the next timer is half a period away on average."""
+        if self._early or command == self.obeyed:
+            return False
+        self._early = True
+        return True
+
+    def costmap_due(self, now_ns: int, rests: bool) -> bool:
+        """Whether to update the costmap; it then counts as updated."""
+        if rests and 0.0 <= (now_ns - self._costmap_ns) / 1e9 < REST_COSTMAP_S:
+            return False
+        self._costmap_ns = now_ns
+        return True
+
+    def begin_step(self, now_ns: int, rests: bool) -> bool:
+        """Note a step; returns whether a rest ends with it."""
+        before, self._rests, self._stepped_ns = self._rests, rests, now_ns
+        return before and not rests

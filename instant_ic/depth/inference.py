@@ -1,0 +1,106 @@
+"""Runs a depth model on encoded images: with a time-out, and on the CPU after a faster provider has failed."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.depth.manifest import InferenceError
+from instant_ic.depth.model import DepthModel
+from instant_ic.jpeg import JpegError
+from instant_ic.limits import decode_rgb
+
+Result = TypeVar("Result")
+Floats = NDArray[np.float32]
+
+_CANCELLATIONS = 20
+_GIVE_UP_S = 10.0  # an inference still running this long after its cancellation hangs in a driver
+logger = logging.getLogger("instant_ic.depth")
+
+
+class Inference:
+    """A depth model that answers within a time-out.
+
+    Args:
+        name, provider, threads: as in ``DepthModel.find``.
+        on_hang: called when an inference does not end after its cancellation; only a new process helps then.
+        timeout_s: an inference that takes longer is cancelled; may be changed at any time.
+
+    Raises:
+        ManifestError, FileNotFoundError: the model cannot be used.
+    """
+
+    def __init__(
+        self, name: str, provider: str, threads: int, on_hang: Callable[[], None], timeout_s: float = 20.0
+    ) -> None:
+        self._name, self._threads, self._on_hang = name, threads, on_hang
+        self.timeout_s = timeout_s
+        self._load(provider)
+
+    def _load(self, provider: str) -> None:
+        """Load the model; report its provider and why a faster one is not used."""
+        self.model = model = DepthModel.find(self._name, self._threads, provider)
+        manifest = model.manifest
+        kind = f"{manifest.output_kind}, {manifest.input_width}x{manifest.input_height}"
+        why = f" ({'; '.join(model.notes)})" if model.notes else ""
+        logger.info("%s (%s) on %s%s", manifest.name, kind, model.provider, why)
+        if provider not in ("auto", model.provider):
+            logger.warning("provider %s was requested, the model runs on %s%s", provider, model.provider, why)
+
+    def estimate(self, image: bytes | NDArray[np.uint8]) -> Floats:
+        """Return ``DepthModel.estimate`` of an encoded panorama.
+
+        Raises:
+            InferenceError: the image cannot be decoded, or the inference failed or timed out.
+            ValueError: the image is no panorama, or the model's outputs do not fit its manifest.
+        """
+        return self._run(image, lambda rgb: self.model.estimate(rgb))
+
+    def complete(self, image: bytes | NDArray[np.uint8], prior: Floats) -> tuple[Floats, Floats]:
+        """Return ``DepthModel.complete`` of an encoded panorama; raises as :meth:`estimate`."""
+        return self._run(image, lambda rgb: self.model.complete(rgb, prior))
+
+    def _run(self, image: bytes | NDArray[np.uint8], work: Callable[[NDArray[np.uint8]], Result]) -> Result:
+        manifest = self.model.manifest
+        try:
+            # Twice the network's input, so that the remaining reduction is by area averaging.
+            rgb = decode_rgb(image, 2 * manifest.input_width, 2 * manifest.input_height)
+        except JpegError as error:
+            raise InferenceError(f"the image {error}") from error
+        try:
+            return self._within_timeout(lambda: work(rgb))
+        except InferenceError as error:
+            if self.model.provider == "cpu":
+                raise
+            self._load("cpu")
+            raise InferenceError(f"{error}; going on with the CPU") from error
+
+    def _within_timeout(self, work: Callable[[], Result]) -> Result:
+        model, future = self.model, Future[Result]()
+
+        def run() -> None:
+            try:
+                future.set_result(work())
+            except Exception as error:  # noqa: BLE001 - raised again in the caller's thread
+                future.set_exception(error)
+
+        threading.Thread(target=run, name="inference", daemon=True).start()
+        timeout_s = self.timeout_s
+        try:
+            return future.result(timeout_s)
+        except TimeoutError:
+            pass
+        for _ in range(_CANCELLATIONS):
+            model.cancel()  # again and again: between two layers, or before the first, it is not heard
+            if wait([future], _GIVE_UP_S / _CANCELLATIONS).done:
+                break
+        else:
+            logger.error("the inference on %s hangs: the node ends for a restart", model.provider)
+            self._on_hang()
+        raise InferenceError(f"the inference took longer than {timeout_s:g} s on {model.provider} and was cancelled")

@@ -1,0 +1,64 @@
+"""Messages of the node ``nerf`` to the plain values of ``instant_ic.vspace``, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from instant_ic.depth.keyframes import decode_sigma
+from instant_ic.msg import (
+    RenderedView,
+    VspaceStatus,
+    compressed_image_message,
+    header,
+    image_array,
+    matrix_from_pose,
+    pose_message,
+    to_time,
+)
+from instant_ic.vspace import KeyframeError
+from instant_ic.vspace.jobs import EncodedView, KeyframeArrays, ViewOrder, decode_panorama
+from instant_ic.vspace.schedule import JobSchedule
+
+
+def decode_keyframe(keyframe: Any) -> KeyframeArrays:
+    """Arguments of ``VirtualSpace.prepare``.
+
+    Raises:
+        KeyframeError: the keyframe is marked unfit, or cannot be decoded.
+    """
+    if not keyframe.fit:
+        raise KeyframeError(f"its depth is marked unfit: {keyframe.message or 'no reason given'}")
+    rgb = decode_panorama(np.asarray(keyframe.panorama.data, np.uint8))
+    if keyframe.depth.encoding != "32FC1":
+        raise KeyframeError(f"depth must be 32FC1 (got {keyframe.depth.encoding!r})")
+    sigma = decode_sigma(image_array(keyframe.sigma)) if keyframe.sigma.data.size else keyframe.relative_sigma
+    return rgb, image_array(keyframe.depth), matrix_from_pose(keyframe.pose), sigma
+
+
+def view_message(order: ViewOrder, encoded: EncodedView, schedule: JobSchedule, now_ns: int) -> Any:
+    """A RenderedView message of a request; the pose is that of the request that was rendered."""
+    return RenderedView(
+        header=header("map", now_ns),
+        request_id=order.id,
+        keyframe_id=0 if schedule.keyframe is None else schedule.keyframe.id,
+        pose=encoded.order.message.pose,
+        fov_rad=order.fov_rad,
+        width=order.width,
+        height=order.height,
+        confidence=float(encoded.view.confidence.mean()),
+        render_ms=schedule.figures(now_ns).render_ms,
+        image=compressed_image_message(encoded.jpeg, "map", now_ns),
+    )
+
+
+def status_message(schedule: JobSchedule, now_ns: int) -> Any:
+    """A VspaceStatus message."""
+    keyframe = schedule.keyframe
+    return VspaceStatus(
+        header=header("map", now_ns),
+        keyframe_pose=pose_message(np.eye(4)) if keyframe is None else keyframe.message.pose,
+        keyframe_stamp=to_time(0) if keyframe is None else keyframe.message.header.stamp,
+        **vars(schedule.figures(now_ns)),
+    )
