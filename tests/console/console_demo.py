@@ -1,4 +1,4 @@
-"""Demo of the page with synthetic data, for work on the page: ``python -m instant_ic.console.demo``.
+"""The page with a synthetic robot, for the browser tests and for work on it: ``python tests/console/console_demo.py``.
 
 The operator drives a robot in a room with an obstacle ahead. Its behaviour at the obstacle is only a sketch of the
 method, enough to try the page; instant_ic.control implements it.
@@ -14,10 +14,10 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+import demo_world
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console import demo_world
 from instant_ic.console.gridimage import GridImage, grey_png, grid_image
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
@@ -195,7 +195,7 @@ class Demo:
 
     def send_layers(self, keyframe: Pose) -> None:
         """Send the layers round a keyframe at this pose (m, rad)."""
-        from instant_ic.console.demo_layers import demo_layers  # takes seconds to import
+        from demo_layers import demo_layers  # takes seconds to import
 
         self._layers_at = keyframe.copy()
         self._version += 1
@@ -381,15 +381,13 @@ def _hits(points: Pose) -> bool:
 
 def main() -> None:
     """Serve the demo until Ctrl-C."""
-    parser = argparse.ArgumentParser(
-        prog="python -m instant_ic.console.demo", description=(__doc__ or "").partition("\n")[0]
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO)
     demo = Demo(ServerConfig(port=arguments.port), DemoConfig(layers=True))
     demo.start()
-    logging.getLogger("instant_ic.console.demo").info("open %s (Ctrl-C stops)", demo.server.url)
+    logging.getLogger("console_demo").info("open %s (Ctrl-C stops)", demo.server.url)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:
