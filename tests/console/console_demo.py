@@ -22,7 +22,7 @@ from instant_ic.console.gridimage import GridImage, grey_png, grid_image
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer, ServerConfig
-from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, ViewScheduler, view_shape
+from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, view_shape
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix, quaternion_from_matrix, wrap_angle
 from instant_ic.geometry.projections import equirect_directions, perspective_directions
 
@@ -105,7 +105,6 @@ class Demo:
         self._command = (0.0, 0.0)
         self._placing = threading.Lock()
         self._transitions = 0
-        self._views = ViewScheduler(self.config.view)
         self._slow_due = 0.0
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
         self._panorama, self._panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
@@ -179,7 +178,7 @@ class Demo:
             self._publish_state()
 
     def _send_images(self) -> None:
-        due = 0.0
+        due = view_due = 0.0
         while not self._stop.wait(0.01):
             now = time.monotonic()
             if now >= due and self.images:
@@ -190,8 +189,9 @@ class Demo:
                 if far:
                     self.send_layers(self.robot)
             rate_hz = self.config.view.virtual_rate_hz if self.mode == "virtual" else PROBE_HZ
-            if self.images and self.server.needs_views() and self._views.due(now, rate_hz):
-                self._send_view(self._views.asked(now))
+            if self.images and self.server.needs_views() and now >= view_due:
+                view_due = now + 1.0 / rate_hz
+                self._send_view()
 
     def send_layers(self, keyframe: Pose) -> None:
         """Send the layers round a keyframe at this pose (m, rad)."""
@@ -311,7 +311,7 @@ class Demo:
         header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist(), "p": camera[:3, 3].tolist()}
         self.server.send_frame(FrameKind.PANORAMA, header, self._panorama)
 
-    def _send_view(self, request_id: int) -> None:
+    def _send_view(self) -> None:
         captured_ms = self.server.now_ms()
         look = self.look
         shape = view_shape(look, self.config.view)
@@ -326,10 +326,8 @@ class Demo:
             "fov": shape.fov_rad,
             "confidence": 0.9,
             "render_ms": 20.0,
-            "request_id": request_id,
         }
         self.server.send_frame(FrameKind.VIEW, header, _jpeg(image))
-        self._views.answered(request_id)
 
 
 def _camera(pose: Pose) -> NDArray[np.float64]:
