@@ -1,6 +1,6 @@
 """Speed of writing and reading bags, compared with rosbags' and foxglove-sdk's writers.
 
-    python benchmarks/bags.py [--seconds 3] [--folder /tmp] [--out result.json]
+    python benchmarks/bags.py [--seconds 3] [--folder /tmp] [--json result.json]
 
 Prints JSON. ``write``: messages of each size in one bag, MB/s of payload into the page cache, with and without zstd.
 ``read``: the same bag with our reader.
@@ -8,8 +8,6 @@ Prints JSON. ``write``: messages of each size in one bag, MB/s of payload into t
 
 from __future__ import annotations
 
-import argparse
-import json
 import shutil
 import tempfile
 import time
@@ -18,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from reporting import parser_of, report
 
 SIZES = {"20 kB": 20_000, "200 kB": 200_000, "1.2 MB": 1_200_000, "5.5 MB": 5_500_000}
 IMAGE = "sensor_msgs/msg/Image"
@@ -108,10 +107,9 @@ def read_speed(root: Path, payload: bytes, seconds: float) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=3.0, help="about 200 MB a second of each measurement")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()), help="where the bags go")
-    parser.add_argument("--out", type=Path, default=None)
     args = parser.parse_args()
     root = Path(tempfile.mkdtemp(dir=args.folder))
     writers: dict[str, Callable[[Path, bytes, int, bool], None]] = {"instant_ic": ours, "rosbags": rosbags}
@@ -136,10 +134,7 @@ def main() -> None:
             result["read_MB_per_s"][name] = read_speed(root, payload, args.seconds)
     finally:
         shutil.rmtree(root, ignore_errors=True)
-    text = json.dumps(result, indent=2)
-    print(text)
-    if args.out is not None:
-        args.out.write_text(text + "\n")
+    report(result, args.json)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import shutil
 import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
+
+from reporting import parser_of, report
 
 from instant_ic.experiments.budget import Usage, cpu_percent, reference_loop, usage
 from instant_ic.experiments.drive import DriveRecorder, drive_through_obstacle
@@ -26,11 +27,10 @@ from instant_ic.msg import ControlState, message_type
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--pace", type=float, default=0.4, help="pace of the stack's time (default 0.4)")
     parser.add_argument("--seconds", type=float, default=20.0, help="time to stand, of the stack's time (default 20)")
     parser.add_argument("--standing", action="store_true", help="do not drive")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument("--log", type=Path, default=None, help="where the stack's output goes")
     args = parser.parse_args()
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
@@ -40,10 +40,7 @@ def main() -> int:
             result["pace"], result["reference_loop_ms"] = args.pace, round(loop.million_ms, 1)
     finally:
         shutil.rmtree(run_dir, ignore_errors=True)
-    text = json.dumps(result, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    print(text)
+    report(result, args.json)
     return 0
 
 

@@ -13,7 +13,6 @@ PYTHONPATH.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import socket
@@ -26,6 +25,8 @@ from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from reporting import parser_of, report
 
 PEER = Path(__file__).with_name("bus_peer.py")
 SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_500_000}
@@ -291,8 +292,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
+    parser = parser_of(__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer messages")
     parser.add_argument(
         "--only",
@@ -316,10 +316,7 @@ def main() -> int:
         "load_after": os.getloadavg()[0],
     }
     result["targets"] = verdicts(result)
-    text = json.dumps(result, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    print(text)
+    report(result, args.json)
     print(table(result), file=sys.stderr)
     return 0
 

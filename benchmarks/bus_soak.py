@@ -22,6 +22,8 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from reporting import parser_of, report
+
 from instant_ic.bus import RECORD, RELIABLE
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
@@ -210,10 +212,9 @@ def soak(seconds: float, factor: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--factor", type=float, default=2.0, help="times the stack's own rates")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument("--worker", nargs=3, metavar=("ROLE", "NAME", "RUN_DIR"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.worker:
@@ -224,10 +225,7 @@ def main() -> int:
             read(run_dir, name)
         return 0
     result = soak(args.seconds, args.factor)
-    text = json.dumps(result, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    print(text)
+    report(result, args.json)
     return 1 if result["lost"] or result["missing"] else 0
 
 

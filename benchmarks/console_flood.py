@@ -13,18 +13,16 @@ JSON in milliseconds; ``ratio`` is flood over quiet.
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
-import json
 import multiprocessing
 import os
 import time
-from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+from reporting import parser_of, report
 
 from instant_ic.console import ConsoleClient, ConsoleServer, ServerConfig
 from instant_ic.console.drive import DriveConfig
@@ -34,25 +32,19 @@ PING = b'{"type":"ping","client_ms":0}'
 PATIENT = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, beat_timeout_s=30.0, max_command_age_s=60.0)
 
 
-@dataclass
 class Backend:
-    """Records when emergency stops reach the topic."""
+    """Records when emergency stops reach the topic; ignores the operator's other actions."""
 
-    stops_s: list[float] = field(default_factory=list)
-
-    def on_drive(self, linear: float, angular: float) -> None:
-        """Ignore the command."""
-
-    def on_operator(self, there: bool) -> None:
-        """Ignore the operator's presence."""
-
-    def on_look(self, look: Any) -> None:
-        """Ignore the request: no view is rendered."""
+    def __init__(self) -> None:
+        self.stops_s: list[float] = []
 
     def on_estop(self, stop: bool) -> None:
         """Record the time at which the node would publish."""
         if stop:
             self.stops_s.append(time.monotonic())
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *args: None
 
 
 def serve(channel: Connection, max_clients: int) -> None:
@@ -193,7 +185,7 @@ def measure(kind: str | None, clients: int, seconds: float, address: str) -> dic
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--flood", choices=("pings", "limit", "http", "connect"), default="pings")
     parser.add_argument("--clients", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=20.0)
@@ -205,12 +197,8 @@ def main() -> None:
         what: {key: round(value / quiet[what][key], 2) for key, value in flooded[what].items()}
         for what in ("round_trip", "stop")
     }
-    print(
-        json.dumps(
-            {"flood_by": args.flood, "clients": args.clients, "load": os.getloadavg()[0], "quiet": quiet,
-             "under_flood": flooded, "ratio": ratio}, indent=1,
-        )
-    )  # fmt: skip
+    about = {"flood_by": args.flood, "clients": args.clients, "load": os.getloadavg()[0]}
+    report(about | {"quiet": quiet, "under_flood": flooded, "ratio": ratio}, args.json)
 
 
 if __name__ == "__main__":

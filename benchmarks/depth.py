@@ -10,8 +10,6 @@ sees). The camera is level, 1.2 m above the floor. Scores count pixels; ``by_sol
 
 from __future__ import annotations
 
-import argparse
-import json
 import platform
 import sys
 import time
@@ -19,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from reporting import parser_of, report
 
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.experiments.depth import DepthSettings, Evaluator, LidarSettings
@@ -144,7 +143,7 @@ def targets(results: dict[str, Any]) -> dict[str, dict[str, bool]]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--count", type=int, default=40, help="panoramas of each kind (default: %(default)s)")
     parser.add_argument("--kinds", default=",".join(KINDS), help="of worlds (default: %(default)s)")
     parser.add_argument("--mesh", type=Path, help="mesh file for the kind mesh; without one it is left out")
@@ -154,7 +153,6 @@ def main() -> int:
     )
     parser.add_argument("--method", default="", help="of scaling (default: the scaler's)")
     parser.add_argument("--threads", type=int, default=2, help="of the model (default: %(default)s)")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument(
         "--sheets", type=Path, metavar="DIR", help="sheets of images of the fused source, 5 %% outliers"
     )
@@ -190,10 +188,7 @@ def main() -> int:
         } if completion else None,
         "targets_met": targets(results), "results": results,
     }  # fmt: skip
-    text = json.dumps(figures, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    print(text)
+    report(figures, args.json)
     print(table(results), file=sys.stderr)
     return 0
 

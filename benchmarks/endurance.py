@@ -24,7 +24,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import json
 import os
 import random
 import shutil
@@ -42,8 +41,9 @@ from typing import Any
 import aiohttp
 import numpy as np
 import psutil
+from reporting import note, parser_of, report
 from rosbags.highlevel import AnyReader
-from stopping import LAUNCH, Rig, driver, rig
+from stopping import LAUNCH, LINKS, Rig, driver, rig
 
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.recover import recover
@@ -73,13 +73,6 @@ LEAK_MB, LEAK_FDS = 24.0, 4.0
 
 NEEDED = ("arbiter", "crawler_base", "console", "grid_slam", "vlp16_driver")
 OTHERS = ("theta_camera", "virtual_robot", "navigator", "depth_estimator", "depth_scaler", "nerf")
-LINKS = {
-    "page link cut": (lambda r: r.page_link.cut(), lambda r: r.page_link.mend()),
-    "camera link cut": (lambda r: r.camera_link.cut(), lambda r: r.camera_link.mend()),
-    "LiDAR packets cease": (lambda r: setattr(r.packets, "cut", True), lambda r: setattr(r.packets, "cut", False)),
-    "serial replies lost": (lambda r: setattr(r.serial, "mute", True), lambda r: setattr(r.serial, "mute", False)),
-    "serial cable pulled": (lambda r: r.serial.pull(), lambda r: r.serial.plug()),
-}
 FAULTS = (
     *(f"{node} {how}" for node in (*NEEDED, *OTHERS, "simulator") for how in ("frozen", "killed")),
     *LINKS,
@@ -536,13 +529,8 @@ def small_disk(at: Path) -> Iterator[Path | None]:
         subprocess.run(["umount", "-l", str(at)], capture_output=True, check=True)
 
 
-def note(text: str) -> None:
-    """Print the progress."""
-    print(text, file=sys.stderr, flush=True)
-
-
 def main(words: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--minutes", type=float, default=60.0, help="of the machine (default: %(default)g)")
     parser.add_argument("--seed", type=int, default=1, help="of the faults and their moments")
     parser.add_argument(
@@ -553,7 +541,6 @@ def main(words: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--only", action="append", default=[], help="faults with this word in their name; repeatable")
     parser.add_argument("--light", action="store_true", help="without depth and virtual space")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     args = parser.parse_args(words)
     factor = args.pace or round(machine_pace(), 2)
     soak = Soak(args, factor)
@@ -583,10 +570,7 @@ def main(words: Sequence[str] | None = None) -> int:
         "growth": levels,
         "found": figures.found,
     }  # fmt: skip
-    text = json.dumps(result, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    print(text)
+    report(result, args.json)
     if not figures.found:
         shutil.rmtree(folder, ignore_errors=True)
     return 1 if figures.found else 0

@@ -7,12 +7,12 @@
 - views: views a second, alone and while training. The paper has 10; goal: at least 60 at 1280 × 720.
 - field-or-warp: PSNR and SSIM of fields against the warp of the same keyframes, with one and with several, true and
   wrong depth, on views of places that were left out. Fields: the default, one that also learns a panorama of the warp
-  from ahead (taught), and the paper's (density, with losses on depth, opacity and distortion). Runs on a CPU too:
-  ``--cpu``.
+  from ahead (taught), and the paper's (density, with losses on depth, opacity and distortion).
 - depth: ``ic depth train`` with the arguments ``DEPTH_TRAINING``, 6 minutes: panoramas a second and held-out errors.
 
 Each step takes less than 10 minutes (``--seconds`` limits a training of a field) and writes OUT/STEP.json, train and
 field-or-warp OUT/STEP.png as well. Wall time; every call ends with a copy to the CPU, so nothing is still running.
+``--cpu`` runs train, views and field-or-warp on a CPU; all their seconds are then CPU seconds of one thread.
 ``--dry-run`` does the same at tiny sizes on the CPU: its figures say only that the script works. Otherwise an NVIDIA
 GPU, torch's CUDA build and `pip install 'instant-ic[triton]'` are needed.
 """
@@ -92,6 +92,16 @@ class Setup:
     geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
     clock: Callable[[], float] = time.perf_counter
 
+    def median_s(self, call: Callable[[], object]) -> float:
+        """Median time of a call, seconds, after one that does not count."""
+        call()
+        times = []
+        for _ in range(self.repeats):
+            start = self.clock()
+            call()
+            times.append(self.clock() - start)
+        return statistics.median(times)
+
     @classmethod
     def tiny(cls, out: Path) -> Setup:
         """Sizes of a dry run."""
@@ -138,17 +148,6 @@ class Place:
     def shown(self, space: VirtualSpace, pose: Any) -> Any:
         """The same in a space."""
         return space.render(self.start @ pose, *self._setup.view, FOV).rgb
-
-
-def median_s(call: Callable[[], object], repeats: int) -> float:
-    """Median wall time of a call, seconds, after one that does not count."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def has_triton() -> bool:
@@ -199,8 +198,8 @@ def _compared(scene: Scene, setup: Setup) -> dict[str, Any]:
         }
     uniform = rng.random(shape, np.float32)
     for name, device in (("ours", ours), ("torch", peer)):
-        step_s = median_s(lambda d=device: d.step(uniform, 1e-4, 1e-4), setup.repeats)
-        view_s = median_s(lambda d=device: d.draw(rays, 0.0, 0.5), setup.repeats)
+        step_s = setup.median_s(lambda d=device: d.step(uniform, 1e-4, 1e-4))
+        view_s = setup.median_s(lambda d=device: d.draw(rays, 0.0, 0.5))
         result[name] = {"step_ms": round(1e3 * step_s, 3), "view_ms": round(1e3 * view_s, 3)}
     return result
 
@@ -260,9 +259,9 @@ def train(setup: Setup) -> dict[str, Any]:
             space.set_keyframe(*keyframe)
             spent, curve = 0.0, []
             while spent < setup.seconds and not space.status.converged:
-                start = time.perf_counter()
+                start = setup.clock()
                 space.train(iterations=10)
-                spent += time.perf_counter() - start
+                spent += setup.clock() - start
                 images[device] = [place.shown(space, pose) for pose in poses]
                 values = [psnr_db(view, real) for view, real in zip(images[device], truth, strict=True)]
                 curve.append((round(spent, 4), round(statistics.mean(values), 3)))
@@ -288,17 +287,17 @@ def views(setup: Setup) -> dict[str, Any]:
     pose = place.start @ pose_matrix(1.0, 0.1, yaw=0.1)
     for device in setup.devices:
         for name, picture in (("field", FIELD_ONLY), ("as shown", PictureConfig())):
-            start = time.perf_counter()
+            start = setup.clock()
             space = VirtualSpace(setup.config(device, picture=picture))
-            found: dict[str, Any] = {"device": space.status.device, "start_s": round(time.perf_counter() - start, 2)}
+            found: dict[str, Any] = {"device": space.status.device, "start_s": round(setup.clock() - start, 2)}
             space.set_keyframe(*first_keyframe)
             space.train(iterations=3)
             for size in setup.sizes:
                 space.render(pose, *size, FOV)  # compiles
-            start = time.perf_counter()
+            start = setup.clock()
             space.set_keyframe(*keyframe)
             space.render(pose, *setup.sizes[-1], FOV)
-            found["first_view_s"] = round(time.perf_counter() - start, 3)
+            found["first_view_s"] = round(setup.clock() - start, 3)
             space.train(iterations=10 if setup.dry else 200)
             for width, height in setup.sizes:
 
@@ -309,9 +308,9 @@ def views(setup: Setup) -> dict[str, Any]:
                     space.train(iterations=10)
                     frame()
 
-                found[f"fps_{width}x{height}"] = round(1 / median_s(frame, setup.repeats), 1)
-                found[f"fps_training_{width}x{height}"] = round(1 / median_s(while_training, setup.repeats), 1)
-            if not setup.dry:
+                found[f"fps_{width}x{height}"] = round(1 / setup.median_s(frame), 1)
+                found[f"fps_training_{width}x{height}"] = round(1 / setup.median_s(while_training), 1)
+            if torch.cuda.is_available():
                 found["gpu_memory_mb"] = round(torch.cuda.max_memory_allocated() / 2**20)
             result.setdefault(device, {})[name] = found
     return result
@@ -394,19 +393,8 @@ def depth(setup: Setup) -> dict[str, Any]:
         for index in range(6):
             cv2.imwrite(str(folder / "rgb" / f"{index}.png"), np.full((64, 128, 3), 40 * index, np.uint8))
             np.save(folder / "depth" / f"{index}.npy", np.full((64, 128), 1.0 + index, np.float32))
-        words = [
-            "--data",
-            f"plain:{folder}",
-            "--encoder",
-            "none",
-            "--height",
-            "64",
-            "--epochs",
-            "1",
-            "--batch-size",
-            "2",
-        ]
-        words += ["--device", "cpu", "--workers", "1"]
+        sizes = "--encoder none --height 64 --epochs 1 --batch-size 2 --device cpu --workers 1"
+        words = ["--data", f"plain:{folder}", *sizes.split()]
     command = [sys.executable, "-m", "instant_ic.cli.main", "depth", "train", *words, "--checkpoint", str(checkpoint)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=580, check=False)
     if done.returncode:
@@ -434,14 +422,14 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("runs/gpu"), help="folder of the results (default runs/gpu)")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each training at most (default 10)")
     parser.add_argument("--dry-run", action="store_true", help="tiny sizes on the CPU")
-    parser.add_argument("--cpu", action="store_true", help="field-or-warp on the CPU; --seconds are CPU seconds")
+    parser.add_argument("--cpu", action="store_true", help="train, views and field-or-warp on the CPU; CPU seconds")
     parser.add_argument("--worlds", default="corridor,random:11,random:12", help="worlds, by commas")
     arguments = parser.parse_args()
     steps = arguments.step.split(",")
     if unknown := sorted(set(steps) - set(STEPS)):
         parser.error(f"--step: no such step: {', '.join(unknown)}; there are {', '.join(STEPS)}")
-    if arguments.cpu and steps != ["field-or-warp"]:
-        parser.error("--cpu: only --step field-or-warp is of use on a CPU")
+    if arguments.cpu and not {*steps} <= {"train", "views", "field-or-warp"}:
+        parser.error("--cpu: only the steps train, views and field-or-warp are of use on a CPU")
     if not (arguments.dry_run or arguments.cpu or torch.cuda.is_available()):
         parser.error("torch finds no CUDA device; --dry-run checks the script without one")
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -454,6 +442,7 @@ def main() -> int:
             False, arguments.out, ("triton", "torch-cuda"), arguments.seconds, worlds=arguments.worlds.split(",")
         )
     if arguments.cpu:
+        torch.set_num_threads(1)
         small = {"view": (320, 180), "clock": time.process_time, "train": TrainConfig(iterations=1000)}
         setup = dataclasses.replace(setup, devices=("cpu",), **small)
     machine = "dry run on the CPU" if setup.dry else "CPU" if arguments.cpu else torch.cuda.get_device_name()
@@ -462,11 +451,8 @@ def main() -> int:
         start = time.perf_counter()
         try:
             found: dict[str, Any] = STEPS[step](setup)
-        except (
-            RuntimeError,
-            ImportError,
-            subprocess.TimeoutExpired,
-        ) as error:  # one step's failure must not hide the others' figures
+        except (RuntimeError, ImportError, subprocess.TimeoutExpired) as error:
+            # One step's failure must not hide the others' figures.
             found, failed = {"error": f"{type(error).__name__}: {error}"}, True
         about = {"step": step, "machine": machine, "python": platform.python_version(), "torch": torch.__version__}
         result = about | {"targets": TARGETS[step], "took_s": round(time.perf_counter() - start, 1), "result": found}

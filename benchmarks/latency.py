@@ -29,7 +29,6 @@ itself.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import random
 import shutil
@@ -45,13 +44,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from reporting import CHROMIUM_FLAGS, parser_of, report
 
 from instant_ic.bus import LATCHED, SENSOR
-from instant_ic.console import demo_world
 from instant_ic.console.view import PROBE
 from instant_ic.experiments.stack import Stack, free_port
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.geometry.projections import equirect_directions
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import (
     ControlState,
@@ -72,11 +70,9 @@ from instant_ic.msg import (
     twist_message,
     twist_values,
 )
+from instant_ic.sim.render import EquirectRenderer
+from instant_ic.sim.worlds import corridor_world
 
-CHROMIUM_FLAGS = [
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 LAUNCH = """launch:
 - node: {{exec: console, param: [{{from: $(config console.yaml)}}, {{name: server.port, value: {port}}}]}}
 - node: {{exec: virtual_robot, param: [{{from: $(config control.yaml)}}]}}
@@ -128,7 +124,7 @@ addEventListener("rendered", ({detail}) => {
 
 
 class Robot:
-    """Simulated input of the nodes from a robot in the demonstration's room; the base follows commands at once."""
+    """Simulated input of the nodes from a robot in the simulator's corridor; the base follows commands at once."""
 
     def __init__(self, stack: Stack, virtual: bool) -> None:
         self.stack, self.virtual = stack, virtual
@@ -159,11 +155,10 @@ class Robot:
         observer.subscribe("/vspace/view", message_type("RenderedView"), self.on_view, SENSOR)
         if not virtual:
             observer.subscribe("/ic/state", ControlState, self.on_state, LATCHED)
-        directions = equirect_directions(1280, 640)
-        ok, jpeg = cv2.imencode(".jpg", demo_world.shade((0, 0, CAMERA_Z), directions))
-        assert ok
-        self.jpeg = jpeg.tobytes()
-        self.depth_m = demo_world.distances((0, 0, CAMERA_Z), equirect_directions(512, 256)).astype(np.float32)
+        renderer, pose = EquirectRenderer(corridor_world()), pose_matrix(z=CAMERA_Z)
+        rgb = renderer.render(pose, 1280, 640).rgb
+        self.jpeg = cv2.imencode(".jpg", rgb[..., ::-1])[1].tobytes()
+        self.depth_m = renderer.render(pose, 512, 256).depth_m
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()
 
@@ -384,9 +379,8 @@ def draws_hz(row: dict[str, Any]) -> float:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--presses", type=int, default=30, help="for each figure (default 30)")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument("--width", type=int, default=960)
     parser.add_argument("--height", type=int, default=600)
     parser.add_argument("--wait", type=float, default=180.0, help="seconds for the nodes to start (default 180)")
@@ -402,10 +396,7 @@ def main() -> int:
         "targets_ms": {"base_p50": 40, "shown_p50": 50},
     }
     result |= {"real": part(False, args), "virtual": part(True, args)}
-    text = json.dumps(result, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    print(text)
+    report(result, args.json)
     return 0
 
 

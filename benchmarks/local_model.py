@@ -10,7 +10,6 @@ that of this process for revolutions as they come at 0.5 m/s, 10 a second, and a
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import time
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from reporting import parser_of, report
 
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.scaler import ScalerConfig
@@ -184,7 +184,7 @@ def evaluate(scene: Scene, model: DepthModel, strips: Path | None) -> dict[str, 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--count", type=int, default=4, help="random worlds; half as many long ones")
     parser.add_argument("--seed", type=int, default=930_000, help="of the first world")
     parser.add_argument("--mesh", type=Path, nargs="*", default=[], help="mesh worlds besides")
@@ -199,7 +199,7 @@ def main() -> None:
     for name in ("structure alone", "structure and network", "local model", "true depth"):
         keys = ("psnr_db_half_to_2_m", "ssim_half_to_2_m", "psnr_db_2_5_m", "mre")
         mean[name] = {key: round(float(np.mean([one[name][key] for one in worlds.values()])), 4) for key in keys}
-    print(json.dumps({"worlds": worlds, "mean": mean}, indent=2))
+    report({"worlds": worlds, "mean": mean}, args.json)
 
 
 if __name__ == "__main__":

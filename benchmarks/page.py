@@ -15,8 +15,6 @@ where the robot is, as the image was taken and moved by the depth of the layers 
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import shutil
 import sys
@@ -26,6 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 from playwright.sync_api import sync_playwright
+from reporting import CHROMIUM_FLAGS, parser_of, report
 
 from instant_ic import paths
 from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
@@ -41,7 +40,6 @@ from instant_ic.sim.worlds import make_world
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.layers import LayerEncoder
 
-CHROMIUM_FLAGS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run"]
 FOV = math.pi / 2
 MOST_BELOW_DB = 0.3
 JPEG_QUALITY = 95
@@ -139,12 +137,11 @@ def real(
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--worlds", nargs="+", default=["corridor", "random:41"], help="names or mesh files")
     parser.add_argument("--keyframes", type=int, default=1, help="that are shown together (default 1)")
     parser.add_argument("--size", default="1280x720")
     parser.add_argument("--strips", type=Path, metavar="FOLDER", help="save truth, cpu, page, page_plain side by side")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     args = parser.parse_args()
     width, height = (int(n) for n in args.size.split("x"))
     size = width, height
@@ -157,10 +154,7 @@ def main() -> int:
         }
     below = max(worst for world in worlds.values() for worst in world["seen"]["worst_below_cpu_db"].values())
     result = {"size": args.size, "target_below_db": MOST_BELOW_DB, "met": below <= MOST_BELOW_DB, "worlds": worlds}
-    text = json.dumps(result, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    print(text)
+    report(result, args.json)
     return 0
 
 

@@ -8,13 +8,12 @@ that fit them best: fit on some worlds and seeds, test on others.
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from reporting import parser_of, report
 
 from instant_ic.experiments.illusion import TeleopSettings
 from instant_ic.experiments.illusion_stack import LIVE, FilmedStack, IllusionFrame
@@ -97,7 +96,7 @@ def save_plot(path: Path, frames: dict[str, list[dict[str, Any]]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--world", default="corridors", help="worlds, by comma (default corridors)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the courses (default 0)")
     parser.add_argument("--episodes", type=int, default=4, help="courses in each world (default 4)")
@@ -121,7 +120,7 @@ def main() -> None:
         save_plot(arguments.plot, frames)
     if arguments.fit:
         result["base_and_gains"] = fit([row for rows in frames.values() for row in rows])
-    print(json.dumps(result, indent=2))
+    report(result, arguments.json)
 
 
 if __name__ == "__main__":

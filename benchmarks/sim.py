@@ -8,13 +8,12 @@ a warm-up call. ``cores_at_5_and_10_hz`` is the load of 5 panoramas and 10 revol
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections.abc import Callable
 
 import cv2
 import numpy as np
+from reporting import parser_of, report
 
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
@@ -71,9 +70,9 @@ def measure(world_name: str, poses: int, seed: int) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = parser_of(__doc__)
     parser.add_argument("--world", default="corridor", help="corridor, random:SEED or a mesh file")
     parser.add_argument("--poses", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    print(json.dumps(measure(arguments.world, arguments.poses, arguments.seed), indent=2))
+    report(measure(arguments.world, arguments.poses, arguments.seed), arguments.json)

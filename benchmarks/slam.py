@@ -9,13 +9,12 @@ All use the default parameters. ``--data`` is the folder with intel.log.gz; defa
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import time
 from pathlib import Path
 
 import numpy as np
+from reporting import parser_of, report
 
 from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
@@ -123,34 +122,34 @@ def simulated() -> list[dict[str, object]]:
 
 def main() -> None:
     parts = ("box", "long", "intel", "intel_seeds", "intel_rbpf", "worlds", "sim")
-    parser = argparse.ArgumentParser(description="measures the grid SLAM")
+    parser = parser_of(__doc__)
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"
     parser.add_argument("--data", type=Path, default=default)
     parser.add_argument("--only", nargs="+", choices=parts, default=parts)
     args = parser.parse_args()
-    report: dict[str, object] = {}
+    result: dict[str, object] = {}
     if "box" in args.only:
-        report["box"] = room_drive(600)[-1]
+        result["box"] = room_drive(600)[-1]
     if "long" in args.only:
-        report["long"] = room_drive(12000)
+        result["long"] = room_drive(12000)
     if any(name.startswith("intel") for name in args.only):
         if (args.data / "intel.log.gz").is_file():
             entries = list(read_log(args.data / "intel.log.gz"))
             stamps = read_stamps(args.data / "intel.exact_stamps")
             relations = read_relations(args.data / "intel.relations").at_stamps(stamps, 0.006)
             if "intel" in args.only:
-                report["intel"] = intel(entries, relations)
+                result["intel"] = intel(entries, relations)
             if "intel_seeds" in args.only:
-                report["intel_seeds"] = [intel(entries, relations, seed) for seed in range(1, 6)]
+                result["intel_seeds"] = [intel(entries, relations, seed) for seed in range(1, 6)]
             if "intel_rbpf" in args.only:
-                report["intel_rbpf"] = intel(entries, relations, particles=ParticleConfig())
+                result["intel_rbpf"] = intel(entries, relations, particles=ParticleConfig())
         else:
-            report["intel"] = f"left out: {args.data / 'intel.log.gz'} is missing"
+            result["intel"] = f"left out: {args.data / 'intel.log.gz'} is missing"
     if "worlds" in args.only:
-        report["worlds"] = worlds()
+        result["worlds"] = worlds()
     if "sim" in args.only:
-        report["sim"] = simulated()
-    print(json.dumps(report, indent=2))
+        result["sim"] = simulated()
+    report(result, args.json)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+from reporting import CHROMIUM_FLAGS, note, parser_of, report
 
 from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.experiments.budget import Usage, cpu_percent, reference_loop, usage
@@ -33,10 +34,6 @@ from instant_ic.experiments.drive import DriveRecorder
 from instant_ic.experiments.stack import Stack, StackError, free_ports, processes_of
 from instant_ic.msg import ControlState, message_type, twist_values
 
-CHROMIUM_FLAGS = [
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 PASSAGE = [ControlState.REAL, ControlState.ENTERING, ControlState.VIRTUAL, ControlState.RETURNING, ControlState.REAL]
 BEYOND_X_M = 5.6
 """Map x behind the box where the key is released."""
@@ -105,10 +102,9 @@ class Watch:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--repeat", type=int, default=1, help="number of drives, each with a new stack (default 1)")
     parser.add_argument("--pace", type=float, default=None, help="fixed pace (default: what the machine can do)")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument("--screenshots", type=Path, metavar="DIR", help="screenshots of the page in each mode")
     parser.add_argument("--width", type=int, default=1280)
     parser.add_argument("--height", type=int, default=720)
@@ -127,9 +123,7 @@ def main() -> int:
             "completed": f"{sum(drive['completed'] for drive in drives)} of {len(drives)}",
             "drives": drives,
         }
-        if args.json:
-            args.json.write_text(json.dumps(result, indent=2) + "\n")
-    print(json.dumps(result, indent=2))
+        report(result, args.json)
     return 0 if all(drive["completed"] for drive in drives) else 1
 
 
@@ -323,11 +317,6 @@ def shot(page: Any, args: argparse.Namespace, name: str) -> None:
     if args.screenshots:
         args.screenshots.mkdir(parents=True, exist_ok=True)
         page.screenshot(path=str(args.screenshots / f"{name}.png"))
-
-
-def note(text: str) -> None:
-    """Print the progress."""
-    print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -20,10 +20,8 @@ All times are seconds of the stack, which runs at the pace of the machine (``--p
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import contextlib
-import json
 import math
 import os
 import random
@@ -44,6 +42,7 @@ from typing import Any, NamedTuple
 
 import aiohttp
 import numpy as np
+from reporting import parser_of, report
 
 from instant_ic import pace
 from instant_ic.bus import LATCHED, registry
@@ -317,25 +316,21 @@ async def silence_page(rig: Rig, page: ConsoleClient) -> None:
         task.cancel()
 
 
+LINKS: dict[str, tuple[Callable[[Rig], object], Callable[[Rig], object]]] = {
+    "page link cut": (lambda rig: rig.page_link.cut(), lambda rig: rig.page_link.mend()),
+    "camera link cut": (lambda rig: rig.camera_link.cut(), lambda rig: rig.camera_link.mend()),
+    "LiDAR packets cease": (lambda r: setattr(r.packets, "cut", True), lambda r: setattr(r.packets, "cut", False)),
+    "serial replies lost": (lambda r: setattr(r.serial, "mute", True), lambda r: setattr(r.serial, "mute", False)),
+    "serial cable pulled": (lambda rig: rig.serial.pull(), lambda rig: rig.serial.plug()),
+}
+"""Faults of links: functions that cause and end them."""
 FAULTS = [
     *(fault for node in PROCESSES for fault in process_faults(node)),
     Fault("emergency stop pressed", press_estop, release_estop),
     Fault("key let go (no loss; soft ramp)", let_go, nothing),
     Fault("page closed", close_page, nothing),
     Fault("page silent", silence_page, nothing),
-    Fault("page link cut", at_once(lambda rig: rig.page_link.cut()), at_once(lambda rig: rig.page_link.mend())),
-    Fault("camera link cut", at_once(lambda rig: rig.camera_link.cut()), at_once(lambda rig: rig.camera_link.mend())),
-    Fault(
-        "LiDAR packets cease",
-        at_once(lambda rig: setattr(rig.packets, "cut", True)),
-        at_once(lambda rig: setattr(rig.packets, "cut", False)),
-    ),
-    Fault(
-        "serial replies lost",
-        at_once(lambda rig: setattr(rig.serial, "mute", True)),
-        at_once(lambda rig: setattr(rig.serial, "mute", False)),
-    ),
-    Fault("serial cable pulled", at_once(lambda rig: rig.serial.pull()), at_once(lambda rig: rig.serial.plug())),
+    *(Fault(name, at_once(breaks), at_once(mends)) for name, (breaks, mends) in LINKS.items()),
 ]
 
 
@@ -511,8 +506,7 @@ def summary(drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
+    parser = parser_of(__doc__)
     parser.add_argument("--only", action="append", default=[], help="faults whose name begins so; may be repeated")
     parser.add_argument("--repeat", type=int, default=2, help="drives for each fault (default 2)")
     parser.add_argument(
@@ -535,10 +529,7 @@ def main() -> int:
         found = asyncio.run(drives(made, faults, args.repeat, args.seed))
     result["faults"] = {name: summary(rows) for name, rows in found.items()}
     result["drives"] = found
-    text = json.dumps(result, indent=2)
-    if args.json:
-        args.json.write_text(text + "\n")
-    print(text)
+    report(result, args.json)
     return 0 if all(len(rows) == args.repeat for rows in found.values()) else 1
 
 

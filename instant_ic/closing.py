@@ -27,8 +27,8 @@ class Closing(ABC):
 def on_end_signal(handler: Callable[..., Any]) -> Iterator[None]:
     """Handle SIGINT, SIGTERM and SIGHUP inside the block.
 
-    A script's ``COMMAND &`` inherits SIGINT as ignored; it is handled all the same. A SIGHUP that ``nohup`` ignores stays
-    ignored. Outside the main thread, where Python has no handlers, nothing is done.
+    A script's ``COMMAND &`` inherits SIGINT as ignored; it is handled all the same. A SIGHUP that ``nohup`` ignores
+    stays ignored. Outside the main thread, where Python has no handlers, nothing is done.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

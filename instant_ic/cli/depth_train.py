@@ -9,9 +9,8 @@ import importlib.util
 import json
 import os
 import shlex
-import signal
 import sys
-import time
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,6 @@ from instant_ic.closing import on_end_signal
 
 if TYPE_CHECKING:
     from instant_ic.training.completion import CompletionConfig, CompletionNet
-    from instant_ic.training.dataset import PanoramaDataset
     from instant_ic.training.feeds import Feed, Samples
     from instant_ic.training.rooms import RoomsConfig
     from instant_ic.training.trainer import Team, Trainer
@@ -68,16 +66,13 @@ def add_parser(commands: Any) -> None:
                       "plain random rooms, or none (default: wide; none with --data)")  # fmt: skip
     data.add_argument("--generated-share", type=float, default=0.5, metavar="SHARE",
                       help="share of generated panoramas in a batch, with --data (%(default)s)")  # fmt: skip
-    data.add_argument("--worlds", type=positive_int, default=None, help="number of generated worlds "
-                      "(default: 100000; 400 with --cache)")  # fmt: skip
+    data.add_argument("--worlds", type=positive_int, default=100_000, help="number of generated worlds (%(default)s)")
     data.add_argument("--poses", type=positive_int, default=6, help="panoramas per world (%(default)s)")
     data.add_argument("--workers", type=not_negative, default=max(1, (os.cpu_count() or 2) - 1), metavar="N",
                       help="background processes for rendering (%(default)s)")  # fmt: skip
     data.add_argument("--pool", type=positive_int, metavar="N", help="size of the pool of generated panoramas")
     data.add_argument("--reuse", type=positive, metavar="N",
                       help="average number of uses of each generated panorama (3; gpu: 6)")  # fmt: skip
-    data.add_argument("--cache", type=Path, metavar="FOLDER", help="render all worlds into this folder once, before "
-                      "the training, instead of rendering during it")  # fmt: skip
     training = parser.add_argument_group("training")
     training.add_argument("--height", type=positive_int, default=256, metavar="ROWS",
                           help="rows of the network's image (%(default)s)")  # fmt: skip
@@ -209,7 +204,7 @@ def _trainer(args: argparse.Namespace, network: CompletionConfig, team: Team, re
 
 def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, report: Any) -> tuple[Feed, Samples]:
     """Training batches and evaluation panoramas selected on the command line."""
-    from instant_ic.training.dataset import Subset
+    from instant_ic.training.dataset import Selection
     from instant_ic.training.feeds import FileFeed, MixedFeed, RenderedFeed
     from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig
 
@@ -230,37 +225,28 @@ def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, repor
         from instant_ic.training.photographs import load
 
         load(textures)  # an error here, not in a rendering process
-    worlds = args.worlds or (400 if args.cache else 100_000)
     feeds: list[Feed] = []
-    held_out: list[Subset] = []
+    held_out: list[tuple[Samples, Any]] = []
     for number, folder in enumerate(folders):
         part = (size - own + number) // len(folders)
         training, kept = folder.split()
         report(f"{folder.folder}: {len(training)} panoramas for training, {len(kept)} for evaluation")
         feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers or 1))
-        held_out.append(Subset(folder, kept))
+        held_out.append((folder, kept))
     if own:
-        recipe = RoomsConfig(worlds=worlds, poses=args.poses, first_world=FIRST_WORLD, height=network.height,
+        recipe = RoomsConfig(worlds=args.worlds, poses=args.poses, first_world=FIRST_WORLD, height=network.height,
                              interiors=generated, textures=textures)  # fmt: skip
-        if args.cache:
-            data = open_cache(args.cache, recipe, args.workers, team, report)
-            training, kept = data.split(0.08)
-            feeds.append(FileFeed(data, training, own, args.seed, team.rank, team.ranks, data.info))
-            held_out.append(Subset(data, kept))
-        else:
-            kept_worlds = max(2, args.held_out // 2)
-            first = FIRST_HELD_OUT - kept_worlds
-            held = RoomsConfig(worlds=kept_worlds, poses=2, first_world=first, height=network.height,
-                               interiors=generated, textures=textures)  # fmt: skip
-            if recipe.first_world + worlds > held.first_world:
-                raise ValueError(f"worlds from seed {held.first_world} are reserved for evaluation: reduce --worlds")
-            feeds.append(RenderedFeed(recipe, own, args.seed, args.workers, max(args.pool, own), args.reuse,
-                                      team.rank, team.ranks))  # fmt: skip
-            if team.rank == 0:
-                report(f"rendering {held.count} panoramas for evaluation")
-                samples = _rendered(held, args.workers)
-                held_out.append(Subset(samples, range(len(samples))))
-    return feeds[0] if len(feeds) == 1 else MixedFeed(feeds), Subset.joined(held_out)
+        kept_worlds = max(2, args.held_out // 2)
+        held = replace(recipe, worlds=kept_worlds, poses=2, first_world=FIRST_HELD_OUT - kept_worlds)
+        if FIRST_WORLD + args.worlds > held.first_world:
+            raise ValueError(f"worlds from seed {held.first_world} are reserved for evaluation: reduce --worlds")
+        feeds.append(RenderedFeed(recipe, own, args.seed, args.workers, max(args.pool, own), args.reuse,
+                                  team.rank, team.ranks))  # fmt: skip
+        if team.rank == 0:
+            report(f"rendering {held.count} panoramas for evaluation")
+            samples = _rendered(held, args.workers)
+            held_out.append((samples, range(len(samples))))
+    return feeds[0] if len(feeds) == 1 else MixedFeed(feeds), Selection(*held_out)
 
 
 def _rendered(recipe: RoomsConfig, workers: int) -> list[Any]:
@@ -268,41 +254,6 @@ def _rendered(recipe: RoomsConfig, workers: int) -> list[Any]:
 
     with Renderers(recipe, workers, lambda place: recipe.first_world + place % recipe.worlds) as renderers:
         return [sample for _ in range(recipe.worlds) for sample in renderers.world()]
-
-
-def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, report: Any) -> PanoramaDataset:
-    """Open the data folder; process 0 renders it first where it is missing or incomplete.
-
-    Raises:
-        UserError: it was rendered with other settings.
-    """
-    from instant_ic.training.dataset import PanoramaDataset, write_dataset
-    from instant_ic.training.feeds import WORLD_TIMEOUT_S, Renderers
-
-    done = folder / "complete"
-    if not done.exists() and team.rank == 0:
-        begin = time.monotonic()
-        size = (recipe.height, 2 * recipe.height)
-        with Renderers(recipe, workers, lambda place: recipe.first_world + place % recipe.worlds) as renderers:
-            samples = (sample for _ in range(recipe.worlds) for sample in renderers.world())
-            for count in write_dataset(folder, samples, recipe.count, size, recipe.as_dict()):
-                if count % 100 == 0 or count == recipe.count:
-                    rate = count / (time.monotonic() - begin)
-                    report(f"rendered {count} of {recipe.count} panoramas, {rate:.1f} per second")
-        done.touch()
-    end = time.monotonic() + WORLD_TIMEOUT_S + recipe.count
-    while not done.exists():
-        if time.monotonic() > end:
-            raise UserError(f"{folder}: timed out while process 0 was rendering")
-        time.sleep(1.0)
-    data = PanoramaDataset(folder)
-    wanted = json.loads(json.dumps(recipe.as_dict()))
-    differs = [key for key, value in wanted.items() if data.info.get(key) != value]
-    if differs:
-        raise UserError(
-            f"{folder} was rendered with another {', '.join(differs)}: give another folder, or delete this one"
-        )
-    return data
 
 
 def _ends_early(trainer: Trainer) -> contextlib.AbstractContextManager[None]:

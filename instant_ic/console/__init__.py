@@ -8,7 +8,7 @@ from instant_ic.console.client import ConsoleClient
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
 from instant_ic.console.protocol import Frame, FrameKind, ProtocolError, decode_frame, encode_frame
 from instant_ic.console.server import Backend, ConsoleError, ConsoleServer, ServerConfig
-from instant_ic.console.view import Look, ViewConfig, ViewScheduler
+from instant_ic.console.view import Look, ViewConfig
 
 __all__ = [
     "Backend",
@@ -24,7 +24,6 @@ __all__ = [
     "ServerConfig",
     "Verdict",
     "ViewConfig",
-    "ViewScheduler",
     "decode_frame",
     "encode_frame",
 ]

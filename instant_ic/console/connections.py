@@ -13,7 +13,6 @@ import ssl
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any
 
 from aiohttp import web
@@ -146,14 +145,6 @@ class Connection(web.RequestHandler):
             self._stall = None
 
 
-@dataclass(frozen=True)
-class Limits:
-    """Largest number of simultaneous connections, in total and of one address."""
-
-    total: int
-    per_address: int
-
-
 class Listener:
     """Accepts connections within limits.
 
@@ -162,13 +153,17 @@ class Listener:
 
     Args:
         server: answers the requests.
-        limits: numbers of connections.
+        most: largest number of simultaneous connections.
+        most_per_address: the same for one address.
         tls: context for https; None: http.
         headers: added to error responses that are created below the application.
     """
 
-    def __init__(self, server: web.Server, limits: Limits, tls: ssl.SSLContext | None, headers: dict[str, str]) -> None:
-        self._server, self._limits, self._tls, self._headers = server, limits, tls, headers
+    def __init__(
+        self, server: web.Server, most: int, most_per_address: int, tls: ssl.SSLContext | None, headers: dict[str, str]
+    ) -> None:
+        self._server, self._tls, self._headers = server, tls, headers
+        self._most, self._most_per_address = most, most_per_address
         self._connections: dict[Connection, None] = {}  # oldest first
         self._rates = AddressBuckets(CONNECTIONS_PER_S, BURST_CONNECTIONS)
         self._sockets: list[socket.socket] = []
@@ -227,9 +222,9 @@ class Listener:
         own = [connection for connection in self._connections if connection.network == network]
         if not self._rates.of(network).take(time.monotonic()):
             reason = f"more than {CONNECTIONS_PER_S:g} new ones a second"
-        elif len(own) >= self._limits.per_address and not self._displace(own):
+        elif len(own) >= self._most_per_address and not self._displace(own):
             reason = f"it has {len(own)} WebSockets"
-        elif len(self._connections) >= self._limits.total and not self._displace(self._connections):
+        elif len(self._connections) >= self._most and not self._displace(self._connections):
             reason = f"all {len(self._connections)} are WebSockets"
         else:
             connection = Connection(self._server, network, self._headers, self._forget)

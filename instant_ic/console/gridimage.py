@@ -28,16 +28,13 @@ class GridImage:
     digest: int
 
 
-def grid_image(
-    grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float, float], *, crop: bool = True
-) -> GridImage | None:
-    """Encode a grid as a PNG.
+def grid_image(grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float, float]) -> GridImage | None:
+    """Encode the known cells of a grid as a PNG, with a margin of 2 cells.
 
     Args:
         grid: cells (H, W) int8, -1 unknown, else 0..100; row 0 is the lowest y.
         resolution: cell size, m.
         origin_xy: lower left corner of the grid, m.
-        crop: crop to the known cells with a margin of 2 cells.
 
     Returns:
         The image; None if no cell is known.
@@ -46,18 +43,15 @@ def grid_image(
     known_columns = np.flatnonzero((grid >= 0).any(axis=0))
     if len(known_rows) == 0:
         return None
-    row_0, row_1, column_0, column_1 = 0, grid.shape[0], 0, grid.shape[1]
-    if crop:
-        row_0, row_1 = max(known_rows[0] - 2, 0), min(known_rows[-1] + 3, row_1)
-        column_0, column_1 = max(known_columns[0] - 2, 0), min(known_columns[-1] + 3, column_1)
-    cells = grid[row_0:row_1, column_0:column_1]
+    row, column = max(known_rows[0] - 2, 0), max(known_columns[0] - 2, 0)
+    cells = grid[row : known_rows[-1] + 3, column : known_columns[-1] + 3]
     grey = np.ascontiguousarray(np.where(cells < 0, UNKNOWN, cells).astype(np.uint8)[::-1])
     header = {
         "resolution": float(resolution),
         "width": int(grey.shape[1]),
         "height": int(grey.shape[0]),
-        "x": float(origin_xy[0] + column_0 * resolution),
-        "y": float(origin_xy[1] + row_0 * resolution),
+        "x": float(origin_xy[0] + column * resolution),
+        "y": float(origin_xy[1] + row * resolution),
     }
     data = grey_png(grey)
     return GridImage(header, data, zlib.crc32(data, zlib.crc32(repr(header).encode())))

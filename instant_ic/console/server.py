@@ -31,7 +31,6 @@ from instant_ic.console.connections import (
     HEADERS_S,
     AddressBuckets,
     Connection,
-    Limits,
     Listener,
     network_of,
 )
@@ -39,7 +38,7 @@ from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, short_text, whole
-from instant_ic.console.session import PendingFrame, PendingLayers, Session
+from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
 from instant_ic.pace import current
 from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
@@ -170,7 +169,7 @@ class ConsoleServer:
         self._requests = AddressBuckets(REQUESTS_PER_S, BURST_REQUESTS)
         self._sockets = AddressBuckets(SOCKETS_PER_S, BURST_SOCKETS)
         self._texts: dict[str, str] = {}
-        self._frames: dict[FrameKind, PendingFrame | PendingLayers] = {}
+        self._frames: dict[FrameKind, PendingFrame | PageLayers] = {}
         self._versions: dict[int, float] = {}  # of layers -> when the next one superseded it; inf: not yet
         self._foreground = frozenset({FrameKind.PANORAMA})
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -315,8 +314,8 @@ class ConsoleServer:
         runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
         await runner.setup()
         assert runner.server is not None
-        limits = Limits(self.config.max_connections, self.config.max_connections_per_address)
-        self._listener = listener = Listener(runner.server, limits, self._tls, SECURITY_HEADERS)
+        limits = self.config.max_connections, self.config.max_connections_per_address
+        self._listener = listener = Listener(runner.server, *limits, self._tls, SECURITY_HEADERS)
         try:
             self.port = await listener.open(self.config.host, self.config.port)
             drive_task = asyncio.create_task(self._drive_forever())
@@ -816,9 +815,9 @@ class ConsoleServer:
             if version != layers.version and now - since < 2 * SUPERSEDED_S
         }
         self._versions[layers.version] = float("inf")
-        pending = self._frames[FrameKind.LAYERS] = PendingLayers(layers)
+        self._frames[FrameKind.LAYERS] = layers
         for session in self._sessions.values():
-            session.put_frame(FrameKind.LAYERS, pending)
+            session.put_frame(FrameKind.LAYERS, layers)
 
     def _show(self, kinds: frozenset[FrameKind]) -> None:
         self._foreground = kinds

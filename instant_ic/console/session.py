@@ -29,20 +29,9 @@ class PendingFrame:
     header: dict[str, Any]
     payload: bytes
 
-    def content(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
-        """Return header and payload."""
+    def frame(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
+        """Return header and payload, as ``PageLayers.frame`` does."""
         return self.header, self.payload
-
-
-@dataclass(frozen=True)
-class PendingLayers:
-    """Layers of the virtual space."""
-
-    layers: PageLayers
-
-    def content(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
-        """Return header and payload without the layers that the page holds."""
-        return self.layers.frame(held)
 
 
 class Session:
@@ -84,7 +73,7 @@ class Session:
         self._offered: frozenset[str] = frozenset()  # of the layers sent last
         self._replies: deque[str] = deque()
         self._texts: dict[str, str] = {}
-        self._frames: dict[FrameKind, PendingFrame | PendingLayers] = {}
+        self._frames: dict[FrameKind, PendingFrame | PageLayers] = {}
         self._sent_frames: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
         self._unacknowledged: dict[FrameKind, int] = {}
         self._parts: deque[Frame] = deque()  # of the layers that are being sent; their sequence numbers are still open
@@ -106,7 +95,7 @@ class Session:
         self._texts[key] = text
         self._wake.set()
 
-    def put_frame(self, kind: FrameKind, frame: PendingFrame | PendingLayers) -> None:
+    def put_frame(self, kind: FrameKind, frame: PendingFrame | PageLayers) -> None:
         """Queue a frame, replacing a pending one of the same kind."""
         self._frames[kind] = frame
         self._wake.set()
@@ -155,9 +144,9 @@ class Session:
             self._sent_frames[kind] += 1
             self._unacknowledged[kind] = self._sent_frames[kind]
             self._last_sent[kind] = now
-            if isinstance(pending, PendingLayers):
-                self._offered = pending.layers.digests
-            data = encode_frame(Frame(kind, self._sent_frames[kind], *pending.content(self._held)))
+            if isinstance(pending, PageLayers):
+                self._offered = pending.digests
+            data = encode_frame(Frame(kind, self._sent_frames[kind], *pending.frame(self._held)))
             if kind is not FrameKind.LAYERS or len(data) <= PART_BYTES:
                 return data
             self._parts.extend(

@@ -1,4 +1,4 @@
-"""Look direction of the operator, and scheduling of requests for rendered views."""
+"""Look direction of the operator, and the shape of the views rendered for it."""
 
 from __future__ import annotations
 
@@ -83,37 +83,3 @@ def view_shape(look: Look, config: ViewConfig) -> ViewShape:
     # If the aspect ratio was clamped or rounded, the larger field of view wins.
     fov = 2 * math.atan(max(half_width, half_height * width / height))
     return ViewShape(fov, width, height)
-
-
-class ViewScheduler:
-    """Schedules view requests: one outstanding at a time, the next after the answer or time-out."""
-
-    def __init__(self, config: ViewConfig) -> None:
-        self.config = config
-        self.lost = 0
-        self._next_id = 1
-        self._outstanding: int | None = None
-        self._asked_s = -math.inf  # time of the last request
-
-    def due(self, now_s: float, rate_hz: float) -> bool:
-        """Whether to send a request now, if there are to be so many a second."""
-        if self._outstanding is not None:
-            if now_s - self._asked_s < self.config.response_timeout_s:
-                return False
-            self.lost += 1
-            self._outstanding = None
-        return now_s - self._asked_s >= 1.0 / rate_hz - 0.001
-
-    def asked(self, now_s: float) -> int:
-        """Record a request and return its id."""
-        number = self._outstanding = self._next_id
-        self._next_id = self._next_id % (2**32 - 1) + 1  # uint32 in ViewRequest; 0 stays unused
-        self._asked_s = now_s
-        return number
-
-    def answered(self, request_id: int) -> bool:
-        """Record an answer; return whether it answers the outstanding request."""
-        if request_id != self._outstanding:
-            return False
-        self._outstanding = None
-        return True

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from instant_ic.console.display import Display
 from instant_ic.console.scene import Scene
-from instant_ic.console.view import PROBE, PROBE_HZ, Look, ViewConfig, ViewScheduler, view_shape
+from instant_ic.console.view import PROBE, PROBE_HZ, Look, ViewConfig, view_shape
 from instant_ic.msg import ViewRequest, header, pose_message
 
 _MOST_PENDING = 8
@@ -15,24 +16,19 @@ _MOST_PENDING = 8
 class ViewRequests:
     """Makes the requests: of views to be shown while a page needs them, else of small ones that are only judged.
 
+    One is outstanding at a time; the next follows its answer or time-out.
+
     Attributes:
         config: rate and size; may be replaced at any time.
         look: the driver's look direction.
     """
 
     def __init__(self, config: ViewConfig, scene: Scene, display: Display) -> None:
+        self.config = config
         self.look = Look()
-        self._scheduler = ViewScheduler(config)
         self._scene, self._display = scene, display
+        self._newest, self._outstanding, self._asked_ns = 0, False, -math.inf
         self._sent_ns: dict[int, int | None] = {}  # recent requests: id -> send time (steady ns); None: only judged
-
-    @property
-    def config(self) -> ViewConfig:
-        return self._scheduler.config
-
-    @config.setter
-    def config(self, config: ViewConfig) -> None:
-        self._scheduler.config = config
 
     def next(self, renders: bool, needed: bool, stamp_ns: int, now_ns: int) -> ViewRequest | None:
         """Return the request that is due, or None.
@@ -46,28 +42,36 @@ class ViewRequests:
         virtual = self._display.with_vbot
         map_from_base = self._scene.vbot_pose() if virtual else self._scene.robot_pose()
         rate_hz = self.config.virtual_rate_hz if virtual and needed else PROBE_HZ
-        if not (virtual or renders) or map_from_base is None or not self._scheduler.due(now_ns / 1e9, rate_hz):
+        if not (virtual or renders) or map_from_base is None or not self._due((now_ns - self._asked_ns) / 1e9, rate_hz):
             return None
         size = self.config if needed else replace(self.config, width=PROBE[0], height=PROBE[1])
         shape = view_shape(self.look, size)
-        number = self._scheduler.asked(now_ns / 1e9)
-        self._sent_ns[number] = now_ns if needed else None
+        self._newest = self._newest % (2**32 - 1) + 1  # uint32 in ViewRequest; 0 stays unused
+        self._outstanding, self._asked_ns = True, now_ns
+        self._sent_ns[self._newest] = now_ns if needed else None
         while len(self._sent_ns) > _MOST_PENDING:
             del self._sent_ns[next(iter(self._sent_ns))]
         return ViewRequest(
             header=header("map", stamp_ns),
-            id=number,
+            id=self._newest,
             pose=pose_message(map_from_base @ self._scene.camera_mount() @ self.look.rotation()),
             fov_rad=shape.fov_rad,
             width=shape.width,
             height=shape.height,
         )
 
+    def _due(self, since_s: float, rate_hz: float) -> bool:
+        """Whether to send a request so long after the last one, if there are to be so many a second."""
+        if self._outstanding and since_s < self.config.response_timeout_s:
+            return False
+        return since_s >= 1.0 / rate_hz - 0.001
+
     def answered(self, request_id: int, now_ns: int) -> float | None:
         """Note an answer; return its delay in seconds, None for a view that is only judged.
 
         A slow renderer answers after the time-out, which is when its delay matters most.
         """
-        self._scheduler.answered(request_id)
+        if request_id == self._newest:
+            self._outstanding = False
         sent_ns = self._sent_ns.get(request_id, now_ns)
         return None if sent_ns is None else (now_ns - sent_ns) / 1e9

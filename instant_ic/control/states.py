@@ -1,6 +1,6 @@
 """The state machine of illusory control as data (paper, III.A): states, guards, actions, sources, reasons.
 
-``diagram.py`` prints these tables for the docs; ``arbiter.py`` runs them with the guards of ``guards.py``.
+``arbiter.py`` runs these tables with the guards of ``guards.py``; ``tests/control/diagram.py`` prints them for docs.
 """
 
 from __future__ import annotations

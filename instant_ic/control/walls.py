@@ -11,11 +11,6 @@ from numpy.typing import NDArray
 from instant_ic.control.static_map import StaticMap
 
 
-def occupied_cells(static: StaticMap, occupied_threshold: int) -> NDArray[np.bool_]:
-    """Mask (H, W) of the cells that may be part of a wall."""
-    return static.occupancy >= occupied_threshold
-
-
 class WallMap:
     """Distance to the nearest wall of a map.
 
@@ -27,7 +22,9 @@ class WallMap:
         import cv2
 
         self.static = static
-        occupied = occupied_cells(static, occupied_threshold).astype(np.uint8)
+        self.occupied: NDArray[np.bool_] = static.occupancy >= occupied_threshold
+        """(H, W) cells that may be part of a wall."""
+        occupied = self.occupied.astype(np.uint8)
         length = max(2, math.ceil(min_length_m / static.resolution))
         lines = cv2.HoughLinesP(occupied * 255, 1.0, math.pi / 180.0, length // 2, minLineLength=length, maxLineGap=3)
         drawn = np.zeros_like(occupied)
@@ -64,21 +61,15 @@ class WallFinder:
 
     def find(self, static: StaticMap) -> WallMap:
         """Return the walls of ``static``; the same object as before if nothing has changed."""
-        if self._found is None or not self._same(self._found.static, static):
-            self._found = WallMap(static, self.min_length_m, self.occupied_threshold)
-        return self._found
-
-    def _same(self, before: StaticMap, now: StaticMap) -> bool:
-        return (
-            before.resolution == now.resolution
-            and before.occupancy.shape == now.occupancy.shape
-            and bool(np.array_equal(before.origin, now.origin))
-            and bool(
-                np.array_equal(
-                    occupied_cells(before, self.occupied_threshold), occupied_cells(now, self.occupied_threshold)
-                )
-            )
-        )
+        before = self._found
+        if (
+            before is None
+            or before.static.resolution != static.resolution
+            or not np.array_equal(before.static.origin, static.origin)
+            or not np.array_equal(before.occupied, static.occupancy >= self.occupied_threshold)
+        ):
+            self._found = before = WallMap(static, self.min_length_m, self.occupied_threshold)
+        return before
 
 
 class WallSearch:

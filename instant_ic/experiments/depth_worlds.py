@@ -48,14 +48,6 @@ class Scene:
     camera_height_m: float
 
 
-def held_out(
-    kind: str, count: int = 20, mesh: str | Path | None = None, height: int = 256
-) -> Iterator[tuple[str, NDArray[np.uint8], NDArray[np.float32], float]]:
-    """Name, image (H, W, 3), ground-truth radial depth (H, W) and camera height of each panorama; see ``scenes``."""
-    for scene in scenes(kind, count, mesh, height):
-        yield scene.name, scene.rgb, scene.depth_m, scene.camera_height_m
-
-
 def scenes(kind: str, count: int = 20, mesh: str | Path | None = None, height: int = 256) -> Iterator[Scene]:
     """The held-out panoramas of a kind; always the same ones.
 

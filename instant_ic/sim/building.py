@@ -50,8 +50,19 @@ class Zone:
             "west": ((self.x0, self.y0), (self.x0, self.y1)),
         }[name]
 
+    def beyond(self, side: str, low: float, high: float, depth: float) -> tuple[float, float, float, float]:
+        """Rectangle x0, y0, x1, y1 behind a wall, from ``low`` to ``high`` in x (north, south) or y."""
+        return {
+            "north": (low, self.y1, high, self.y1 + depth),
+            "south": (low, self.y0 - depth, high, self.y0),
+            "east": (self.x1, low, self.x1 + depth, high),
+            "west": (self.x0 - depth, low, self.x0, high),
+        }[side]
+
 
 SIDES = ("north", "south", "east", "west")
+INWARD_YAW = {"north": -math.pi / 2, "south": math.pi / 2, "east": math.pi, "west": 0.0}
+"""Heading of a thing with its back to a wall."""
 
 
 @dataclass
@@ -68,13 +79,7 @@ class Building:
 
     def door(self, room: Zone, side: str, at: float, thickness: float, width: float = 0.95) -> Zone:
         """Add a doorway through the wall on one side of ``room``; ``at`` is its centre in x (north, south) or y."""
-        low, high = at - width / 2, at + width / 2
-        rect = {
-            "north": (low, room.y1, high, room.y1 + thickness),
-            "south": (low, room.y0 - thickness, high, room.y0),
-            "east": (room.x1, low, room.x1 + thickness, high),
-            "west": (room.x0 - thickness, low, room.x0, high),
-        }[side]
+        rect = room.beyond(side, at - width / 2, at + width / 2, thickness)
         trim = room.finish.trim
         finish = Finish(trim, room.finish.floor, trim, None, trim)
         return self.add(Zone(*rect, height=DOOR_M, finish=finish, doorway=True))

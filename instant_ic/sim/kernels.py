@@ -743,41 +743,14 @@ def _compose(
 
 
 @_jit
-def _irradiance(
-    s: int,
-    x: Scalar,
-    y: Scalar,
-    z: Scalar,
-    light_at: npt.NDArray[np.int64],
-    light_uv: F32,
-    light_linear: F32,
-    light: F32,
-) -> tuple[Scalar, Scalar, Scalar]:
-    """Baked light at a point of surface ``s``, bilinear in its light map."""
-    width, height = light_at[s, 1], light_at[s, 2]
-    if width == 0:
-        e = light_linear[s, 0] * x + light_linear[s, 1] * y + light_linear[s, 2] * z + light_linear[s, 3]
-        e = max(e, np.float32(0.02))
-        return e, e, e
-    a = light_uv[s, 0, 0] * x + light_uv[s, 0, 1] * y + light_uv[s, 0, 2] * z + light_uv[s, 0, 3]
-    b = light_uv[s, 1, 0] * x + light_uv[s, 1, 1] * y + light_uv[s, 1, 2] * z + light_uv[s, 1, 3]
-    return _light_texel(light, light_at[s, 0], width, height, a, b)
-
-
-@_jit
 def light_at_hits(
-    surface: I32,
-    range_m: F32,
-    origins: F32,
-    directions: F32,
-    light_at: npt.NDArray[np.int64],
-    light_uv: F32,
-    light_linear: F32,
-    light: F32,
-    albedo: F32,
+    surface: I32, range_m: F32, origins: F32, directions: F32, light_at: I64, light_uv: F32, light: F32, albedo: F32,
     out: F32,
-) -> None:
-    """Light (N, 3) reflected by the surfaces that rays hit (irradiance · albedo); zero where the range is negative."""
+) -> None:  # fmt: skip
+    """Light (N, 3) reflected by the rectangles that rays hit (irradiance · albedo); zero where the range is negative.
+
+    The irradiance is bilinear in each surface's light map.
+    """
     for i in range(surface.shape[0]):
         r = range_m[i]
         if r < 0:
@@ -786,7 +759,9 @@ def light_at_hits(
         x = origins[i, 0] + r * directions[i, 0]
         y = origins[i, 1] + r * directions[i, 1]
         z = origins[i, 2] + r * directions[i, 2]
-        er, eg, eb = _irradiance(s, x, y, z, light_at, light_uv, light_linear, light)
+        a = light_uv[s, 0, 0] * x + light_uv[s, 0, 1] * y + light_uv[s, 0, 2] * z + light_uv[s, 0, 3]
+        b = light_uv[s, 1, 0] * x + light_uv[s, 1, 1] * y + light_uv[s, 1, 2] * z + light_uv[s, 1, 3]
+        er, eg, eb = _light_texel(light, light_at[s, 0], light_at[s, 1], light_at[s, 2], a, b)
         out[i, 0] = er * albedo[s, 0]
         out[i, 1] = eg * albedo[s, 1]
         out[i, 2] = eb * albedo[s, 2]

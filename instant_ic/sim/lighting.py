@@ -155,7 +155,7 @@ def _gather(world: World, points: F32, normals: F32, rays: int) -> tuple[F32, np
         bounce = np.zeros((count, 3), np.float32)
         kernels.light_at_hits(
             s, np.where(hit & ~back, distance, -1.0).astype(np.float32), start, direction, world.light_at,
-            world.light_uv, world.light_linear, world.light, albedo, bounce,
+            world.light_uv, world.light, albedo, bounce,
         )  # fmt: skip
         openness = np.where(hit, np.minimum(distance / _AMBIENT_REACH_M, 1.0), 1.0)
         result += bounce + _AMBIENT * (0.25 + 0.75 * openness[:, None].astype(np.float32))

@@ -420,30 +420,14 @@ def _lamp(rng: np.random.Generator) -> FloatArray:
     return _grey(0.94 + 0.05 * np.sin(2 * np.pi * 16 * x) * np.sin(2 * np.pi * 16 * y))
 
 
+#: By name. The order is part of each texture's seed: new ones come last.
 _GENERATORS: dict[str, Callable[[np.random.Generator], FloatArray]] = {
-    "paint": _paint,
-    "roughcast": _roughcast,
-    "wallpaper": _wallpaper,
-    "brick": _brick,
-    "blocks": _blocks,
-    "floor_tiles": _floor_tiles,
-    "lino": _lino,
-    "planks": _planks,
-    "carpet": _carpet,
-    "concrete": _concrete,
-    "ceiling_tiles": _ceiling_tiles,
-    "wood": _wood,
-    "white": _white,
-    "metal": _metal,
-    "fabric": _fabric,
-    "cardboard": _cardboard,
-    "books": _books,
-    "door": _door,
-    "poster": _poster,
-    "notices": _notices,
-    "window": _window,
-    "lamp": _lamp,
-}
+    make.__name__.removeprefix("_"): make
+    for make in (
+        _paint, _roughcast, _wallpaper, _brick, _blocks, _floor_tiles, _lino, _planks, _carpet, _concrete,
+        _ceiling_tiles, _wood, _white, _metal, _fabric, _cardboard, _books, _door, _poster, _notices, _window, _lamp,
+    )
+}  # fmt: skip
 
 #: Textures that end at their border (one image stretched over its surface).
 CLAMPED = frozenset({"books", "door", "poster", "notices", "window", "cardboard"})

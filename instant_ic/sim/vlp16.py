@@ -5,6 +5,8 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 from typing import Annotated
 
 import numba
@@ -229,9 +231,7 @@ class Vlp16:
         now_ns = self._epoch_ns(time_s)
         moment = datetime.fromtimestamp(now_ns // 1_000_000_000, UTC)
         body = f"GPRMC,{moment:%H%M%S},A,0000.0000,N,00000.0000,E,000.0,000.0,{moment:%d%m%y},000.0,E"
-        checksum = 0
-        for character in body.encode("ascii"):
-            checksum ^= character
+        checksum = reduce(xor, body.encode("ascii"))
         return wire.encode_position_packet((now_ns // 1000) % wire.HOUR_US, 2, f"${body}*{checksum:02X}")
 
 

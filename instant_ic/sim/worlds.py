@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from instant_ic.sim import furniture
-from instant_ic.sim.building import SIDES, Building, Finish, Zone
+from instant_ic.sim.building import INWARD_YAW, SIDES, Building, Finish, Zone
 from instant_ic.sim.mesh_files import load_world
 from instant_ic.sim.world import Material, World
 
@@ -226,17 +226,11 @@ def side_room(
     at = float(rng.uniform(low + 0.5, high - 0.5))
     centre = start[0] + sign_x * at if side in ("north", "south") else start[1] + sign_y * at
     width = float(rng.uniform(0.85, 1.2))
-    building.door(zone, side, centre, wall, width)
+    door = building.door(zone, side, centre, wall, width)
     # At most as wide as its share of the wall, so that neighbouring side rooms do not overlap.
     left, right = min(at - low, 3.0) + 0.15, min(high - at, 3.0) + 0.15
     ends = sorted((centre - left, centre + right) if sign_x + sign_y > 0 else (centre + left, centre - right))
-    depth = float(rng.uniform(2.2, 5.0))
-    rect = {
-        "north": (ends[0], zone.y1 + wall, ends[1], zone.y1 + wall + depth),
-        "south": (ends[0], zone.y0 - wall - depth, ends[1], zone.y0 - wall),
-        "east": (zone.x1 + wall, ends[0], zone.x1 + wall + depth, ends[1]),
-        "west": (zone.x0 - wall - depth, ends[0], zone.x0 - wall, ends[1]),
-    }[side]
+    rect = door.beyond(side, ends[0], ends[1], float(rng.uniform(2.2, 5.0)))
     finish = random_finish(rng) if rng.random() < 0.7 else zone.finish
     return building.add(Zone(*rect, height=float(rng.uniform(2.3, max(2.4, zone.height))), finish=finish))
 
@@ -290,7 +284,6 @@ def _furnish(rng: np.random.Generator, building: Building, zone: Zone, keep: tup
     for _ in range(int(rng.poisson(0.16 * w * d if not narrow else 0.06 * w * d))):
         against = rng.random() < 0.75
         side = str(rng.choice(SIDES))
-        inward = {"north": -math.pi / 2, "south": math.pi / 2, "east": math.pi, "west": 0.0}[side]
         gap = 0.45
         if against:
             x = {"east": zone.x1 - gap, "west": zone.x0 + gap}.get(
@@ -309,7 +302,7 @@ def _furnish(rng: np.random.Generator, building: Building, zone: Zone, keep: tup
         if any(math.hypot(x - px, y - py) < radius + pr for px, py, pr in placed):
             continue
         placed.append((x, y, radius))
-        _piece(rng, build, (x, y), inward if against else float(rng.uniform(-math.pi, math.pi)), zone.height)
+        _piece(rng, build, (x, y), INWARD_YAW[side] if against else float(rng.uniform(-math.pi, math.pi)), zone.height)
 
 
 def _piece(

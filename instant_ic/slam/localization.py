@@ -113,7 +113,7 @@ class Localizer:
         )
         self._pooled = [pool(self._field.values, POOL << level) for level in range(LEVELS)]
         cells = np.floor((free - self._field.origin) / (POOL * self._field.resolution)).astype(np.int64)
-        self._free = [np.zeros(pooled.shape, dtype=np.bool_) for pooled in self._pooled]
+        self._free: list[NDArray[np.bool_]] = [np.zeros(pooled.shape, dtype=np.bool_) for pooled in self._pooled]
         for level, mask in enumerate(self._free):
             mask[tuple((cells[:, ::-1] >> level).T)] = True
         self._rotations = math.ceil(2 * math.pi / ROTATION_STEP_RAD)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import wrap_angle
 from instant_ic.slam.likelihood_field import LikelihoodField
@@ -29,34 +30,28 @@ CANDIDATES = 12
 """Number of coarse peaks to refine."""
 APART_M, APART_RAD = 0.6, 0.3
 """Poses this far apart, or turned by this much, are different places."""
+LEAST = np.float64(0.05)  # float32 would round it up, and leave out a cell of just this value
+"""Values of the field up to it count as 0 in the pooled one."""
 
 
-@njit(cache=True)
-def pool(field, size):  # type: ignore[no-untyped-def]
+def pool(field: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     """Best value near each pooled cell.
 
     Args:
-        field: float32 (H, W).
+        field: (H, W).
         size: cells along a side of a pooled cell.
 
     Returns:
-        float32 (ceil(H/size), ceil(W/size)); cell (j, i) holds the maximum within ``size`` cells of the field's cell
+        (ceil(H/size), ceil(W/size)); cell (j, i) holds the maximum within ``size`` cells of the field's cell
         (j·size, i·size) along either axis.
     """
     height, width = field.shape
-    rows, columns = (height + size - 1) // size, (width + size - 1) // size
-    pooled = np.zeros((rows, columns), dtype=np.float32)
-    for y in range(height):
-        j = y // size
-        for x in range(width):
-            value = field[y, x]
-            if value > 0.05:
-                i = x // size
-                for v in range(j, min(j + 2, rows)):
-                    for u in range(i, min(i + 2, columns)):
-                        if value > pooled[v, u]:
-                            pooled[v, u] = value
-    return pooled
+    whole = np.pad(field, ((0, -height % size), (0, -width % size)))
+    blocks = whole.reshape(whole.shape[0] // size, size, -1, size).max(axis=(1, 3))
+    blocks[~(blocks > LEAST)] = 0.0
+    blocks[1:] = np.maximum(blocks[1:], blocks[:-1])
+    blocks[:, 1:] = np.maximum(blocks[:, 1:], blocks[:, :-1])
+    return blocks
 
 
 @njit(cache=True)
@@ -97,30 +92,17 @@ def score_volume(field, origin, resolution, points, centre, cells, rotations, ro
     return sums
 
 
-@njit(cache=True)
-def peaks(volume, count, apart, apart_rotations):  # type: ignore[no-untyped-def]
+def peaks(volume: NDArray[np.float32], count: int, apart: int, apart_rotations: int) -> NDArray[np.int64]:
     """Best poses of a score volume, each apart from every better one; rows of rotation, y, x indices."""
-    turns, rows, columns = volume.shape
-    left = volume.copy()
-    found = np.zeros((count, 3), dtype=np.int64)
-    taken = 0
-    while taken < count:
-        best = np.float32(0.0)
-        for r in range(turns):
-            for j in range(rows):
-                for i in range(columns):
-                    if left[r, j, i] > best:
-                        best = left[r, j, i]
-                        found[taken, 0], found[taken, 1], found[taken, 2] = r, j, i
-        if best <= 0.0:
+    left, found = volume.copy(), list[NDArray[np.int64]]()
+    reach = np.array([apart_rotations, apart, apart])
+    while len(found) < count:
+        best = np.array(np.unravel_index(np.argmax(left), left.shape))
+        if left[tuple(best)] <= 0.0:
             break
-        r0, j0, i0 = found[taken]
-        taken += 1
-        for r in range(max(0, r0 - apart_rotations), min(turns, r0 + apart_rotations + 1)):
-            for j in range(max(0, j0 - apart), min(rows, j0 + apart + 1)):
-                for i in range(max(0, i0 - apart), min(columns, i0 + apart + 1)):
-                    left[r, j, i] = 0.0
-    return found[:taken]
+        found.append(best)
+        left[tuple(map(slice, np.maximum(best - reach, 0), best + reach + 1))] = 0.0
+    return np.array(found, dtype=np.int64).reshape(-1, 3)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from instant_ic.sim import furniture, worlds
-from instant_ic.sim.building import SIDES, Building, Finish, Zone
+from instant_ic.sim.building import INWARD_YAW, SIDES, Building, Finish, Zone
 from instant_ic.sim.world import Material, World, WorldBuilder
 
 # Relative frequency of each kind.
@@ -117,8 +117,7 @@ class _Floor:
             y = z.y0 + at if not along_x else (z.y0 + away if side == "south" else z.y1 - away)
             extent = (size[1], size[0]) if along_x else size
             if self.take((x, y), extent):
-                yaw = {"north": -math.pi / 2, "south": math.pi / 2, "east": math.pi, "west": 0.0}[side]
-                return (float(x), float(y)), yaw
+                return (float(x), float(y)), INWARD_YAW[side]
         return None
 
 

@@ -58,7 +58,7 @@ class RoomsConfig:
         return self.worlds * self.poses
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, for the folder's ``dataset.json``."""
+        """Plain values, for the training record."""
         module = "depth.interiors.interior_world" if self.interiors == "wide" else "sim.worlds.random_world"
         return {"kind": f"instant_ic.{module}", **asdict(self)}
 

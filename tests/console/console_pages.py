@@ -7,12 +7,12 @@ import shutil
 import time
 
 import cv2
+import demo_world
 import numpy as np
 import pytest
+from console_demo import Demo, DemoConfig
 
-from instant_ic.console import demo_world
 from instant_ic.console.access import AccessConfig
-from instant_ic.console.demo import Demo, DemoConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import ServerConfig
 from instant_ic.console.view import ViewConfig

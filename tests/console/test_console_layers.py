@@ -72,13 +72,6 @@ def test_a_layer_that_the_page_holds_is_not_sent_again():
     ("change", "text"),
     [
         ({"image": b""}, r"layers\[0\]\.image is empty"),
-        ({"size": (0, 4)}, r"size must be 1 to 65535"),
-        ({"size": (1, 4)}, r"corners must lie within 4 x 1"),
-        ({"inverse_depth": np.array([0.5, math.nan, 0.0], np.float32)}, "inverse_depth must be finite"),
-        ({"inverse_depth": np.array([0.5, -0.1, 0.0], np.float32)}, "inverse_depth must be finite and >= 0"),
-        ({"inverse_depth": np.array([0.5], np.float32)}, "do not fit"),
-        ({"triangles": np.array([[0, 1, 3]], np.uint32)}, r"indices below 3 \(got 3\)"),
-        ({"triangles": np.array([0, 1, 2], np.uint32)}, "three corners"),
         ({"map_from_camera": np.full((4, 4), math.nan)}, "map_from_camera must be 4 x 4 finite numbers"),
         ({"gain": (1.0, math.inf, 1.0)}, "gain must be 3 finite numbers"),
     ],

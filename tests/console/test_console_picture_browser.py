@@ -7,6 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
+from console_demo import Demo, DemoConfig
 from console_pages import (
     BROWSER_TEST,
     PAD,
@@ -19,7 +20,6 @@ from console_pages import (
     wait_until,
 )
 
-from instant_ic.console.demo import Demo, DemoConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import ServerConfig
 from instant_ic.console.view import ViewConfig

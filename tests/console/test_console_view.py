@@ -1,13 +1,15 @@
 """Look direction, shape and pace of the rendered views; maps as PNG."""
 
 import math
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from instant_ic.console.gridimage import grid_image
-from instant_ic.console.view import Look, ViewConfig, ViewScheduler, view_shape
+from instant_ic.console.view import Look, ViewConfig, view_shape
+from instant_ic.console.view_requests import ViewRequests
 
 
 def test_look_left_and_up():
@@ -42,25 +44,36 @@ def test_extreme_windows_stay_within_a_drawable_field_of_view():
     assert shape.width / shape.height < 2.7
 
 
-def test_one_request_outstanding_and_the_wanted_rate():
-    views = ViewScheduler(ViewConfig(response_timeout_s=0.5))
-    assert views.due(0.0, 10.0)
-    first = views.asked(0.0)
-    assert not views.due(0.2, 10.0)  # unanswered
-    assert not views.answered(first + 7)
-    assert not views.due(0.2, 10.0)
-    assert views.answered(first)
-    assert views.due(0.2, 10.0)
-    assert not views.due(0.2, 1.0)
-    assert views.due(1.0, 1.0)
+def requested(views, at_s, needed=True):
+    """Id of the request that is made at a time; None if none is due."""
+    request = views.next(renders=True, needed=needed, stamp_ns=0, now_ns=round(1e9 * at_s))
+    return request and request.id
 
 
-def test_answer_that_never_comes_does_not_stop_the_requests():
-    views = ViewScheduler(ViewConfig(response_timeout_s=0.5))
-    views.asked(0.0)
-    assert not views.due(0.49, 10.0)
-    assert views.due(0.5, 10.0)
-    assert views.lost == 1
+@pytest.fixture
+def views():
+    scene = SimpleNamespace(vbot_pose=lambda: np.eye(4), camera_mount=lambda: np.eye(4))
+    config = ViewConfig(virtual_rate_hz=10, response_timeout_s=0.5)
+    return ViewRequests(config, scene, SimpleNamespace(with_vbot=True))
+
+
+def test_one_request_outstanding_and_the_wanted_rate(views):
+    assert requested(views, 5.0) == 1
+    assert requested(views, 5.2) is None  # unanswered
+    views.answered(8, round(5.2e9))
+    assert requested(views, 5.2) is None
+    assert views.answered(1, round(5.2e9)) == pytest.approx(0.2)
+    assert requested(views, 5.09) is None
+    assert requested(views, 5.2, needed=False) is None  # only judged: once a second
+    assert requested(views, 5.2) == 2
+
+
+def test_answer_that_never_comes_does_not_stop_the_requests(views):
+    assert requested(views, 5.0) == 1
+    assert requested(views, 5.49) is None
+    assert requested(views, 5.5) == 2
+    assert views.answered(1, round(6e9)) == pytest.approx(1.0)  # late: its delay counts
+    assert requested(views, 5.9) is None  # the second is still outstanding
 
 
 @pytest.mark.parametrize(

@@ -92,17 +92,6 @@ def test_own_folder_and_worlds_mixed_and_started_from_weights(tmp_path: Path) ->
     assert made["start"]["file"] == "a.pt" and made["start"]["record"]["steps"] == record(first)["steps"]
 
 
-def test_cache_is_rendered_once_and_never_by_another_recipe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("--cache", str(tmp_path / "rooms"), "--worlds", "3", "--poses", "2", "--batch-size", "2", "--workers", "0",
-             "--epochs", "1")  # fmt: skip
-    assert ic(*words, "--checkpoint", str(tmp_path / "w.pt")) == 0
-    assert SEEDS == [100_000, 100_001, 100_002] and "rendered 6 of 6" in capsys.readouterr().out
-    assert ic(*words, "--checkpoint", str(tmp_path / "w.pt")) == 0
-    assert len(SEEDS) == 3
-    with pytest.raises(UserError, match="another kind, interiors"):
-        ic(*words, "--generated", "random", "--checkpoint", str(tmp_path / "w.pt"))
-
-
 def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
     trainer = SimpleNamespace(stop=False)
     before = signal.getsignal(signal.SIGINT)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_completion
-from instant_ic.training.dataset import Sample, Subset
+from instant_ic.training.dataset import Sample, Selection
 from instant_ic.training.feeds import FileFeed
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.slicenet import CheckpointError
@@ -40,7 +40,13 @@ def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, **op
     feed = FileFeed(samples, np.arange(9), 3, info={"kind": "stripes"})
     torch.manual_seed(0)
     return Trainer(
-        feed, Subset(samples, range(9, 12)), CompletionNet(TINY), config, output, report=lambda line: None, **options
+        feed,
+        Selection((samples, range(9, 12))),
+        CompletionNet(TINY),
+        config,
+        output,
+        report=lambda line: None,
+        **options,
     )
 
 

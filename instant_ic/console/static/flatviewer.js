@@ -6,7 +6,7 @@
 /** @import { Scene } from "./images.js" */
 /** @import { Samples } from "./viewer.js" */
 /** @typedef {CanvasRenderingContext2D | OffscreenCanvasRenderingContext2D} Context */
-/** @typedef {{bitmap: ImageBitmap, finished: OffscreenCanvas | null, colour: Colour}} Layer */
+/** @typedef {{bitmap: ImageBitmap, finished: ImageBitmap | OffscreenCanvas, colour: Colour}} View An image, also in a colour. */
 
 const TURN = 2 * Math.PI;
 import { plain } from "./colour.js";
@@ -25,7 +25,7 @@ export class FlatViewer {
     this.lost = false;
     /** @type {ImageData | null} */
     this._panorama = null;
-    /** @type {Layer | null} */
+    /** @type {View | null} */
     this._view = null;
     /** @type {OffscreenCanvasRenderingContext2D | null} */
     this._samples = null;
@@ -41,7 +41,8 @@ export class FlatViewer {
 
   /** @param {ImageBitmap} bitmap */
   setView(bitmap) {
-    this._view = renewed(this._view, bitmap);
+    this._view?.bitmap.close();
+    this._view = { bitmap, finished: bitmap, colour: plain };
   }
 
   /** @param {Scene} scene */
@@ -118,27 +119,20 @@ export class FlatViewer {
 const levels = ({ gain, offset }) =>
   gain.map((value, channel) => Uint8ClampedArray.from({ length: 256 }, (_, level) => value * level + 255 * offset[channel]));
 
-/** @param {Layer | null} old @param {ImageBitmap} bitmap @returns {Layer} */
-function renewed(old, bitmap) {
-  old?.bitmap.close();
-  return { bitmap, finished: null, colour: plain };
-}
-
-/** Returns the image in its colour; cached. @param {Layer} layer @param {Colour} colour */
-function finished(layer, colour) {
-  if (colour === plain) return layer.bitmap;
-  if (layer.finished && sameColour(layer.colour, colour)) return layer.finished;
-  const { width, height } = layer.bitmap;
+/** Returns the image in its colour; cached. @param {View} view @param {Colour} colour */
+function finished(view, colour) {
+  if (colour === plain) return view.bitmap;
+  if (sameColour(view.colour, colour)) return view.finished;
+  const { width, height } = view.bitmap;
   const context = offscreen(width, height);
-  context.drawImage(layer.bitmap, 0, 0);
+  context.drawImage(view.bitmap, 0, 0);
   const image = context.getImageData(0, 0, width, height), data = image.data;
   for (let i = 0; i < data.length; i += 4)
     for (let channel = 0; channel < 3; channel++)
       data[i + channel] = data[i + channel] * colour.gain[channel] + 255 * colour.offset[channel]; // Uint8ClampedArray clamps
   context.putImageData(image, 0, 0);
-  layer.finished = context.canvas;
-  layer.colour = colour;
-  return context.canvas;
+  view.colour = colour;
+  return view.finished = context.canvas;
 }
 
 /** @param {Colour} a @param {Colour} b */

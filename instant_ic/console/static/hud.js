@@ -58,11 +58,7 @@ export function showHealth({ vspace, battery, faults, nodes, pace }) {
   const over = nodes.filter(texts.overBudget), total = nodes.reduce((sum, node) => sum + node.cpu_percent, 0);
   write(byId("cpu"), nodes.length ? `${Math.round(total)} %` : "–");
   byId("cpu").className = over.length ? "warn" : "";
-  replaceItems(byId("cpu-list"), nodes.map(texts.cpuText), (line) => {
-    const item = document.createElement("li");
-    item.textContent = line;
-    return item;
-  });
+  replaceLines(byId("cpu-list"), nodes.map(texts.cpuText));
   replaceItems(byId("faults"), faults, ({ level, name, text }) => {
     const item = document.createElement("li"), bold = document.createElement("b");
     item.className = level;
@@ -78,11 +74,16 @@ export function showHealth({ vspace, battery, faults, nodes, pace }) {
  * @template T
  * @param {HTMLElement} element @param {T[]} entries @param {(entry: T) => HTMLElement} item
  */
-export function replaceItems(element, entries, item) {
+function replaceItems(element, entries, item) {
   const key = JSON.stringify(entries);
   if (element.dataset.key === key) return;
   element.dataset.key = key;
   element.replaceChildren(...entries.map(item));
+}
+
+/** Fills a list with lines of text. @param {HTMLElement} element @param {string[]} lines */
+export function replaceLines(element, lines) {
+  replaceItems(element, lines, (line) => Object.assign(document.createElement("li"), { textContent: line }));
 }
 
 /** @param {Drive} drive */

@@ -54,7 +54,6 @@ export class Images {
     this.view = null;
     this.blend = 0;
     this.dissolveMs = 250;
-    this.decodeErrors = 0;
     this.changed = true;
     this.motion = new Motion();
     this.prediction = new Prediction();
@@ -109,14 +108,20 @@ export class Images {
   /** Decodes an image, passes it to the viewer, then acknowledges it. @param {PanoramaFrame | ViewFrame} frame */
   async take(frame) {
     try {
-      const bitmap = frame.kind === VIEW ? await this._takeView(frame) : await this._takePanorama(frame);
+      const bitmap = await decoded(frame.payload);
+      if (frame.kind === VIEW) {
+        this.viewer.setView(bitmap);
+        this.view = { ...frame.header, aspect: bitmap.width / bitmap.height };
+      } else {
+        this.viewer.setPanorama(bitmap);
+        this.panorama = frame.header;
+      }
       if (this.viewer.name === "webgl") bitmap.close();
       this.changed = true;
       const arrivals = this._arrivals[frame.kind];
       arrivals.push(performance.now());
       if (arrivals.length > 30) arrivals.shift();
     } catch (error) {
-      this.decodeErrors++;
       console.warn(`image ${frame.sequence} of kind ${frame.kind}: ${error}`);
     } finally {
       this.link.acknowledge(frame);
@@ -141,7 +146,6 @@ export class Images {
         this.changed = loaded = true;
       }
     } catch (error) {
-      this.decodeErrors++;
       console.warn(`layers of version ${frame.header.version}: ${error}; the ones before stay`);
     }
     if (load === this._loads) this.link.acknowledge(frame, loaded);
@@ -168,22 +172,6 @@ export class Images {
   /** Whether the layers take the place of rendered views. */
   get rendersLayers() {
     return this.layers !== null && !this.viewer.lost;
-  }
-
-  /** @param {PanoramaFrame} frame */
-  async _takePanorama(frame) {
-    const bitmap = await decoded(frame.payload);
-    this.viewer.setPanorama(bitmap);
-    this.panorama = frame.header;
-    return bitmap;
-  }
-
-  /** @param {ViewFrame} frame */
-  async _takeView(frame) {
-    const bitmap = await decoded(frame.payload);
-    this.viewer.setView(bitmap);
-    this.view = { ...frame.header, aspect: bitmap.width / bitmap.height };
-    return bitmap;
   }
 
   /** Images of a kind per second, over the last 3 s. @param {Kind} kind */

@@ -6,7 +6,7 @@
 /** @import { Mat3, Vec3 } from "./math.js" */
 import { identity, multiply, rotate, transpose } from "./math.js";
 import { plain } from "./colour.js";
-import { link, Program } from "./program.js";
+import { Program } from "./program.js";
 
 /**
  * Triangles with an image. The vertices are corners of the panorama's pixels; `size` is height and width of that lattice.
@@ -46,7 +46,7 @@ const IMAGE = 6, CONFIDENCE = 7; // texture units
 const BEYOND_LEVEL = 4; // mipmap level of what no layer covers
 
 // Homogeneous coordinates are divided by the vertex's distance: what is endlessly far needs no large numbers.
-const VERTEX = `#version 300 es
+const VERTEX = `
 in vec2 corner;
 in float inverse;
 uniform vec2 size;
@@ -126,15 +126,13 @@ export class LayerRenderer {
   constructor(gl, slow) {
     this._gl = gl;
     const sharp = `precision highp float;\nconst bool SHARP = ${!slow};\nconst float SHARPNESS = 0.7;\n${ANGLES}`;
-    this._program = link(gl, VERTEX, `#version 300 es\n${sharp}${FRAGMENT}`);
+    this._program = new Program(gl, sharp + FRAGMENT, VERTEX);
     this._far = new Program(gl, sharp + FAR);
     this._minification = slow ? gl.LINEAR_MIPMAP_NEAREST : gl.LINEAR_MIPMAP_LINEAR; // the CPU would read two levels
     this._anisotropy = slow ? null : gl.getExtension("EXT_texture_filter_anisotropic");
     /** @type {(Loaded & {layer: Layer})[]} Each is shown where the ones before show nothing. */
     this._layers = [];
     this._empty = this._texture(null);
-    /** @type {Map<string, WebGLUniformLocation | null>} */
-    this._places = new Map();
   }
 
   /** Replaces the layers; surfaces that are here already stay. @param {Layer[]} layers */
@@ -150,11 +148,6 @@ export class LayerRenderer {
     return this._layers.length > 0;
   }
 
-  /** Number of triangles of all layers. */
-  get triangles() {
-    return this._layers.reduce((sum, { count }) => sum + count / 3, 0);
-  }
-
   /**
    * The alpha of what is rendered is 1 where the place was seen.
    * @param {Camera} camera @param {number} width @param {number} height
@@ -163,9 +156,8 @@ export class LayerRenderer {
    * @param {boolean} mixed blending is on: each pixel is written once, the nearest surface found before
    */
   render(camera, width, height, tint, photo = null, mixed = false) {
-    const gl = this._gl, program = this._program, at = this._at;
+    const gl = this._gl, at = this._program.use();
     gl.viewport(0, 0, width, height);
-    gl.useProgram(program);
     gl.uniform2fv(at("tanHalf"), camera.tanHalf);
     gl.uniform3fv(at("offset"), tint.offset);
     gl.uniform1i(at("image"), IMAGE);
@@ -237,20 +229,13 @@ export class LayerRenderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** Place of a uniform of the layers' program, looked up once. @param {string} name */
-  _at = (name) => {
-    let place = this._places.get(name);
-    if (place === undefined) this._places.set(name, place = this._gl.getUniformLocation(this._program, name));
-    return place;
-  };
-
   /** @param {Surface} surface @returns {Loaded} */
   _upload(surface) {
     const gl = this._gl, vertices = gl.createVertexArray(), buffers = [0, 1, 2].map(() => gl.createBuffer());
     gl.bindVertexArray(vertices);
     gl.bindBuffer(gl.ARRAY_BUFFER, buffers[0]);
     gl.bufferData(gl.ARRAY_BUFFER, surface.corners, gl.STATIC_DRAW);
-    const corner = gl.getAttribLocation(this._program, "corner"), inverse = gl.getAttribLocation(this._program, "inverse");
+    const [corner, inverse] = ["corner", "inverse"].map((name) => gl.getAttribLocation(this._program.linked, name));
     gl.enableVertexAttribArray(corner);
     gl.vertexAttribPointer(corner, 2, gl.UNSIGNED_SHORT, false, 0, 0);
     gl.bindBuffer(gl.ARRAY_BUFFER, buffers[1]);

@@ -63,7 +63,8 @@ export class Look {
   /** Turns by angles in radians, left and up. @param {number} yaw @param {number} pitch */
   turn(yaw, pitch) {
     this._centring = null;
-    this._turn(yaw, pitch);
+    this.yaw = wrapAngle(this.yaw + yaw);
+    this.pitch = clamp(this.pitch + pitch, -MAX_PITCH, MAX_PITCH);
   }
 
   /** @param {number} factor of the field of view */
@@ -85,12 +86,6 @@ export class Look {
     }
   }
 
-  /** @param {number} yaw @param {number} pitch */
-  _turn(yaw, pitch) {
-    this.yaw = wrapAngle(this.yaw + yaw);
-    this.pitch = clamp(this.pitch + pitch, -MAX_PITCH, MAX_PITCH);
-  }
-
   /** @param {PointerEvent} event @param {HTMLElement} element */
   _drag(event, element) {
     const last = this._pointers.get(event.pointerId);
@@ -106,7 +101,7 @@ export class Look {
     }
     // The image follows the pointer: a drag to the right turns the line of sight to the left.
     const perPixel = this.vfov / element.clientHeight;
-    this._turn((event.clientX - last[0]) * perPixel, (event.clientY - last[1]) * perPixel);
+    this.turn((event.clientX - last[0]) * perPixel, (event.clientY - last[1]) * perPixel);
     this._pointers.set(event.pointerId, [event.clientX, event.clientY]);
   }
 }

@@ -14,8 +14,8 @@ export class Motion {
     /** @type {Vec3 | null} x, y, yaw in the map frame; null: unknown. */
     this.pose = null;
     this.easeMs = 400;
-    /** @type {Vec3 | null} */
-    this._followed = null;
+    /** @type {Vec3 | null} Pose of the shown robot without the remaining offset of the other one. */
+    this.own = null;
     /** @type {Vec3} Remaining offset of the other robot's pose. */
     this._residual = [0, 0, 0];
     this._easedMs = 0;
@@ -24,11 +24,6 @@ export class Motion {
 
   get yaw() {
     return this.pose?.[2] ?? null;
-  }
-
-  /** Pose of the shown robot without the remaining offset of the other one. */
-  get own() {
-    return this._followed;
   }
 
   /**
@@ -44,17 +39,17 @@ export class Motion {
       const apart = difference(this.pose, target);
       this._residual = size(apart) < EASED_M && Math.abs(apart[2]) < EASED_RAD ? apart : [0, 0, 0];
       this._easedMs = 0;
-      this._followed = target;
+      this.own = target;
     }
     this._robot = robot;
     // Move on at the velocity and smooth only the remaining error, so that steady motion is shown without lag.
-    const went = this._followed && advanced(this._followed, twist, ageMs < EXTRAPOLATION_MS ? elapsedMs / 1000 : 0);
+    const went = this.own && advanced(this.own, twist, ageMs < EXTRAPOLATION_MS ? elapsedMs / 1000 : 0);
     const left = went ? difference(target, went) : null;
-    if (!went || !left || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this._followed = target;
-    else this._followed = sum(went, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
+    if (!went || !left || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this.own = target;
+    else this.own = sum(went, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
     this._easedMs += elapsedMs; // elapsed, not absolute: after a short hang the page continues where it was
     const t = this.easeMs > 0 ? clamp(this._easedMs / this.easeMs, 0, 1) : 1;
-    this.pose = sum(this._followed, this._residual, 1 - t * t * (3 - 2 * t));
+    this.pose = sum(this.own, this._residual, 1 - t * t * (3 - 2 * t));
   }
 }
 

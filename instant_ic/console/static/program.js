@@ -1,7 +1,7 @@
 // @ts-check
-// WebGL 2 programs that fill the target: a fragment shader and its uniforms.
+// WebGL 2 programs and their uniforms.
 
-const VERTEX = `#version 300 es
+const WHOLE = `
 out vec2 screen;
 void main() {
   vec2 corner = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2);
@@ -9,32 +9,31 @@ void main() {
   gl_Position = vec4(screen, 0.0, 1.0);
 }`;
 
-/** A program that fills the target. */
 export class Program {
-  /** @param {WebGL2RenderingContext} gl @param {string} fragment */
-  constructor(gl, fragment) {
+  /** Without a vertex shader it fills the target. @param {WebGL2RenderingContext} gl @param {string} fragment @param {string} vertex */
+  constructor(gl, fragment, vertex = WHOLE) {
     this._gl = gl;
-    this._program = link(gl, VERTEX, `#version 300 es\n${fragment}`);
+    this.linked = link(gl, `#version 300 es\n${vertex}`, `#version 300 es\n${fragment}`);
     /** @type {Map<string, WebGLUniformLocation | null>} */
     this._places = new Map();
   }
 
   /** Uses it; returns its uniforms by name. */
   use() {
-    this._gl.useProgram(this._program);
+    this._gl.useProgram(this.linked);
     return this._at;
   }
 
   /** @param {string} name @returns {WebGLUniformLocation | null} */
   _at = (name) => {
     let place = this._places.get(name);
-    if (place === undefined) this._places.set(name, place = this._gl.getUniformLocation(this._program, name));
+    if (place === undefined) this._places.set(name, place = this._gl.getUniformLocation(this.linked, name));
     return place;
   };
 }
 
 /** Compiles and links. @param {WebGL2RenderingContext} gl @param {string} vertexSource @param {string} fragmentSource */
-export function link(gl, vertexSource, fragmentSource) {
+function link(gl, vertexSource, fragmentSource) {
   const program = gl.createProgram();
   for (const { type, source } of [
     { type: gl.VERTEX_SHADER, source: vertexSource }, { type: gl.FRAGMENT_SHADER, source: fragmentSource }]) {

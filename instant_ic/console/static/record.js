@@ -5,7 +5,7 @@
 /** @import { Link } from "./link.js" */
 /** @import { RecordingStatus } from "./messages.js" */
 import { byId, elementOf, mark, write } from "./dom.js";
-import { announce, replaceItems, toast } from "./hud.js";
+import { announce, replaceLines, toast } from "./hud.js";
 import { bytesText, clockText, recorderText, recordText } from "./texts.js";
 
 const RUNNING = ["recording", "disk full", "paused"];
@@ -102,9 +102,5 @@ export class Recording {
 
 /** Lists lines, newest first. @param {HTMLElement} element @param {string[]} lines */
 function list(element, lines) {
-  replaceItems(element, lines.length ? lines.reverse() : ["None yet."], (line) => {
-    const item = document.createElement("li");
-    item.textContent = line;
-    return item;
-  });
+  replaceLines(element, lines.length ? lines.reverse() : ["None yet."]);
 }

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import cv2
+import demo_world
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console import demo_world
 from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource, confidence_png
 from instant_ic.console.layers import PageLayers
 from instant_ic.geometry.poses import Matrix

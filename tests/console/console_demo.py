@@ -1,4 +1,4 @@
-"""Demo of the page with synthetic data, for work on the page: ``python -m instant_ic.console.demo``.
+"""The page with a synthetic robot, for the browser tests and for work on it: ``python tests/console/console_demo.py``.
 
 The operator drives a robot in a room with an obstacle ahead. Its behaviour at the obstacle is only a sketch of the
 method, enough to try the page; instant_ic.control implements it.
@@ -14,15 +14,15 @@ import time
 from dataclasses import dataclass, field
 from typing import Any
 
+import demo_world
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console import demo_world
 from instant_ic.console.gridimage import GridImage, grey_png, grid_image
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer, ServerConfig
-from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, ViewScheduler, view_shape
+from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, view_shape
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix, quaternion_from_matrix, wrap_angle
 from instant_ic.geometry.projections import equirect_directions, perspective_directions
 
@@ -105,7 +105,6 @@ class Demo:
         self._command = (0.0, 0.0)
         self._placing = threading.Lock()
         self._transitions = 0
-        self._views = ViewScheduler(self.config.view)
         self._slow_due = 0.0
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
         self._panorama, self._panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
@@ -179,7 +178,7 @@ class Demo:
             self._publish_state()
 
     def _send_images(self) -> None:
-        due = 0.0
+        due = view_due = 0.0
         while not self._stop.wait(0.01):
             now = time.monotonic()
             if now >= due and self.images:
@@ -190,12 +189,13 @@ class Demo:
                 if far:
                     self.send_layers(self.robot)
             rate_hz = self.config.view.virtual_rate_hz if self.mode == "virtual" else PROBE_HZ
-            if self.images and self.server.needs_views() and self._views.due(now, rate_hz):
-                self._send_view(self._views.asked(now))
+            if self.images and self.server.needs_views() and now >= view_due:
+                view_due = now + 1.0 / rate_hz
+                self._send_view()
 
     def send_layers(self, keyframe: Pose) -> None:
         """Send the layers round a keyframe at this pose (m, rad)."""
-        from instant_ic.console.demo_layers import demo_layers  # takes seconds to import
+        from demo_layers import demo_layers  # takes seconds to import
 
         self._layers_at = keyframe.copy()
         self._version += 1
@@ -311,7 +311,7 @@ class Demo:
         header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist(), "p": camera[:3, 3].tolist()}
         self.server.send_frame(FrameKind.PANORAMA, header, self._panorama)
 
-    def _send_view(self, request_id: int) -> None:
+    def _send_view(self) -> None:
         captured_ms = self.server.now_ms()
         look = self.look
         shape = view_shape(look, self.config.view)
@@ -326,10 +326,8 @@ class Demo:
             "fov": shape.fov_rad,
             "confidence": 0.9,
             "render_ms": 20.0,
-            "request_id": request_id,
         }
         self.server.send_frame(FrameKind.VIEW, header, _jpeg(image))
-        self._views.answered(request_id)
 
 
 def _camera(pose: Pose) -> NDArray[np.float64]:
@@ -381,15 +379,13 @@ def _hits(points: Pose) -> bool:
 
 def main() -> None:
     """Serve the demo until Ctrl-C."""
-    parser = argparse.ArgumentParser(
-        prog="python -m instant_ic.console.demo", description=(__doc__ or "").partition("\n")[0]
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO)
     demo = Demo(ServerConfig(port=arguments.port), DemoConfig(layers=True))
     demo.start()
-    logging.getLogger("instant_ic.console.demo").info("open %s (Ctrl-C stops)", demo.server.url)
+    logging.getLogger("console_demo").info("open %s (Ctrl-C stops)", demo.server.url)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

@@ -1,0 +1,34 @@
+"""What the benchmarks share: the command line, the JSON result and the browser's options."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+CHROMIUM_FLAGS = [
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+
+
+def parser_of(doc: str | None) -> argparse.ArgumentParser:
+    """Parser with a module's docstring as its help, and the option ``--json``."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
+    return parser
+
+
+def report(result: dict[str, Any], out: Path | None) -> None:
+    """Print the result as JSON, and write it to a file if there is one."""
+    text = json.dumps(result, indent=2)
+    if out is not None:
+        out.write_text(text + "\n")
+    print(text, flush=True)
+
+
+def note(text: str) -> None:
+    """Print the progress."""
+    print(text, file=sys.stderr, flush=True)
