@@ -22,6 +22,7 @@ from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.bus.transport import Payload, RawPublisher, RawSubscription, Received, Transport
 from instant_ic.config import params
 from instant_ic.config.parameter_info import ParameterInfo, is_live, parameter_infos, plain
+from instant_ic.diagnosis import Diagnosis
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import (
@@ -412,6 +413,12 @@ class Node(Generic[ConfigT]):
             if before is not None and before[0] >= WARN:
                 self.log.info("%s: %s", name, message or "fine again")
 
+    def diagnose_all(self, *states: Diagnosis | None) -> None:
+        """Set the diagnoses that a library has made; None is left out."""
+        for state in states:
+            if state is not None:
+                self.diagnose(state.name, state.level, state.text, **state.values)
+
     def _log_diagnosis(self, name: str, level: int, message: str) -> None:
         """Log a diagnosis; one that was never OK is logged once, as information, while other nodes still start."""
         if not self.lockstep and name not in self._well and time.monotonic() < self._began_s + _START_GRACE_S:
@@ -631,6 +638,7 @@ class Node(Generic[ConfigT]):
         for index, (_, subscription, received) in enumerate(pending):
             if index and subscription.raw.qos.depth == 1 and not self.lockstep:
                 # Earlier callbacks may have taken long: for a newest-only topic, use what has arrived since.
+                self._wake.wait(0.0)
                 for newer in subscription.raw.take():
                     if newer.publisher == received.publisher:
                         received = newer
