@@ -86,6 +86,7 @@ class LocalPublisher:
             self._leave()
             raise registry.RegistryError(f"publisher of {topic} by node {host.node}: {error}") from error
         self.fd = int(self._socket.getsockopt(zmq.FD))
+        self._send_part = super(zmq.Socket, self._socket).send  # without pyzmq's layer for other kinds of sockets
 
     def send(self, payload: Payload, publish_ns: int | None = None) -> None:
         """Send one message without waiting. The payload may be changed as soon as this returns.
@@ -166,7 +167,7 @@ class LocalPublisher:
             if self.closed:
                 return
             deadline = time.monotonic() + LINGER_S
-            newest = max((slot.sequence for slot in self._pool.slots), default=0)
+            newest = max((slot.written for slot in self._pool.slots), default=0)
             # A slot can be opened only as long as this process keeps it.
             while self.subscriber_count and self._read_by_all()[1] < newest and time.monotonic() < deadline:
                 time.sleep(0.002)
@@ -199,8 +200,8 @@ class LocalPublisher:
         name, kind = self._name, INLINE if slot is None else SHARED
         if slot is not None and copy:
             name, kind, body = KEY_COPY + name, INLINE, slot.view(size)
-        self._socket.send(name + HEADER.pack(kind, MARK, sequence, publish_ns, self._id, self._type_hash, size), _MORE)
-        self._socket.send(body)
+        self._send_part(name + HEADER.pack(kind, MARK, sequence, publish_ns, self._id, self._type_hash, size), _MORE)
+        self._send_part(body)
 
     def _has_room(self, size: int) -> bool:
         """Whether a large message may go through the socket: its own limit counts messages, not bytes."""

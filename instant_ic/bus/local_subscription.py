@@ -11,7 +11,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import zmq
@@ -33,7 +33,8 @@ _RECONNECT_MS = 20
 _GRACE_S = 2.0  # the last messages of a publisher that has left the registry may still be on the way
 _SEARCH_S = 1.0
 _MOST_COMPLAINTS = 64
-_NOBLOCK = int(zmq.NOBLOCK)
+_NOBLOCK, _EVENTS, _POLLIN = int(zmq.NOBLOCK), int(zmq.EVENTS), int(zmq.POLLIN)
+_leases: dict[Slot, weakref.ref[Any]] = {}  # of messages in use, also when their subscription is gone
 _new = tuple.__new__  # what Received(...) calls in the end, without a Python call in between
 
 log = logging.getLogger(__name__)
@@ -131,14 +132,18 @@ class LocalSubscription:
         for identity, source in self._sources.items():
             source.left_s = 0.0 if identity in present else source.left_s or time.monotonic()
 
-    def read(self) -> None:
-        """Read all messages that have arrived."""
+    def read(self, one: bool = False) -> None:
+        """Read all messages that have arrived, or only ``one``: looking for more would delay it, but must follow."""
         socket = self._socket
         receive = socket.recv
-        while int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+        while one or int(socket.getsockopt(_EVENTS)) & _POLLIN:
+            try:
+                first = receive(_NOBLOCK)
+            except zmq.Again:
+                return
             try:
                 # A missing part shows as the next message's first, or as none: neither is a body of that size.
-                header = unpack_header(receive(_NOBLOCK))
+                header = unpack_header(first)
                 if header[0] == SHARED or header[6] < _LARGE_FROM_BYTES:
                     self._message(header, receive(_NOBLOCK))
                 else:
@@ -148,6 +153,8 @@ class LocalSubscription:
                     receive(_NOBLOCK)
                 self.stats.rejected += 1
                 self._complain(str(error)[:40], f"{str(error) or 'message in parts'}; the message is dropped")
+            if one:
+                return
 
     def _message(self, header: Header, body: bytes | memoryview) -> None:
         kind, _, sequence, publish_ns, publisher, digest, size = header
@@ -230,9 +237,9 @@ class LocalSubscription:
             slot.unlock()
             return copy
         array = np.frombuffer(slot.view(size), np.uint8)
-        source.views += 1
         # Everything derived from the message refers to this array: when it is freed, nothing reads the slot any more.
-        weakref.finalize(array, self._done, source, slot, sequence).atexit = False
+        _leases[slot] = weakref.ref(array, lambda _: self._done(source, slot, sequence))
+        source.views += 1
         return array.data
 
     def _done(self, source: _Source, slot: Slot, sequence: int) -> None:
@@ -241,6 +248,7 @@ class LocalSubscription:
             self.stats.overwritten += 1
             log.error("%s: %s overwrote a message that was still in use", self.topic, source.node)
         source.views -= 1
+        del _leases[slot]
         slot.unlock()
 
     def _without_shared_memory(self, source: _Source, sequence: int, error: OSError) -> NoReturn:

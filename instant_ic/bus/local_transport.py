@@ -66,6 +66,7 @@ class LocalTransport:
         self._left_s = 0.0  # when it last stopped waiting
         self._next_look_s = 0.0
         self._read_lock, self._readers, self._inputs = self._host.read_lock, self._host.readers, self._host.inputs
+        self._unread: list[int] = []  # of these sockets only one message was read
         self._writers: list[LocalPublisher] = []
         self._wake, self._poke = (os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) for _ in range(2))
         self._inputs.register(self._wake, select.EPOLLIN)
@@ -140,22 +141,24 @@ class LocalTransport:
     def wait(self, timeout: float) -> None:
         """Read the node's sockets until a message arrives, the event is set, or the time is over."""
         self._driver, self._waiting = threading.get_ident(), True
+        self._read(self._unread)
         timeout = 0.0 if self._set else timeout
         if self.patient:
             ready = [*_readable([self._wake], timeout), *self._readers]
         else:
             ready = [fd for fd, _ in self._inputs.poll(timeout, 64)]
-        self._read(ready)
+        self._read(ready, one=not self.patient)
+        self._unread = ready
         if self._wake in ready:  # left as it is, it would end every later wait
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._wake)
         self._waiting, self._left_s = False, time.monotonic()
 
-    def _read(self, fds: Iterable[int]) -> None:
+    def _read(self, fds: Iterable[int], one: bool = False) -> None:
         with self._read_lock:
             for fd in fds:
                 if (subscription := self._readers.get(fd)) is not None:
-                    subscription.read()
+                    subscription.read(one)
 
     def _run(self) -> None:
         while not self._stop.is_set():

@@ -23,6 +23,7 @@ from typing import Self
 
 NAME = "instant_ic"
 _SLOT = struct.Struct("<Q8s")  # sequence, publisher
+_SEQUENCE = struct.Struct("<Q")
 _PAYLOAD_AT = 60  # CDR's body starts 4 bytes later, so its arrays are aligned to 64
 _STEP = 1 << 16
 _F_SEAL_FUTURE_WRITE = 0x10  # not in Python's fcntl; later mappings are read-only
@@ -61,7 +62,7 @@ class Memory:
         # Reserve the pages now: without free memory this raises here, instead of SIGBUS in the middle of a copy.
         os.posix_fallocate(memory.fd, 0, size)
         fcntl.fcntl(memory.fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
-        Memory.__init__(memory, memory.fd, mmap.PROT_READ | mmap.PROT_WRITE)
+        memory.__init__(memory.fd, mmap.PROT_READ | mmap.PROT_WRITE)  # type: ignore[misc]
         return memory
 
     @classmethod
@@ -101,10 +102,16 @@ class Slot(Memory):
     Attributes:
         number: unique within a publisher.
         held: the message is leased.
+        written: sequence of the message that its publisher has written last; 0 while it writes one.
     """
 
     number = 0
     held = False
+    written = 0
+
+    def __init__(self, fd: int, access: int = mmap.PROT_READ) -> None:
+        super().__init__(fd, access)
+        self.capacity = len(self.map) - _PAYLOAD_AT  # bytes of the largest message
 
     @classmethod
     def create(cls, number: int, size: int, publisher: bytes) -> Slot:
@@ -121,14 +128,9 @@ class Slot(Memory):
         return slot
 
     @property
-    def capacity(self) -> int:
-        """Bytes of the largest message."""
-        return len(self.map) - _PAYLOAD_AT
-
-    @property
     def sequence(self) -> int:
         """Sequence of the message in the slot; 0 while one is being written."""
-        return int(_SLOT.unpack_from(self.map)[0])
+        return int(_SEQUENCE.unpack_from(self.map)[0])
 
     def lock(self, kind: int = fcntl.LOCK_EX) -> bool:
         """Take the lock; False while another process holds it."""
@@ -149,7 +151,8 @@ class Slot(Memory):
 
     def finish(self, sequence: int) -> None:
         """Mark the message as complete."""
-        struct.pack_into("<Q", self.map, 0, sequence)
+        _SEQUENCE.pack_into(self.map, 0, sequence)
+        self.written = sequence
 
     def lease(self, sequence: int, size: int) -> bool:
         """Lock the slot for reading until :meth:`unlock`; False when it does not hold this message any more."""
@@ -198,12 +201,12 @@ class SlotPool:
             OSError: there is no memory for another slot.
         """
         for slot in list(self.slots):
-            if slot is keep or slot.sequence > must or not slot.lock():
+            if slot is keep or slot.written > must or not slot.lock():
                 continue
             if slot.capacity < size:  # too small for the present messages
                 self.slots.remove(slot)
                 slot.close()
-            elif slot.sequence <= should or len(self.slots) >= LEAST_SLOTS:
+            elif slot.written <= should or len(self.slots) >= LEAST_SLOTS:
                 self.slots.remove(slot)
                 self.slots.append(slot)
                 return slot
