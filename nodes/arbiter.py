@@ -132,7 +132,7 @@ class ArbiterNode(Node[ArbiterConfig]):
             return
         scan = self.inbox.scan()
         costmap = self.surroundings.update_costmap(scan, self.inbox.cloud(), self.walls.map)
-        self.show(*self.surroundings.findings.values())
+        self.diagnose_all(*self.surroundings.findings.values())
         if costmap is None or scan is None:
             return
         if self.surroundings.map_jumped:
@@ -154,7 +154,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         frame = msg.HARD_STOP if decision.hard else "base_link"
         self.cmd_vel.publish(msg.twist_stamped(*decision.command, now_ns, frame))
         self.publish_decision(decision, inputs, now_ns)
-        self.show(*self.surroundings.findings.values())
+        self.diagnose_all(*self.surroundings.findings.values())
         # One more step if the next timer may be later than a time-out: time-outs are exact.
         self.cancel_extra()
         stale_in_s = self.arbiter.stale_in_s(inputs, self.clock.steady_ns())

@@ -4,49 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from instant_ic.bag import BagError, BagMessage
-from instant_ic.bag.live_nodes import missing_readers, reached_base
-from instant_ic.bag.player import BagPlayer, PlayOptions
+from instant_ic.bag.config import BagPlayerConfig
+from instant_ic.bag.live_nodes import missing_readers, refuse_base
+from instant_ic.bag.player import BagPlayer
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
-from instant_ic.config.ranges import NotNegative
 from instant_ic.msg import message_type, register_type, to_time
 
 _BASE_PERIOD_S = 0.5
 _WAIT_S = 60.0  # for the nodes of wait_for
-
-
-@dataclass(frozen=True)
-class BagPlayerConfig(PlayOptions):
-    """Parameters, in addition to those of playing.
-
-    Attributes:
-        bag: folder of the bag, or a ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
-        drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
-        publish_clock: whether to publish ``/clock``.
-        delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
-        wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
-        linger_s: seconds that the player stays after the last message, so that other nodes finish their work.
-        force: play commands and states although a base is running, which may move the robot.
-    """
-
-    bag: str = ""
-    drop_transforms: tuple[str, ...] = ()
-    publish_clock: bool = True
-    delay_s: NotNegative = 0.5
-    wait_for: tuple[str, ...] = ()
-    linger_s: NotNegative = 1.0
-    force: bool = False
-
-    def __post_init__(self) -> None:
-        if not self.bag:
-            raise ValueError("bag must name a folder (got '')")
-        super().__post_init__()
 
 
 class BagPlayerNode(Node[BagPlayerConfig]):
@@ -63,13 +34,11 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         """Open the bag, create its topics, start the thread."""
         try:
             self.player = BagPlayer(Path(self.config.bag).expanduser(), self.config)
-        except BagError as error:
-            raise NodeError(str(error)) from None
-        try:
             self.check_base()
-        except NodeError:
-            self.player.close()
-            raise
+        except BagError as error:
+            if self.player is not None:
+                self.player.close()
+            raise NodeError(str(error)) from None
         self._clock_out: Publisher | None = None
         if self.config.publish_clock:
             self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
@@ -94,21 +63,13 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         """Check the run directory for a base, real or simulated, that could obey the played messages.
 
         Raises:
-            NodeError: there is one, and ``force`` is not set.
+            BagError: there is one, and ``force`` is not set.
         """
         assert self.player is not None
-        if self.run_dir is None or self.config.force:
-            return
-        nodes = [node for node in registry.list_nodes(self.run_dir) if node.name != self.name]
-        played = {self.resolve(topic.topic): topic.topic for topic in self.player.topics}
-        if reached := reached_base(nodes, played):
-            base, topics = reached
-            left_out = " ".join(f"-x {topic}" for topic in topics)
-            raise NodeError(
-                f"{self.config.bag}: {', '.join(topics)} would reach the robot of {base}, which runs in "
-                f"{self.run_dir}. Leave them out ({left_out}), rename them (--remap "
-                f"{topics[0]}:=/bag{topics[0]}), end the stack, or play them all the same with --force"
-            )
+        if self.run_dir is not None and not self.config.force:
+            nodes = [node for node in registry.list_nodes(self.run_dir) if node.name != self.name]
+            played = {self.resolve(topic.topic): topic.topic for topic in self.player.topics}
+            refuse_base(self.config.bag, self.run_dir, nodes, played)
 
     def _run(self) -> None:
         assert self.player is not None

@@ -5,51 +5,20 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from datetime import datetime
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from instant_ic.bag import BagError
 from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.config import BagRecorderConfig
 from instant_ic.bag.on_demand import OnDemand
 from instant_ic.bag.recorder import Recorder, RecordOptions, Subscribe, TakeMessage
-from instant_ic.bus import ERROR, OK, RECORD, WARN, Node, NodeError, main, registry
+from instant_ic.bus import RECORD, Node, NodeError, main, registry
 from instant_ic.bus.node import Subscription
 from instant_ic.bus.topic_watch import TopicWatch
 from instant_ic.bus.transport import Received, Stats
-from instant_ic.config.ranges import NotNegative, Range
 from instant_ic.msg import Bool, ControlState
-
-
-@dataclass(frozen=True)
-class BagRecorderConfig(RecordOptions):
-    """Parameters, in addition to those of writing.
-
-    Attributes:
-        path: folder of the bag, which must not exist; empty creates ``runs/bag_DATE_TIME`` in the working directory. In
-            snapshot mode, the folder for the snapshots.
-        topics: names or patterns of the topics to record; empty records everything.
-        exclude: names or patterns of the topics to leave out.
-        discovery_period_s: seconds between searches for new topics.
-        duration_s: seconds after which recording ends; 0 records until stopped.
-        start_paused: record only after a resume command.
-        snapshot_after_s: seconds after the request that a snapshot also holds.
-    """
-
-    path: str = ""
-    topics: tuple[str, ...] = ()
-    exclude: tuple[str, ...] = ()
-    discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
-    duration_s: NotNegative = 0.0
-    start_paused: bool = False
-    snapshot_after_s: NotNegative = 2.0
-
-    def folder(self) -> Path:
-        """Folder of the bag."""
-        if self.path:
-            return Path(self.path).expanduser()
-        return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
 
 
 class BagRecorderNode(Node[BagRecorderConfig]):
@@ -180,16 +149,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
 
     def _report(self) -> None:
         assert self.recorder is not None
-        recorder = self.recorder
-        if error := (self.on_demand.trouble() if self.on_demand else "") or recorder.problem():
-            self.diagnose("bag", ERROR, error)
-        elif warning := recorder.warning():
-            self.diagnose("bag", WARN, warning, **{topic.strip("/"): n for topic, n in recorder.lost().items()})
-        else:
-            self.diagnose("bag", OK, recorder.summary(), messages=recorder.count)
-        if unknown := recorder.unknown_types():
-            named = ", ".join(f"{type_name} ({topic})" for type_name, topic in sorted(unknown.items()))
-            self.diagnose("types", WARN, f"recorded without type definition, which is unknown here: {named}")
+        self.diagnose_all(*self.recorder.diagnoses(self.on_demand.trouble() if self.on_demand else ""))
 
     def teardown(self) -> None:
         if self.recorder is None:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from instant_ic.base.command_gate import CommandGate
 from instant_ic.base.config import CrawlerBaseConfig, RoboclawConfig
 from instant_ic.base.controller import BaseController, BaseState, ControllerThread, Health
 from instant_ic.base.odometry import OdometryEstimate
+from instant_ic.base.pace import refuse_pace
 from instant_ic.base.report import BaseReport
 from instant_ic.base.roboclaw import SerialPort, open_serial
-from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.bus import ERROR, LATCHED, SENSOR, WARN, Node, NodeError, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.estop import EstopLatch
 from instant_ic.geometry.poses import matrix_from_pose2
@@ -30,7 +30,7 @@ from instant_ic.msg import (
     twist_values,
     type_name,
 )
-from instant_ic.pace import current
+from instant_ic.pace import PaceError, current
 
 _TWISTS = (type_name(TwistStamped), type_name(Twist))
 """Types allowed on /cmd_vel."""
@@ -45,7 +45,10 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         """Create the topics and the control loop."""
         config = self.config
         self.thread: ControllerThread | None = None
-        self.refuse_pace()
+        try:
+            refuse_pace(current(), config.roboclaw.port, self.run_dir)
+        except PaceError as error:
+            raise NodeError(str(error)) from None
         self.controller = BaseController(config, self.clock.now_ns, self.clock.steady_ns, type(self).open_port)
         also = "/cmd_vel is also published by %s; it must be the arbiter alone"
         self.gate = CommandGate(config, lambda publisher: self.log.warning(also, publisher))
@@ -57,8 +60,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
         self.diagnose("link", WARN, f"connecting to {config.roboclaw.port}")
-        self.show_latch()
-        self.show(self.gate.publishers)
+        self.diagnose_all(self.latch.diagnosis, self.gate.publishers)
         self.timer(1.0, self.watch)
         if self.lockstep:
             self.timer(1.0 / config.rate_hz, self.hurry)
@@ -86,25 +88,11 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         else:
             self.on_step(self.controller.step())
 
-    def refuse_pace(self) -> None:
-        """Refuse to run a real base on scaled time: it would stop late. Only the simulator's base may.
-
-        Raises:
-            NodeError: the stack's time is not the machine's, and the port is not the simulator's in the run directory.
-        """
-        pace, folder = current(), self.run_dir
-        if pace.real or (folder is not None and Path(self.config.roboclaw.port).is_relative_to(folder)):
-            return
-        raise NodeError(
-            f"the stack runs at pace {pace.factor:g}, for simulated devices only, and {self.config.roboclaw.port} is "
-            f"not the simulator's (in {folder}): start with --pace 1"
-        )
-
     def on_command(self, received: Received) -> None:
         """Pass a command to the controller if the gate admits it."""
         if self.gate.admit_publisher(received.publisher, self.clock.steady_ns()):
             self.drive(received)
-        self.show(self.gate.publishers, self.gate.command)
+        self.diagnose_all(self.gate.publishers, self.gate.command)
 
     def drive(self, received: Received) -> None:
         """Decode the driving node's command and pass it on unless it is stale, unstamped or not finite."""
@@ -142,14 +130,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.controller.emergency_stop(self.latch.stopped)
         if self.latch.stopped:
             self.hurry()
-        self.show_latch()
-
-    def show_latch(self) -> None:
-        if not self.latch.stopped:
-            self.diagnose("emergency stop", OK, "released")
-            return
-        by = "a button on the robot" if self.latch.button else self.latch.publisher
-        self.diagnose("emergency stop", WARN, f"latched by {by}: release it on the operator's page")
+        self.diagnose_all(self.latch.diagnosis)
 
     def on_step(self, state: BaseState) -> None:
         """Publish the result of a controller step, the odometry at once; called on the serial thread."""
@@ -161,7 +142,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def on_state(self, state: BaseState) -> None:
         """Publish the state of link and controller."""
         if state.link:
-            self.show(self.report.link(state.connected, state.link, self.clock.steady_ns()))
+            self.diagnose_all(self.report.link(state.connected, state.link, self.clock.steady_ns()))
         if state.health is not None:
             self.publish_health(state.health)
 
@@ -179,7 +160,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         """Publish the battery message, the controller's faults and its emergency stop input."""
         charge = self.report.charge(health)
         self.battery.publish(battery_message(health.battery_v, charge, self.config.base_frame, health.stamp_ns))
-        self.show(*self.report.health(health))
+        self.diagnose_all(*self.report.health(health))
         pressed = health.status.estop
         if pressed != self.button:
             self.button = pressed
@@ -191,7 +172,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         """Report the last ``recent_s``: repeats, impossible readings, dropped commands."""
         now_ns = self.clock.steady_ns()
         self.gate.update(now_ns)
-        self.show(*self.report.recent(now_ns), self.gate.publishers, self.gate.command)
+        self.diagnose_all(*self.report.recent(now_ns), self.gate.publishers, self.gate.command)
 
     def on_end(self, fault: BaseException | None, unstopped: str) -> None:
         """Report why the serial thread ended, and end the node unless it is ending anyway."""

@@ -54,7 +54,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.subscribe("/slam/save", msg.String, self.on_save, qos=RELIABLE)
         self.subscribe("/initialpose", msg.PoseWithCovarianceStamped, self.on_initial_pose, qos=RELIABLE)
         self.timer(self.config.map_period_s, self.publish_map)
-        self.timer(1.0, lambda: self.show(self.queue.watch(self.clock.steady_ns())))
+        self.timer(1.0, lambda: self.diagnose_all(self.queue.watch(self.clock.steady_ns())))
 
     def reconfigure(self, config: GridSlamConfig) -> None:
         super().reconfigure(config)
@@ -96,7 +96,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.queue.add(scan, mount, now_ns, self.clock.steady_ns())
         except ScanError as error:
             self.queue.drop(str(error))
-        self.show(self.queue.state)
+        self.diagnose_all(self.queue.state)
         self.place_ready()
 
     def place_ready(self) -> None:
@@ -113,7 +113,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         """Call the library for one scan and publish the result."""
         config, slam, stamp = self.config, self.slam, queued.scan.stamp_ns
         result = slam.process(queued.scan, odometry, queued.base_from_laser)
-        self.show(*diagnoses(slam, result, odometry is not None, config.use_wheel_odom))
+        self.diagnose_all(*diagnoses(slam, result, odometry is not None, config.use_wheel_odom))
         self.placed_ns = stamp
         if odometry is None:
             self.tf_broadcast(config.odom_frame, config.base_frame, matrix_from_pose2(slam.odom_from_base), stamp)

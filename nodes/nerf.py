@@ -106,7 +106,7 @@ class NerfNode(Node[NerfConfig]):
         self.schedule.next()
 
     def report(self, outcome: Outcome) -> None:
-        self.show(*self.schedule.findings(outcome))
+        self.diagnose_all(*self.schedule.findings(outcome))
         if outcome.error is not None and outcome.is_bug:
             self.fault(f"virtual space, {outcome.job.kind.value}", outcome.error)
 

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from instant_ic.bus import OK, SENSOR, WARN, Node, NodeError, main
-from instant_ic.geometry.poses import pose2_from_matrix, pose_matrix
-from instant_ic.geometry.transforms import TransformError
+from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar.capture import CaptureError
+from instant_ic.lidar.compensation import compensated_scan
 from instant_ic.lidar.config import Vlp16DriverConfig
 from instant_ic.lidar.feed import PacketFeed, Packets
-from instant_ic.lidar.flatscan import check_level, coverage, flat_scan, warm_up
-from instant_ic.lidar.motion import MotionError, PlanarMotion
+from instant_ic.lidar.flatscan import check_level, coverage, warm_up
 from instant_ic.lidar.packets import DATA_PACKET_BYTES
 from instant_ic.lidar.player import CapturePlayer
 from instant_ic.lidar.receiver import PacketReceiver, ReceiverError
@@ -34,7 +33,6 @@ from instant_ic.msg import (
 
 _MAX_WAITING = 5
 """Revolutions that may wait for the node's thread; with more the machine is too slow for the sensor."""
-_MOTION_SAMPLES = 13
 
 
 class Vlp16DriverNode(Node[Vlp16DriverConfig]):
@@ -85,7 +83,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
                     if is_data:
                         self.take(payload, stamp)
                     else:
-                        self.call_soon(self.show, self.report.position(payload))
+                        self.call_soon(self.diagnose_all, self.report.position(payload))
         except Exception as error:  # noqa: BLE001 - nothing else reports what ends a thread
             self.call_soon(self.fault, "receiver", error)
             self.call_soon(self.stop)
@@ -109,7 +107,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             return
         for stamp, port, payload in self.player.due(self.clock.steady_ns()):
             if port == self.config.position_port and len(payload) != DATA_PACKET_BYTES:
-                self.show(self.report.position(payload))
+                self.diagnose_all(self.report.position(payload))
             else:
                 self.take(payload, stamp)
         if not self.player.ended:
@@ -151,48 +149,26 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         if self.feed.sources.doubt(self.clock.steady_ns()) is not None:
             # Without a scan the robot stops; a forged one could drive it into a wall.
             self.report.withheld += 1
-            self.show(self.report.source(self.clock.steady_ns()))
+            self.diagnose_all(self.report.source(self.clock.steady_ns()))
             return
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))
         if coverage(revolution) < config.scan.min_coverage:
             # Half blind: it would mislead map matching, and the scan itself does not show the fault to other nodes.
             self.report.partial += 1
             return
-        try:
-            scan = flat_scan(revolution, self.base_from_lidar, config.scan, self.motion(revolution))
-        except MotionError as error:
-            self.diagnose("motion", WARN, f"scan is not motion-compensated: {error}")
-            scan = flat_scan(revolution, self.base_from_lidar, config.scan, None)
+        scan, state = compensated_scan(revolution, self.base_from_lidar, config.scan, self.tf)
+        self.diagnose_all(state)
         angles, limits = (scan.angle_min, scan.angle_increment), (config.scan.range_min, config.scan.range_max)
         duration_s = (revolution.end_ns - revolution.stamp_ns) * 1e-9
         self.scan.publish(
             scan_message(scan.ranges, *angles, *limits, config.frame_id, scan.stamp_ns, scan_time=duration_s)
         )
 
-    def motion(self, revolution: Revolution) -> PlanarMotion | None:
-        """Poses of the base around a revolution from /tf; None where they are not published."""
-        newest_ns = self.tf.newest_ns("base_link")
-        if newest_ns is None:
-            self.diagnose("motion", OK, "no odometry: the base is assumed to stand still")
-            return None
-        # Odometry of the last milliseconds has not arrived yet: the motion is extrapolated.
-        stop_ns = min(revolution.end_ns, newest_ns)
-        start_ns = min(revolution.stamp_ns, stop_ns - 50_000_000)
-        stamps_ns = np.linspace(start_ns, stop_ns, _MOTION_SAMPLES).astype(np.int64)
-        try:
-            poses = [pose2_from_matrix(self.tf.lookup("odom", "base_link", int(stamp))) for stamp in stamps_ns]
-        except TransformError as error:
-            self.diagnose("motion", WARN, f"scan is not motion-compensated: {error}")
-            return None
-        self.diagnose("motion", OK, "scan is motion-compensated")
-        return PlanarMotion(stamps_ns, np.array(poses))
-
     def check(self) -> None:
         """Report silence and losses; each second."""
         config = self.config
         where = f"{config.host}:{self.receiver.port}" if config.source == "udp" else config.pcap
-        for state in self.report.check(self.clock.steady_ns(), config.silence_s, config.source, where):
-            self.show(state)
+        self.diagnose_all(*self.report.check(self.clock.steady_ns(), config.silence_s, config.source, where))
 
     def teardown(self) -> None:
         if hasattr(self, "ending"):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Collection, Mapping
+from pathlib import Path
 
+from instant_ic.bag.errors import BagError
 from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.bus.registry import NodeInfo
 
@@ -40,6 +42,26 @@ def reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tupl
         if found:
             return base.name, found
     return None
+
+
+def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Mapping[str, str]) -> None:
+    """Refuse to play what a base in the run directory, real or simulated, could obey.
+
+    Args:
+        bag, run_dir: for the text of the error.
+        nodes, played: see :func:`reached_base`.
+
+    Raises:
+        BagError: there is one.
+    """
+    if reached := reached_base(nodes, played):
+        base, topics = reached
+        left_out = " ".join(f"-x {topic}" for topic in topics)
+        raise BagError(
+            f"{bag}: {', '.join(topics)} would reach the robot of {base}, which runs in {run_dir}. Leave them out "
+            f"({left_out}), rename them (--remap {topics[0]}:=/bag{topics[0]}), end the stack, or play them all the "
+            "same with --force"
+        )
 
 
 def missing_readers(

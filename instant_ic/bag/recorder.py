@@ -13,7 +13,7 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -28,6 +28,7 @@ from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
 from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, check_ranges
+from instant_ic.diagnosis import Diagnosis, Level
 
 FOREIGN_CLOCK_NS = 10_000_000_000
 """A stamp farther than this from the simulated clock comes from another clock."""
@@ -341,18 +342,23 @@ class Recorder:
             return f"{text}, {status['bytes'] / 1e6:.1f} MB in {status['files']} files"
         return f"{text}, the last {status['cached_s']:g} s at hand ({status['cached_bytes'] / 1e6:.0f} MB)"
 
-    def problem(self) -> str:
-        """Why messages are not recorded; empty when recording works."""
-        if self.state in (FAILED, DISK_FULL):
-            return self.error
-        if overflow := self.dropped.overflow:
-            return f"{self.summary()}; the disk is too slow, dropped: {_counts(overflow)}"
-        return ""
-
-    def warning(self) -> str:
-        """Losses before the recorder; empty without losses."""
+    def diagnoses(self, fault: str = "") -> Iterator[Diagnosis]:
+        """State of the recording; ``fault`` is one of another recording that goes before its own."""
         lost = self.lost()
-        return f"{self.summary()}; lost: {_counts(lost)}" if lost else ""
+        if not fault and self.state in (FAILED, DISK_FULL):
+            fault = self.error
+        elif not fault and (overflow := self.dropped.overflow):
+            fault = f"{self.summary()}; the disk is too slow, dropped: {_counts(overflow)}"
+        if fault:
+            yield Diagnosis("bag", Level.ERROR, fault)
+        elif lost:
+            values = {topic.strip("/"): count for topic, count in lost.items()}
+            yield Diagnosis("bag", Level.WARN, f"{self.summary()}; lost: {_counts(lost)}", values)
+        else:
+            yield Diagnosis("bag", Level.OK, self.summary(), {"messages": self.count})
+        if unknown := self.unknown_types():
+            named = ", ".join(f"{type_name} ({topic})" for type_name, topic in sorted(unknown.items()))
+            yield Diagnosis("types", Level.WARN, f"recorded without type definition, which is unknown here: {named}")
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Complete the bag; its metadata contain the losses and the nodes' parameters.

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import select
+import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 import zmq
 
@@ -13,8 +16,16 @@ from instant_ic.bus import registry
 _MOST_SOCKETS = 4096
 
 
+class Reader(Protocol):
+    """A subscription that is read when its descriptor is readable."""
+
+    def discover(self) -> None: ...
+    def read(self, one: bool = False) -> None: ...
+    def close(self) -> None: ...
+
+
 class Host:
-    """Run directory, node name, clocks and ZeroMQ context of one transport.
+    """Run directory, node name, clocks, ZeroMQ context and open subscriptions of one transport.
 
     Raises:
         RegistryError: the run directory cannot be used.
@@ -28,3 +39,6 @@ class Host:
         self.next_order: Callable[[], int] = itertools.count().__next__  # a message's position in order of arrival
         self.context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.context.set(zmq.MAX_SOCKETS, _MOST_SOCKETS)
+        self.read_lock = threading.RLock()  # for the sockets of subscriptions
+        self.readers: dict[int, Reader] = {}  # by the descriptor of its socket
+        self.inputs = select.epoll()  # for the thread that waits for messages

@@ -12,22 +12,11 @@ from collections.abc import Callable
 import zmq
 
 from instant_ic.bus import registry
-from instant_ic.bus.frame import (
-    HEADER,
-    INLINE,
-    KEY_COPY,
-    KEY_INLINE,
-    KEY_SHARED,
-    MOST_BYTES,
-    REFERENCE,
-    SHARED,
-    type_digest,
-    unpack_header,
-)
+from instant_ic.bus.frame import HEADER, INLINE, KEY_COPY, MARK, MOST_BYTES, REFERENCE, SHARED, type_digest
 from instant_ic.bus.host import Host
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.shm import LEAST_SLOTS, PeerProgress, Slot, SlotPool
-from instant_ic.bus.transport import Buffer, Payload, PublisherStats, TransportError
+from instant_ic.bus.transport import Buffer, Payload, PublisherStats, TransportError, joined
 
 SHARED_FROM_BYTES = 96 << 10
 """Messages of this size and more go through shared memory. Below it, copying through a socket costs less than the
@@ -39,11 +28,13 @@ SLOTS_A_READER = 5
 _QUEUE_BYTES = 128 << 20
 """What may wait for a blocked reader: of messages through the socket, and of large ones that no slot had room for."""
 LINGER_S = 0.2  # lets a last zero command leave when a node shuts down
-_MEMORY_RETRY_S = 5.0
 _MORE = int(zmq.SNDMORE)
 _NOBLOCK = int(zmq.NOBLOCK)
 
 log = logging.getLogger(__name__)
+
+
+_Message = tuple[int, int, int, Buffer, Slot | None]  # sequence, publication time in ns, size, body, its slot
 
 
 class LocalPublisher:
@@ -52,34 +43,32 @@ class LocalPublisher:
     Args:
         host: the node's transport.
         topic, type_name, qos: what it publishes.
-        on_close: called once when the publisher is closed.
+
+    Attributes:
+        closed: it takes no more messages, and its socket closes.
 
     Raises:
         RegistryError: the node already publishes the topic, or the path is too long.
     """
 
-    def __init__(
-        self, host: Host, topic: str, type_name: str, qos: QoS, on_close: Callable[[LocalPublisher], None]
-    ) -> None:
+    def __init__(self, host: Host, topic: str, type_name: str, qos: QoS) -> None:
         self.topic = topic
         self.type_name = type_name
         self.qos = qos
         self.stats = PublisherStats()
+        self.subscriber_count = 0
         self._now_ns, self._steady_ns = host.now_ns, host.steady_ns
-        self._on_close = on_close
         self._lock = threading.RLock()  # publish may be called from any thread; the bus thread serves subscriptions
         self._name = topic.encode()
         self._type_hash = type_digest(type_name)
         self._id = os.urandom(8)
         self._sequence = 0
-        self._subscribers = 0
         self._copies = 0  # subscribers that want large messages inline
         self._progress: dict[bytes, PeerProgress] = {}
         self._pool = SlotPool(self._id)
-        self._memory_retry_s = 0.0
         self._inlined: deque[tuple[int, int]] = deque()  # sequence and size of large messages through the socket
-        self._last: tuple[bytes, Buffer, Slot | None] | None = None  # header, third part, slot of the latched value
-        self._closed = False
+        self._last: _Message | None = None  # the latched value
+        self.closed = False
         self._claim, self._path = registry.claim_socket(host.run_dir, topic, host.node)
         self._socket = host.context.socket(zmq.XPUB)
         try:
@@ -89,18 +78,7 @@ class LocalPublisher:
             self._socket.setsockopt(zmq.SNDHWM, _QUEUE_BYTES // SHARED_FROM_BYTES)
             self._socket.bind(f"ipc://{self._path}")
             self._path.chmod(0o600)
-            self._claim.write(
-                {
-                    "topic": topic,
-                    "type": type_name,
-                    "qos": qos.name,
-                    "node": host.node,
-                    "pid": os.getpid(),
-                    "socket": str(self._path),
-                    "id": self._id.hex(),
-                    "started_ns": time.time_ns(),
-                }
-            )
+            registry.announce(self._claim, topic, type_name, qos.name, host.node, self._path, self._id)
         except registry.RegistryError:
             self._leave()
             raise
@@ -108,11 +86,7 @@ class LocalPublisher:
             self._leave()
             raise registry.RegistryError(f"publisher of {topic} by node {host.node}: {error}") from error
         self.fd = int(self._socket.getsockopt(zmq.FD))
-
-    @property
-    def subscriber_count(self) -> int:
-        """Number of connected readers."""
-        return self._subscribers
+        self._send_part = super(zmq.Socket, self._socket).send  # without pyzmq's layer for other kinds of sockets
 
     def send(self, payload: Payload, publish_ns: int | None = None) -> None:
         """Send one message without waiting. The payload may be changed as soon as this returns.
@@ -120,9 +94,9 @@ class LocalPublisher:
         Raises:
             TransportError: the message is larger than 4 GiB.
         """
-        if not isinstance(payload, (bytes, bytearray, memoryview)):
-            payload = payload[0] if len(payload) == 1 else b"".join(payload)
-        body = payload if isinstance(payload, bytes) else memoryview(payload).cast("B")
+        body = joined(payload)
+        if not isinstance(body, bytes):
+            body = body.cast("B")
         size = len(body)
         if size >= SHARED_FROM_BYTES:
 
@@ -132,13 +106,8 @@ class LocalPublisher:
             self.send_filled(size, copy, publish_ns)
             return
         with self._lock:
-            if self._closed:
-                return
-            header = self._header(INLINE, size, publish_ns)
-            if self._subscribers:
-                self._emit(self._name + KEY_INLINE, header, body)
-            if self.qos.latched:
-                self._last = header, bytes(body), None
+            if not self.closed:
+                self._send(size, body, publish_ns)
         self.stats.add(self._steady_ns(), size)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
@@ -155,21 +124,25 @@ class LocalPublisher:
             self.send(data, publish_ns)
             return
         with self._lock:
-            if self._closed:
+            if self.closed:
                 return
-            if not self._subscribers and not self.qos.latched:
+            if not self.subscriber_count and not self.qos.latched:
                 self._sequence += 1
             elif (slot := self._slot(size)) is not None:
-                self._send_shared(slot, size, fill, publish_ns)
-            elif not self.qos.latched and not self._has_room(size):
-                self._sequence += 1  # readers count the gap
-            else:
+                try:
+                    with slot.begin(size) as target:
+                        fill(target)
+                    slot.finish(self._sequence + 1)
+                finally:
+                    slot.unlock()
+                reference = REFERENCE.pack(os.getpid(), slot.fd, slot.number, self._pool.oldest)
+                self._send(size, reference, publish_ns, slot)
+            elif self.qos.latched or self._has_room(size):
                 body = bytearray(size)
                 fill(memoryview(body))
-                header = self._header(INLINE, size, publish_ns)
-                self._emit(self._name + KEY_INLINE, header, body)
-                if self.qos.latched:
-                    self._last = header, body, None
+                self._send(size, body, publish_ns)
+            else:
+                self._sequence += 1  # readers count the gap
         self.stats.add(self._steady_ns(), size)
 
     def serve(self) -> None:
@@ -178,7 +151,7 @@ class LocalPublisher:
         Sending may take the event from the descriptor, so it is called every second in any case.
         """
         with self._lock:
-            while not self._closed and int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            while not self.closed and int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 request = self._socket.recv(_NOBLOCK)
                 while self._socket.getsockopt(zmq.RCVMORE):  # no subscription has a second part
                     self._socket.recv(_NOBLOCK)
@@ -191,17 +164,15 @@ class LocalPublisher:
     def close(self) -> None:
         """End the topic and remove it from the registry; the last messages get up to 0.2 s to leave."""
         with self._lock:
-            if self._closed:
+            if self.closed:
                 return
             deadline = time.monotonic() + LINGER_S
-            newest = max((slot.sequence for slot in self._pool.slots), default=0)
+            newest = max((slot.written for slot in self._pool.slots), default=0)
             # A slot can be opened only as long as this process keeps it.
-            while self._subscribers and self._read_by_all()[1] < newest and time.monotonic() < deadline:
+            while self.subscriber_count and self._read_by_all()[1] < newest and time.monotonic() < deadline:
                 time.sleep(0.002)
                 self.serve()
-            self._closed = True
-        self._on_close(self)
-        with self._lock:
+            self.closed = True
             self._leave()
             self._pool.close()
 
@@ -213,16 +184,24 @@ class LocalPublisher:
         self._path.unlink(missing_ok=True)
         self._claim.release()
 
-    def _header(self, kind: int, size: int, publish_ns: int | None) -> bytes:
+    def _send(self, size: int, body: Buffer, publish_ns: int | None, slot: Slot | None = None) -> None:
         self._sequence += 1
-        stamp = self._now_ns() if publish_ns is None else publish_ns
-        return HEADER.pack(kind, self._sequence, stamp, self._id, self._type_hash, size)
+        message = self._sequence, self._now_ns() if publish_ns is None else publish_ns, size, body, slot
+        if self.subscriber_count:
+            self._emit(message)
+        if slot is not None and self._copies:
+            self._emit(message, copy=True)
+        if self.qos.latched:
+            self._last = (*message[:3], bytes(body), slot)
 
-    def _emit(self, key: bytes, header: bytes, body: Buffer) -> None:
-        send = self._socket.send
-        send(key, _MORE)
-        send(header, _MORE)
-        send(body)
+    def _emit(self, message: _Message, copy: bool = False) -> None:
+        """Send a message; ``copy`` means one in shared memory to the subscribers that want it inline."""
+        sequence, publish_ns, size, body, slot = message
+        name, kind = self._name, INLINE if slot is None else SHARED
+        if slot is not None and copy:
+            name, kind, body = KEY_COPY + name, INLINE, slot.view(size)
+        self._send_part(name + HEADER.pack(kind, MARK, sequence, publish_ns, self._id, self._type_hash, size), _MORE)
+        self._send_part(body)
 
     def _has_room(self, size: int) -> bool:
         """Whether a large message may go through the socket: its own limit counts messages, not bytes."""
@@ -234,46 +213,26 @@ class LocalPublisher:
         self._inlined.append((self._sequence + 1, size))
         return True
 
-    def _send_shared(self, slot: Slot, size: int, fill: Callable[[memoryview], None], publish_ns: int | None) -> None:
-        try:
-            with slot.begin(size) as target:
-                fill(target)
-            header = self._header(SHARED, size, publish_ns)
-            slot.finish(self._sequence)
-        finally:
-            slot.unlock()
-        reference = REFERENCE.pack(os.getpid(), slot.fd, slot.number, self._pool.oldest)
-        if self.qos.latched:
-            self._last = header, reference, slot
-        if self._subscribers:
-            self._emit(self._name + KEY_SHARED, header, reference)
-        if self._copies:
-            self._emit(KEY_COPY + self._name, _inline(header), slot.view(size))
-
     def _slot(self, size: int) -> Slot | None:
         """A locked slot, or None when this message must go through the socket."""
-        if self._memory_retry_s and time.monotonic() < self._memory_retry_s:
-            self.stats.not_shared += 1
-            return None
-        must, should = self._read_by_all()
-        keep = self._last[2] if self._last else None
+        why = "readers hold all slots"
         try:
-            slot = self._pool.acquire(size, LEAST_SLOTS + SLOTS_A_READER * self._subscribers, must, should, keep)
+            keep = self._last[4] if self._last else None
+            most = LEAST_SLOTS + SLOTS_A_READER * self.subscriber_count
+            if (slot := self._pool.acquire(size, most, *self._read_by_all(), keep)) is not None:
+                return slot
         except OSError as error:
-            self._memory_retry_s = time.monotonic() + _MEMORY_RETRY_S
-            self.stats.not_shared += 1
-            self.stats.not_shared_why = f"no shared memory for {size} bytes: {error.strerror or error}"
-            log.warning("%s: %s; large messages go through the socket, slower", self.topic, self.stats.not_shared_why)
-            return None
-        if slot is None:
-            self.stats.not_shared += 1
-            self.stats.not_shared_why = "readers hold all slots"
-        return slot
+            why = f"no shared memory for {size} bytes: {error.strerror or error}"
+            if self.stats.not_shared_why != why:
+                log.warning("%s: %s; large messages go through the socket, slower", self.topic, why)
+        self.stats.not_shared += 1
+        self.stats.not_shared_why = why
+        return None
 
     def _read_by_all(self) -> tuple[int, int]:
         """Sequences up to which all readers that want every message, and all readers, have looked at the messages."""
         must = self._sequence
-        should = must if self._subscribers <= len(self._progress) else 0  # others announce no progress
+        should = must if self.subscriber_count <= len(self._progress) else 0  # others announce no progress
         for progress in self._progress.values():
             sequence = progress.sequence()
             should = min(should, sequence)
@@ -286,18 +245,11 @@ class LocalPublisher:
     def _on_subscription(self, prefix: bytes, begins: bool) -> None:
         """Count a reader, and give it the last value; the others get it again and know its sequence."""
         every = self._name.startswith(prefix)
-        inline, copies = every or prefix == self._name + KEY_INLINE, prefix == KEY_COPY + self._name
-        self._subscribers += inline if begins else -inline
+        inline, copies = every or prefix == self._name + bytes([INLINE]), prefix == KEY_COPY + self._name
+        self.subscriber_count += inline if begins else -inline
         self._copies += copies if begins else -copies
-        if not begins or self._last is None:
-            return
-        header, body, slot = self._last
-        if slot is None and inline:
-            self._emit(self._name + KEY_INLINE, header, body)
-        elif slot is not None and every:
-            self._emit(self._name + KEY_SHARED, header, body)
-        elif slot is not None and copies:
-            self._emit(KEY_COPY + self._name, _inline(header), slot.view(unpack_header(header)[5]))
+        if begins and self._last is not None and (every or (copies if self._last[4] else inline)):
+            self._emit(self._last, copies)
 
     def _on_announcement(self, announcement: bytes, begins: bool) -> None:
         if not begins:
@@ -308,8 +260,3 @@ class LocalPublisher:
             self._progress[announcement] = PeerProgress(announcement, self._id, joined)
         except (OSError, ValueError, OverflowError) as error:
             log.debug("%s: progress of a reader cannot be read: %s", self.topic, error)
-
-
-def _inline(header: bytes) -> bytes:
-    """The header of the inline copy of a message in shared memory."""
-    return HEADER.pack(INLINE, *unpack_header(header)[1:])

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import logging
-import os
+import select
 import threading
 import time
 import weakref
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import zmq
 
 from instant_ic.bus import registry
-from instant_ic.bus.frame import KEY_COPY, KEY_INLINE, REFERENCE, SHARED, FrameError, Header, type_digest, unpack_header
+from instant_ic.bus.frame import INLINE, KEY_COPY, REFERENCE, SHARED, FrameError, Header, type_digest, unpack_header
 from instant_ic.bus.host import Host
 from instant_ic.bus.qos import QoS
-from instant_ic.bus.shm import ProgressPage, Slot
+from instant_ic.bus.shm import Slot, progress_page, store_progress
 from instant_ic.bus.transport import Received, Stats
 
 VIEWS_HELD = 4
@@ -31,23 +31,23 @@ _QUEUE = 256  # messages that ZeroMQ keeps in this process; the publisher keeps 
 _LARGE_FROM_BYTES = 64 << 10
 _RECONNECT_MS = 20
 _GRACE_S = 2.0  # the last messages of a publisher that has left the registry may still be on the way
-# The leftovers of a killed process change no folder. Every second its process is looked for, now and then its lock.
-_LOOK_S = 1.0
-_FULL_LOOK_S = 5.0
-_MOST_UNKNOWN = 64
-_NOBLOCK = int(zmq.NOBLOCK)
+_SEARCH_S = 1.0
+_MOST_COMPLAINTS = 64
+_NOBLOCK, _EVENTS, _POLLIN = int(zmq.NOBLOCK), int(zmq.EVENTS), int(zmq.POLLIN)
+_leases: dict[Slot, weakref.ref[Any]] = {}  # of messages in use, also when their subscription is gone
 _new = tuple.__new__  # what Received(...) calls in the end, without a Python call in between
 
 log = logging.getLogger(__name__)
 
 
 class _Source:
-    """One publisher of the topic."""
+    """One publisher of the topic; ``place`` is its place on the page of progress."""
 
-    def __init__(self, info: registry.PublisherInfo) -> None:
+    def __init__(self, info: registry.PublisherInfo, place: int) -> None:
         self.info = info
         self.node, self.type_name = info.node, info.type_name
         self.address = f"ipc://{info.socket}"  # a successor of the same node has the same
+        self.place = place
         self.left_s = 0.0  # when it was noticed that it has left the registry; 0: it has not
         self.expected = 0  # sequence of the next message; 0 before the first
         self.slots: dict[int, Slot] = {}
@@ -62,86 +62,66 @@ class LocalSubscription:
         host: the node's transport.
         topic, type_name, qos: what it reads; ``type_name`` None accepts any type.
         on_ready: called when there are messages after there were none; it must not wait.
-        on_close: called once when the subscription is closed.
 
     Raises:
         RegistryError: the topic's name is invalid, or its folder cannot be used.
     """
 
-    def __init__(
-        self,
-        host: Host,
-        topic: str,
-        type_name: str | None,
-        qos: QoS,
-        on_ready: Callable[[], None],
-        on_close: Callable[[LocalSubscription], None],
-    ) -> None:
+    def __init__(self, host: Host, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]) -> None:
         self.topic = registry.check_topic(topic)
         self.type_name = type_name
         self.qos = qos
         self.stats = Stats()
-        self.publishers: list[registry.PublisherInfo] = []
-        self._host = host
-        self._on_ready, self._on_close = on_ready, on_close
+        self._host, self._on_ready = host, on_ready
         self._name = self.topic.encode()
         self._digest = type_digest(type_name) if type_name else None
         self._lock = threading.Lock()
         self._queue: deque[Received] = deque()
         self._depth = qos.depth
         self._now_ns, self._steady_ns, self._next_order = host.now_ns, host.steady_ns, host.next_order
-        self._folder = str(registry.topic_dir(host.run_dir, topic))
-        registry.own_folder(Path(self._folder))
-        self._seen_mtime = -1
-        self._next_look = self._next_full_look = 0.0
+        folder = registry.topic_dir(host.run_dir, topic)
+        registry.own_folder(folder)
+        self._folder = registry.TopicFolder(folder)
         self._sources: dict[bytes, _Source] = {}  # by identity; a connection to each
-        self._next_search = 0.0
+        self._next_search_s = 0.0
         self._told: set[object] = set()
         self._socket = host.context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
         self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
-        self._page = ProgressPage(newest_only=qos.depth == 1)
-        self._socket.setsockopt(zmq.SUBSCRIBE, self._page.announcement)
+        self._page, self._announcement = progress_page(newest_only=qos.depth == 1)
+        self._socket.setsockopt(zmq.SUBSCRIBE, self._announcement)
         self._socket.setsockopt(zmq.SUBSCRIBE, self._name)
         self.fd = int(self._socket.getsockopt(zmq.FD))
+        host.readers[self.fd] = self
+        host.inputs.register(self.fd, select.EPOLLIN)
 
-    # -- on the reading thread, under the transport's read lock ------------------------------------
+    # -- on the reading thread, under the read lock ------------------------------------
 
     def discover(self) -> None:
-        """Connect to new publishers and disconnect from those that left.
+        """Connect to new publishers and disconnect from those that left; :meth:`read` must follow.
 
         Raises:
             OSError: the run directory is gone.
         """
-        mtime = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - five times a second for each topic
+        if self._folder.look():
+            self._connect()
         now = time.monotonic()
-        if mtime == self._seen_mtime and now < self._next_look:
-            return
-        self._next_look = now + _LOOK_S
-        complete = len(self._sources) == len(self.publishers)  # none to connect again, none in its grace
-        known = mtime == self._seen_mtime and now < self._next_full_look and complete
-        if known and all(registry.running(info) for info in self.publishers):
-            return
-        self._seen_mtime, self._next_full_look = mtime if registry.settled(mtime) else -1, now + _FULL_LOOK_S
-        self._look_up(now)
-        self.read()  # the last messages of those that left; an event may have been taken from `fd` here
         for identity, source in list(self._sources.items()):
             if source.left_s and now - source.left_s > _GRACE_S:
                 del self._sources[identity]
-                self._page.forget(identity)
                 if not self._connected(source.address):
                     self._socket.disconnect(source.address)
 
     def _connected(self, address: str) -> bool:
         return any(source.address == address for source in self._sources.values())
 
-    def _look_up(self, now: float) -> None:
-        """Read the registry, and connect to publishers that are new in it."""
-        self.publishers = registry.topic_publishers(self._host.run_dir, self.topic)
-        present = {bytes.fromhex(info.id): info for info in self.publishers}
+    def _connect(self) -> None:
+        """Connect to the publishers that are new in the registry, and note which have left it."""
+        present = {bytes.fromhex(info.id): info for info in self._folder.publishers}
         for identity in present.keys() - self._sources.keys():
-            source = _Source(present[identity])
+            taken = {source.place for source in self._sources.values()}
+            source = _Source(present[identity], next(place for place in itertools.count() if place not in taken))
             if not self._connected(source.address):
                 try:
                     self._socket.connect(source.address)
@@ -150,26 +130,21 @@ class LocalSubscription:
                     continue
             self._sources[identity] = source  # its messages are known from now on, also after it has left
         for identity, source in self._sources.items():
-            source.left_s = 0.0 if identity in present else source.left_s or now
-
-    def read_rest(self) -> None:
-        """Read what :meth:`read` of one message has left; usually nothing."""
-        if int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            self.read()
+            source.left_s = 0.0 if identity in present else source.left_s or time.monotonic()
 
     def read(self, one: bool = False) -> None:
-        """Read all messages that have arrived, or only one: then :meth:`read_rest` must follow before a wait."""
+        """Read all messages that have arrived, or only ``one``: looking for more would delay it, but must follow."""
         socket = self._socket
         receive = socket.recv
-        while True:
+        while one or int(socket.getsockopt(_EVENTS)) & _POLLIN:
             try:
-                receive(_NOBLOCK)  # the key
+                first = receive(_NOBLOCK)
             except zmq.Again:
                 return
             try:
-                # A missing part shows as the next message's key, or as none: neither is a header.
-                header = unpack_header(receive(_NOBLOCK))
-                if header[0] == SHARED or header[5] < _LARGE_FROM_BYTES:
+                # A missing part shows as the next message's first, or as none: neither is a body of that size.
+                header = unpack_header(first)
+                if header[0] == SHARED or header[6] < _LARGE_FROM_BYTES:
                     self._message(header, receive(_NOBLOCK))
                 else:
                     self._message(header, receive(_NOBLOCK, copy=False).buffer.toreadonly())
@@ -178,11 +153,11 @@ class LocalSubscription:
                     receive(_NOBLOCK)
                 self.stats.rejected += 1
                 self._complain(str(error)[:40], f"{str(error) or 'message in parts'}; the message is dropped")
-            if one or not int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            if one:
                 return
 
     def _message(self, header: Header, body: bytes | memoryview) -> None:
-        kind, sequence, publish_ns, publisher, digest, size = header
+        kind, _, sequence, publish_ns, publisher, digest, size = header
         source = self._sources.get(publisher) or self._met(publisher)
         gap = sequence - source.expected if source.expected else 0
         if gap < 0:  # a latched value, sent again
@@ -202,7 +177,7 @@ class LocalSubscription:
         elif gap:
             self.stats.lose(source.node, gap)
         if size >= _LARGE_FROM_BYTES:
-            self._page.store(publisher, sequence)
+            store_progress(self._page, source.place, publisher, sequence)
         if payload is None:
             return
         node, steady = source.node, self._steady_ns()
@@ -215,10 +190,7 @@ class LocalSubscription:
             queue = self._queue
             waiting = len(queue)
             if waiting and self._depth == 1:
-                for index, other in enumerate(queue):
-                    if other.publisher == node:
-                        del queue[index]
-                        break
+                queue = self._queue = deque(other for other in queue if other.publisher != node)
             elif waiting >= self._depth:
                 self.stats.lose(queue.popleft().publisher, 1)
             queue.append(message)
@@ -233,11 +205,12 @@ class LocalSubscription:
             FrameError: the registry does not name it.
         """
         now = time.monotonic()
-        if now >= self._next_search:
-            self._look_up(now)
+        if now >= self._next_search_s:
+            self._folder.read()
+            self._connect()
             if publisher in self._sources:
                 return self._sources[publisher]
-            self._next_search = now + _LOOK_S
+            self._next_search_s = now + _SEARCH_S
         raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")
 
     def _shared(self, source: _Source, header: Header, body: bytes | memoryview) -> memoryview | None:
@@ -245,7 +218,7 @@ class LocalSubscription:
         if len(body) != REFERENCE.size:
             raise FrameError(f"reference of {len(body)} bytes; it has {REFERENCE.size}")
         pid, fd, number, oldest = REFERENCE.unpack(body)
-        _, sequence, _, publisher, _, size = header
+        _, _, sequence, _, publisher, _, size = header
         for retired in [n for n in source.slots if n < oldest]:
             del source.slots[retired]
         slot = source.slots.get(number)
@@ -261,12 +234,12 @@ class LocalSubscription:
             return None
         if source.views >= VIEWS_HELD:
             copy = memoryview(bytes(slot.view(size)))
-            slot.release()
+            slot.unlock()
             return copy
         array = np.frombuffer(slot.view(size), np.uint8)
-        source.views += 1
         # Everything derived from the message refers to this array: when it is freed, nothing reads the slot any more.
-        weakref.finalize(array, self._done, source, slot, sequence).atexit = False
+        _leases[slot] = weakref.ref(array, lambda _: self._done(source, slot, sequence))
+        source.views += 1
         return array.data
 
     def _done(self, source: _Source, slot: Slot, sequence: int) -> None:
@@ -275,16 +248,17 @@ class LocalSubscription:
             self.stats.overwritten += 1
             log.error("%s: %s overwrote a message that was still in use", self.topic, source.node)
         source.views -= 1
-        slot.release()
+        del _leases[slot]
+        slot.unlock()
 
     def _without_shared_memory(self, source: _Source, sequence: int, error: OSError) -> NoReturn:
         """Replace the subscription by one to inline messages only."""
         if KEY_COPY not in self._told:
             self._told.add(KEY_COPY)
             source.expected = source.expected or sequence  # the last value comes again
-            for wanted in (self._name + KEY_INLINE, KEY_COPY + self._name):
+            for wanted in (self._name + bytes([INLINE]), KEY_COPY + self._name):
                 self._socket.setsockopt(zmq.SUBSCRIBE, wanted)
-            for unwanted in (self._name, self._page.announcement):
+            for unwanted in (self._name, self._announcement):
                 self._socket.setsockopt(zmq.UNSUBSCRIBE, unwanted)
         raise FrameError(
             f"shared memory of {source.node} cannot be used ({error.strerror or error}); asking for large messages "
@@ -299,14 +273,9 @@ class LocalSubscription:
 
     def _complain(self, what: object, text: str) -> None:
         """Log an error once."""
-        if what not in self._told and len(self._told) < _MOST_UNKNOWN:
+        if what not in self._told and len(self._told) < _MOST_COMPLAINTS:
             self._told.add(what)
             log.error("%s: %s", self.topic, text)
-
-    def shut(self) -> None:
-        """Close the socket; views of messages stay valid."""
-        self._socket.close()
-        self._page.close()
 
     # -- on the node's thread --------------------------------------------------------------------
 
@@ -319,4 +288,10 @@ class LocalSubscription:
         return messages
 
     def close(self) -> None:
-        self._on_close(self)
+        """Close the socket; views of messages stay valid."""
+        with self._host.read_lock:
+            if self._host.readers.get(self.fd) is self:  # not closed before
+                del self._host.readers[self.fd]
+                self._host.inputs.unregister(self.fd)
+                self._socket.close()
+                self._page.close()

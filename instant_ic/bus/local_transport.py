@@ -1,11 +1,9 @@
 """Topics of one node on one machine: ZeroMQ sockets found through the registry; no broker, no master.
 
 Which thread reads: while the node's thread waits in :meth:`LocalTransport.wait`, it reads its own sockets, so a message
-wakes only that thread. During a long callback the bus thread reads instead, so that the newest message does not grow
-old in a queue. The bus thread also serves new subscriptions and looks for publishers.
-
-A thread that wakes runs with cold caches: a message then costs ten times what it costs in a row of messages. So no
-thread wakes to look whether there is something to do, except for publishers.
+wakes only that thread. When it has been away for longer (a long callback), the bus thread reads instead. The bus thread
+also serves new subscriptions and looks for publishers; between these looks it sleeps, since a thread that wakes runs
+with cold caches and costs ten times what it costs in a row of messages.
 
 Both wait on the sockets' file descriptors and touch a socket only under a lock, since ZeroMQ's are not thread-safe.
 A thread that touches one must read all it has: its descriptor does not report an event twice.
@@ -19,7 +17,7 @@ import os
 import select
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from instant_ic.bus import registry
@@ -28,10 +26,9 @@ from instant_ic.bus.local_publisher import LINGER_S, LocalPublisher
 from instant_ic.bus.local_subscription import LocalSubscription
 from instant_ic.bus.qos import QoS
 
-_DISCOVERY_S = 0.2
+_LOOK_S = 0.2
 _IDLE_S = 1.0
-_BUSY_S = 0.015  # a longer callback is slow
-_SLOW_FOR_S = 10.0  # how long after a slow callback a message wakes the bus thread during each callback
+_AWAY_S = 0.015  # a longer callback is noticed at the next look
 _CLOSE_S = 5.0
 
 log = logging.getLogger(__name__)
@@ -65,27 +62,15 @@ class LocalTransport:
         self.run_dir = self._host.run_dir
         self.node = node
         self._driver: int | None = None  # the thread that waits
-        self._set = self._written = False
-        self._quiet = False  # what the bus thread reads now wakes nobody
-        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._wake_poll = select.poll()
-        self._wake_poll.register(self._wake, select.POLLIN)
-        self._read_lock = threading.RLock()
-        self._writers: dict[int, LocalPublisher] = {}  # by the descriptor of its socket
-        self._readers: dict[int, LocalSubscription] = {}
-        self._unread: list[LocalSubscription] = []  # may have more, which their descriptors do not show
-        self._stop = threading.Event()
-        self._inputs = select.epoll()
-        self._events = select.epoll()
-        self._poke = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._waiting = False
-        self._left_s = time.monotonic()
-        self._slow_until_s = 0.0
-        self._bus_reads = True
-        self._inputs.register(self._wake, select.EPOLLIN)
-        self._events.register(self._poke, select.EPOLLIN)
-        self._events.register(self._inputs.fileno(), select.EPOLLIN)
+        self._set = self._waiting = False
+        self._left_s = 0.0  # when it last stopped waiting
         self._next_look_s = 0.0
+        self._read_lock, self._readers, self._inputs = self._host.read_lock, self._host.readers, self._host.inputs
+        self._unread: list[int] = []  # of these sockets only one message was read
+        self._writers: list[LocalPublisher] = []
+        self._wake, self._poke = (os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) for _ in range(2))
+        self._inputs.register(self._wake, select.EPOLLIN)
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bus", daemon=True)
         self._thread.start()
 
@@ -96,28 +81,13 @@ class LocalTransport:
     def set(self) -> None:
         """End the present or the next wait; may be called from any thread."""
         if not self._set:
-            if self._quiet and threading.get_ident() == self._thread.ident:
-                return
             self._set = True
             if threading.get_ident() != self._driver:
-                self._written = True
                 os.eventfd_write(self._wake, 1)
 
     def clear(self) -> None:
         """Let later waits wait."""
         self._set = False
-        if self._written:
-            self._written = False
-            self._drain()
-
-    def is_set(self) -> bool:
-        """Whether the next wait ends at once."""
-        return self._set
-
-    def _drain(self) -> None:
-        """Take the event from its descriptor, which would end every later wait at once."""
-        with contextlib.suppress(BlockingIOError):
-            os.eventfd_read(self._wake)
 
     def advertise(self, topic: str, type_name: str, qos: QoS) -> LocalPublisher:
         """Create a publisher, which readers can find at once.
@@ -125,9 +95,9 @@ class LocalTransport:
         Raises:
             RegistryError: the node already publishes the topic, or the path is too long.
         """
-        publisher = LocalPublisher(self._host, registry.check_topic(topic), type_name, qos, self._forget_publisher)
-        self._writers[publisher.fd] = publisher
-        self._events.register(publisher.fd, select.EPOLLIN)
+        publisher = LocalPublisher(self._host, registry.check_topic(topic), type_name, qos)
+        self._writers = [*(writer for writer in self._writers if not writer.closed), publisher]
+        os.eventfd_write(self._poke, 1)
         return publisher
 
     def subscribe(self, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]) -> LocalSubscription:
@@ -140,25 +110,10 @@ class LocalTransport:
                 not wait.
         """
         with self._read_lock:
-            subscription = LocalSubscription(self._host, topic, type_name, qos, on_ready, self._forget_subscription)
-            self._readers[subscription.fd] = subscription
-            self._inputs.register(subscription.fd, select.EPOLLIN)
+            subscription = LocalSubscription(self._host, topic, type_name, qos, on_ready)
         self._next_look_s = 0.0
         os.eventfd_write(self._poke, 1)
         return subscription
-
-    def _forget_publisher(self, publisher: LocalPublisher) -> None:
-        """Stop serving a publisher; its socket closes next."""
-        if self._writers.pop(publisher.fd, None) is not None:
-            self._events.unregister(publisher.fd)
-
-    def _forget_subscription(self, subscription: LocalSubscription) -> None:
-        """Stop reading a subscription and close its socket."""
-        with self._read_lock:
-            if self._readers.get(subscription.fd) is subscription:  # not closed before
-                del self._readers[subscription.fd]
-                self._inputs.unregister(subscription.fd)
-                subscription.shut()
 
     def close(self) -> None:
         """Close everything; the last messages get up to 0.2 s to leave."""
@@ -169,12 +124,11 @@ class LocalTransport:
         self._thread.join(timeout=_CLOSE_S)
         for subscription in list(self._readers.values()):
             subscription.close()
-        for publisher in list(self._writers.values()):
+        for publisher in self._writers:
             publisher.close()
         with self._read_lock:
             self._set = True  # later calls of `set` do nothing
             self._inputs.close()
-            self._events.close()
             os.close(self._wake)
             os.close(self._poke)
         started_s = time.monotonic()
@@ -186,100 +140,70 @@ class LocalTransport:
 
     def wait(self, timeout: float) -> None:
         """Read the node's sockets until a message arrives, the event is set, or the time is over."""
-        if self._set:
-            return
-        self._waiting = True
-        self._driver = threading.get_ident()
-        if self._bus_reads:
-            with self._read_lock:  # the bus thread may just be taking the event from its descriptor
-                self._hand_reading(False)
-        now = time.monotonic()
-        if now - self._left_s > _BUSY_S:
-            self._slow_until_s = now + _SLOW_FOR_S
-        self._read_rest()
-        if self.patient and not self._set:
-            self._wake_poll.poll(1000.0 * timeout)
-        if self.patient or self._set:
-            timeout = 0.0
-        self._read(self._inputs.poll(timeout, 64), one=True)
-        self._left_s = time.monotonic()
+        self._driver, self._waiting = threading.get_ident(), True
+        self._read(self._unread)
+        timeout = 0.0 if self._set else timeout
         if self.patient:
-            self._read_rest()
-        elif self._left_s < self._slow_until_s:
-            self._hand_reading(True)
-        self._waiting = False
+            ready = [*_readable([self._wake], timeout), *self._readers]
+        else:
+            ready = [fd for fd, _ in self._inputs.poll(timeout, 64)]
+        self._read(ready, one=not self.patient)
+        self._unread = ready
+        if self._wake in ready:  # left as it is, it would end every later wait
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._wake)
+        self._waiting, self._left_s = False, time.monotonic()
 
-    def _hand_reading(self, to_bus: bool) -> None:
-        """Let the bus thread read, or no longer."""
-        self._bus_reads = to_bus
-        self._events.modify(self._inputs.fileno(), select.EPOLLIN if to_bus else 0)
-
-    def _read(self, events: list[tuple[int, int]], one: bool) -> None:
-        """Read what waits, or ``one`` message of each socket: looking for more would delay it."""
+    def _read(self, fds: Iterable[int], one: bool = False) -> None:
         with self._read_lock:
-            for fd, _ in events:
-                subscription = self._readers.get(fd)
-                if subscription is not None:
+            for fd in fds:
+                if (subscription := self._readers.get(fd)) is not None:
                     subscription.read(one)
-                    if one:
-                        self._unread.append(subscription)
-                elif one or not self._waiting:  # the event; left as it is, it would end every poll at once
-                    self._drain()
-
-    def _read_rest(self) -> None:
-        """Read what was left of sockets of which one message was read."""
-        if self._unread:
-            with self._read_lock:
-                unread, self._unread = self._unread, []
-                for subscription in unread:
-                    if self._readers.get(subscription.fd) is subscription:
-                        subscription.read_rest()
 
     def _run(self) -> None:
-        inputs = self._inputs.fileno()
-        early = False
         while not self._stop.is_set():
             now = time.monotonic()
-            if now >= self._next_look_s:
-                self._next_look_s = now + _IDLE_S
-                if self._look() and self._readers:
-                    self._next_look_s = min(self._next_look_s, now + _DISCOVERY_S)
-            if not (self._waiting or self._bus_reads or self.patient) and now - self._left_s > _BUSY_S:
-                self._hand_reading(True)
-                self._read_rest()
-            timeout = _BUSY_S if early else max(0.0, self._next_look_s - now)
-            early = False
             try:
-                for fd, _ in self._events.poll(timeout, 64):
-                    if fd == inputs:
-                        # Most callbacks end soon: two threads that read in turn would wait for each other all the time.
-                        early = not self._waiting and time.monotonic() - self._left_s < _BUSY_S
-                        if early:
-                            self._hand_reading(False)
-                        else:
-                            self._read(self._inputs.poll(0, 64), one=False)
-                    elif fd == self._poke:
-                        os.eventfd_read(fd)
-                    elif (publisher := self._writers.get(fd)) is not None:
+                if now >= self._next_look_s:
+                    self._next_look_s = now + _IDLE_S
+                    self._look()
+                    self._next_look_s = min(self._next_look_s, now + (_LOOK_S if self._readers else _IDLE_S))
+                writers = {writer.fd: writer for writer in self._writers if not writer.closed}
+                away = not (self._waiting or self.patient) and now - self._left_s > _AWAY_S
+                inputs = list(self._readers) if away else []
+                ready = _readable([self._poke, *writers, *inputs], max(0.0, self._next_look_s - now))
+                if self._poke in ready:
+                    os.eventfd_read(self._poke)
+                for fd in ready:
+                    if (publisher := writers.get(fd)) is not None:
                         publisher.serve()
+                if not self._waiting:
+                    self._read(ready)
+            except OSError as error:  # the run directory is gone
+                log.error("%s: %s", self.node, error)
             except Exception:  # one bad event must not stop the bus
                 log.exception("%s: fault on the bus thread", self.node)
-                self._stop.wait(_BUSY_S)
+                self._stop.wait(_AWAY_S)
 
-    def _look(self) -> bool:
-        """Look for publishers; False when the run directory is gone."""
-        for publisher in list(self._writers.values()):
+    def _look(self) -> None:
+        """Look for publishers and subscribers.
+
+        Raises:
+            OSError: the run directory is gone.
+        """
+        for publisher in self._writers:
             publisher.serve()
-        fine = True
-        for subscription in list(self._readers.values()):
+        for fd, subscription in list(self._readers.items()):
             with self._read_lock:
-                try:
-                    if self._readers.get(subscription.fd) is subscription:  # not just closed
-                        self._quiet = self.patient
-                        subscription.discover()
-                except OSError as error:
-                    log.error("%s: %s", subscription.topic, error)
-                    fine = False
-                finally:
-                    self._quiet = False
-        return fine
+                if self._readers.get(fd) is subscription:  # not just closed
+                    subscription.discover()
+                    if not self.patient:  # a patient node reads all sockets when it wakes
+                        subscription.read()
+
+
+def _readable(fds: Iterable[int], timeout_s: float) -> list[int]:
+    """Wait for the first of some descriptors and return those that are readable."""
+    poll = select.poll()
+    for fd in fds:
+        poll.register(fd, select.POLLIN)
+    return [fd for fd, _ in poll.poll(1000.0 * timeout_s)]

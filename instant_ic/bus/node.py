@@ -413,11 +413,11 @@ class Node(Generic[ConfigT]):
             if before is not None and before[0] >= WARN:
                 self.log.info("%s: %s", name, message or "fine again")
 
-    def show(self, *diagnoses: Diagnosis | None) -> None:
-        """Set the diagnoses of a library object."""
-        for one in diagnoses:
-            if one is not None:
-                self.diagnose(one.name, one.level, one.text, **one.values)
+    def diagnose_all(self, *states: Diagnosis | None) -> None:
+        """Set the diagnoses that a library has made; None is left out."""
+        for state in states:
+            if state is not None:
+                self.diagnose(state.name, state.level, state.text, **state.values)
 
     def _log_diagnosis(self, name: str, level: int, message: str) -> None:
         """Log a diagnosis; one that was never OK is logged once, as information, while other nodes still start."""
@@ -638,6 +638,7 @@ class Node(Generic[ConfigT]):
         for index, (_, subscription, received) in enumerate(pending):
             if index and subscription.raw.qos.depth == 1 and not self.lockstep:
                 # Earlier callbacks may have taken long: for a newest-only topic, use what has arrived since.
+                self._wake.wait(0.0)
                 for newer in subscription.raw.take():
                     if newer.publisher == received.publisher:
                         received = newer

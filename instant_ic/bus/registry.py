@@ -31,6 +31,9 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
 _FILE_TIME_STEP_NS = 50_000_000  # more than the kernel's
 _PREDECESSOR_S = 2.0  # how long a claim waits for a predecessor that is shutting down
+# The leftovers of a killed process change no folder. Every second its process is looked for, now and then its lock.
+_LOOK_S = 1.0
+_FULL_LOOK_S = 5.0
 _MAX_IPC_PATH = 107  # sockaddr_un.sun_path less its final zero
 
 
@@ -259,6 +262,26 @@ def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
     return claim, socket
 
 
+def announce(claim: Claim, topic: str, type_name: str, qos: str, node: str, socket: Path, identity: bytes) -> None:
+    """Write the entry of a publisher whose socket is bound; readers find it from now on.
+
+    Raises:
+        RegistryError: the disk is full, or the run directory is gone.
+    """
+    claim.write(
+        {
+            "topic": topic,
+            "type": type_name,
+            "qos": qos,
+            "node": node,
+            "pid": os.getpid(),
+            "socket": str(socket),
+            "id": identity.hex(),
+            "started_ns": time.time_ns(),
+        }
+    )
+
+
 def _is_at(fd: int, path: Path) -> bool:
     """Whether this path still names the open file, and no other one or none."""
     try:
@@ -289,7 +312,7 @@ def _content(path: str, written: tuple[int, int]) -> dict[str, Any]:
     return entry
 
 
-def _entries(folder: Path) -> Iterator[dict[str, Any]]:
+def _entries(folder: Path | str) -> Iterator[dict[str, Any]]:
     try:
         names = sorted(name for name in os.listdir(folder) if name.endswith(".json"))  # noqa: PTH208 - as below
     except FileNotFoundError:
@@ -309,6 +332,45 @@ def _entries(folder: Path) -> Iterator[dict[str, Any]]:
 def topic_publishers(run_dir: Path, topic: str) -> list[PublisherInfo]:
     """Live publishers of one topic."""
     return [_publisher(entry) for entry in _entries(topic_dir(run_dir, topic))]
+
+
+class TopicFolder:
+    """Live publishers of one topic, read again when its folder changes or a publisher's process has ended.
+
+    Args:
+        folder: of the topic, see :func:`topic_dir`.
+
+    Attributes:
+        publishers: those found at the last look.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.publishers: list[PublisherInfo] = []
+        self._folder = str(folder)
+        self._seen_mtime = -1
+        self._next_look_s = self._next_full_look_s = 0.0
+
+    def look(self) -> bool:
+        """Read the entries if they may have changed; returns whether it did.
+
+        Raises:
+            OSError: the folder is gone.
+        """
+        mtime = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - five times a second for each topic
+        now = time.monotonic()
+        same = mtime == self._seen_mtime
+        if same and now < self._next_look_s:
+            return False
+        self._next_look_s = now + _LOOK_S
+        if same and now < self._next_full_look_s and all(map(running, self.publishers)):
+            return False
+        self._seen_mtime, self._next_full_look_s = mtime if settled(mtime) else -1, now + _FULL_LOOK_S
+        self.read()
+        return True
+
+    def read(self) -> None:
+        """Read the entries."""
+        self.publishers = [_publisher(entry) for entry in _entries(self._folder)]
 
 
 def _publisher(entry: dict[str, Any]) -> PublisherInfo:

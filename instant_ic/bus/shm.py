@@ -11,6 +11,7 @@ of memory in which it stores how far it has read (its progress).
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import mmap
@@ -18,82 +19,99 @@ import os
 import re
 import struct
 from pathlib import Path
+from typing import Self
 
 NAME = "instant_ic"
 _SLOT = struct.Struct("<Q8s")  # sequence, publisher
+_SEQUENCE = struct.Struct("<Q")
 _PAYLOAD_AT = 60  # CDR's body starts 4 bytes later, so its arrays are aligned to 64
 _STEP = 1 << 16
 _F_SEAL_FUTURE_WRITE = 0x10  # not in Python's fcntl; later mappings are read-only
 _ENTRY = struct.Struct("<8sQ")  # publisher, sequence of the newest message looked at
 _PAGE = mmap.PAGESIZE
-_ENTRIES = _PAGE // _ENTRY.size
 _ANNOUNCEMENT = re.compile(rb"!(\d{1,10})/(\d{1,10})/([01])\Z")
 
 LEAST_SLOTS = 4
 """Slots that a publisher makes before it overwrites a message that only newest-only readers still have to look at."""
 
 
-def _sealed(size: int) -> int:
-    """A ``memfd`` of a fixed size.
-
-    Raises:
-        OSError: the machine does not have that much free memory.
-    """
-    fd = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-    try:
-        # Reserve the pages now: without free memory this raises here, instead of SIGBUS in the middle of a copy.
-        os.posix_fallocate(fd, 0, size)
-        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
-    except BaseException:
-        os.close(fd)
-        raise
-    return fd
-
-
-def _open_sealed(pid: int, fd: int, least: int) -> int:
-    """Open another process's ``memfd`` for reading.
-
-    Raises:
-        FileNotFoundError: there is none of that number, or it is something else.
-        OSError: it cannot be opened.
-    """
-    path = f"/proc/{pid}/fd/{fd}"
-    # The number may belong to another file by now, even to a device: look before opening.
-    if not str(Path(path).readlink()).startswith(f"/memfd:{NAME}"):
-        raise FileNotFoundError(errno.ENOENT, "no shared memory of the bus", path)
-    found = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    if fcntl.fcntl(found, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK and os.fstat(found).st_size >= least:
-        return found
-    os.close(found)
-    raise FileNotFoundError(errno.ENOENT, "shared memory of the bus without seal, or too small", path)
-
-
-class Slot:
-    """Memory of one message, on either side; made by :meth:`create` or :meth:`open`, closed when nothing refers to it.
+class Memory:
+    """A sealed ``memfd`` and its mapping, on either side; closed when nothing refers to it.
 
     Args:
-        fd: its ``memfd``, which the slot then owns.
-        access: ``mmap.PROT_READ``, for the publisher with ``mmap.PROT_WRITE``.
-
-    Attributes:
-        number: unique within a publisher.
-        capacity: bytes of the largest message.
-        held: the message is leased.
+        fd: its descriptor, which this object then owns.
+        access: ``mmap.PROT_READ``, for its owner with ``mmap.PROT_WRITE``.
 
     Raises:
         OSError: it cannot be mapped.
     """
 
-    def __init__(self, fd: int, access: int, number: int = 0) -> None:
-        try:
-            self._map = mmap.mmap(fd, os.fstat(fd).st_size, mmap.MAP_SHARED | mmap.MAP_POPULATE, access)
-        except BaseException:
+    def __init__(self, fd: int, access: int = mmap.PROT_READ) -> None:
+        self.fd = fd  # closed with this object, also if the next line fails
+        self.map = mmap.mmap(fd, os.fstat(fd).st_size, mmap.MAP_SHARED | mmap.MAP_POPULATE, access)
+
+    @classmethod
+    def make(cls, size: int) -> Self:
+        """New memory.
+
+        Raises:
+            OSError: the machine does not have that much free memory.
+        """
+        memory = cls.__new__(cls)
+        memory.fd = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        # Reserve the pages now: without free memory this raises here, instead of SIGBUS in the middle of a copy.
+        os.posix_fallocate(memory.fd, 0, size)
+        fcntl.fcntl(memory.fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+        memory.__init__(memory.fd, mmap.PROT_READ | mmap.PROT_WRITE)  # type: ignore[misc]
+        return memory
+
+    @classmethod
+    def open(cls, pid: int, fd: int, publisher: bytes | None = None) -> Self:
+        """Map another process's memory for reading; ``publisher`` is whose slot it must be.
+
+        Raises:
+            FileNotFoundError: there is none of that number, or it is something else.
+            OSError: it cannot be opened or mapped.
+        """
+        path = f"/proc/{pid}/fd/{fd}"
+        # The number may belong to another file by now, even to a device: look before opening.
+        if not str(Path(path).readlink()).startswith(f"/memfd:{NAME}"):
+            raise FileNotFoundError(errno.ENOENT, "no shared memory of the bus", path)
+        found = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        sealed = fcntl.fcntl(found, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK
+        if not sealed or os.fstat(found).st_size < _PAGE:
+            os.close(found)
+            raise FileNotFoundError(errno.ENOENT, "shared memory of the bus without seal, or too small", path)
+        memory = cls(found)
+        if publisher is not None and _SLOT.unpack_from(memory.map)[1] != publisher:
+            raise FileNotFoundError(errno.ENOENT, "a slot of another publisher", path)
+        return memory
+
+    def close(self) -> None:
+        """Close the descriptor, and with it the lock; views keep the memory, and other processes their share."""
+        fd, self.fd = getattr(self, "fd", -1), -1
+        if fd >= 0:
             os.close(fd)
-            raise
-        self.fd = fd
-        self.number = number
-        self.capacity = len(self._map) - _PAYLOAD_AT
-        self.held = False
+
+    __del__ = close
+
+
+class Slot(Memory):
+    """Memory of one message; made by :meth:`create` or :meth:`open`.
+
+    Attributes:
+        number: unique within a publisher.
+        held: the message is leased.
+        written: sequence of the message that its publisher has written last; 0 while it writes one.
+    """
+
+    number = 0
+    held = False
+    written = 0
+
+    def __init__(self, fd: int, access: int = mmap.PROT_READ) -> None:
+        super().__init__(fd, access)
+        self.capacity = len(self.map) - _PAYLOAD_AT  # bytes of the largest message
 
     @classmethod
     def create(cls, number: int, size: int, publisher: bytes) -> Slot:
@@ -102,33 +120,17 @@ class Slot:
         Raises:
             OSError: the machine does not have that much free memory.
         """
-        length = -(-(size * 9 // 8 + _PAYLOAD_AT) // _STEP) * _STEP
-        slot = cls(_sealed(length), mmap.PROT_READ | mmap.PROT_WRITE, number)
-        try:
+        slot = cls.make(-(-(size * 9 // 8 + _PAYLOAD_AT) // _STEP) * _STEP)
+        slot.number = number
+        with contextlib.suppress(OSError):  # kernels before 5.1 do not support this seal
             fcntl.fcntl(slot.fd, fcntl.F_ADD_SEALS, _F_SEAL_FUTURE_WRITE)
-        except OSError as error:
-            if error.errno != errno.EINVAL:  # kernels before 5.1 do not support this seal
-                raise
-        _SLOT.pack_into(slot._map, 0, 0, publisher)
-        return slot
-
-    @classmethod
-    def open(cls, pid: int, fd: int, publisher: bytes) -> Slot:
-        """Another process's slot, read-only.
-
-        Raises:
-            FileNotFoundError: the slot is gone.
-            OSError: it cannot be opened or mapped.
-        """
-        slot = cls(_open_sealed(pid, fd, _PAYLOAD_AT), mmap.PROT_READ)
-        if _SLOT.unpack_from(slot._map)[1] != publisher:
-            raise FileNotFoundError(errno.ENOENT, "a slot of another publisher")
+        _SLOT.pack_into(slot.map, 0, 0, publisher)
         return slot
 
     @property
     def sequence(self) -> int:
         """Sequence of the message in the slot; 0 while one is being written."""
-        return int(_SLOT.unpack_from(self._map)[0])
+        return int(_SEQUENCE.unpack_from(self.map)[0])
 
     def lock(self, kind: int = fcntl.LOCK_EX) -> bool:
         """Take the lock; False while another process holds it."""
@@ -140,18 +142,20 @@ class Slot:
 
     def unlock(self) -> None:
         fcntl.flock(self.fd, fcntl.LOCK_UN)
+        self.held = False
 
     def begin(self, size: int) -> memoryview:
         """Memory for the next message of ``size`` bytes, under the lock; the previous message becomes invalid."""
         self.finish(0)
-        return memoryview(self._map)[_PAYLOAD_AT : _PAYLOAD_AT + size]
+        return memoryview(self.map)[_PAYLOAD_AT : _PAYLOAD_AT + size]
 
     def finish(self, sequence: int) -> None:
         """Mark the message as complete."""
-        struct.pack_into("<Q", self._map, 0, sequence)
+        _SEQUENCE.pack_into(self.map, 0, sequence)
+        self.written = sequence
 
     def lease(self, sequence: int, size: int) -> bool:
-        """Lock the slot for reading; False, and not locked, when it does not hold this message any more."""
+        """Lock the slot for reading until :meth:`unlock`; False when it does not hold this message any more."""
         if self.held or size > self.capacity or not self.lock(fcntl.LOCK_SH):
             return False
         self.held = self.sequence == sequence
@@ -159,22 +163,9 @@ class Slot:
             self.unlock()
         return self.held
 
-    def release(self) -> None:
-        """End the lease."""
-        self.unlock()
-        self.held = False
-
     def view(self, size: int) -> memoryview:
         """Read-only view of the message."""
-        return memoryview(self._map)[_PAYLOAD_AT : _PAYLOAD_AT + size].toreadonly()
-
-    def close(self) -> None:
-        """Close the descriptor, and with it the lock; views keep the memory, and other processes their share."""
-        fd, self.fd = getattr(self, "fd", -1), -1
-        if fd >= 0:
-            os.close(fd)
-
-    __del__ = close
+        return memoryview(self.map)[_PAYLOAD_AT : _PAYLOAD_AT + size].toreadonly()
 
 
 class SlotPool:
@@ -210,12 +201,12 @@ class SlotPool:
             OSError: there is no memory for another slot.
         """
         for slot in list(self.slots):
-            if slot is keep or slot.sequence > must or not slot.lock():
+            if slot is keep or slot.written > must or not slot.lock():
                 continue
             if slot.capacity < size:  # too small for the present messages
                 self.slots.remove(slot)
                 slot.close()
-            elif slot.sequence <= should or len(self.slots) >= LEAST_SLOTS:
+            elif slot.written <= should or len(self.slots) >= LEAST_SLOTS:
                 self.slots.remove(slot)
                 self.slots.append(slot)
                 return slot
@@ -236,47 +227,23 @@ class SlotPool:
         self.slots.clear()
 
 
-class ProgressPage:
-    """How far one subscription has read from each publisher.
+def progress_page(newest_only: bool) -> tuple[Memory, bytes]:
+    """A subscription's page, on which it stores how far it has read; and the ZeroMQ subscription that announces it.
 
     Args:
-        newest_only: the publisher may overwrite a message before this subscription has looked at it.
-
-    Attributes:
-        announcement: the ZeroMQ subscription that announces the page to publishers.
+        newest_only: a publisher may overwrite a message before this subscription has looked at it.
 
     Raises:
         OSError: there is no memory.
     """
+    page = Memory.make(_PAGE)
+    return page, b"!%d/%d/%d" % (os.getpid(), page.fd, newest_only)
 
-    def __init__(self, newest_only: bool) -> None:
-        self._fd = os.memfd_create(f"{NAME}_progress", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.write(self._fd, bytes(_PAGE))
-        fcntl.fcntl(self._fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
-        self._memory = mmap.mmap(self._fd, _PAGE)
-        self._places: dict[bytes, int] = {}
-        self.announcement = b"!%d/%d/%d" % (os.getpid(), self._fd, newest_only)
 
-    def close(self) -> None:
-        """Release the memory; publishers keep what they have mapped."""
-        os.close(self._fd)
-        self._memory.close()
-
-    def store(self, publisher: bytes, sequence: int) -> None:
-        """Note that the message of this sequence, and all before it, have been looked at."""
-        place = self._places.get(publisher)
-        if place is None:
-            free = set(range(_ENTRIES)) - set(self._places.values())
-            if not free:
-                return
-            place = self._places[publisher] = min(free)
-        _ENTRY.pack_into(self._memory, place * _ENTRY.size, publisher, sequence)
-
-    def forget(self, publisher: bytes) -> None:
-        """Free the entry of a publisher that is gone."""
-        place = self._places.pop(publisher, None)
-        if place is not None:
-            _ENTRY.pack_into(self._memory, place * _ENTRY.size, bytes(8), 0)
+def store_progress(page: Memory, place: int, publisher: bytes, sequence: int) -> None:
+    """Note that a publisher's messages up to this one have been looked at; ``place`` is the publisher's on the page."""
+    if place * _ENTRY.size < _PAGE:  # further publishers wait for messages that nobody has looked at
+        _ENTRY.pack_into(page.map, place * _ENTRY.size, publisher, sequence)
 
 
 class PeerProgress:
@@ -300,21 +267,13 @@ class PeerProgress:
         self.newest_only = bool(newest_only)
         self._publisher = publisher
         self._joined = joined
-        self._place = 0
-        opened = _open_sealed(pid, fd, _PAGE)
-        try:
-            self._memory = mmap.mmap(opened, _PAGE, mmap.MAP_SHARED, mmap.PROT_READ)
-        finally:
-            os.close(opened)
+        page = Memory.open(pid, fd)
+        page.close()  # the mapping stays
+        self._map = page.map
 
     def sequence(self) -> int:
         """The subscription has looked at all messages up to this one."""
-        found, sequence = _ENTRY.unpack_from(self._memory, self._place * _ENTRY.size)
-        if found != self._publisher:
-            for place, (other, value) in enumerate(_ENTRY.iter_unpack(self._memory)):
-                if other == self._publisher:
-                    self._place, sequence = place, value
-                    break
-            else:
-                return self._joined
-        return max(self._joined, int(sequence))
+        at = self._map.find(self._publisher)
+        if at < 0 or at % _ENTRY.size:
+            return self._joined
+        return max(self._joined, int(_ENTRY.unpack_from(self._map, at)[1]))

@@ -1,8 +1,11 @@
 """Parameters of the cameras."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
+from instant_ic.camera.loop import ReconnectConfig
 from instant_ic.config.ranges import NotNegative, NotNegativeInt, Percent, Positive, PositiveInt, check_ranges
+from instant_ic.config.robot import CAMERA_MOUNT, Mount
 
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
 """(width, height, frames/s) that the Theta Z1 offers, with firmware 2.21.1."""
@@ -82,3 +85,37 @@ class FilesConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+
+
+@dataclass(frozen=True)
+class ThetaCameraConfig:
+    """Parameters of the node ``theta_camera``.
+
+    Attributes:
+        source: ``theta`` (Web API), ``video`` (device, RTSP address or video file), ``files``.
+        url: address of the Theta; device, address or path for the other sources.
+        frame_id: the camera's frame.
+        camera_mount: the camera's pose on base_link.
+        silence_s: seconds without an image that cause a warning; four times as long is an error.
+        health_period_s: seconds between requests for the Theta's battery and temperature.
+        theta: live preview.
+        video: stream through OpenCV.
+        files: images from files.
+        reconnect: delays between connection attempts.
+    """
+
+    source: Literal["theta", "video", "files"] = "theta"
+    url: str = "http://192.168.1.1"
+    frame_id: str = "camera"
+    camera_mount: Mount = CAMERA_MOUNT
+    silence_s: Positive = 2.0
+    health_period_s: Positive = 10.0
+    theta: ThetaConfig = field(default_factory=ThetaConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
+    files: FilesConfig = field(default_factory=FilesConfig)
+    reconnect: ReconnectConfig = field(default_factory=ReconnectConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if not self.url:
+            raise ValueError("url must not be empty")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from instant_ic import estop_state
+from instant_ic.diagnosis import Diagnosis, Level
 
 FUTURE_NS = 500_000_000
 """A release stamped farther ahead than this was published before the clock was set back."""
@@ -39,6 +40,14 @@ class EstopLatch:
     def stopped(self) -> bool:
         """Whether nothing may move."""
         return self.pressed or self.button
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """Whether the emergency stop is latched, by whom, and how to release it."""
+        if not self.stopped:
+            return Diagnosis("emergency stop", Level.OK, "released")
+        by = "a button on the robot" if self.button else self.publisher
+        return Diagnosis("emergency stop", Level.WARN, f"latched by {by}: release it on the operator's page")
 
     def hear(self, pressed: bool, publisher: str, publish_ns: int, received_ns: int) -> str:
         """Take a message of ``/operator/estop``.

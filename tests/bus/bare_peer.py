@@ -16,7 +16,7 @@ from pathlib import Path
 import zmq
 from rosbags.typesys import Stores, get_typestore
 
-HEADER = struct.Struct("<4sBBHQq8s8sQ")
+HEADER = struct.Struct("<B4sB3xQq8s8sQ")
 REFERENCE = struct.Struct("<IIII")
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 STRING = "std_msgs/msg/String"
@@ -45,9 +45,9 @@ def subscribe(run_dir: Path, topic: str, count: int) -> None:
     for path in found:
         socket.connect("ipc://" + json.loads(path.read_text())["socket"])
     for _ in range(count):
-        _key, header, body = socket.recv_multipart()
-        magic, version, kind, _, sequence, _, _, type_hash, size = HEADER.unpack(header)
-        assert (magic, version, type_hash) == (b"IIC\0", 3, HASH)
+        first, body = socket.recv_multipart()
+        kind, magic, version, sequence, _, _, type_hash, size = HEADER.unpack_from(first, len(topic))
+        assert (magic, version, type_hash) == (b"IIC\0", 4, HASH)
         cdr = shared(body, sequence, size) if kind == 1 else body
         text = TYPES.deserialize_cdr(cdr, STRING).data
         sys.stdout.write(json.dumps([kind, sequence, len(text), text[:5]]) + "\n")
@@ -68,8 +68,8 @@ def publish(run_dir: Path, topic: str, sizes: list[int]) -> None:
         pass
     for sequence, size in enumerate(sizes, start=1):
         cdr = bytes(TYPES.serialize_cdr(TYPES.types[STRING](data="x" * size), STRING))
-        header = HEADER.pack(b"IIC\0", 3, 0, 0, sequence, time.time_ns(), identity, HASH, len(cdr))
-        socket.send_multipart([topic.encode() + b"\0", header, cdr])
+        header = HEADER.pack(0, b"IIC\0", 4, sequence, time.time_ns(), identity, HASH, len(cdr))
+        socket.send_multipart([topic.encode() + header, cdr])
     sys.stdin.read()
 
 

@@ -311,10 +311,10 @@ def test_killed_publisher_leaves_no_memory_behind_and_its_place_is_swept(bus: Bu
         gc.collect()
         return Path("/proc/self/maps").read_text().count("memfd:instant_ic ")
 
+    reader = bus.reader()  # has a page of memory of its own
     before = mapped()
     process = subprocess.Popen([sys.executable, str(HERE / "large_talker.py"), str(bus.run_dir)])
     try:
-        reader = bus.reader()
         wait_for(lambda: len(reader.poll()) >= 3)
         assert isinstance(reader.received[0].payload, memoryview)  # it did come through shared memory
     finally:
@@ -379,11 +379,11 @@ def test_full_memory_is_told_in_diagnostics(bus: Bus, monkeypatch: pytest.Monkey
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("instant_ic.bus.shm.os.posix_fallocate", full)
     node = Node[None](None, bus.node("sender"), SystemClock(), "sender")
     out = node.publisher_raw("/x", BYTES, RELIABLE)
     node.start()
     reader = bus.reader()
+    monkeypatch.setattr("instant_ic.bus.shm.os.posix_fallocate", full)
     wait_for(lambda: out.subscriber_count == 1)
     out.publish_bytes(numbered(1, LARGE))
     wait_for(lambda: reader.numbers() == [1])

@@ -17,6 +17,7 @@ from instant_ic.bus.frame import (
     HEADER,
     INLINE,
     MAGIC,
+    MARK,
     REFERENCE,
     SHARED,
     VERSION,
@@ -24,7 +25,7 @@ from instant_ic.bus.frame import (
     type_digest,
     unpack_header,
 )
-from instant_ic.bus.shm import PeerProgress, ProgressPage, Slot, SlotPool
+from instant_ic.bus.shm import PeerProgress, Slot, SlotPool, progress_page, store_progress
 
 ID = b"publishr"
 
@@ -60,21 +61,21 @@ def stranger(bus: Bus):
 
 def good(stranger: Stranger) -> bytes:
     """A header as the good publisher would send it."""
-    return HEADER.pack(INLINE, 1, 5, stranger.out._id, type_digest(BYTES), 3)
+    return HEADER.pack(INLINE, MARK, 1, 5, stranger.out._id, type_digest(BYTES), 3)
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.binary(max_size=60) | st.builds(lambda rest: MAGIC + bytes([VERSION]) + rest, st.binary(max_size=60)))
+@given(st.binary(max_size=60) | st.builds(lambda rest: b"\0" + MAGIC + bytes([VERSION]) + rest, st.binary(max_size=60)))
 def test_foreign_bytes_are_a_header_or_an_error(data: bytes) -> None:
     try:
-        assert len(unpack_header(data)) == 6
+        assert len(unpack_header(data)) == 7
     except FrameError as error:
         assert str(error)
 
 
 def test_frame_of_another_version_says_so() -> None:
     with pytest.raises(FrameError, match=f"not a frame of version {VERSION} .version {VERSION + 1}"):
-        unpack_header(MAGIC + bytes([VERSION + 1]) + bytes(43))
+        unpack_header(b"/x\0" + MAGIC + bytes([VERSION + 1]) + bytes(43))
 
 
 def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Stranger, caplog) -> None:
@@ -82,16 +83,16 @@ def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Strange
     bad = [
         [b"/x"],
         [b"/x", b"no header"],
-        [b"/x\0", header],
-        [b"/x\0", header, b"four"],
-        [b"/x\0", HEADER.pack(SHARED, 1, 5, stranger.out._id, type_digest(BYTES), 3), b"abc"],
-        [b"/x\0", HEADER.pack(INLINE, 1, 5, b"nobody..", type_digest(BYTES), 3), b"abc"],
+        [b"/x" + header],
+        [b"/x" + header, b"four"],
+        [b"/x" + HEADER.pack(SHARED, MARK, 1, 5, stranger.out._id, type_digest(BYTES), 3), b"abc"],
+        [b"/x" + HEADER.pack(INLINE, MARK, 1, 5, b"nobody..", type_digest(BYTES), 3), b"abc"],
         [b"/xyz", b"", b"", b"", b""],
     ]
     for count, parts in enumerate(bad, start=1):
         stranger.send(*parts)
         assert reader.stats.rejected >= count, parts
-    assert "not a frame of version 3" in caplog.text
+    assert "not a frame of version 4" in caplog.text
     assert "message of 4 bytes, 3 announced" in caplog.text
     assert "not in the registry (identity 6e6f626f64792e2e)" in caplog.text
     assert reader.poll() == []
@@ -103,8 +104,8 @@ def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Strange
 def test_reference_to_something_else_is_not_opened(stranger: Stranger, caplog) -> None:
     """A descriptor that is no memory of the bus, here a pipe nobody writes to: opening it would block."""
     pipe = os.pipe()
-    header = HEADER.pack(SHARED, 1, 5, stranger.out._id, type_digest(BYTES), 3)
-    stranger.send(b"/x\1", header, REFERENCE.pack(os.getpid(), pipe[0], 1, 1))
+    header = HEADER.pack(SHARED, MARK, 1, 5, stranger.out._id, type_digest(BYTES), 3)
+    stranger.send(b"/x" + header, REFERENCE.pack(os.getpid(), pipe[0], 1, 1))
     assert "shared memory of sender cannot be used (no shared memory of the bus)" in caplog.text
     assert stranger.reader.poll() == []
     for end in pipe:
@@ -151,7 +152,7 @@ def test_slot_is_refilled_only_when_nobody_uses_or_still_wants_it() -> None:
     assert second is not first  # in use
     third = written(pool, 3, must=1)
     assert third not in (first, second)  # a reliable reader has not looked at it
-    reader.release()
+    reader.unlock()
     assert written(pool, 4) is first  # the oldest
     assert written(pool, 5, should=0) not in (first, second, third)  # newest-only readers: not before there are four
     assert written(pool, 6, should=0) is second
@@ -175,7 +176,7 @@ def test_mapping_is_read_only_sealed_and_checks_the_size() -> None:
     slot.finish(5)
     mapping = Slot.open(os.getpid(), slot.fd, ID)
     assert mapping.lease(5, slot.capacity)
-    mapping.release()
+    mapping.unlock()
     assert not mapping.lease(5, slot.capacity + 1) and not mapping.lease(4, LARGE)
     assert mapping.view(LARGE) == numbered(5, LARGE)
     assert mapping.view(LARGE).readonly
@@ -204,13 +205,15 @@ def test_writer_killed_in_a_slot_leaves_no_message_in_it() -> None:
 
 
 def test_progress_is_seen_by_the_publisher() -> None:
-    page = ProgressPage(newest_only=False)
-    peer = PeerProgress(page.announcement, ID, joined=3)
+    page, announcement = progress_page(newest_only=False)
+    peer = PeerProgress(announcement, ID, joined=3)
     assert peer.sequence() == 3 and not peer.newest_only
-    page.store(b"another!", 9)
-    page.store(ID, 7)
+    store_progress(page, 0, b"another!", 9)
+    store_progress(page, 1, ID, 7)
     assert peer.sequence() == 7
-    page.forget(ID)
+    store_progress(page, 1, b"the next", 8)  # in the place of a publisher that is gone
+    assert peer.sequence() == 3
+    store_progress(page, 256, ID, 9)  # the page is full
     assert peer.sequence() == 3
     for wrong in (b"!1/2/3/0", b"!x", b"!99999999999/1/0", b"!%d/0/0" % os.getpid()):
         with pytest.raises((OSError, ValueError)):

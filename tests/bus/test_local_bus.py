@@ -121,6 +121,7 @@ def test_publisher_that_leaves_the_registry_long_after_the_last_look_is_heard_fo
     ahead_s = 0.0
     clock = SimpleNamespace(**vars(time) | {"monotonic": lambda: time.monotonic() + ahead_s})
     monkeypatch.setattr(local_subscription, "time", clock)
+    monkeypatch.setattr(registry, "time", clock)
     monkeypatch.setattr(local_subscription, "_GRACE_S", 60.0)
     sender = LocalTransport(run_dir, "sender", time.time_ns)
     try:
@@ -132,7 +133,7 @@ def test_publisher_that_leaves_the_registry_long_after_the_last_look_is_heard_fo
         wait_for(lambda: inbox.poll() == said_before)
         ahead_s = 1000.0
         next(run_dir.glob("topics/chatter/*.json")).unlink()
-        wait_for(lambda: inbox.raw.publishers == [])
+        wait_for(lambda: inbox.raw._folder.publishers == [])
         say("late")
         wait_for(lambda: inbox.poll() == [*said_before, "late"])
         assert inbox.raw.stats.rejected == 0
@@ -143,13 +144,13 @@ def test_publisher_that_leaves_the_registry_long_after_the_last_look_is_heard_fo
 
 
 def test_killed_publisher_is_noticed_without_a_look_at_its_lock(transport, talker, monkeypatch):
-    monkeypatch.setattr(local_subscription, "_FULL_LOOK_S", 1e6)
+    monkeypatch.setattr(registry, "_FULL_LOOK_S", 1e6)
     inbox = Inbox(transport, "/chatter")
     process = talker()
     wait_for(lambda: len(inbox.poll()) >= 3)
     process.kill()
     process.wait(10)
-    wait_for(lambda: inbox.raw.publishers == [])
+    wait_for(lambda: inbox.raw._folder.publishers == [])
 
 
 def test_folder_that_just_changed_is_not_settled():
@@ -317,12 +318,11 @@ def test_an_event_during_a_long_callback_does_not_keep_the_bus_thread_busy(bus, 
     publisher = bus.publisher("/x")
     wait_for(lambda: publisher.subscriber_count)
     waker.wait(0.01)
-    wait_for(lambda: transport._bus_reads)  # the callback has become long
     rounds: list[None] = []
     read = transport._read
     monkeypatch.setattr(transport, "_read", lambda *args, **names: (rounds.append(None), read(*args, **names)))
     publisher.send(b"first")  # the bus thread reads it and sets the event
-    wait_for(lambda: waker.is_set())
+    wait_for(lambda: waker._set)
     time.sleep(0.2)
     assert len(rounds) <= 6
     waker.wait(3600.0)  # ended by the event

@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 
 from instant_ic import pace
 from instant_ic.base.config import RoboclawConfig
+from instant_ic.base.pace import refuse_pace
 from instant_ic.base.roboclaw import open_serial
-from instant_ic.bus import NodeError
 from instant_ic.bus.clock import SystemClock
 from instant_ic.pace import Pace, PaceError, PaceFiles
-from nodes.crawler_base import CrawlerBaseNode
 
 
 @pytest.fixture(autouse=True)
@@ -239,18 +238,10 @@ def test_time_outs_on_the_machines_clock_hold_at_every_pace_that_may_come(tmp_pa
     os.close(end)
 
 
-class _Base:
-    """What ``refuse_pace`` looks at."""
-
-    def __init__(self, run_dir, port):
-        self.run_dir = run_dir
-        self.config = type("C", (), {"roboclaw": type("R", (), {"port": port})})
-
-
 def test_real_base_refuses_slow_motion_and_the_simulators_does_not(tmp_path):
-    real, simulated = _Base(tmp_path, "/dev/ttyACM0"), _Base(tmp_path, f"{tmp_path}/dev/roboclaw")
-    CrawlerBaseNode.refuse_pace(real)
+    simulated = f"{tmp_path}/dev/roboclaw"
+    refuse_pace(pace.current(), "/dev/ttyACM0", tmp_path)
     pace.use(Pace.from_now(0.5))
-    CrawlerBaseNode.refuse_pace(simulated)
-    with pytest.raises(NodeError, match=r"pace 0\.5, for simulated devices only, and /dev/ttyACM0 is not"):
-        CrawlerBaseNode.refuse_pace(real)
+    refuse_pace(pace.current(), simulated, tmp_path)
+    with pytest.raises(PaceError, match=r"pace 0\.5, for simulated devices only, and /dev/ttyACM0 is not"):
+        refuse_pace(pace.current(), "/dev/ttyACM0", tmp_path)

@@ -79,11 +79,11 @@ def test_subscriber_of_inline_messages_needs_no_shared_memory(bus: Bus) -> None:
         socket.subscribe(b"/x\0")
         socket.subscribe(b"=/x")
         socket.connect(f"ipc://{out._path}")
-        assert socket.recv_multipart()[2] == numbered(1, LARGE)
+        assert socket.recv_multipart()[1] == numbered(1, LARGE)
         for value, size in ((2, 10), (3, LARGE)):
             out.send(numbered(value, size))
-            _, header, body = socket.recv_multipart()
-            assert body == numbered(value, size) and header[5] == 0
+            first, body = socket.recv_multipart()
+            assert body == numbered(value, size) and first[-49] == 0
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ int zmq_send(void *socket, const void *buffer, size_t length, int flags);
 enum { SUB = 2, XPUB = 9, SUBSCRIBE = 6, RCVTIMEO = 27, SNDMORE = 2 };
 
 #pragma pack(push, 1)
-struct header { char magic[4]; uint8_t version, kind; uint16_t zero; uint64_t sequence; int64_t publish_ns;
+struct header { uint8_t kind; char magic[4]; uint8_t version, zero[3]; uint64_t sequence; int64_t publish_ns;
                 uint8_t publisher[8], type_hash[8]; uint64_t size; };
 struct reference { uint32_t pid, descriptor, slot, oldest; };
 #pragma pack(pop)
@@ -69,10 +69,10 @@ int main(int count, char **arguments) {
         zmq_setsockopt(socket, SUBSCRIBE, topic, strlen(topic));
         if (zmq_connect(socket, endpoint)) fail(endpoint);
         for (int left = atoi(arguments[4]); left; left--) {
-            if (zmq_recv(socket, key, sizeof key, 0) < 0) fail("receive");
-            if (zmq_recv(socket, &header, sizeof header, 0) != sizeof header) fail("header");
+            if (zmq_recv(socket, key, sizeof key, 0) != strlen(topic) + sizeof header) fail("receive");
+            memcpy(&header, key + strlen(topic), sizeof header);
             if (zmq_recv(socket, body, sizeof body, 0) < 0) fail("body");
-            if (memcmp(header.magic, "IIC", 4) || header.version != 3) fail("version");
+            if (memcmp(header.magic, "IIC", 4) || header.version != 4) fail("version");
             uint64_t total = header.kind ? sum_shared((struct reference *)body, &header) : sum(body, header.size);
             printf("%d %lu %lu %lu\n", header.kind, header.sequence, header.size, total);
             fflush(stdout);
@@ -87,10 +87,10 @@ int main(int count, char **arguments) {
     } while (key[0] != 1 || strcmp((char *)key + 1, topic));
     memset(&header, 0, sizeof header);
     memcpy(header.magic, "IIC", 4);
-    header.version = 3, header.sequence = 1, header.publish_ns = 5, header.size = 8;
+    header.version = 4, header.sequence = 1, header.publish_ns = 5, header.size = 8;
     unhex(arguments[4], header.publisher), unhex(arguments[5], header.type_hash);
-    zmq_send(socket, topic, strlen(topic) + 1, SNDMORE); /* with the final zero: the key of an inline message */
-    zmq_send(socket, &header, sizeof header, SNDMORE);
+    memcpy(key, topic, strlen(topic)), memcpy(key + strlen(topic), &header, sizeof header);
+    zmq_send(socket, key, strlen(topic) + sizeof header, SNDMORE);
     zmq_send(socket, "\0\1\0\0from", 8, 0);
     while (getchar() != EOF) {}
     return 0;

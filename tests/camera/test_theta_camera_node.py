@@ -16,10 +16,11 @@ from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.camera.config import FilesConfig, ThetaConfig
+from instant_ic.camera.device import PASSWORD_VARIABLE, USER_VARIABLE
 from instant_ic.camera.loop import ReconnectConfig
 from instant_ic.config.params import build, load_file
 from instant_ic.msg import CompressedImage, stamp_ns, transform_matrix
-from nodes.theta_camera import PASSWORD_VARIABLE, USER_VARIABLE, ThetaCameraConfig, ThetaCameraNode
+from nodes.theta_camera import ThetaCameraConfig, ThetaCameraNode
 
 START = 1_700_000_000_000_000_000
 

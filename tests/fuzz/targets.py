@@ -437,16 +437,16 @@ _BUS_PUBLISHER = b"publishr"
 
 def _bus_frames() -> list[bytes]:
     """The parts of one message, each behind its length in four bytes."""
-    from instant_ic.bus.frame import HEADER, INLINE, REFERENCE, SHARED, type_digest
+    from instant_ic.bus.frame import HEADER, INLINE, MARK, REFERENCE, SHARED, type_digest
 
     digest, body = type_digest("std_msgs/msg/String"), b"\0\1\0\0\6\0\0\0hello\0"
-    inline = HEADER.pack(INLINE, 1, 5, _BUS_PUBLISHER, digest, len(body))
-    shared = HEADER.pack(SHARED, 2, 6, _BUS_PUBLISHER, digest, 200_000)
+    inline = HEADER.pack(INLINE, MARK, 1, 5, _BUS_PUBLISHER, digest, len(body))
+    shared = HEADER.pack(SHARED, MARK, 2, 6, _BUS_PUBLISHER, digest, 200_000)
     messages = [
-        (b"/topic\0", inline, body),
-        (b"/topic\1", shared, REFERENCE.pack(1, 0, 1, 1)),
-        (b"/topic\0", inline),
-        (b"/topic\0", inline, body, body),
+        (b"/topic" + inline, body),
+        (b"/topic" + shared, REFERENCE.pack(1, 0, 1, 1)),
+        (b"/topic" + inline,),
+        (b"/topic" + inline, body, body),
     ]
     return [b"".join(len(part).to_bytes(4, "little") + part for part in parts) for parts in messages]
 
@@ -461,7 +461,7 @@ def _parse_bus() -> Callable[[bytes], object]:
     from instant_ic.bus.qos import RELIABLE
 
     host = Host(_folder() / "run", "fuzz", lambda: 0, lambda: 0)
-    subscription = LocalSubscription(host, "/topic", "std_msgs/msg/String", RELIABLE, lambda: None, lambda _: None)
+    subscription = LocalSubscription(host, "/topic", "std_msgs/msg/String", RELIABLE, lambda: None)
     stem = host.run_dir / "topics" / "topic" / "stranger"
     claim = registry.Claim(stem, "fuzz")
     claim.write(

@@ -1,0 +1,48 @@
+"""The camera that the parameters of the node ``theta_camera`` select, and the Theta's health."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+
+from instant_ic.camera.config import ThetaCameraConfig
+from instant_ic.camera.files import FileCamera
+from instant_ic.camera.source import Camera, CameraError
+from instant_ic.camera.theta import ThetaCamera, ThetaClient
+from instant_ic.camera.video import VideoCamera
+from instant_ic.diagnosis import Diagnosis, Level
+
+USER_VARIABLE = "INSTANT_IC_THETA_USER"
+PASSWORD_VARIABLE = "INSTANT_IC_THETA_PASSWORD"
+"""Environment variable for the credentials: parameters are visible in ``ic param`` and in files."""
+
+_BATTERY_LOW = 0.2  # share of the charge
+_BOARD_HOT_C = 70.0
+
+
+def open_camera(config: ThetaCameraConfig, now_ns: Callable[[], int]) -> Camera:
+    """The camera of ``config.source``, not connected yet; ``now_ns`` stamps its images."""
+    if config.source == "theta":
+        user, password = os.environ.get(USER_VARIABLE, ""), os.environ.get(PASSWORD_VARIABLE, "")
+        return ThetaCamera(config.url, config.theta, user, password, now_ns)
+    if config.source == "video":
+        return VideoCamera(config.url, config.video, now_ns)
+    return FileCamera(config.url, config.files, now_ns)
+
+
+def health(client: ThetaClient) -> Diagnosis:
+    """Battery, temperature and errors of a Theta, or why they are unknown; asks the camera, so it may take seconds."""
+    try:
+        state = client.state()
+    except CameraError as error:
+        return Diagnosis("health", Level.WARN, str(error))
+    low = state.battery is not None and state.battery < _BATTERY_LOW
+    hot = state.board_temperature_c is not None and state.board_temperature_c >= _BOARD_HOT_C
+    text = [*(["battery is low: charge it"] if low else []), *(["it is getting hot"] if hot else []), *state.errors]
+    values = {
+        "battery": state.battery,
+        "battery_temperature_c": state.battery_temperature_c,
+        "board_temperature_c": state.board_temperature_c,
+    }
+    level = Level.ERROR if state.errors else Level.WARN if low or hot else Level.OK
+    return Diagnosis("health", level, ", ".join(text) or "no faults", values)
