@@ -229,7 +229,7 @@ def test_a_short_film(corridor: teleop_worlds.Course, tmp_path: Path) -> None:
         assert each["with_obstacle"] == (each["distance_m"] < 0)
         both = each["psnr_with_db"], each["psnr_without_db"]
         assert each["scores"][LIVE]["psnr_db"] == both[0 if each["with_obstacle"] else 1]
-    illusion.save(tmp_path / "film.json", told)
+    save_json(tmp_path / "film.json", told)
     assert json.loads((tmp_path / "film.json").read_text()) == told
     save_strip(tmp_path / "strip.png", [first])
     strip = cv2.imread(str(tmp_path / "strip.png"))

@@ -31,6 +31,7 @@ def add_kind(kinds: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run ``ic evaluate follow``; return the exit status."""
     from instant_ic.experiments import follow
+    from instant_ic.experiments.results import save_json
 
     check_outputs(args)
     contacts = 0
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         episodes = follow.evaluate(args.episodes, args.seed, args.jobs, show_progress, args.timeout)
     figures = follow.report(episodes, args.seed)
     if args.json:
-        args.json.write_text(json.dumps(figures, indent=2) + "\n")
+        save_json(args.json, figures)
     if args.plot:
         follow.plot(episodes, args.seed, args.plot)
     each = figures.pop("each")
