@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import perspective_directions, sample_equirect
+
+Image: TypeAlias = NDArray[np.uint8]
 
 
 def perspective_crop(
@@ -113,3 +115,98 @@ def save_figure(figure: Any, path: Path) -> None:
     """Write a figure, creating its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
+
+
+Series: TypeAlias = dict[str, dict[float, list[float]]]
+"""Name → x → values, of which mean and standard deviation are plotted."""
+_INK = "#010203"
+"""Replaced by the page's text colour."""
+_COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#8A8A8A",
+    "#B8860B",
+    "#7B5EA7",
+    "#C44E52",
+)
+
+
+def curves_svg(panels: Sequence[tuple[str, str, Series]], columns: int = 2) -> str:
+    """Line plots as SVG text that follows the page's light or dark colours.
+
+    Args:
+        panels: label of x, label of y, and the curves of each panel; the same name has the same colour everywhere.
+        columns: panels side by side.
+    """
+    import io
+
+    import matplotlib
+
+    names = list(dict.fromkeys(name for _, _, series in panels for name in series))
+    rows = -(-len(panels) // columns)
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "instant-ic", "text.color": _INK}):
+        figure, axes = new_figure(rows, columns, (4.6 * columns, 3.1 * rows + 0.5))
+        for axis, (x_label, y_label, series) in zip(axes.ravel(), panels, strict=False):
+            for name, points in series.items():
+                colour = _COLOURS[names.index(name) % len(_COLOURS)]
+                at = sorted(points)
+                mean = np.array([np.mean(points[x]) for x in at])
+                wide = np.array([np.std(points[x]) for x in at])
+                axis.plot(at, mean, color=colour, linewidth=1.6, marker="o", markersize=2.5, label=name)
+                axis.fill_between(at, mean - wide, mean + wide, color=colour, alpha=0.15, linewidth=0)
+            axis.set_xlabel(x_label, color=_INK)
+            axis.set_ylabel(y_label, color=_INK)
+            axis.tick_params(colors=_INK)
+            axis.grid(alpha=0.25)
+            axis.patch.set_alpha(0)
+            for spine in axis.spines.values():
+                spine.set_color(_INK)
+        for axis in axes.ravel()[len(panels) :]:
+            axis.set_axis_off()
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        legend = figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
+        for text in legend.get_texts():
+            text.set_color(_INK)
+        out = io.StringIO()
+        figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
+    text = out.getvalue()
+    return text[text.index("<svg") :].replace(_INK, "currentColor")
+
+
+def image_strip(columns: Sequence[str], rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], tile: int) -> Image:
+    """Rows of labelled images under the columns' names; RGB, ready to be encoded.
+
+    Args:
+        columns: names.
+        rows: label and one image a column, all of one shape.
+        tile: width of an image, pixels.
+    """
+    import cv2
+
+    label_px, head_px = 64, 24
+    height, width = rows[0][1][0].shape[:2]
+    size = (tile, max(round(tile * height / width), 1))
+
+    def write(image: Image, text: str, at: tuple[int, int]) -> None:
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+
+    head = np.full((head_px, label_px + len(columns) * tile, 3), 255, np.uint8)
+    for number, title in enumerate(columns):
+        write(head, title, (label_px + number * tile + 8, 17))
+    lines = [head]
+    for text, images in rows:
+        label = np.full((size[1], label_px, 3), 255, np.uint8)
+        write(label, text, (4, size[1] // 2))
+        lines.append(np.hstack([label, *(cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in images)]))
+    return np.vstack(lines)
+
+
+def jpeg(image: NDArray[np.uint8], quality: int = 88) -> bytes:
+    """Encode an RGB image."""
+    import cv2
+
+    return bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1])

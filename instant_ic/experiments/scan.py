@@ -51,7 +51,7 @@ class ScanQuality:
         cell_m: edge of the grid's cells and about that of the triangles; thinner objects are lost.
         spacing_m: distance between stations.
         width: of the stations' panoramas, pixels.
-        colour: standard deviation of the logarithm of exposure, white balance and each texture's colour.
+        colour: standard deviation of the logarithm of the white balance; twice of the exposure, half of each texture.
         older: share of the free-standing objects that stood elsewhere, and of the posters that were others.
     """
 
@@ -100,7 +100,7 @@ class Station:
 
 def aged(world: World, quality: ScanQuality, rng: np.random.Generator) -> World:
     """The world when it was scanned: other light and colours, objects elsewhere, other posters."""
-    drift = np.exp(rng.normal(0, quality.colour, (int(world.texture.max()) + 1, 3)))[world.texture]
+    drift = np.exp(rng.normal(0, 0.5 * quality.colour, (int(world.texture.max()) + 1, 3)))[world.texture]
     light = np.exp(rng.normal(0, quality.colour, 3) + rng.normal(0, 2 * quality.colour))
     tint, emission = world.tint * drift * light, world.emission * np.float32(light.mean())
     texture = world.texture.copy()

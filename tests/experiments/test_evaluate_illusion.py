@@ -17,6 +17,7 @@ from instant_ic.experiments.illusion_page import PageView, Screen, compose, plac
 from instant_ic.experiments.illusion_plot import save_plot, save_strip
 from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, TRUE_VIEW, FilmedStack, IllusionFrame
 from instant_ic.experiments.illusion_truth import Passage, Score, corners, fog_pixels, score, surfaces, without
+from instant_ic.experiments.results import save_json
 from instant_ic.experiments.teleop_stack import StackConfig
 from instant_ic.experiments.teleop_worlds import Obstacle
 from instant_ic.geometry.image_quality import psnr_db
