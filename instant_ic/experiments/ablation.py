@@ -58,8 +58,9 @@ def _means(results: Sequence[Result], name: str, key: str) -> dict[str, list[flo
     """Source → mean over the distances above 0, one for each seed."""
     found: dict[str, list[float]] = {}
     for one in results:
-        for source, values in series([one], name, "straight", key).items():
-            away = [value[0] for at, value in values.items() if at > 0]
+        path = "recorded" if "bag" in one.unit.arguments else "straight"
+        for source, values in series([one], name, path, key).items():
+            away = [float(np.mean(value)) for at, value in values.items() if at > 0]
             if away:
                 found.setdefault(source, []).append(float(np.mean(away)))
     return found

@@ -7,6 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from instant_ic.experiments import recorded
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.pictures import Series, curves_svg, image_strip, jpeg
 from instant_ic.experiments.report import Figure, Part, Table, image_address
@@ -39,6 +42,12 @@ def view_units(
         "step_m": 0.5 if options.quick else 0.25,
         "reach_m": 2.0 if options.quick else 4.0,
     }
+    if options.bag is not None:
+        common |= {"bag": str(options.bag), "paths": ["straight"], "seed": 0}
+        common["sources"] = [name for name in sources if name in recorded.SOURCES]
+        count = recorded.count_keyframes(options.bag) - 1
+        chosen = sorted({round(at) for at in np.linspace(0, count - 1, min(options.seeds, count))})
+        return [Unit(experiment, {**common, "number": k, "images": keep_images and k == chosen[0]}) for k in chosen]
     return [
         Unit(
             experiment,
@@ -56,9 +65,16 @@ def view_units(
 
 def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
     """Compare the sources in one world; the rows, and one image strip a path for the shown seed."""
-    given = {key: value for key, value in arguments.items() if key not in ("world", "images")}
-    settings = VspaceSettings(**{key: tuple(v) if isinstance(v, list) else v for key, v in given.items()})
-    comparison = compare(arguments["world"], settings)
+    given: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in arguments.items()
+        if key not in ("world", "images", "bag", "number")
+    }
+    settings = VspaceSettings(**given)
+    if "bag" in arguments:
+        comparison = recorded.compare_recorded(Path(arguments["bag"]), settings, arguments["number"])
+    else:
+        comparison = compare(arguments["world"], settings)
     images = {}
     for path, strip in comparison.strips.items() if arguments["images"] else ():
         columns = ["truth", *settings.sources]
@@ -74,7 +90,8 @@ def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
 
 def family(result: Result) -> str:
     """World without its seed: results of one family are averaged."""
-    return Path(result.unit.arguments["world"].partition(":")[0]).name
+    given = result.unit.arguments
+    return Path(given["bag"] if "bag" in given else given["world"].partition(":")[0]).name
 
 
 def rows(results: Sequence[Result], of_family: str, path: str) -> Iterator[dict[str, Any]]:
@@ -96,7 +113,7 @@ def curves_and_tables(results: Sequence[Result], command: str) -> list[Part]:
     """For each family of worlds: curves, a table of PSNR and SSIM a path, and the strips."""
     parts: list[Part] = []
     for name in dict.fromkeys(family(one) for one in results if one.data):
-        paths = [path for path in PATHS if any(True for _ in rows(results, name, path))]
+        paths = [path for path in (*PATHS, "recorded") if any(True for _ in rows(results, name, path))]
         own = command.format(world=name)
         panels = [
             (f"{path}: distance from the panorama, m", label, series(results, name, path, key))
@@ -110,7 +127,7 @@ def curves_and_tables(results: Sequence[Result], command: str) -> list[Part]:
         for one in results:
             if family(one) == name:
                 for path, address in one.data.get("images", {}).items():
-                    title = f"{one.unit.arguments['world']}, {path}"
+                    title = f"{one.unit.arguments.get('world', name)}, {path}"
                     parts.append(Figure(f"Views, {title}", address, own))
     return parts
 
@@ -119,7 +136,8 @@ def command_of(options: Options, experiment: str) -> str:
     """The command that measures again what a table shows; ``{world}`` is its world."""
     quick = " --quick" if options.quick else f" --seeds {options.seeds}"
     method = "" if options.method == "ours" else f" --method {options.method}"
-    return f"ic experiment {experiment} --world {{world}}{quick}{method} -o REPORT"
+    where = "--world {world}" if options.bag is None else "--bag {world}"
+    return f"ic experiment {experiment} {where}{quick}{method} -o REPORT"
 
 
 def _table(caption: str, found: Series, command: str) -> Table:

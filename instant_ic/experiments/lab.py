@@ -25,6 +25,8 @@ EXPERIMENTS = {
     "reconstruction": "reconstruction",
     "training-time": "training_time",
     "ablation": "ablation",
+    "teleoperation": "teleoperation",
+    "operators": "operators",
     "environments": "environments",
 }
 """Name of each experiment → its module in this package."""
@@ -41,6 +43,7 @@ class Options:
         worlds: names of ``sim.worlds.make_world``. A world of the simulator without a seed gets each seed; a mesh file
             gets a random free start for each. Empty: the experiment's own.
         method: ``ours`` or ``paper``: the virtual space that is compared.
+        bag: recording to use instead of worlds, for experiments that compare views; None: none.
         quick: small images, two seeds and short training, to see whether everything works.
         size: width and height of the views; None: 320 × 180, quick 96 × 54.
     """
@@ -48,6 +51,7 @@ class Options:
     seeds: int = 5
     worlds: tuple[str, ...] = ()
     method: str = "ours"
+    bag: Path | None = None
     quick: bool = False
     size: tuple[int, int] | None = None
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Floats: TypeAlias = NDArray[np.floating]
 
 STATION_HEIGHT_M = 1.5
-RANGE_M = (0.4, 20.0)
+RANGE_M = (0.4, 15.0)
 """Ranges that the scanner measures."""
 AROUND_M = 7.0
 """Stations stand within this distance of the start."""
@@ -66,9 +66,9 @@ class ScanQuality:
 
 
 QUALITIES = {
-    "survey": ScanQuality(0.002, 0.003, 0.02, 0.02, 2.5, 4096, 0.05, 0.0),
-    "tripod": ScanQuality(0.004, 0.01, 0.1, 0.03, 3.0, 4096, 0.12, 0.5),
-    "mobile": ScanQuality(0.01, 0.03, 0.4, 0.05, 3.0, 2048, 0.12, 0.5),
+    "survey": ScanQuality(0.002, 0.003, 0.02, 0.03, 3.0, 4096, 0.05, 0.0),
+    "tripod": ScanQuality(0.004, 0.01, 0.1, 0.04, 3.0, 4096, 0.12, 0.5),
+    "mobile": ScanQuality(0.01, 0.03, 0.4, 0.06, 3.0, 2048, 0.12, 0.5),
     "phone": ScanQuality(0.02, 0.06, 1.0, 0.08, 3.0, 1024, 0.15, 0.5),
 }
 """``survey``: a tripod scanner with targets, on the same day. The others are a year older. ``tripod``: registered by
@@ -123,7 +123,7 @@ def station_places(world: World, start: Sequence[float], spacing_m: float, rng: 
         ValueError: there is no free floor at the start.
     """
     mask = world.occupied(0.03, 1.9, 0.05)
-    free = mask.centre(mask.reachable(np.asarray(start[:2]), _CLEARANCE_M))
+    free = mask.centre(mask.reachable((start[0], start[1]), _CLEARANCE_M))
     away = np.linalg.norm(free - np.asarray(start[:2]), axis=1)
     free, away = free[away < AROUND_M], away[away < AROUND_M]
     if not len(free):
@@ -155,7 +155,8 @@ def take_station(world: World, place: Floats, quality: ScanQuality, rng: np.rand
     range_m[lost.reshape(range_m.shape) | (range_m < RANGE_M[0]) | (range_m > RANGE_M[1])] = 0
     tilt, turn = (math.radians(quality.registration_deg * share) for share in (0.25, 1.0))
     roll, pitch, yaw = rng.normal(0, [tilt, tilt, turn])
-    error = pose_matrix(*rng.normal(0, quality.registration_m, 3), roll, pitch, yaw)
+    x, y, z = rng.normal(0, quality.registration_m, 3)
+    error = pose_matrix(x, y, z, roll, pitch, yaw)
     return Station(true @ error, range_m, frame.rgb)
 
 

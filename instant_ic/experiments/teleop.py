@@ -64,7 +64,9 @@ class _Episode:
         self.drive = Drive(index, method, way_m=course.way_m)
         log = read_commands(settings.log) if settings.log is not None else None
         self.recorded = log is not None
-        self.operator: Operator = make_operator(course.goals, lambda: floor_plan(course.world), log)
+        self.operator: Operator = make_operator(
+            course.goals, lambda: floor_plan(course.world), log, settings.manner, seed
+        )
         per_obstacle = 20.0 * len(course.obstacles)
         self.limit_s = READY_S + (log[-1, 0] + 20.0 if log is not None else 20.0 + 4.0 * course.way_m + per_obstacle)
         self.stack = make_stack(course.world, config)

@@ -13,7 +13,7 @@ from typing import Any
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import counted, errors_for_the_user, use_one_thread_for_matrices
 
-_NAMES = ("reconstruction", "training-time", "ablation", "environments", "all")
+_NAMES = ("reconstruction", "training-time", "ablation", "teleoperation", "operators", "environments", "all")
 
 
 def add_parser(subparsers: Any) -> None:
@@ -40,6 +40,11 @@ def add_parser(subparsers: Any) -> None:
         help="corridor, random, long, a world with its seed (random:7), or a mesh file (.glb, ...); repeatable",
     )
     add("--method", choices=("ours", "paper"), default="ours", help="virtual space (default: %(default)s)")
+    add(
+        "--bag",
+        type=Path,
+        help="recording with /keyframe, for reconstruction and ablation: later panoramas are the truth",
+    )
     add("--quick", action="store_true", help="two seeds, small images, short training: does everything work?")
     add("--size", metavar="WxH", help="size of the views (default: 320x180)")
     add("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="units in parallel (default: %(default)s)")
@@ -60,7 +65,9 @@ def _experiment(args: argparse.Namespace) -> int:
     began = time.monotonic()
     names = list(lab.EXPERIMENTS) if args.name == "all" else [args.name]
     size = _size(args.size) if args.size else None
-    options = lab.Options(args.seeds, tuple(args.world), args.method, args.quick, size)
+    options = lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, size)
+    if args.bag is not None and not {*names} <= {"reconstruction", "ablation"}:
+        raise UserError("--bag works with reconstruction and ablation only: the others need a world", 2)
     modules = {name: lab.module(name) for name in names}
     units = [unit for module in modules.values() for unit in module.units(options)]
     with counted("measuring", len(units)) as advance:
