@@ -50,7 +50,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
         ):
             if better in means["ssim"] and worse in means["ssim"]:
                 held = all(np.mean(of[better]) >= np.mean(of[worse]) for of in means.values())
-                verdict[f"{name}: {claim}, PSNR and SSIM"] = held
+                verdict[f"{name}: {claim}, PSNR and SSIM"] = bool(held)
     return Section("Ablation study (V.C, Figs. 6, 8)", [*parts, *curves_and_tables(results, command)], verdict)
 
 

@@ -135,42 +135,37 @@ _COLOURS = (
 )
 
 
-def curves_svg(panels: Sequence[tuple[str, str, Series]], columns: int = 2) -> str:
-    """Line plots as SVG text that follows the page's light or dark colours.
+def curves_svg(panels: Sequence[tuple[str, str, Series]]) -> str:
+    """Line plots as SVG text, one a panel, that follow the page's light or dark colours.
 
     Args:
-        panels: label of x, label of y, and the curves of each panel; the same name has the same colour everywhere.
-        columns: panels side by side.
+        panels: label of x, label of y, and the curves; the same name has the same colour in all panels.
     """
+    names = list(dict.fromkeys(name for _, _, series in panels for name in series))
+    colours = {name: _COLOURS[number % len(_COLOURS)] for number, name in enumerate(names)}
+    return "".join(_curves_svg(*panel, colours) for panel in panels)
+
+
+def _curves_svg(x_label: str, y_label: str, series: Series, colours: dict[str, str]) -> str:
     import io
 
     import matplotlib
 
-    names = list(dict.fromkeys(name for _, _, series in panels for name in series))
-    rows = -(-len(panels) // columns)
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "instant-ic", "text.color": _INK}):
-        figure, axes = new_figure(rows, columns, (4.6 * columns, 3.1 * rows + 0.5))
-        for axis, (x_label, y_label, series) in zip(axes.ravel(), panels, strict=False):
-            for name, points in series.items():
-                colour = _COLOURS[names.index(name) % len(_COLOURS)]
-                at = sorted(points)
-                mean = np.array([np.mean(points[x]) for x in at])
-                wide = np.array([np.std(points[x]) for x in at])
-                axis.plot(at, mean, color=colour, linewidth=1.6, marker="o", markersize=2.5, label=name)
-                axis.fill_between(at, mean - wide, mean + wide, color=colour, alpha=0.15, linewidth=0)
-            axis.set_xlabel(x_label, color=_INK)
-            axis.set_ylabel(y_label, color=_INK)
-            axis.tick_params(colors=_INK)
-            axis.grid(alpha=0.25)
-            axis.patch.set_alpha(0)
-            for spine in axis.spines.values():
-                spine.set_color(_INK)
-        for axis in axes.ravel()[len(panels) :]:
-            axis.set_axis_off()
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        legend = figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-        for text in legend.get_texts():
-            text.set_color(_INK)
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "instant-ic"}):
+        figure, axes = new_figure(1, 1, (4.8, 3.7))
+        axis = axes[0, 0]
+        for name, points in series.items():
+            at = sorted(points)
+            mean, wide = (np.array([of(points[x]) for x in at]) for of in (np.mean, np.std))
+            axis.plot(at, mean, color=colours[name], linewidth=1.6, marker="o", markersize=2.5, label=name)
+            axis.fill_between(at, mean - wide, mean + wide, color=colours[name], alpha=0.15, linewidth=0)
+        axis.set_xlabel(x_label, color=_INK)
+        axis.set_ylabel(y_label, color=_INK)
+        axis.tick_params(colors=_INK)
+        axis.grid(alpha=0.25)
+        for spine in axis.spines.values():
+            spine.set_color(_INK)
+        figure.legend(loc="outside lower center", ncols=4, fontsize=7, frameon=False, labelcolor=_INK)
         out = io.StringIO()
         figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
     text = out.getvalue()

@@ -39,7 +39,8 @@ def section(results: Sequence[Result], options: Options) -> Section:
         Text(
             "One panorama at the start. Conventional IC shows a mesh that was scanned before: by stations with range "
             "noise, registration errors and another exposure and white balance, meshed in a grid. Its colours are "
-            "fitted to the panorama by one factor a channel. mesh is a perfect scan, the upper bound."
+            "fitted to the panorama by one factor a channel. mesh is a perfect scan, the upper bound. The paper, "
+            "with a tripod scanner: instant IC is above in SSIM for about 2 m straight and for 1 to 2 m on the curve."
         ),
         Table(
             "Scan qualities",
@@ -61,11 +62,13 @@ def section(results: Sequence[Result], options: Options) -> Section:
                 lines.append(line)
                 for path, claim in _CLAIM_M.items():
                     reach = line[1 + 2 * PATHS.index(path)]
-                    held = bool(np.mean(reach) >= claim) if reach else None
-                    verdict[f"{name}, {path}: SSIM above the {scan} scan's for {claim:g} m (paper)"] = held
+                    source = f"{scan} scan" if scan != "mesh" else "perfect scan"
+                    text = f"{name}, {path}: SSIM above that of the {source} for {claim:g} m"
+                    verdict[text] = bool(np.mean(reach) >= claim) if reach else None
         columns = ("scan", *(f"{path}, {key}" for path in PATHS for key in ("SSIM", "PSNR")))
         title = f"{name}: metres from the panorama up to which {options.method} is above"
-        parts.append(Table(title, columns, lines, command.format(world=name)))
+        if lines:
+            parts.append(Table(title, columns, lines, command.format(world=name)))
     return Section(
         "Reconstruction accuracy (V.A, Figs. 3, 4, 7)", [*parts, *curves_and_tables(results, command)], verdict
     )

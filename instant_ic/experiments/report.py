@@ -33,7 +33,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """An image: SVG text, or a ``data:`` address of an image or film."""
+    """Plots as SVG text, or the ``data:`` address of an image or film."""
 
     caption: str
     source: str
@@ -114,11 +114,13 @@ h1 { font-size: 1.5rem; line-height: 1.2; } h2 { margin-top: 2.5rem; border-top:
   padding-top: 1rem; font-size: 1.25rem; }
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
-caption { text-align: left; font-weight: 600; padding: .4rem 0; }
+h3 { font-size: .95rem; margin: 1.4rem 0 .3rem; }
 th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper); }
-figure { margin: 1.2rem 0; } figcaption { font-size: .9rem; font-weight: 600; margin-bottom: .3rem; }
-img, video, figure svg { max-width: 100%; height: auto; }
+figure { margin: 0; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(19rem, 1fr)); gap: .5rem; }
+.plots svg { width: 100%; height: auto; }
+img { width: 100%; } .strip { min-width: 44rem; }
 code { display: block; overflow-x: auto; background: var(--soft); padding: .3rem .5rem; font-size: .78rem;
   margin: .3rem 0 1.2rem; white-space: pre; }
 .yes { color: var(--good); } .no { color: var(--bad); } nav a { margin-right: 1rem; }
@@ -168,13 +170,14 @@ def _part(part: Part) -> str:
     caption = html.escape(part.caption)
     if isinstance(part, Figure):
         if part.source.startswith("data:"):
-            body = f'<img src="{part.source}" alt="{caption}">'
+            kind = "strip" if part.source.startswith("data:image/jpeg") else "whole"
+            body = f'<div class="wide"><img class="{kind}" src="{part.source}" alt="{caption}"></div>'
         else:
-            body = part.source  # SVG
-        return f"<figure><figcaption>{caption}</figcaption>{body}</figure>{command}"
+            body = f'<div class="plots">{part.source}</div>'
+        return f"<h3>{caption}</h3><figure>{body}</figure>{command}"
     head = "".join(f"<th>{html.escape(str(column))}</th>" for column in part.columns)
     rows = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in part.rows)
-    return f'<div class="wide"><table><caption>{caption}</caption><tr>{head}</tr>{rows}</table></div>{command}'
+    return f'<h3>{caption}</h3><div class="wide"><table><tr>{head}</tr>{rows}</table></div>{command}'
 
 
 def _cell(value: Any) -> str:

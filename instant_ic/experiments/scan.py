@@ -33,7 +33,9 @@ AROUND_M = 7.0
 _CLEARANCE_M = 0.4
 _GRAZING = 0.08
 """Surfaces that a beam meets at a smaller sine give no return."""
-_BAND_CELLS = 3
+_BAND_CELLS = 2
+_AT_ONCE = 500_000
+"""Cells that are fused together, which bounds the memory."""
 _PICTURE_M = 0.5
 """Clamped textures above this height are posters; lower ones are doors."""
 _SHIFT_M = 0.4
@@ -177,17 +179,19 @@ def fuse(stations: Sequence[Station], cell_m: float) -> tuple[Floats, NDArray[np
     band = np.zeros(cells.max(axis=0) + _BAND_CELLS + 3, bool)
     band[tuple(cells.T)] = True
     band = binary_dilation(band, iterations=_BAND_CELLS)
-    at = np.argwhere(band)
-    centres = low + at * cell_m
-    total, weight = np.zeros(len(at)), np.zeros(len(at))
+    at = np.argwhere(band).astype(np.int32)
+    total, weight = np.zeros(len(at), np.float32), np.zeros(len(at), np.float32)
     reach = _BAND_CELLS * cell_m
-    for one in stations:
-        row, column, distance = one.pixels(centres)
-        measured = one.range_m[row, column]
-        signed = measured - distance
-        share = np.where((measured > 0) & (signed > -reach), 1 / np.maximum(distance, 0.5) ** 2, 0)
-        total += share * np.clip(signed / reach, -1, 1)
-        weight += share
+    for begin in range(0, len(at), _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE)
+        centres = low + at[part] * cell_m
+        for one in stations:
+            row, column, distance = one.pixels(centres)
+            measured = one.range_m[row, column]
+            signed = measured - distance
+            share = np.where((measured > 0) & (signed > -reach), 1 / np.maximum(distance, 0.5) ** 2, 0)
+            total[part] += share * np.clip(signed / reach, -1, 1)
+            weight[part] += share
     seen = weight > 0
     known = np.zeros(band.shape, bool)
     known[tuple(at[seen].T)] = True
