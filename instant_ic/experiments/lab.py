@@ -31,7 +31,9 @@ EXPERIMENTS = {
 }
 """Name of each experiment → its module in this package."""
 WORLD = "corridor"
-"""Default world: its seed is that of the unit."""
+"""Default world."""
+GENERATED = ("corridor", "corridor-free", "random", "long")
+"""Worlds that have seeds."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +68,16 @@ class Options:
         return self.size or ((96, 54) if self.quick else (320, 180))
 
     def cases(self, worlds: Sequence[str] = (WORLD,)) -> list[tuple[str, int]]:
-        """World and seed of each unit."""
+        """World of each unit, and the seed of its start; 0: the world's own start."""
+        numbers = range(2 if self.quick else self.seeds)
         found = []
         for world in self.worlds or worlds:
-            for seed in range(2 if self.quick else self.seeds):
-                named = f"{world}:{seed}" if world in ("corridor", "corridor-free", "random", "long") else world
-                if (named, 0) not in found:
-                    found.append((named, 0 if named != world or ":" in world else seed))
+            if world in GENERATED:
+                found += [(f"{world}:{seed}", 0) for seed in numbers]
+            elif world.partition(":")[0] in GENERATED:
+                found.append((world, 0))
+            else:
+                found += [(world, seed) for seed in numbers]
         return found
 
 

@@ -151,8 +151,9 @@ def take_station(world: World, place: Floats, quality: ScanQuality, rng: np.rand
     _, face = renderer.cast(true[:3, 3], directions.reshape(-1, 3) @ true[:3, :3].T.astype(np.float32))
     surface = world.face_surface[np.maximum(face, 0)]
     sine = np.abs(np.einsum("ij,ij->i", world.normal[surface], directions.reshape(-1, 3) @ true[:3, :3].T))
-    # Glass gives no return, and what shines here is a window or a lamp.
-    lost = (face < 0) | (sine < _GRAZING) | (world.emission[surface] > 0)
+    # Glass gives no return; what shines and is upright is a window.
+    glass = (world.emission[surface] > 0) & (np.abs(world.normal[surface, 2]) < 0.5)
+    lost = (face < 0) | (sine < _GRAZING) | glass
     range_m = range_m + rng.normal(0, quality.noise_m, range_m.shape).astype(np.float32)
     range_m[lost.reshape(range_m.shape) | (range_m < RANGE_M[0]) | (range_m > RANGE_M[1])] = 0
     tilt, turn = (math.radians(quality.registration_deg * share) for share in (0.25, 1.0))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from instant_ic.experiments.vspace_sources import (
     CAMERA_HEIGHT_M,
     KEYFRAMES,
+    Drawer,
     Picture,
     Place,
     VspaceSettings,
@@ -175,6 +176,7 @@ def compare(
     comparison = Comparison(place.start)
     width, height = settings.size
     fov = math.radians(settings.fov_deg)
+    ready: dict[str, tuple[Drawer, float]] = {}
     for path in settings.paths:
         # The path must also be free behind the start; where it ends, fewer keyframes are taken.
         keyframes = max(settings.keyframes, *(KEYFRAMES.get(source, 1) for source in settings.sources))
@@ -184,7 +186,9 @@ def compare(
         poses = path_poses(place.world, place.start, path, settings.distances_m)
         truths = [place.renderer.render_perspective(pose, width, height, fov, supersample=3).rgb for pose in poses]
         for source in settings.sources:
-            draw, seconds = make_source(source, shots, settings, place)
+            if source not in ready or keyframes > 1:  # the last panorama alone is the same on all paths
+                ready[source] = make_source(source, shots, settings, place)
+            draw, seconds = ready[source]
             for distance, pose, truth in zip(settings.distances_m, poses, truths, strict=False):
                 picture, confidence = draw(pose, width, height, fov)
                 comparison.rows.append(_row(path, source, distance, picture, truth, seconds, confidence))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.scan import QUALITIES, ScanQuality, scan_world
+from instant_ic.experiments.scan import QUALITIES, ScanQuality, aged, scan_world
 
 if TYPE_CHECKING:
     from instant_ic.depth.sources import DepthResult
@@ -34,7 +34,7 @@ SOURCES = {
     "depth-warp": "the panorama warped by the depth of `ours`, as a mesh",
     "point-warp": "the same as points",
     "true-warp": "mesh warp by the world's own depth",
-    "mesh": "conventional IC with a perfect scan: exact geometry, obstacle not there yet, colours changed",
+    "mesh": "conventional IC with a perfect scan: exact geometry, obstacle not there yet, colours fitted",
     **{name: f"conventional IC with a real scan: {name}" for name in QUALITIES},
 }
 KEYFRAMES = {"older": 3}
@@ -137,14 +137,6 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
             f"depth of the panorama at ({pose[0, 3]:.2f}, {pose[1, 3]:.2f}) cannot be scaled: {result.message}"
         )
     return Shot(pose, rgb, true, raw, result, np.linalg.norm(points, axis=1))
-
-
-def scanned(world: World, seed: int) -> World:
-    """The world as scanned at another time: with different exposure and white balance, and drift per texture."""
-    rng = np.random.default_rng([71, seed])
-    drift = np.exp(rng.normal(0, 0.12, (int(world.texture.max()) + 1, 3)))[world.texture]
-    tint = world.tint * drift * (0.85 * np.array([1.08, 1.0, 0.88]))
-    return replace(world, tint=tint.astype(np.float32), emission=world.emission * np.float32(0.85))
 
 
 def train(space: Any, cpu_seconds: float) -> None:
@@ -277,10 +269,14 @@ def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: P
     if name == "mesh":
         from instant_ic.sim.render import EquirectRenderer
 
-        renderer = EquirectRenderer(scanned(place.before, settings.seed))
+        quality = replace(QUALITIES["tripod"], older=0.0)
+        renderer = EquirectRenderer(aged(place.before, quality, np.random.default_rng([73, settings.seed])))
+        theirs, own = (one.render(last.pose, 256, 128).rgb / 255 + 1e-3 for one in (place.renderer, renderer))
+        gain = np.median(theirs / own, axis=(0, 1))  # as ``MeshSpace`` fits its colours
 
         def draw_mesh(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
-            return renderer.render_perspective(pose, width, height, fov, supersample=2).rgb, 1.0
+            rgb = renderer.render_perspective(pose, width, height, fov, supersample=2).rgb
+            return np.clip(np.rint(rgb * gain), 0, 255).astype(np.uint8), 1.0
 
         return draw_mesh, 0.0
     if name == "point-warp":
