@@ -118,7 +118,7 @@ h3 { font-size: .95rem; margin: 1.4rem 0 .3rem; }
 th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper); }
 figure { margin: 0; }
-.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(19rem, 1fr)); gap: .5rem; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); gap: .5rem; }
 .plots svg { width: 100%; height: auto; }
 img { width: 100%; } .strip { min-width: 44rem; }
 code { display: block; overflow-x: auto; background: var(--soft); padding: .3rem .5rem; font-size: .78rem;

@@ -7,6 +7,7 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,7 @@ def stills(frames: Sequence[_Frame]) -> list[_Frame]:
     shown = [frame for frame in frames if frame.virtual]
     if not shown:
         return list(frames[:1])
-    ends = [at for at, frame in enumerate(frames[1:]) if frame.virtual and not frames[at + 1].virtual]
+    ends = [at for at, (frame, after) in enumerate(pairwise(frames)) if frame.virtual and not after.virtual]
     first = next(at for at, frame in enumerate(frames) if frame.virtual)
     last = ends[0] if ends else len(frames) - 1
     beside = math.ceil(_BESIDE_S / _FRAME_S)

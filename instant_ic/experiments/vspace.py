@@ -179,7 +179,7 @@ def compare(
     ready: dict[str, tuple[Drawer, float]] = {}
     for path in settings.paths:
         # The path must also be free behind the start; where it ends, fewer keyframes are taken.
-        keyframes = max(settings.keyframes, *(KEYFRAMES.get(source, 1) for source in settings.sources))
+        keyframes = max(KEYFRAMES.get(source, 1) for source in settings.sources)
         back = path_poses(place.world, place.start, path, [-float(k) for k in range(keyframes)])
         shots = [take_shot(place.renderer, pose, settings, place.model) for pose in reversed(back)]
         comparison.depth[path] = depth_figures(shots)

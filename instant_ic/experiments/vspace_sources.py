@@ -26,7 +26,7 @@ SOURCES = {
     "true-depth": "the same with the world's own depth: the ceiling",
     "no-depth": "field trained from colours alone (paper: -depth)",
     "no-scale": "the model's depth as it comes, not scaled (paper: -scale)",
-    "older": "ours with three keyframes in a row, each a metre behind the next",
+    "older": "ours with two older keyframes behind it, a metre apart, for what is hidden from the newest",
     "exact-fill": "true depth, and the truth where no keyframe has seen the place",
     "paper": "the paper's choices: density field alone, six cube faces, depth scaled by the 99.5 % maxima",
     "paper-no-scale": "the same, depth not scaled",
@@ -54,7 +54,6 @@ class VspaceSettings:
         seconds: CPU seconds of training.
         size: width and height of the views; fov_deg: their horizontal field of view.
         panorama_width: of the keyframes, pixels.
-        keyframes: 1, or more, each a metre behind the next on the path.
         step_m, reach_m: distances from the last panorama are multiples of ``step_m`` up to ``reach_m``.
         seed: of LiDAR noise, training, scans and changed colours.
         start_seed: above 0: of a random start instead of the world's own.
@@ -66,7 +65,6 @@ class VspaceSettings:
     size: tuple[int, int] = (640, 360)
     fov_deg: float = 90.0
     panorama_width: int = 2048
-    keyframes: int = 1
     step_m: float = 0.25
     reach_m: float = 4.0
     seed: int = 0
@@ -81,8 +79,6 @@ class VspaceSettings:
             raise ValueError(f"seconds must be > 0 (got {self.seconds:g})")
         if not (0 < self.step_m <= self.reach_m <= 20):
             raise ValueError(f"distances must be 0 < step <= reach <= 20 m (got {self.step_m:g}, {self.reach_m:g})")
-        if not 1 <= self.keyframes <= 8:
-            raise ValueError(f"keyframes must be 1 to 8 (got {self.keyframes})")
         if not 64 <= self.panorama_width <= 8192 or self.panorama_width % 8:
             raise ValueError(f"panorama width must be 64 to 8192, a multiple of 8 (got {self.panorama_width})")
         if not 1 <= self.fov_deg < 170:
@@ -248,12 +244,8 @@ def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: P
         return draw
 
     if name in ("ours", "field", "no-scale", "true-depth", "exact-fill", "older", "paper", "paper-no-scale"):
-        count = max(settings.keyframes, KEYFRAMES.get(name, 1))
-        own = replace(config, keyframes=count)
-        if name.startswith("paper"):
-            own, count = paper_config(config), 1
-        elif name == "field":
-            own = field_alone(own)
+        count = KEYFRAMES.get(name, 1)
+        own = paper_config(config) if name.startswith("paper") else field_alone(config) if name == "field" else config
         space = make_space(shots[-count:], name, settings, own)
         train(space, settings.seconds)
         draw = of_view(space) if name != "exact-fill" else _exactly_filled(space, place.renderer)

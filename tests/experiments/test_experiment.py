@@ -5,9 +5,12 @@ import json
 import math
 import re
 
+import cv2
 import numpy as np
 import pytest
 
+from instant_ic.bag.writer import BagWriter
+from instant_ic.bus import LATCHED
 from instant_ic.cli.main import main
 from instant_ic.experiments import box_room, lab, reconstruction, report
 from instant_ic.experiments.illusion_truth import moved_by, things
@@ -23,8 +26,11 @@ from instant_ic.experiments.scan import (
     scan_world,
     station_places,
 )
+from instant_ic.experiments.teleop_operator import MANNERS, ManneredOperator, Sight
+from instant_ic.experiments.teleoperation import _Frame, stills
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.msg import Keyframe, compressed_image_message, header, image_message, pose_message, serialize
 from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.world import Material
@@ -171,3 +177,67 @@ def test_mistakes_are_reported_in_a_line(arguments, words, status, tmp_path, cap
 def test_a_world_that_is_not_there_is_reported_with_the_rest(tmp_path, capsys) -> None:
     assert main(["experiment", "ablation", "--quick", "--jobs", "1", "--world", "no.glb", "-o", str(tmp_path)]) == 1
     assert "no.glb" in capsys.readouterr().err and "no.glb" in (tmp_path / "report.html").read_text()
+
+
+def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
+    with BagWriter(tmp_path / "bag") as writer:
+        for number, x in enumerate((0.0, 0.5, 1.0)):
+            pose = pose_matrix(x)
+            room = box_room.panorama(pose, 128)
+            message = Keyframe(
+                header=header("map", 7),
+                id=number,
+                pose=pose_message(pose),
+                panorama=compressed_image_message(cv2.imencode(".png", room.rgb[..., ::-1])[1].tobytes(), "camera", 7),
+                depth=image_message(room.depth_m, "32FC1", "camera", 7),
+                sigma=image_message(np.empty((0, 0), np.uint8), "mono8", "camera", 7),
+                source="network",
+                scale=1.0,
+                quality=0.9,
+                relative_sigma=0.03,
+                fit=True,
+                message="",
+            )
+            kind = "instant_ic_msgs/msg/Keyframe"
+            writer.write("/keyframe", kind, bytes(serialize(message)), 10**9 * (number + 1), LATCHED)
+    options = Options(5, bag=tmp_path / "bag", size=(48, 32))
+    units = reconstruction.units(options)
+    assert [unit.arguments["number"] for unit in units] == [0, 1]
+    arguments = {**units[0].arguments, "sources": ["panorama", "depth-warp"], "panorama_width": 256}
+    found = reconstruction.measure(arguments)
+    psnr = {(row["source"], row["distance_m"]): row["psnr_db"] for row in found["rows"]}
+    assert set(psnr) == {(source, at) for source in ("panorama", "depth-warp") for at in (0.5, 1.0)}
+    assert psnr["depth-warp", 0.5] > psnr["panorama", 0.5] + 3
+    assert found["images"]["recorded"].startswith("data:image/jpeg")
+    results = [Result(units[0], found, 1.0, 1.0)]
+    assert "recorded" in str(reconstruction.section(results, options).parts)
+    with pytest.raises(ValueError, match="/keyframe is missing"):
+        with BagWriter(tmp_path / "empty"):
+            pass
+        reconstruction.units(Options(5, bag=tmp_path / "empty"))
+
+
+def sight(time_s: float) -> Sight:
+    return Sight(time_s, np.zeros(3), False, False, (0.4, 0.0), np.zeros(3))
+
+
+def test_operators_differ_as_their_manners_say() -> None:
+    ahead = np.array([[10.0, 0.0]])
+
+    def commands(manner: str, seed: int = 0) -> list[tuple[float, float]]:
+        operator = ManneredOperator(ahead, None, MANNERS[manner], seed)
+        return [operator.command(sight(0.05 * step)) for step in range(20)]
+
+    assert commands("plain") == [(0.4, 0.0)] * 20
+    assert commands("cautious") == [(0.2, 0.0)] * 20
+    assert commands("late") == [(0.0, 0.0)] * 10 + [(0.4, 0.0)] * 10
+    noisy = np.array(commands("noisy"))
+    assert noisy[:, 1].std() > 0.01 and noisy.tolist() == np.array(commands("noisy")).tolist()
+    assert noisy.tolist() != np.array(commands("noisy", 1)).tolist()
+
+
+def test_stills_are_before_first_middle_last_and_after() -> None:
+    shown = [False] * 10 + [True] * 21 + [False] * 3
+    frames = [_Frame(0.25 * k, virtual, np.zeros((2, 2, 3), np.uint8)) for k, virtual in enumerate(shown)]
+    assert [frame.time_s / 0.25 for frame in stills(frames)] == [6, 10, 20, 30, 33]
+    assert stills(frames[:3]) == frames[:1]

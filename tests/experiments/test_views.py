@@ -69,7 +69,6 @@ def test_scores_by_hand():
         ({"sources": ()}, "got none"),
         ({"seconds": 0.0}, "seconds"),
         ({"step_m": 0.0}, "step"),
-        ({"keyframes": 9}, "keyframes"),
         ({"panorama_width": 100}, "multiple of 8"),
         ({"fov_deg": 180.0}, "field of view"),
     ],
