@@ -37,7 +37,7 @@ from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import follow_worlds as worlds
-from instant_ic.experiments.processes import process_pool
+from instant_ic.experiments.processes import run_all
 from instant_ic.geometry.poses import matrix_from_pose2, relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 
@@ -333,29 +333,10 @@ def evaluate(
         TimeoutError: the episodes took longer than ``timeout_s``.
         RuntimeError: a process died.
     """
-    from concurrent.futures import as_completed
-    from concurrent.futures.process import BrokenProcessPool
-
-    if episodes < 1 or jobs < 1:
-        raise ValueError(f"episodes and jobs must be at least 1 (got {episodes}, {jobs})")
-    done: list[Episode] = []
-    tell = on_episode or (lambda episode: None)
-    if jobs == 1:
-        prepare()
-        for index in range(episodes):
-            done.append(run_episode(seed, index))
-            tell(done[-1])
-        return done
-    with process_pool(jobs, prepare) as pool:
-        try:
-            futures = [pool.submit(run_episode, seed, index) for index in range(episodes)]
-            for future in as_completed(futures, timeout=timeout_s):
-                done.append(future.result())
-                tell(done[-1])
-        except BrokenProcessPool as error:
-            raise RuntimeError("a process that drove an episode died (out of memory?); try --jobs 1") from error
-        except TimeoutError as error:
-            raise TimeoutError(f"the episodes took longer than {timeout_s:.0f} s; {len(done)} are done") from error
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1 (got {episodes})")
+    tasks = [(seed, index) for index in range(episodes)]
+    done = run_all(run_episode, tasks, jobs, prepare, on_episode, timeout_s)
     return sorted(done, key=lambda episode: episode.index)
 
 

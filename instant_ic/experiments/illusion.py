@@ -5,13 +5,9 @@ The drive is that of ``ic evaluate teleop`` with illusory control. ``illusion_st
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,7 +23,8 @@ from instant_ic.experiments.illusion_stack import (
     Screen,
     StackConfig,
 )
-from instant_ic.experiments.processes import process_pool
+from instant_ic.experiments.processes import run_all
+from instant_ic.experiments.results import finite
 from instant_ic.experiments.teleop import prepare, run_episode
 from instant_ic.experiments.teleop_settings import TeleopSettings
 
@@ -96,35 +93,8 @@ def evaluate(
         TimeoutError: the episodes took longer than ``timeout_s``.
         RuntimeError: a process died, or a stack did not become ready.
     """
-    from concurrent.futures import as_completed
-    from concurrent.futures.process import BrokenProcessPool
-
-    if jobs < 1:
-        raise ValueError(f"jobs must be at least 1 (got {jobs})")
-    films: list[Film] = []
-    began, late = time.monotonic(), f"the episodes took longer than {timeout_s:.0f} s"
-
-    def take(film: Film) -> None:
-        films.append(film)
-        if on_film is not None:
-            on_film(film)
-
-    if jobs == 1 or settings.episodes == 1:
-        prepare()
-        for index in range(settings.episodes):
-            if time.monotonic() - began > timeout_s:
-                raise TimeoutError(late)
-            take(film_episode(settings, index))
-        return films
-    with process_pool(min(jobs, settings.episodes), prepare) as pool:
-        try:
-            futures = [pool.submit(film_episode, settings, index) for index in range(settings.episodes)]
-            for future in as_completed(futures, timeout=timeout_s):
-                take(future.result())
-        except BrokenProcessPool as error:
-            raise RuntimeError("a process that filmed an episode died (out of memory?); try --jobs 1") from error
-        except TimeoutError as error:
-            raise TimeoutError(late) from error
+    tasks = [(settings, index) for index in range(settings.episodes)]
+    films = run_all(film_episode, tasks, jobs, prepare, on_film, timeout_s)
     return sorted(films, key=lambda film: film.index)
 
 
@@ -156,7 +126,7 @@ def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
         result[source] = {**figures(frames, source), "by_distance": by_distance(frames, source)}
     result["readiness"] = readiness(frames)
     result["each"] = [asdict(frame) for frame in frames]
-    rounded: dict[str, Any] = _rounded(result)
+    rounded: dict[str, Any] = finite(result, 4)
     return rounded
 
 
@@ -207,29 +177,8 @@ def readiness(frames: Sequence[IllusionFrame]) -> dict[str, Any]:
     }
 
 
-def save(path: Path, figures_: dict[str, Any]) -> None:
-    """Write the report atomically: an interrupted program leaves no half of a file."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(json.dumps(figures_, indent=2) + "\n")
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
-
-
 def _row(distance_m: float) -> float:
     return STEP_M * round(distance_m / STEP_M) + 0.0  # no −0
-
-
-def _rounded(value: Any) -> Any:
-    """Round numbers to four places; NaN and infinity become None, which JSON has."""
-    if isinstance(value, dict):
-        return {key: _rounded(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(one) for one in value]
-    if isinstance(value, float):
-        return round(value, 4) if math.isfinite(value) else None
-    return value
 
 
 __all__ = ["Film", "TeleopSettings", "evaluate", "film_episode", "report"]

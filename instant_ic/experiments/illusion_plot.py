@@ -20,10 +20,9 @@ from instant_ic.experiments.illusion_stack import (
     WEBGL,
     WEBGL_TRUE_DEPTH,
 )
-from instant_ic.experiments.pictures import new_figure, save_figure
+from instant_ic.experiments.pictures import image_strip, new_figure, save_figure
 
-_TILE = (400, 225)
-_LABEL_PX, _HEAD_PX = 64, 24
+_TILE = 400
 _COLUMNS = {
     LIVE: "shown",
     WEBGL: "shown in WebGL",
@@ -51,17 +50,9 @@ def save_strip(path: Path, films: Sequence[Film]) -> None:
     film = max(films, key=lambda film: len(film.stills))
     if not film.stills:
         raise ValueError(f"{path}: there is no strip because no obstacle was passed")
-    head = np.full((_HEAD_PX, _LABEL_PX + len(_COLUMNS) * _TILE[0], 3), 255, np.uint8)
-    for number, title in enumerate(_COLUMNS.values()):
-        _write(head, title, (_LABEL_PX + number * _TILE[0] + 8, 17))
-    rows = [head]
-    for distance in sorted(film.stills):
-        label = np.full((_TILE[1], _LABEL_PX, 3), 255, np.uint8)
-        _write(label, f"{distance:+.1f} m", (4, _TILE[1] // 2))
-        still = film.stills[distance]
-        tiles = [cv2.resize(still[name], _TILE, interpolation=cv2.INTER_AREA) for name in _COLUMNS]
-        rows.append(np.hstack([label, *tiles]))
-    if not cv2.imwrite(str(path), np.vstack(rows)[..., ::-1]):
+    rows = [(f"{at:+.1f} m", [film.stills[at][name] for name in _COLUMNS]) for at in sorted(film.stills)]
+    strip = image_strip(list(_COLUMNS.values()), rows, _TILE)
+    if not cv2.imwrite(str(path), strip[..., ::-1]):
         raise ValueError(f"{path}: the strip cannot be written")
 
 
@@ -106,7 +97,3 @@ def save_plot(path: Path, report: dict[str, Any]) -> None:
 def _ends(*values: NDArray[np.float64]) -> NDArray[np.float64]:
     together = np.concatenate(values)
     return np.array([np.nanmin(together) - 1, np.nanmax(together) + 1])
-
-
-def _write(image: NDArray[np.uint8], text: str, at: tuple[int, int]) -> None:
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)

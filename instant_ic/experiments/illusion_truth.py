@@ -16,6 +16,7 @@ from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.projections import perspective_directions
 
 if TYPE_CHECKING:
+    from instant_ic.sim.contact import OccupancyMask
     from instant_ic.sim.render import Frame
     from instant_ic.sim.world import World
 
@@ -81,33 +82,46 @@ class Passage:
         return along - near, obstacle
 
 
-def without(world: World, obstacle: Obstacle) -> World:
-    """The world without the object that stands at an obstacle's place; its shadow remains.
+def things(world: World) -> tuple[NDArray[np.int32], OccupancyMask, NDArray[np.int32]]:
+    """Number of the free-standing object that each surface belongs to, (S,), 0 for none; the floor plan; its numbers.
 
-    The object is what is connected to that place in the floor plan of ``OBJECT_M`` without the walls. Surfaces that
-    lie in its cells completely and above the floor are moved far below the floor. What lies on a wall stays: posters
-    and skirting boards.
+    An object is what is connected in the floor plan of ``OBJECT_M`` without the walls. Its surfaces lie in its cells
+    completely, above the floor and below ``OBJECT_M``. What lies on a wall is no object: posters and skirting boards.
     """
-    things, walls = (world.occupied(low, high, _CELL_M) for low, high in (OBJECT_M, WALL_M))
+    plan, walls = (world.occupied(low, high, _CELL_M) for low, high in (OBJECT_M, WALL_M))
     beside_walls = cv2.dilate(walls.cells.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    _, labels = cv2.connectedComponents((things.cells & ~beside_walls).astype(np.uint8), connectivity=8)
-    outline = np.fliplr(things.index(corners(obstacle))).astype(np.int32)
-    place = cv2.dilate(cv2.fillConvexPoly(np.zeros(labels.shape, np.uint8), outline, 1), np.ones((3, 3), np.uint8))
-    found = np.setdiff1d(np.unique(labels[place > 0]), [0])
-
-    cells = cv2.dilate(np.isin(labels, found).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-
-    def within(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Surfaces all of whose corners lie in a mask's cells, (S,)."""
-        corner = replace(things, cells=mask).at(world.vertices[:, :2])
-        return np.asarray(corner.reshape(len(world.normal), -1).all(axis=1))
-
-    vertices = world.vertices.reshape(len(world.normal), -1, 3).copy()
+    _, labels = cv2.connectedComponents((plan.cells & ~beside_walls).astype(np.uint8), connectivity=8)
+    around = cv2.dilate(labels.astype(np.float32), np.ones((5, 5), np.uint8)).astype(np.int32)
+    vertices = world.vertices.reshape(len(world.normal), -1, 3)
+    row, column = plan.index(world.vertices[:, :2]).T
+    inside = (row >= 0) & (row < around.shape[0]) & (column >= 0) & (column < around.shape[1])
+    row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+    own = np.where(inside, around[row, column], 0).reshape(vertices.shape[:2])
+    on_wall = (inside & beside_walls[row, column]).reshape(own.shape).all(axis=1)
     high = vertices[..., 2].max(axis=1)
     # A box's sides begin on the floor; the floor itself does not rise.
-    gone = within(cells) & (high > 0.01) & (high < WALL_M[0]) & ~within(beside_walls)
-    vertices[gone, :, 2] -= _AWAY_M
-    return replace(world, vertices=vertices.reshape(-1, 3))
+    whole = (own == own[:, :1]).all(axis=1) & (high > 0.01) & (high < WALL_M[0]) & ~on_wall
+    return np.where(whole, own[:, 0], 0), plan, labels
+
+
+def moved_by(world: World, surfaces: NDArray[np.bool_], shift_m: FloatArray) -> World:
+    """The world with surfaces (S,) displaced by (3,) metres; their texture and light go with them."""
+    changed = {name: getattr(world, name).copy() for name in ("vertices", "offset", "uv", "light_uv", "light_linear")}
+    by = shift_m.astype(np.float32)
+    changed["vertices"].reshape(len(world.normal), -1, 3)[surfaces] += by
+    changed["offset"][surfaces] += world.normal[surfaces] @ by
+    for name in ("uv", "light_uv", "light_linear"):
+        changed[name][surfaces, ..., 3] -= changed[name][surfaces, ..., :3] @ by
+    return replace(world, **changed)
+
+
+def without(world: World, obstacle: Obstacle) -> World:
+    """The world without the object that stands at an obstacle's place; its shadow remains."""
+    owner, plan, labels = things(world)
+    outline = np.fliplr(plan.index(corners(obstacle))).astype(np.int32)
+    place = cv2.dilate(cv2.fillConvexPoly(np.zeros(labels.shape, np.uint8), outline, 1), np.ones((3, 3), np.uint8))
+    found = np.setdiff1d(np.unique(labels[place > 0]), [0])
+    return moved_by(world, np.isin(owner, found), np.array([0.0, 0.0, -_AWAY_M]))
 
 
 @dataclass(frozen=True)

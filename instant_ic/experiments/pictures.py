@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import perspective_directions, sample_equirect
+
+Image: TypeAlias = NDArray[np.uint8]
 
 
 def perspective_crop(
@@ -113,3 +115,93 @@ def save_figure(figure: Any, path: Path) -> None:
     """Write a figure, creating its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
+
+
+Series: TypeAlias = dict[str, dict[float, list[float]]]
+"""Name → x → values, of which mean and standard deviation are plotted."""
+_INK = "#010203"
+"""Replaced by the page's text colour."""
+_COLOURS = (
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#8A8A8A",
+    "#B8860B",
+    "#7B5EA7",
+    "#C44E52",
+)
+
+
+def curves_svg(panels: Sequence[tuple[str, str, Series]]) -> str:
+    """Line plots as SVG text, one a panel, that follow the page's light or dark colours.
+
+    Args:
+        panels: label of x, label of y, and the curves; the same name has the same colour in all panels.
+    """
+    names = list(dict.fromkeys(name for _, _, series in panels for name in series))
+    colours = {name: _COLOURS[number % len(_COLOURS)] for number, name in enumerate(names)}
+    return "".join(_curves_svg(*panel, colours) for panel in panels)
+
+
+def _curves_svg(x_label: str, y_label: str, series: Series, colours: dict[str, str]) -> str:
+    import io
+
+    import matplotlib
+
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "instant-ic"}):
+        figure, axes = new_figure(1, 1, (4.8, 3.7))
+        axis = axes[0, 0]
+        for name, points in series.items():
+            at = sorted(points)
+            mean, wide = (np.array([of(points[x]) for x in at]) for of in (np.mean, np.std))
+            axis.plot(at, mean, color=colours[name], linewidth=1.6, marker="o", markersize=2.5, label=name)
+            axis.fill_between(at, mean - wide, mean + wide, color=colours[name], alpha=0.15, linewidth=0)
+        axis.set_xlabel(x_label, color=_INK)
+        axis.set_ylabel(y_label, color=_INK)
+        axis.tick_params(colors=_INK)
+        axis.grid(alpha=0.25)
+        for spine in axis.spines.values():
+            spine.set_color(_INK)
+        figure.legend(loc="outside lower center", ncols=4, fontsize=7, frameon=False, labelcolor=_INK)
+        out = io.StringIO()
+        figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
+    text = out.getvalue()
+    return text[text.index("<svg") :].replace(_INK, "currentColor")
+
+
+def image_strip(columns: Sequence[str], rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], tile: int) -> Image:
+    """Rows of labelled images under the columns' names; RGB, ready to be encoded.
+
+    Args:
+        columns: names.
+        rows: label and one image a column, all of one shape.
+        tile: width of an image, pixels.
+    """
+    import cv2
+
+    label_px, head_px = 64, 24
+    height, width = rows[0][1][0].shape[:2]
+    size = (tile, max(round(tile * height / width), 1))
+
+    def write(image: Image, text: str, at: tuple[int, int]) -> None:
+        cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+
+    head = np.full((head_px, label_px + len(columns) * tile, 3), 255, np.uint8)
+    for number, title in enumerate(columns):
+        write(head, title, (label_px + number * tile + 8, 17))
+    lines = [head]
+    for text, images in rows:
+        label = np.full((size[1], label_px, 3), 255, np.uint8)
+        write(label, text, (4, size[1] // 2))
+        lines.append(np.hstack([label, *(cv2.resize(one, size, interpolation=cv2.INTER_AREA) for one in images)]))
+    return np.vstack(lines)
+
+
+def jpeg(image: NDArray[np.uint8], quality: int = 88) -> bytes:
+    """Encode an RGB image."""
+    import cv2
+
+    return bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1])

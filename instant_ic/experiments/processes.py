@@ -8,11 +8,14 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
 from multiprocessing.context import SpawnContext, SpawnProcess
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 _GONE_S = 30.0
 """A killed process is normally gone at once; a longer wait means that the kernel holds it (a hung file system)."""
@@ -54,6 +57,65 @@ def process_pool(count: int, prepare: Callable[[], None]) -> Iterator[ProcessPoo
             process.kill()
         results.close()
         _wait_until_gone(started)
+
+
+def run_all(
+    function: Callable[..., T],
+    tasks: Sequence[tuple[Any, ...]],
+    jobs: int,
+    prepare: Callable[[], None],
+    on_result: Callable[[T], None] | None = None,
+    timeout_s: float = 7200.0,
+) -> list[T]:
+    """Call a function for each task's arguments, ``jobs`` at once; with more than one job, each in its own process.
+
+    Args:
+        function: of a module, so that other processes find it.
+        tasks: positional arguments of each call.
+        jobs: calls in parallel.
+        prepare: called first in each process.
+        on_result: called with each result as it arrives.
+        timeout_s: for all calls.
+
+    Returns:
+        Results in the order of completion.
+
+    Raises:
+        ValueError: ``jobs`` is less than 1.
+        TimeoutError: the calls took longer than ``timeout_s``.
+        RuntimeError: a process died.
+    """
+    if jobs < 1:
+        raise ValueError(f"jobs must be at least 1 (got {jobs})")
+    results: list[T] = []
+
+    def take(result: T) -> None:
+        results.append(result)
+        if on_result is not None:
+            on_result(result)
+
+    def late() -> TimeoutError:
+        return TimeoutError(f"it took longer than {timeout_s:.0f} s; {len(results)} of {len(tasks)} are done")
+
+    if jobs == 1 or len(tasks) <= 1:
+        began = time.monotonic()
+        if tasks:
+            prepare()
+        for task in tasks:
+            if time.monotonic() - began > timeout_s:
+                raise late()
+            take(function(*task))
+        return results
+    with process_pool(min(jobs, len(tasks)), prepare) as pool:
+        try:
+            futures = [pool.submit(function, *task) for task in tasks]
+            for future in as_completed(futures, timeout=timeout_s):
+                take(future.result())
+        except BrokenProcessPool as error:
+            raise RuntimeError("a process died (out of memory?); try --jobs 1") from error
+        except TimeoutError as error:
+            raise late() from error
+    return results
 
 
 def _wait_until_gone(processes: list[SpawnProcess]) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import teleop_figures as figures
-from instant_ic.experiments.processes import process_pool
+from instant_ic.experiments.processes import run_all
 from instant_ic.experiments.teleop_figures import Drive, Switch
 from instant_ic.experiments.teleop_operator import Operator, Sight, make_operator, read_commands
 from instant_ic.experiments.teleop_results import in_order
@@ -64,7 +64,9 @@ class _Episode:
         self.drive = Drive(index, method, way_m=course.way_m)
         log = read_commands(settings.log) if settings.log is not None else None
         self.recorded = log is not None
-        self.operator: Operator = make_operator(course.goals, lambda: floor_plan(course.world), log)
+        self.operator: Operator = make_operator(
+            course.goals, lambda: floor_plan(course.world), log, settings.manner, seed
+        )
         per_obstacle = 20.0 * len(course.obstacles)
         self.limit_s = READY_S + (log[-1, 0] + 20.0 if log is not None else 20.0 + 4.0 * course.way_m + per_obstacle)
         self.stack = make_stack(course.world, config)
@@ -222,41 +224,16 @@ def evaluate(
         TimeoutError: the drives took longer than ``timeout_s``.
         RuntimeError: a process died, or a stack did not become ready.
     """
-    from concurrent.futures import as_completed
-    from concurrent.futures.process import BrokenProcessPool
-
-    if jobs < 1:
-        raise ValueError(f"jobs must be at least 1 (got {jobs})")
     if settings.log is not None:
         read_commands(settings.log)  # fail before anything is started
-    drives = list(done)
-    known = {(drive.index, drive.method) for drive in drives}
-    tasks = [(i, name) for i in range(settings.episodes) for name in settings.methods if (i, name) not in known]
-    began = time.monotonic()
+    known = {(drive.index, drive.method) for drive in done}
+    tasks = [(settings, i, name) for i in range(settings.episodes) for name in settings.methods]
+    tasks = [task for task in tasks if task[1:] not in known]
+    return in_order([*done, *run_all(_drive, tasks, jobs, prepare, on_drive, timeout_s)])
 
-    def take(drive: Drive) -> None:
-        drives.append(drive)
-        if on_drive is not None:
-            on_drive(drive)
 
-    late = f"the drives took longer than {timeout_s:.0f} s"
-    if jobs == 1 or len(tasks) <= 1:
-        prepare()
-        for index, name in tasks:
-            if time.monotonic() - began > timeout_s:
-                raise TimeoutError(late)
-            take(run_episode(settings, index, methods=(name,))[0])
-        return in_order(drives)
-    with process_pool(min(jobs, len(tasks)), prepare) as pool:
-        try:
-            futures = [pool.submit(run_episode, settings, index, None, (name,)) for index, name in tasks]
-            for future in as_completed(futures, timeout=timeout_s):
-                take(future.result()[0])
-        except BrokenProcessPool as error:
-            raise RuntimeError("a process that drove a course died (out of memory?); try --jobs 1") from error
-        except TimeoutError as error:
-            raise TimeoutError(late) from error
-    return in_order(drives)
+def _drive(settings: TeleopSettings, index: int, method: str) -> Drive:
+    return run_episode(settings, index, methods=(method,))[0]
 
 
 __all__ = ["Drive", "TeleopSettings", "evaluate", "run_episode"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,6 +80,7 @@ class ScriptedOperator:
 
     def __init__(self, goals: FloatArray, plan: OccupancyMask) -> None:
         self.goals, self.plan = goals, plan
+        self.notices_s = NOTICES_S
         self.at = 0
         self.detours = 0
         self.done = self.gave_up = False
@@ -129,7 +131,7 @@ class ScriptedOperator:
             self._held_since = None
         elif self._held_since is None:
             self._held_since = sight.time_s
-        elif sight.time_s - self._held_since > NOTICES_S:
+        elif sight.time_s - self._held_since > self.notices_s:
             self._held_since = None
             self._held_at.append(sight.robot[:2].copy())
             self.detours += 1
@@ -145,6 +147,56 @@ class ScriptedOperator:
         ways = (route(self.plan, sight.robot, self.goals[self.at :], spare) for spare in HUMAN_SPARE_M)
         self._route = next((way for way in ways if way is not None), None)
         return 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class Manner:
+    """How an operator differs from the scripted one.
+
+    Attributes:
+        speed: share of the forward speed.
+        delay_s: from what is seen to the command.
+        noise: standard deviation of both speeds, as a share of full speed; it lasts about half a second.
+        notices_s: time without motion under a command after which the operator looks for the reason.
+    """
+
+    speed: float = 1.0
+    delay_s: float = 0.0
+    noise: float = 0.0
+    notices_s: float = NOTICES_S
+
+
+MANNERS = {
+    "plain": Manner(),
+    "cautious": Manner(speed=0.5, notices_s=3.0),
+    "hasty": Manner(notices_s=0.4),
+    "late": Manner(delay_s=0.5),
+    "noisy": Manner(noise=0.15),
+}
+
+
+class ManneredOperator(ScriptedOperator):
+    """The scripted operator with a manner; the same seed gives the same commands."""
+
+    def __init__(self, goals: FloatArray, plan: OccupancyMask, manner: Manner, seed: int) -> None:
+        super().__init__(goals, plan)
+        self.manner, self.notices_s = manner, manner.notices_s
+        self._rng, self._noise = np.random.default_rng([83, seed]), np.zeros(2)
+        self._waiting: deque[tuple[float, Twist2]] = deque()
+        self._now: Twist2 = (0.0, 0.0)
+
+    def command(self, sight: Sight) -> Twist2:
+        """Return the command for the view of ``delay_s`` ago."""
+        linear, angular = super().command(sight)
+        self._noise = 0.9 * self._noise + self.manner.noise * math.sqrt(0.19) * self._rng.normal(size=2)
+        if linear or angular:
+            angular += float(self._noise[1]) * TURN_RAD_S
+            linear *= self.manner.speed if linear > 0 else 1.0
+            linear += float(self._noise[0]) * CRUISE_M_S if linear else 0.0
+        self._waiting.append((sight.time_s + self.manner.delay_s, (linear, angular)))
+        while self._waiting and self._waiting[0][0] <= sight.time_s + 1e-9:
+            self._now = self._waiting.popleft()[1]
+        return self._now
 
 
 class RecordedOperator:
@@ -245,9 +297,11 @@ def _read_bag(path: Path) -> list[Sequence[float]]:
     return rows
 
 
-def make_operator(goals: FloatArray, plan: Callable[[], OccupancyMask], log: FloatArray | None) -> Operator:
-    """The recorded operator if there is a log, else the scripted one."""
-    return ScriptedOperator(goals, plan()) if log is None else RecordedOperator(log)
+def make_operator(
+    goals: FloatArray, plan: Callable[[], OccupancyMask], log: FloatArray | None, manner: str = "plain", seed: int = 0
+) -> Operator:
+    """The recorded operator if there is a log, else the scripted one with a manner of ``MANNERS``."""
+    return ManneredOperator(goals, plan(), MANNERS[manner], seed) if log is None else RecordedOperator(log)
 
 
 def _far(a: FloatArray, b: FloatArray) -> float:

@@ -216,7 +216,7 @@ class Video:
         self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, size)
         if not self._writer.isOpened():
             raise ValueError(f"{path}: the video cannot be written")
-        self._map: _Map | None = None
+        self._map: PlanImage | None = None
         self._next_s = 0.0
         self.pictures = 0
 
@@ -235,31 +235,33 @@ class Video:
             return
         self._next_s = stack.time_s + 1.0 / FPS - 1e-6
         if self._map is None:
-            self._map = _Map(floor_plan(stack.simulation.world, 0.05))
-        self._writer.write(np.hstack([self._picture(stack), self._map.draw(stack)]))
+            self._map = PlanImage(floor_plan(stack.simulation.world, 0.05))
+        self._writer.write(np.hstack([operator_image(stack), self._map.draw(stack)]))
         self.pictures += 1
 
-    def _picture(self, stack: SimulatedStack) -> NDArray[np.uint8]:
-        import cv2
 
-        shown = stack.log.pictures[-1]
-        if shown.virtual:
-            rgb = decode(shown.jpeg)
-        else:
-            rgb = photograph(stack, shown, *_PICTURE, math.pi / 2)
-        frame = np.ascontiguousarray(cv2.resize(rgb, _PICTURE)[..., ::-1])
-        mode = Mode(stack.log.mode[-1]).name
-        for words, top in (
-            (f"{'virtual space' if shown.virtual else 'camera'}  ({mode})", 0),
-            (stack.log.reason[-1], 334),
-        ):
-            frame[top : top + 26] //= 2
-            at = (10, top + 18)
-            cv2.putText(frame, words[:80], at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-        return frame
+def operator_image(stack: SimulatedStack) -> NDArray[np.uint8]:
+    """What the operator sees, with mode and reason, (360, 640, 3) BGR."""
+    import cv2
+
+    shown = stack.log.pictures[-1]
+    if shown.virtual:
+        rgb = decode(shown.jpeg)
+    else:
+        rgb = photograph(stack, shown, *_PICTURE, math.pi / 2)
+    frame = np.ascontiguousarray(cv2.resize(rgb, _PICTURE)[..., ::-1])
+    mode = Mode(stack.log.mode[-1]).name
+    for words, top in (
+        (f"{'virtual space' if shown.virtual else 'camera'}  ({mode})", 0),
+        (stack.log.reason[-1], 334),
+    ):
+        frame[top : top + 26] //= 2
+        at = (10, top + 18)
+        cv2.putText(frame, words[:80], at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return frame
 
 
-class _Map:
+class PlanImage:
     """The floor plan scaled to a square, with the robots on it (BGR)."""
 
     def __init__(self, plan: OccupancyMask) -> None:
@@ -296,4 +298,4 @@ class _Map:
         return frame
 
 
-__all__ = ["FPS", "Video", "save_plot"]
+__all__ = ["FPS", "PlanImage", "Video", "operator_image", "save_plot"]

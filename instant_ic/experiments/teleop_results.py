@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from instant_ic.experiments import teleop_figures as figures
+from instant_ic.experiments.results import finite, save_text
 from instant_ic.experiments.teleop_figures import Drive, Switch
 from instant_ic.experiments.teleop_settings import TeleopSettings
 from instant_ic.experiments.teleop_stack import METHODS
@@ -26,9 +26,9 @@ def report(drives: Sequence[Drive], settings: TeleopSettings) -> dict[str, Any]:
         **_conditions(settings),
         "drives": len(drives),
         "drives_planned": settings.episodes * len(settings.methods),
-        "methods": _finite(methods),
+        "methods": finite(methods),
         "targets": figures.targets(methods["ic"]) if "ic" in methods else {},
-        "each": _finite(rows),
+        "each": finite(rows),
     }
 
 
@@ -37,12 +37,7 @@ def save(path: Path, drives: Sequence[Drive], settings: TeleopSettings) -> None:
     text = json.dumps(report(drives, settings), indent=2)
     # Tracks are long: one line each.
     rows = (f"    {json.dumps([d.index, d.method, d.tracks], separators=(',', ':'))}" for d in drives)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(text.removesuffix("\n}") + ',\n  "tracks": [\n' + ",\n".join(rows) + "\n  ]\n}\n")
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    save_text(path, text.removesuffix("\n}") + ',\n  "tracks": [\n' + ",\n".join(rows) + "\n  ]\n}\n")
 
 
 def load(path: Path, settings: TeleopSettings) -> list[Drive]:
@@ -92,11 +87,3 @@ def _conditions(settings: TeleopSettings) -> dict[str, Any]:
 def _with_nan(row: dict[str, Any]) -> dict[str, Any]:
     """Convert null, JSON's value for unknown, back to NaN."""
     return {key: math.nan if value is None and key != "psnr_db" else value for key, value in row.items()}
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -6,6 +6,7 @@ import functools
 from dataclasses import dataclass
 from pathlib import Path
 
+from instant_ic.experiments.teleop_operator import MANNERS
 from instant_ic.experiments.teleop_stack import DEPTHS, METHODS, StackConfig
 from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS, Course, make_course
 
@@ -22,6 +23,7 @@ class TeleopSettings:
         log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
         pictures: whether to render and compare the images on either side of a switch.
         overrides: parameters ``node.key:=value`` on top of the shipped ones.
+        manner: of the scripted operator, of ``MANNERS``.
     """
 
     episodes: int = 50
@@ -32,11 +34,16 @@ class TeleopSettings:
     log: Path | None = None
     pictures: bool = True
     overrides: tuple[str, ...] = ()
+    manner: str = "plain"
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
-        for key, given, allowed in (("methods", self.methods, METHODS), ("depth", (self.depth,), DEPTHS)):
+        for key, given, allowed in (
+            ("methods", self.methods, METHODS),
+            ("depth", (self.depth,), DEPTHS),
+            ("manner", (self.manner,), tuple(MANNERS)),
+        ):
             unknown = [name for name in given if name not in allowed]
             if unknown or not given:
                 raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 
 from instant_ic.experiments.vspace_sources import (
     CAMERA_HEIGHT_M,
+    KEYFRAMES,
     Drawer,
     Picture,
-    Shot,
+    Place,
     VspaceSettings,
     depth_figures,
     field_alone,
     make_source,
     make_space,
+    paper_config,
     take_shot,
     train,
 )
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
 
 CLEARANCE_M = 0.3
 _RADII_M = (2.5, 4.0, 6.0, 10.0, 16.0)
-_STRIP_AT_M = (0.5, 1.0, 2.0, 3.0)
+STRIP_AT_M = (0.5, 1.0, 2.0, 3.0)
 
 
 @dataclass(frozen=True)
@@ -50,82 +52,13 @@ class Row:
 
 
 @dataclass
-class Report:
-    """Result of ``evaluate``."""
+class Comparison:
+    """Result of ``compare``: the rows, and images by path, distance and source (``truth`` among the sources)."""
 
-    world: str
     start: tuple[float, float, float]
-    settings: VspaceSettings
-    depth: dict[str, Any]
+    depth: dict[str, Any] = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)
-    training: list[Row] = field(default_factory=list)
-    """``ours`` and ``field`` at the panorama (distance 0) and 1 m ahead by training time, on the first path."""
     strips: dict[str, dict[float, dict[str, Picture]]] = field(default_factory=dict)
-    """Path → distance → source → image; ``truth`` among the sources."""
-
-    def figures(self) -> dict[str, Any]:
-        """Figures for JSON."""
-        return {
-            "world": self.world,
-            "start": list(self.start),
-            "settings": asdict(self.settings),
-            "metrics": "PSNR over all channels; SSIM of Wang et al.: Gaussian window, sigma 1.5, K 0.01 and 0.03, mean "
-            "over channels; truth is supersampled 3 x 3",
-            "depth": self.depth,
-            "rows": [asdict(row) for row in self.rows],
-            "training": [asdict(row) for row in self.training],
-            "mean": self.means(),
-            "verdict": self.verdict(),
-        }
-
-    def table(self, key: str) -> dict[str, dict[str, dict[float, float]]]:
-        """Path → source → distance → value."""
-        table: dict[str, dict[str, dict[float, float]]] = {}
-        for row in self.rows:
-            table.setdefault(row.path, {}).setdefault(row.source, {})[row.distance_m] = getattr(row, key)
-        return table
-
-    def means(self) -> dict[str, dict[str, dict[str, float]]]:
-        """Path → source → mean of PSNR and SSIM from 0.25 m on (at the panorama itself every source is good)."""
-        result: dict[str, dict[str, dict[str, float]]] = {}
-        for key in ("psnr_db", "ssim"):
-            for path, sources in self.table(key).items():
-                for source, values in sources.items():
-                    away = [value for distance, value in values.items() if distance > 0]
-                    if away:
-                        mean = round(float(np.mean(away)), 4)
-                        result.setdefault(path, {}).setdefault(source, {})[key] = mean
-        return result
-
-    def verdict(self) -> dict[str, Any]:
-        """Target check: ``ours`` against the simpler sources at every distance from 0.25 to 2 m, and the warps."""
-        result: dict[str, Any] = {}
-        simpler, warps = ("no-depth", "no-scale", "panorama"), ("depth-warp", "point-warp")
-        for path in self.settings.paths:
-            entry: dict[str, Any] = {}
-            psnr, ssim = self.table("psnr_db").get(path, {}), self.table("ssim").get(path, {})
-            if "ours" not in psnr:
-                continue
-            for other in (name for name in simpler if name in psnr):
-                near = [d for d in psnr["ours"] if 0.25 <= d <= 2.0]
-                worse = [d for d in near if not (psnr["ours"][d] > psnr[other][d] and ssim["ours"][d] > ssim[other][d])]
-                entry[f"beats {other} from 0.25 to 2 m"] = {"met": bool(near) and not worse, "not at_m": worse}
-            present = [name for name in warps if name in psnr]
-            away = [d for d in psnr["ours"] if d > 0]
-            if present and away:
-                worst = min(psnr["ours"][d] - max(psnr[name][d] for name in present) for d in away)
-                means = self.means()[path]
-                gain, gain_ssim = (
-                    means["ours"][key] - max(means[name][key] for name in present) for key in ("psnr_db", "ssim")
-                )
-                entry["against the better warp"] = {
-                    "mean_db": round(gain, 2),
-                    "worst_db": round(worst, 2),
-                    "mean_ssim": round(gain_ssim, 4),
-                    "met": bool(gain >= 0 and gain_ssim >= 0 and worst >= -1),
-                }
-            result[path] = entry
-        return result
 
 
 def path_poses(world: World, start: tuple[float, float, float], path: str, distances: Iterable[float]) -> list[Any]:
@@ -165,8 +98,8 @@ def path_poses(world: World, start: tuple[float, float, float], path: str, dista
     return max((along(side / radius) for radius in _RADII_M for side in (1, -1)), key=len)
 
 
-def start_pose(world: World, start: tuple[float, float, float] | None) -> tuple[float, float, float]:
-    """The given start, or the world's own, rotated to where the straight path is longest.
+def start_pose(world: World, start: tuple[float, float, float] | None, seed: int = 0) -> tuple[float, float, float]:
+    """The given start, or the world's own; with a seed above 0 a random free one; rotated to the longest straight path.
 
     Raises:
         ValueError: the start is not free.
@@ -177,13 +110,44 @@ def start_pose(world: World, start: tuple[float, float, float] | None) -> tuple[
                 f"start {start[0]:g},{start[1]:g} is not {CLEARANCE_M} m clear of everything: choose another"
             )
         return start
-    x, y, yaw = world.spawn
-    candidates = [(x, y, yaw + k * math.pi / 4) for k in range(8)]
+    places = [world.spawn]
+    if seed:
+        places = [tuple(pose) for pose in world.sample_free_poses(np.random.default_rng([79, seed]), 4, 0.5).tolist()]
+    candidates = [(x, y, yaw + k * math.pi / 4) for x, y, yaw in places for k in range(8)]
     steps = np.arange(0, 4.01, 0.25)
     best = max(candidates, key=lambda pose: len(path_poses(world, pose, "straight", steps)))
     if not path_poses(world, best, "straight", [0.0]):
-        raise ValueError(f"the world's own start ({x:g}, {y:g}) is not free: give --start x,y,yaw")
+        raise ValueError(f"the world's own start ({best[0]:g}, {best[1]:g}) is not free: choose another world")
     return best
+
+
+def make_place(
+    world: str,
+    settings: VspaceSettings,
+    start: tuple[float, float, float] | None = None,
+    config: VirtualSpaceConfig | None = None,
+) -> Place:
+    """Make what the sources need.
+
+    Raises:
+        ValueError: world or start is invalid.
+    """
+    from instant_ic import paths
+    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+    from instant_ic.sim.render import EquirectRenderer
+    from instant_ic.sim.worlds import make_world
+    from instant_ic.vspace import VirtualSpaceConfig
+    from instant_ic.vspace.warm_up import warm_up
+
+    made = make_world(world)
+    config = config or VirtualSpaceConfig(source="auto", panorama_width=settings.panorama_width)
+    warm_up(config)
+    model = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1)
+    # When the place was scanned, the obstacle was not there yet.
+    before = (
+        made if world.partition(":")[0] != "corridor" else make_world(world.replace("corridor", "corridor-free", 1))
+    )
+    return Place(made, before, EquirectRenderer(made), start_pose(made, start, settings.start_seed), config, model)
 
 
 def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
@@ -191,101 +155,82 @@ def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
     return min(psnr_db(picture, truth), 99.0), ssim(picture, truth)
 
 
-def evaluate(
+def compare(
     world: str,
     settings: VspaceSettings,
     start: tuple[float, float, float] | None = None,
-    tell: Callable[[str, int, int], None] = lambda words, done, total: None,
     config: VirtualSpaceConfig | None = None,
-) -> Report:
-    """Run the evaluation.
+) -> Comparison:
+    """Compare the views of each source with the world's own along each path.
 
     Args:
         world: as for ``sim.worlds.make_world``.
+        settings: of the comparison.
         start: (x, y, yaw) of the last panorama; None: the world's own start.
-        tell: called with the current activity, the number of finished images and their total.
         config: of the virtual space.
 
     Raises:
         ValueError: world, start or a setting is invalid, or the depth of a panorama cannot be scaled.
     """
-    from instant_ic import paths as places
-    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-    from instant_ic.sim.render import EquirectRenderer
-    from instant_ic.sim.worlds import make_world
-    from instant_ic.vspace import VirtualSpaceConfig
-    from instant_ic.vspace.warm_up import warm_up
-
-    tell(f"world {world}", 0, 1)
-    made = make_world(world)
-    renderer = EquirectRenderer(made)
-    start = start_pose(made, start)
-    config = config or VirtualSpaceConfig(device="cpu", panorama_width=max(settings.panorama_width, 64))
-    config = replace(config, keyframes=settings.keyframes)
-    model = DepthModel.load(places.shipped_file("models", DEFAULT_MODEL), threads=1)
-    warm_up(config)
+    place = make_place(world, settings, start, config)
+    comparison = Comparison(place.start)
     width, height = settings.size
     fov = math.radians(settings.fov_deg)
-    routes = {path: path_poses(made, start, path, settings.distances_m) for path in settings.paths}
-    total = sum(len(poses) for poses in routes.values()) * len(settings.sources)
-    report = Report(world, start, settings, {})
-    shots_of: dict[str, list[Shot]] = {}
-    for path in settings.paths:
-        # The path must also be free behind the start; where it ends, fewer keyframes are taken, and the report states
-        # it.
-        back = path_poses(made, start, path, [-float(k) for k in range(settings.keyframes)])
-        shots_of[path] = (
-            next(iter(shots_of.values()))
-            if settings.keyframes == 1 and shots_of
-            else [take_shot(renderer, pose, settings, model) for pose in reversed(back)]
-        )
-        report.depth[path] = depth_figures(shots_of[path])
-
-    def before() -> World:
-        return make_world(world.replace("corridor", "corridor-free", 1)) if _has_obstacle(world) else made
-
-    truths = {
-        path: [renderer.render_perspective(pose, width, height, fov, supersample=3).rgb for pose in poses]
-        for path, poses in routes.items()
-    }
     ready: dict[str, tuple[Drawer, float]] = {}
-    done = 0
-    for source in settings.sources:
-        for path, poses in routes.items():
-            tell(f"{source}, {path}", done, total)
-            if source not in ready or settings.keyframes > 1:
-                ready[source] = make_source(source, shots_of[path], settings, config, before)
+    for path in settings.paths:
+        # The path must also be free behind the start; where it ends, fewer keyframes are taken.
+        keyframes = max(KEYFRAMES.get(source, 1) for source in settings.sources)
+        back = path_poses(place.world, place.start, path, [-float(k) for k in range(keyframes)])
+        shots = [take_shot(place.renderer, pose, settings, place.model) for pose in reversed(back)]
+        comparison.depth[path] = depth_figures(shots)
+        poses = path_poses(place.world, place.start, path, settings.distances_m)
+        truths = [place.renderer.render_perspective(pose, width, height, fov, supersample=3).rgb for pose in poses]
+        for source in settings.sources:
+            if source not in ready or keyframes > 1:  # the last panorama alone is the same on all paths
+                ready[source] = make_source(source, shots, settings, place)
             draw, seconds = ready[source]
-            for distance, pose, truth in zip(settings.distances_m, poses, truths[path], strict=False):
+            for distance, pose, truth in zip(settings.distances_m, poses, truths, strict=False):
                 picture, confidence = draw(pose, width, height, fov)
-                report.rows.append(_row(path, source, distance, picture, truth, seconds, confidence))
-                if distance in _STRIP_AT_M:
-                    strip = report.strips.setdefault(path, {}).setdefault(distance, {"truth": truth})
+                comparison.rows.append(_row(path, source, distance, picture, truth, seconds, confidence))
+                if distance in STRIP_AT_M:
+                    strip = comparison.strips.setdefault(path, {}).setdefault(distance, {"truth": truth})
                     strip[source] = picture
-                done += 1
-                tell(f"{source}, {path}, {distance:g} m", done, total)
-        ready.pop(source, None)
-    if settings.times:
-        path = settings.paths[0]
-        space = make_space(shots_of[path], "scaled", settings, config)
-        spent = 0.0
-        for seconds in sorted(settings.times):
-            tell(f"ours after {seconds:g} s", done, total)
+    return comparison
+
+
+def converge(
+    world: str,
+    settings: VspaceSettings,
+    times_s: Sequence[float],
+    start: tuple[float, float, float] | None = None,
+    config: VirtualSpaceConfig | None = None,
+) -> list[Row]:
+    """Views at the panorama and 1 m ahead by training time: ``ours`` as shown, its ``field`` alone, and ``paper``.
+
+    Args: as ``compare``; ``times_s`` are CPU seconds.
+    """
+    place = make_place(world, settings, start, config)
+    width, height = settings.size
+    fov = math.radians(settings.fov_deg)
+    poses = path_poses(place.world, place.start, "straight", (0.0, 1.0))
+    truths = [place.renderer.render_perspective(pose, width, height, fov, supersample=3).rgb for pose in poses]
+    shots = [take_shot(place.renderer, poses[0], settings, place.model)]
+    rows = []
+    trained = replace(place.config, source="field")
+    for name, shown_as in (("ours", ("ours", "field")), ("paper", ("paper",))):
+        own = paper_config(trained) if name == "paper" else trained
+        space, spent = make_space(shots, name, settings, own), 0.0
+        for seconds in sorted(times_s):
             train(space, seconds - spent)
             spent = seconds
-            for distance, pose, truth in zip(settings.distances_m, routes[path], truths[path], strict=False):
-                if distance in (0.0, 1.0):
-                    for source, shown in (("ours", config), ("field", field_alone(config))):
-                        space.config = shown
-                        view = space.render(pose, width, height, fov)
-                        confidence = float(view.confidence.mean())
-                        report.training.append(_row(path, source, distance, view.rgb, truth, seconds, confidence))
-            space.config = config
-    return report
-
-
-def _has_obstacle(world: str) -> bool:
-    return world.partition(":")[0] == "corridor"
+            for source in shown_as:
+                space.config = field_alone(own) if source == "field" else own
+                for distance, pose, truth in zip((0.0, 1.0), poses, truths, strict=False):
+                    view = space.render(pose, width, height, fov)
+                    confidence = float(view.confidence.mean())
+                    rows.append(_row("straight", source, distance, view.rgb, truth, seconds, confidence))
+            space.config = own
+    return rows
 
 
 def _row(

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.experiments.scan import QUALITIES, ScanQuality, aged, scan_world
+
 if TYPE_CHECKING:
     from instant_ic.depth.sources import DepthResult
     from instant_ic.sim.render import EquirectRenderer
@@ -24,12 +26,19 @@ SOURCES = {
     "true-depth": "the same with the world's own depth: the ceiling",
     "no-depth": "field trained from colours alone (paper: -depth)",
     "no-scale": "the model's depth as it comes, not scaled (paper: -scale)",
+    "older": "ours with two older keyframes behind it, a metre apart, for what is hidden from the newest",
+    "exact-fill": "true depth, and the truth where no keyframe has seen the place",
+    "paper": "the paper's choices: density field alone, six cube faces, depth scaled by the 99.5 % maxima",
+    "paper-no-scale": "the same, depth not scaled",
     "panorama": "the panorama turned, without depth",
     "depth-warp": "the panorama warped by the depth of `ours`, as a mesh",
     "point-warp": "the same as points",
     "true-warp": "mesh warp by the world's own depth",
-    "mesh": "conventional IC: the world scanned beforehand; obstacle not there yet, colours changed",
+    "mesh": "conventional IC with a perfect scan: exact geometry, obstacle not there yet, colours fitted",
+    **{name: f"conventional IC with a real scan: {name}" for name in QUALITIES},
 }
+KEYFRAMES = {"older": 3}
+"""Number of panoramas of the sources that have several."""
 Picture = NDArray[np.uint8]
 CAMERA_HEIGHT_M, LIDAR_HEIGHT_M = 1.2, 0.6
 Drawer: TypeAlias = Callable[[NDArray[np.float64], int, int, float], tuple[Picture, float]]
@@ -43,37 +52,33 @@ class VspaceSettings:
     Attributes:
         paths: of ``PATHS``; sources: of ``SOURCES``.
         seconds: CPU seconds of training.
-        times: training times, CPU seconds, at which ``ours`` and ``field`` are measured at the panorama and 1 m ahead.
         size: width and height of the views; fov_deg: their horizontal field of view.
         panorama_width: of the keyframes, pixels.
-        keyframes: 1, or more, each a metre behind the next on the path.
         step_m, reach_m: distances from the last panorama are multiples of ``step_m`` up to ``reach_m``.
-        seed: of LiDAR noise, training and the changed colours.
+        seed: of LiDAR noise, training, scans and changed colours.
+        start_seed: above 0: of a random start instead of the world's own.
     """
 
     paths: tuple[str, ...] = PATHS
     sources: tuple[str, ...] = ("ours", "no-depth", "no-scale", "panorama", "depth-warp", "mesh")
     seconds: float = 8.0
-    times: tuple[float, ...] = ()
     size: tuple[int, int] = (640, 360)
     fov_deg: float = 90.0
     panorama_width: int = 2048
-    keyframes: int = 1
     step_m: float = 0.25
     reach_m: float = 4.0
     seed: int = 0
+    start_seed: int = 0
 
     def __post_init__(self) -> None:
         for key, allowed in (("paths", PATHS), ("sources", tuple(SOURCES))):
             unknown = [name for name in getattr(self, key) if name not in allowed]
             if unknown or not getattr(self, key):
                 raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
-        if not (self.seconds > 0 and all(t > 0 for t in self.times)):
-            raise ValueError("seconds and times must be > 0")
+        if not self.seconds > 0:
+            raise ValueError(f"seconds must be > 0 (got {self.seconds:g})")
         if not (0 < self.step_m <= self.reach_m <= 20):
             raise ValueError(f"distances must be 0 < step <= reach <= 20 m (got {self.step_m:g}, {self.reach_m:g})")
-        if not 1 <= self.keyframes <= 8:
-            raise ValueError(f"keyframes must be 1 to 8 (got {self.keyframes})")
         if not 64 <= self.panorama_width <= 8192 or self.panorama_width % 8:
             raise ValueError(f"panorama width must be 64 to 8192, a multiple of 8 (got {self.panorama_width})")
         if not 1 <= self.fov_deg < 170:
@@ -93,6 +98,20 @@ class Shot:
     true_depth_m: NDArray[np.float32]
     raw: NDArray[np.float32]
     result: DepthResult
+    range_m: NDArray[np.floating]
+    """LiDAR ranges, (N,)."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A world, the world before the obstacle came, and what the sources share."""
+
+    world: World
+    before: World
+    renderer: EquirectRenderer
+    start: tuple[float, float, float]
+    config: VirtualSpaceConfig
+    model: Any
 
 
 def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: VspaceSettings, model: Any) -> Shot:
@@ -113,15 +132,7 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
         raise ValueError(
             f"depth of the panorama at ({pose[0, 3]:.2f}, {pose[1, 3]:.2f}) cannot be scaled: {result.message}"
         )
-    return Shot(pose, rgb, true, raw, result)
-
-
-def scanned(world: World, seed: int) -> World:
-    """The world as scanned at another time: with different exposure and white balance, and drift per texture."""
-    rng = np.random.default_rng([71, seed])
-    drift = np.exp(rng.normal(0, 0.12, (int(world.texture.max()) + 1, 3)))[world.texture]
-    tint = world.tint * drift * (0.85 * np.array([1.08, 1.0, 0.88]))
-    return replace(world, tint=tint.astype(np.float32), emission=world.emission * np.float32(0.85))
+    return Shot(pose, rgb, true, raw, result, np.linalg.norm(points, axis=1))
 
 
 def train(space: Any, cpu_seconds: float) -> None:
@@ -162,22 +173,50 @@ def point_warp(
     return np.clip(np.rint(filled), 0, 255).astype(np.uint8), float(seen.mean())
 
 
-def make_space(shots: list[Shot], depth: str, settings: VspaceSettings, config: VirtualSpaceConfig) -> Any:
-    """A virtual space with the keyframes, oldest first, using ``scaled``, ``raw`` or ``true`` depth.
+def paper_config(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
+    """The paper's field: a density, shown alone."""
+    return field_alone(replace(config, field=replace(config.field, geometry="density"), keyframes=1, older=0))
+
+
+def through_cube(rgb: Picture) -> Picture:
+    """A panorama (H, 2 H, 3) as six perspective images of 90° show it, a quarter of its width each."""
+    import cv2
+
+    from instant_ic.geometry.projections import CUBE_FACES, equirect_directions, equirect_to_cube
+
+    size = rgb.shape[1] // 4
+    directions, image = equirect_directions(rgb.shape[1], rgb.shape[0]), np.zeros_like(rgb)
+    for face, rotation in zip(equirect_to_cube(rgb, size), CUBE_FACES.values(), strict=True):
+        x, y, z = np.moveaxis(directions @ rotation.astype(np.float32), -1, 0)
+        here = x >= np.maximum(np.abs(y), np.abs(z)) - 1e-6
+        ahead = np.where(here, x, 1)
+        u, v = ((0.5 * size * (1 - side / ahead) - 0.5).astype(np.float32) for side in (y, z))
+        sampled = cv2.remap(face, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        image[here] = np.clip(np.rint(sampled), 0, 255)[here]
+    return image
+
+
+def make_space(shots: list[Shot], source: str, settings: VspaceSettings, config: VirtualSpaceConfig) -> Any:
+    """A virtual space with the keyframes, oldest first, with the images and depth of a source.
 
     The last keyframe is untrained. The others are trained until they are ready, as during a drive (at most
     ``settings.seconds``).
     """
+    from instant_ic.depth.scale_rules import solid_angle_quantile
     from instant_ic.vspace import VirtualSpace
 
     space = VirtualSpace(config)
     for number, shot in enumerate(shots):
-        if depth == "scaled":
-            space.set_keyframe(shot.rgb, shot.result.depth_m, shot.pose, shot.result.sigma)
-        elif depth == "raw":
-            space.set_keyframe(shot.rgb, shot.raw, shot.pose, shot.result.relative_sigma)
+        rgb = through_cube(shot.rgb) if source.startswith("paper") else shot.rgb
+        if source in ("no-scale", "paper-no-scale"):
+            space.set_keyframe(rgb, shot.raw, shot.pose, shot.result.relative_sigma)
+        elif source == "paper":
+            scale = np.quantile(shot.range_m, 0.995) / solid_angle_quantile(shot.raw, 0.995)
+            space.set_keyframe(rgb, shot.raw * np.float32(scale), shot.pose, shot.result.relative_sigma)
+        elif source in ("true-depth", "exact-fill"):
+            space.set_keyframe(rgb, shot.true_depth_m, shot.pose, 0.02)
         else:
-            space.set_keyframe(shot.rgb, shot.true_depth_m, shot.pose, 0.02)
+            space.set_keyframe(rgb, shot.result.depth_m, shot.pose, shot.result.sigma)
         if number < len(shots) - 1:
             start = time.process_time()
             while not space.status.ready_iterations and time.process_time() - start < settings.seconds:
@@ -187,19 +226,14 @@ def make_space(shots: list[Shot], depth: str, settings: VspaceSettings, config: 
 
 def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
     """The same configuration, but rendering the field however little it is trained."""
-    return replace(config, picture=replace(config.picture, field_alone=True))
+    return replace(config, source="field", picture=replace(config.picture, field_alone=True))
 
 
-def make_source(
-    name: str, shots: list[Shot], settings: VspaceSettings, config: VirtualSpaceConfig, before: Callable[[], World]
-) -> tuple[Drawer, float]:
-    """Prepare a source; return its renderer and the CPU seconds spent.
-
-    ``before`` returns the world as it was when it was scanned.
-    """
+def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: Place) -> tuple[Drawer, float]:
+    """Prepare a source from keyframes, oldest first; return its renderer and the CPU seconds spent."""
     from instant_ic.vspace.warp import PanoramaWarp
 
-    last = shots[-1]
+    last, config = shots[-1], place.config
     start = time.process_time()
 
     def of_view(drawer: Any) -> Drawer:
@@ -209,24 +243,32 @@ def make_source(
 
         return draw
 
-    if name in ("ours", "field", "no-scale", "true-depth"):
-        depth = {"no-scale": "raw", "true-depth": "true"}.get(name, "scaled")
-        space = make_space(shots, depth, settings, field_alone(config) if name == "field" else config)
+    if name in ("ours", "field", "no-scale", "true-depth", "exact-fill", "older", "paper", "paper-no-scale"):
+        count = KEYFRAMES.get(name, 1)
+        own = paper_config(config) if name.startswith("paper") else field_alone(config) if name == "field" else config
+        space = make_space(shots[-count:], name, settings, own)
         train(space, settings.seconds)
-        return of_view(space), time.process_time() - start
+        draw = of_view(space) if name != "exact-fill" else _exactly_filled(space, place.renderer)
+        return draw, time.process_time() - start
     if name == "no-depth":
         from instant_ic.experiments.colour_only import ColourOnlyField
 
         colours = ColourOnlyField(last.rgb, last.pose, config)
         colours.train(settings.seconds)
         return of_view(colours), time.process_time() - start
+    if name in QUALITIES:
+        return of_view(_scanned_space(QUALITIES[name], last, settings, place)), time.process_time() - start
     if name == "mesh":
         from instant_ic.sim.render import EquirectRenderer
 
-        renderer = EquirectRenderer(scanned(before(), settings.seed))
+        quality = replace(QUALITIES["tripod"], older=0.0)
+        renderer = EquirectRenderer(aged(place.before, quality, np.random.default_rng([73, settings.seed])))
+        truth, aged_view = (one.render(last.pose, 256, 128).rgb / 255 + 1e-3 for one in (place.renderer, renderer))
+        gain = np.median(truth / aged_view, axis=(0, 1))  # as ``MeshSpace`` fits its colours
 
         def draw_mesh(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
-            return renderer.render_perspective(pose, width, height, fov, supersample=2).rgb, 1.0
+            rgb = renderer.render_perspective(pose, width, height, fov, supersample=2).rgb
+            return np.clip(np.rint(rgb * gain), 0, 255).astype(np.uint8), 1.0
 
         return draw_mesh, 0.0
     if name == "point-warp":
@@ -246,6 +288,31 @@ def make_source(
         return warp.render(turned, width, height, fov).rgb, 1.0
 
     return draw_turned, 0.0
+
+
+def _exactly_filled(space: Any, renderer: EquirectRenderer) -> Drawer:
+    def draw(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
+        view, true = space.render(pose, width, height, fov), renderer.render_perspective(pose, width, height, fov)
+        seen = view.confidence > 0
+        return np.where(seen[..., None], view.rgb, true.rgb), float(view.confidence.mean())
+
+    return draw
+
+
+def _scanned_space(quality: ScanQuality, last: Shot, settings: VspaceSettings, place: Place) -> Any:
+    """The stack's own space of a scanned mesh, its colours fitted to the newest keyframe."""
+    import tempfile
+    from pathlib import Path
+
+    from instant_ic.vspace.mesh_space import MeshSpace
+
+    quality = replace(quality, width=min(quality.width, 4 * settings.panorama_width))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scan.glb"
+        scan_world(place.before, place.start, quality, settings.seed, file)
+        space = MeshSpace(replace(place.config, source="mesh", mesh=str(file)))
+    space.set_keyframe(last.rgb, last.result.depth_m, last.pose, last.result.sigma)
+    return space
 
 
 def depth_figures(shots: list[Shot]) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from instant_ic.experiments.illusion_page import PageView, Screen, compose, plac
 from instant_ic.experiments.illusion_plot import save_plot, save_strip
 from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, TRUE_VIEW, FilmedStack, IllusionFrame
 from instant_ic.experiments.illusion_truth import Passage, Score, corners, fog_pixels, score, surfaces, without
+from instant_ic.experiments.results import save_json
 from instant_ic.experiments.teleop_stack import StackConfig
 from instant_ic.experiments.teleop_worlds import Obstacle
 from instant_ic.geometry.image_quality import psnr_db
@@ -229,7 +230,7 @@ def test_a_short_film(corridor: teleop_worlds.Course, tmp_path: Path) -> None:
         assert each["with_obstacle"] == (each["distance_m"] < 0)
         both = each["psnr_with_db"], each["psnr_without_db"]
         assert each["scores"][LIVE]["psnr_db"] == both[0 if each["with_obstacle"] else 1]
-    illusion.save(tmp_path / "film.json", told)
+    save_json(tmp_path / "film.json", told)
     assert json.loads((tmp_path / "film.json").read_text()) == told
     save_strip(tmp_path / "strip.png", [first])
     strip = cv2.imread(str(tmp_path / "strip.png"))

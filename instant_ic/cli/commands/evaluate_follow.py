@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from typing import Any
@@ -26,6 +25,7 @@ def add_kind(kinds: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from instant_ic.experiments import follow
+    from instant_ic.experiments.results import save_json
 
     check_outputs(args)
     contacts = 0
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         episodes = follow.evaluate(args.episodes, args.seed, args.jobs, show_progress, args.timeout)
     figures = follow.report(episodes, args.seed)
     if args.json:
-        args.json.write_text(json.dumps(figures, indent=2) + "\n")
+        save_json(args.json, figures)
     if args.plot:
         follow.plot(episodes, args.seed, args.plot)
     each = figures.pop("each")

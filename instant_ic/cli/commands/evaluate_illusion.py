@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _evaluate(args: argparse.Namespace) -> int:
     from instant_ic.experiments import illusion, illusion_plot
+    from instant_ic.experiments.results import save_json
 
     settings = illusion.TeleopSettings(
         args.episodes, args.seed, args.world, ("ic",), pictures=False, overrides=tuple(args.param)
@@ -59,7 +60,7 @@ def _evaluate(args: argparse.Namespace) -> int:
         films = illusion.evaluate(settings, args.jobs, show_progress, args.timeout)
     figures = illusion.report(films, settings)
     if args.json:
-        illusion.save(args.json, figures)
+        save_json(args.json, figures)
     if args.plot:
         illusion_plot.save_plot(args.plot, figures)
     figures.pop("each")

@@ -1,0 +1,66 @@
+"""V.C, Figs. 6 and 8: what depth, scaling, keyframes and fill contribute, beside the paper's own choices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from instant_ic.experiments.compared import (
+    command_of,
+    curves_and_tables,
+    family,
+    measure_views,
+    series,
+    view_units,
+)
+from instant_ic.experiments.lab import WORLD, Options, Result, Unit
+from instant_ic.experiments.report import Part, Section, Table, Text
+from instant_ic.experiments.vspace_sources import SOURCES
+
+measure = measure_views
+_OURS = ("ours", "older", "no-scale", "no-depth", "depth-warp", "point-warp", "panorama", "true-depth", "exact-fill")
+_PAPER = ("paper", "paper-no-scale", "no-depth", "ours", "depth-warp", "panorama", "true-depth")
+
+
+def units(options: Options) -> list[Unit]:
+    """Straight ahead, as in the paper."""
+    sources = _PAPER if options.method == "paper" else (*_OURS, "paper", "paper-no-scale")
+    return view_units("ablation", options, sources, (WORLD,), ("straight",))
+
+
+def section(results: Sequence[Result], options: Options) -> Section:
+    """Curves, tables, and each source's mean difference from ours."""
+    command = command_of(options, "ablation")
+    parts: list[Part] = [
+        Table("Sources", ("source", "what it is"), [[name, SOURCES[name]] for name in (*_OURS, *_PAPER[:2])]),
+        Text("no-depth is the paper's Ours (-depth), paper-no-scale its Ours (-scale), paper its Ours."),
+    ]
+    verdict: dict[str, bool | None] = {}
+    for name in dict.fromkeys(family(one) for one in results if one.data):
+        means = {key: _means(results, name, key) for key in ("psnr_db", "ssim")}
+        lines = [[source, means["psnr_db"][source], means["ssim"][source]] for source in means["psnr_db"]]
+        title = f"{name}: mean over all distances above 0"
+        parts.append(Table(title, ("source", "PSNR, dB", "SSIM"), lines, command.format(world=name)))
+        for better, worse, claim in (
+            (options.method, "no-depth", "the depth prior improves the view (paper)"),
+            ("paper", "paper-no-scale", "scaling improves the paper's own field (paper)"),
+            ("ours", "no-scale", "scaling improves ours"),
+            ("ours", "depth-warp", "ours is not below plain depth warping"),
+        ):
+            if better in means["ssim"] and worse in means["ssim"]:
+                held = all(np.mean(of[better]) >= np.mean(of[worse]) for of in means.values())
+                verdict[f"{name}: {claim}, PSNR and SSIM"] = bool(held)
+    return Section("Ablation study (V.C, Figs. 6, 8)", [*parts, *curves_and_tables(results, command)], verdict)
+
+
+def _means(results: Sequence[Result], name: str, key: str) -> dict[str, list[float]]:
+    """Source → mean over the distances above 0, one for each seed."""
+    found: dict[str, list[float]] = {}
+    for one in results:
+        path = "recorded" if "bag" in one.unit.arguments else "straight"
+        for source, values in series([one], name, path, key).items():
+            away = [float(np.mean(value)) for at, value in values.items() if at > 0]
+            if away:
+                found.setdefault(source, []).append(float(np.mean(away)))
+    return found

@@ -1,0 +1,152 @@
+"""What the experiments on views share: units, rows by source and distance, curves, tables and image strips."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from instant_ic.experiments import recorded
+from instant_ic.experiments.lab import Options, Result, Unit
+from instant_ic.experiments.pictures import Series, curves_svg, image_strip, jpeg
+from instant_ic.experiments.report import Figure, Part, Table, image_address
+from instant_ic.experiments.vspace import compare
+from instant_ic.experiments.vspace_sources import PATHS, VspaceSettings
+
+TABLE_M = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+"""Distances of the tables."""
+LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
+_TILE_PX = 240
+_SHOWN_SEED = 0
+"""Seed whose images are kept."""
+
+
+def view_units(
+    experiment: str,
+    options: Options,
+    sources: Sequence[str],
+    worlds: Sequence[str],
+    paths: Sequence[str] = PATHS,
+    keep_images: bool = True,
+) -> list[Unit]:
+    """A unit for each world and seed."""
+    common: dict[str, Any] = {
+        "sources": list(sources),
+        "paths": list(paths),
+        "size": list(options.view_size),
+        "panorama_width": 512 if options.quick else 2048,
+        "seconds": 0.5 if options.quick else 8.0,
+        "step_m": 0.5 if options.quick else 0.25,
+        "reach_m": 2.0 if options.quick else 4.0,
+    }
+    if options.bag is not None:
+        common |= {"bag": str(options.bag), "paths": ["straight"], "seed": 0}
+        common["sources"] = [name for name in sources if name in recorded.SOURCES]
+        count = recorded.count_keyframes(options.bag) - 1
+        chosen = sorted({round(at) for at in np.linspace(0, count - 1, min(options.seeds, count))})
+        return [Unit(experiment, {**common, "number": k, "images": keep_images and k == chosen[0]}) for k in chosen]
+    return [
+        Unit(
+            experiment,
+            {
+                "world": world,
+                "seed": _number(world, seed),
+                "start_seed": seed,
+                **common,
+                "images": keep_images and _number(world, seed) == _SHOWN_SEED,
+            },
+        )
+        for world, seed in options.cases(worlds)
+    ]
+
+
+def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Compare the sources in one world; the rows, and one image strip a path for the shown seed."""
+    given: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in arguments.items()
+        if key not in ("world", "images", "bag", "number")
+    }
+    settings = VspaceSettings(**given)
+    if "bag" in arguments:
+        comparison = recorded.compare_recorded(Path(arguments["bag"]), settings, arguments["number"])
+    else:
+        comparison = compare(arguments["world"], settings)
+    images = {}
+    for path, strip in comparison.strips.items() if arguments["images"] else ():
+        columns = ["truth", *settings.sources]
+        rows = [(f"{at:g} m", [strip[at][name] for name in columns]) for at in sorted(strip)]
+        images[path] = image_address(jpeg(image_strip(columns, rows, _TILE_PX)))
+    return {
+        "start": list(comparison.start),
+        "depth": comparison.depth,
+        "rows": [asdict(row) for row in comparison.rows],
+        "images": images,
+    }
+
+
+def family(result: Result) -> str:
+    """World without its seed: results of one family are averaged."""
+    given = result.unit.arguments
+    return Path(given["bag"] if "bag" in given else given["world"].partition(":")[0]).name
+
+
+def rows(results: Sequence[Result], of_family: str, path: str) -> Iterator[dict[str, Any]]:
+    """All rows of a family of worlds along a path."""
+    for result in results:
+        if family(result) == of_family:
+            yield from (row for row in result.data.get("rows", ()) if row["path"] == path)
+
+
+def series(results: Sequence[Result], of_family: str, path: str, key: str) -> Series:
+    """Source → distance → values over the seeds."""
+    found: Series = {}
+    for row in rows(results, of_family, path):
+        found.setdefault(row["source"], {}).setdefault(row["distance_m"], []).append(row[key])
+    return found
+
+
+def curves_and_tables(results: Sequence[Result], command: str) -> list[Part]:
+    """For each family of worlds: curves, a table of PSNR and SSIM a path, and the strips."""
+    parts: list[Part] = []
+    for name in dict.fromkeys(family(one) for one in results if one.data):
+        paths = [path for path in (*PATHS, "recorded") if any(True for _ in rows(results, name, path))]
+        own = command.format(world=name)
+        panels = [
+            (f"{path}: distance from the panorama, m", label, series(results, name, path, key))
+            for path in paths
+            for key, label in LABELS.items()
+        ]
+        parts.append(Figure(f"{name}: PSNR and SSIM by distance", curves_svg(panels), own))
+        for path in paths:
+            for key, label in LABELS.items():
+                parts.append(_table(f"{name}, {path}: {label}", series(results, name, path, key), own))
+        for one in results:
+            if family(one) == name:
+                for path, address in one.data.get("images", {}).items():
+                    title = f"{one.unit.arguments.get('world', name)}, {path}"
+                    parts.append(Figure(f"Views, {title}", address, own))
+    return parts
+
+
+def command_of(options: Options, experiment: str) -> str:
+    """The command that measures again what a table shows; ``{world}`` is its world."""
+    quick = " --quick" if options.quick else f" --seeds {options.seeds}"
+    method = "" if options.method == "ours" else f" --method {options.method}"
+    where = "--world {world}" if options.bag is None else "--bag {world}"
+    return f"ic experiment {experiment} {where}{quick}{method} -o REPORT"
+
+
+def _table(caption: str, found: Series, command: str) -> Table:
+    distances = [at for at in TABLE_M if any(at in values for values in found.values())]
+    lines = [[source, *(values.get(at, []) for at in distances)] for source, values in found.items()]
+    return Table(caption, ["source", *(f"{at:g} m" for at in distances)], lines, command)
+
+
+def _number(world: str, seed: int) -> int:
+    """Seed of a world by its name, else the given one."""
+    own = world.partition(":")[2]
+    return int(own) if own.isdigit() else seed

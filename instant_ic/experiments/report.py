@@ -1,0 +1,189 @@
+"""One self-contained HTML page, and its JSON, from the sections of experiments."""
+
+from __future__ import annotations
+
+import base64
+import html
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from instant_ic.experiments.lab import Result
+from instant_ic.experiments.results import finite, save_json, save_text
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text and numbers; a number may be a list, which is shown as its mean and standard deviation."""
+
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Plots as SVG text, or the ``data:`` address of an image or film."""
+
+    caption: str
+    source: str
+    command: str = ""
+
+
+Part: TypeAlias = Text | Table | Figure
+
+
+@dataclass(frozen=True)
+class Section:
+    """One experiment.
+
+    Attributes:
+        title: with the paper's section.
+        parts: in order.
+        verdict: sentence → whether the paper's or our claim holds; None: not measured.
+    """
+
+    title: str
+    parts: Sequence[Part]
+    verdict: dict[str, bool | None] = field(default_factory=dict)
+
+
+def spread(values: Sequence[float | None], digits: int = 2) -> str:
+    """Mean ± standard deviation of what is known, and the number of values where it is one."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return "–"
+    mean = f"{statistics.fmean(known):.{digits}f}"
+    return f"{mean} ± {statistics.stdev(known):.{digits}f}" if len(known) > 1 else f"{mean} (1)"
+
+
+def image_address(jpeg_or_other: bytes, kind: str = "image/jpeg") -> str:
+    """Bytes of an image as an address for a page."""
+    return f"data:{kind};base64,{base64.b64encode(jpeg_or_other).decode()}"
+
+
+def write(folder: Path, sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> None:
+    """Write ``report.html`` and ``report.json``; ``conditions`` are machine, versions, command and times."""
+    save_text(folder / "report.html", _page(sections, results, conditions))
+    save_json(
+        folder / "report.json",
+        finite(
+            {
+                "conditions": conditions,
+                "verdict": {name: section.verdict for name, section in sections.items()},
+                "tables": {
+                    name: [vars(part) for part in section.parts if isinstance(part, Table)]
+                    for name, section in sections.items()
+                },
+                "units": [
+                    {
+                        "experiment": one.unit.experiment,
+                        "arguments": one.unit.arguments,
+                        "wall_s": one.wall_s,
+                        "cpu_s": one.cpu_s,
+                        "error": one.error,
+                        **{key: value for key, value in one.data.items() if key != "images"},
+                    }
+                    for one in results
+                ],
+            },
+            5,
+        ),
+    )
+
+
+_STYLE = """
+:root { color-scheme: light dark; --ink: #1c2128; --paper: #fff; --line: #d4d9df; --soft: #f3f5f7; --good: #0b6e3b;
+  --bad: #a8321f; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e4e8ec; --paper: #14181d; --line: #3a424c; --soft: #1e242b;
+  --good: #5fd394; --bad: #ff9b85; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 1rem; max-width: 62rem; color: var(--ink); background: var(--paper);
+  font: 16px/1.5 system-ui, sans-serif; }
+h1 { font-size: 1.5rem; line-height: 1.2; } h2 { margin-top: 2.5rem; border-top: 1px solid var(--line);
+  padding-top: 1rem; font-size: 1.25rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
+h3 { font-size: .95rem; margin: 1.4rem 0 .3rem; }
+th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper); }
+figure { margin: 0; }
+.plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); gap: .5rem; }
+.plots svg { width: 100%; height: auto; }
+img { width: 100%; } .strip { min-width: 44rem; }
+code { display: block; overflow-x: auto; background: var(--soft); padding: .3rem .5rem; font-size: .78rem;
+  margin: .3rem 0 1.2rem; white-space: pre; }
+.yes { color: var(--good); } .no { color: var(--bad); } nav a { margin-right: 1rem; }
+dl { display: grid; grid-template-columns: auto 1fr; gap: 0 1rem; font-size: .85rem; } dd { margin: 0; }
+a { color: inherit; }
+"""
+
+
+def _page(sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> str:
+    links = "".join(f'<a href="#{name}">{html.escape(name)}</a>' for name in sections)
+    bodies = "".join(_section(name, section, results) for name, section in sections.items())
+    facts = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(str(v))}</dd>" for k, v in conditions.items())
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>Instant IC: experiments</title><style>{_STYLE}</style></head><body>"
+        f"<h1>Instant IC: the paper's experiments</h1><nav>{links}</nav>"
+        f"<p>Numbers are mean ± standard deviation over the seeds.</p>{bodies}"
+        f"<h2>Conditions</h2><dl>{facts}</dl></body></html>\n"
+    )
+
+
+def _section(name: str, section: Section, results: Sequence[Result]) -> str:
+    own = [one for one in results if one.unit.experiment == name]
+    parts = [f'<h2 id="{name}">{html.escape(section.title)}</h2>']
+    if section.verdict:
+        marks = {True: ("yes", "holds"), False: ("no", "does not hold"), None: ("", "not measured")}
+        rows = "".join(
+            f'<li>{html.escape(text)}: <b class="{marks[held][0]}">{marks[held][1]}</b></li>'
+            for text, held in section.verdict.items()
+        )
+        parts.append(f"<ul>{rows}</ul>")
+    parts += [_part(part) for part in section.parts]
+    failed = [one for one in own if one.error]
+    if failed:
+        rows = "".join(f"<li>{html.escape(str(one.unit.arguments))}: {html.escape(one.error)}</li>" for one in failed)
+        parts.append(f"<p>Failed:</p><ul>{rows}</ul>")
+    wall, cpu = (sum(getattr(one, key) for one in own) for key in ("wall_s", "cpu_s"))
+    parts.append(f"<p>{len(own)} units, {wall:.0f} s of wall time, {cpu:.0f} s of CPU time.</p>")
+    return "".join(parts)
+
+
+def _part(part: Part) -> str:
+    if isinstance(part, Text):
+        return f"<p>{html.escape(part.text)}</p>"
+    command = f"<code>{html.escape(part.command)}</code>" if part.command else ""
+    caption = html.escape(part.caption)
+    if isinstance(part, Figure):
+        if part.source.startswith("data:"):
+            kind = "strip" if part.source.startswith("data:image/jpeg") else "whole"
+            body = f'<div class="wide"><img class="{kind}" src="{part.source}" alt="{caption}"></div>'
+        else:
+            body = f'<div class="plots">{part.source}</div>'
+        return f"<h3>{caption}</h3><figure>{body}</figure>{command}"
+    head = "".join(f"<th>{html.escape(str(column))}</th>" for column in part.columns)
+    rows = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in part.rows)
+    return f'<h3>{caption}</h3><div class="wide"><table><tr>{head}</tr>{rows}</table></div>{command}'
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, list):
+        known = [abs(one) for one in value if one is not None]
+        return spread(value, 3 if known and max(known) <= 1 else 2 if known and max(known) < 100 else 0)
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "–" if value is None else html.escape(str(value))

@@ -1,0 +1,145 @@
+"""V.D, Fig. 9: the whole flow with numbered stills, a film, the state over time, and both trajectories on the map."""
+
+from __future__ import annotations
+
+import io
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.experiments import illusion, teleop_results
+from instant_ic.experiments.illusion_stack import SOURCES, FilmedStack
+from instant_ic.experiments.lab import Options, Result, Unit
+from instant_ic.experiments.pictures import jpeg
+from instant_ic.experiments.report import Figure, Part, Section, Table, Text, image_address
+from instant_ic.experiments.teleop import run_episode
+from instant_ic.experiments.teleop_plot import PlanImage, operator_image, save_plot
+from instant_ic.experiments.teleop_settings import TeleopSettings
+from instant_ic.experiments.teleop_worlds import floor_plan
+
+_FRAME_S = 0.25
+_SIZE = (500, 180)
+_BESIDE_S = 1.0
+"""Stills 1 and 5 are this long before and after the virtual space."""
+
+
+@dataclass(frozen=True)
+class _Frame:
+    time_s: float
+    virtual: bool
+    image: NDArray[np.uint8]
+
+
+class _Recorded(FilmedStack):
+    """Keeps what the operator sees, beside the map."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.frames: list[_Frame] = []
+        self._plan = PlanImage(floor_plan(self.simulation.world, 0.05))
+
+    def step(self, operate: Callable[[], tuple[float, float]] | None = None) -> None:
+        """As ``FilmedStack.step``; then keep a frame if one is due."""
+        super().step(operate)
+        due = not self.frames or self.time_s >= self.frames[-1].time_s + _FRAME_S - 1e-6
+        if due and self.log.pictures and self.log.time_s:
+            image = cv2.resize(
+                np.hstack([operator_image(self), self._plan.draw(self)]), _SIZE, interpolation=cv2.INTER_AREA
+            )
+            rgb = np.ascontiguousarray(image[..., ::-1])
+            self.frames.append(_Frame(self.time_s, self.log.pictures[-1].virtual, rgb))
+
+
+def units(options: Options) -> list[Unit]:
+    """A drive through the corridor's obstacle for each seed; the first is shown."""
+    cases = options.cases()[: 1 if options.quick else None]
+    return [
+        Unit("teleoperation", {"world": world, "seed": number, "images": number == 0})
+        for number, (world, _) in enumerate(cases)
+    ]
+
+
+def measure(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Drive one course and compare what the operator sees with the truth."""
+    settings = TeleopSettings(1, arguments["seed"], arguments["world"], ("ic",))
+    film, course = illusion.Film(0), settings.course(0)
+    stacks: list[_Recorded] = []
+
+    def make_stack(world: Any, config: Any) -> _Recorded:
+        stacks.append(_Recorded(world, config, course, 0, film.take))
+        return stacks[-1]
+
+    (drive,) = run_episode(settings, 0, methods=("ic",), make_stack=make_stack)
+    film.completed = drive.completed
+    images = {}
+    if arguments["images"]:
+        frames = stacks[0].frames
+        for number, frame in enumerate(stills(frames), 1):
+            what = "virtual" if frame.virtual else "real"
+            images[f"{number}: {frame.time_s:.1f} s, {what}"] = image_address(jpeg(frame.image))
+        images["Film"] = image_address(_webp([frame.image for frame in frames]), "image/webp")
+        with tempfile.TemporaryDirectory() as folder:
+            plot = Path(folder) / "plot.png"
+            save_plot(plot, [drive], teleop_results.report([drive], settings), settings, 1)
+            images["Trajectories of r-bot and v-bot, state over time"] = image_address(plot.read_bytes(), "image/png")
+    row = {key: value for key, value in asdict(drive).items() if key != "tracks"}
+    views = {source: illusion.figures(film.frames, source) for source in SOURCES} if film.frames else {}
+    return {"drive": row, "views": views, "images": images}
+
+
+def stills(frames: Sequence[_Frame]) -> list[_Frame]:
+    """Five frames as in the paper's Fig. 9: before, first, middle and last in the virtual space, and after it."""
+    shown = [frame for frame in frames if frame.virtual]
+    if not shown:
+        return list(frames[:1])
+    ends = [at for at, (frame, after) in enumerate(pairwise(frames)) if frame.virtual and not after.virtual]
+    first = next(at for at, frame in enumerate(frames) if frame.virtual)
+    last = ends[0] if ends else len(frames) - 1
+    beside = math.ceil(_BESIDE_S / _FRAME_S)
+    chosen = (max(first - beside, 0), first, (first + last) // 2, last, min(last + beside, len(frames) - 1))
+    return [frames[at] for at in chosen]
+
+
+def section(results: Sequence[Result], options: Options) -> Section:
+    """Figures of the shown drive, and a table over all drives."""
+    quick = "--quick" if options.quick else f"--seeds {options.seeds}"
+    command = f"ic experiment teleoperation {quick} -o REPORT"
+    parts: list[Part] = [Text("All nodes in one process in simulated time; the operator drives straight on.")]
+    for one in results:
+        parts += [Figure(name, address, command) for name, address in one.data.get("images", {}).items()]
+    done = [one for one in results if one.data]
+    lines: list[list[Any]] = [
+        ["time, s", [one.data["drive"]["seconds"] for one in done]],
+        ["obedience", [one.data["drive"]["obedience"] for one in done]],
+        ["contacts", [one.data["drive"]["contacts"] for one in done]],
+        ["largest gap of v-bot and r-bot, m", [one.data["drive"]["gap_max_m"] for one in done]],
+    ]
+    for source in SOURCES:
+        for key, label in (("psnr_mean_db", "PSNR, dB"), ("ssim_mean", "SSIM")):
+            lines.append([f"{source}: {label}", [one.data["views"].get(source, {}).get(key) for one in done]])
+    parts.append(Table("Drives", ("figure", "value"), lines, command))
+    flow = [
+        one.data["drive"]["completed"]
+        and [s["to_virtual"] for s in one.data["drive"]["switches"]][:2] == [True, False]
+        and not one.data["drive"]["contacts"]
+        for one in done
+    ]
+    verdict = {"the flow r to v to r works without a model made beforehand (paper)": all(flow) if flow else None}
+    return Section("Teleoperation (V.D, Fig. 9)", parts, verdict)
+
+
+def _webp(images: Sequence[NDArray[np.uint8]]) -> bytes:
+    from PIL import Image
+
+    first, *others = [Image.fromarray(image) for image in images]
+    out = io.BytesIO()
+    first.save(out, "WEBP", save_all=True, append_images=others, duration=round(1000 * _FRAME_S), loop=0, quality=50)
+    return out.getvalue()

@@ -1,0 +1,82 @@
+"""V.B, Fig. 5: image quality by training time, for what is shown, for the field alone and for the paper's field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from instant_ic.experiments.compared import LABELS, command_of, family, view_units
+from instant_ic.experiments.lab import WORLD, Options, Result, Unit
+from instant_ic.experiments.pictures import Series, curves_svg
+from instant_ic.experiments.report import Figure, Part, Section, Table, Text
+from instant_ic.experiments.vspace import converge
+from instant_ic.experiments.vspace_sources import VspaceSettings
+
+_TIMES_S, _QUICK_S = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0), (0.2, 0.5)
+_SETTLED_DB = 0.5
+"""A curve has converged when it is this near to its last value."""
+
+
+def units(options: Options) -> list[Unit]:
+    """All times in each world."""
+    made = view_units("training-time", options, ("ours",), (WORLD,), ("straight",), False)
+    times = list(_QUICK_S if options.quick else _TIMES_S)
+    keys = ("world", "seed", "start_seed", "size", "panorama_width")
+    return [Unit(one.experiment, {**{k: one.arguments[k] for k in keys}, "times_s": times}) for one in made]
+
+
+def measure(arguments: dict[str, Any]) -> dict[str, Any]:
+    """Train in one world."""
+    settings = VspaceSettings(
+        ("straight",),
+        ("ours",),
+        size=tuple(arguments["size"]),
+        panorama_width=arguments["panorama_width"],
+        seed=arguments["seed"],
+        start_seed=arguments["start_seed"],
+    )
+    return {"rows": [asdict(row) for row in converge(arguments["world"], settings, arguments["times_s"])]}
+
+
+def section(results: Sequence[Result], options: Options) -> Section:
+    """Curves and tables at the panorama and 1 m ahead."""
+    command = command_of(options, "training-time")
+    parts: list[Part] = [
+        Text(
+            "Seconds are CPU seconds of one process, or of the GPU's host where there is one. ours is what the "
+            "operator sees: the panorama warped by its depth from the first moment on, the field where it is better."
+        )
+    ]
+    verdict: dict[str, bool | None] = {}
+    for name in dict.fromkeys(family(one) for one in results if one.data):
+        panels = []
+        for at in (0.0, 1.0):
+            for key, label in LABELS.items():
+                found: Series = {}
+                for one in results:
+                    for row in one.data.get("rows", ()):
+                        if family(one) == name and row["distance_m"] == at:
+                            by_time = found.setdefault(row["source"], {})
+                            by_time.setdefault(row["seconds"], []).append(row[key])
+                panels.append((f"training, s ({at:g} m ahead)", label, found))
+                times = sorted({x for values in found.values() for x in values})
+                lines = [[source, *(values.get(x, []) for x in times)] for source, values in found.items()]
+                columns = ("source", *(f"{x:g} s" for x in times))
+                parts.append(Table(f"{name}, {at:g} m ahead: {label}", columns, lines, command.format(world=name)))
+                if at == 0 and key == "psnr_db":
+                    for source, values in found.items():
+                        claim = f"{name}: {source} has converged within 4 s (paper: 3-4 s on its GPU)"
+                        verdict[claim] = _settled(values)
+        parts.insert(1, Figure(f"{name}: by training time", curves_svg(panels), command.format(world=name)))
+    return Section("Training time (V.B, Fig. 5)", parts, verdict)
+
+
+def _settled(values: dict[float, list[float]]) -> bool | None:
+    """Whether the value at 4 s is nearly the last one; None where nothing later was measured."""
+    later = [x for x in values if x > 4]
+    if not later or 4.0 not in values:
+        return None
+    return bool(np.mean(values[4.0]) >= np.mean(values[max(later)]) - _SETTLED_DB)
