@@ -19,6 +19,7 @@ THROUGH = 2  # odds that a beam takes from the voxels of a column whose mean it 
 OCCUPIED, FREE = 3, -2
 UNSEEN, OPEN, PLATE = -2, -1, -10  # values of the index of columns
 _BESIDE_M = 0.02  # a beam that passes a column's mean at this distance says nothing about its surface
+_GRAZING = 4.0  # beams along whose line the points around spread so much farther (variance) run along their surface
 _CROWDED_M = 1.2  # nearer, beams pass so close to each other that a quarter of them is enough
 _SHORT_OF_M = 0.12  # beams free space up to this distance before their end
 _THING_CELLS = 12  # sides of a thing take their height from columns so far away
@@ -54,7 +55,7 @@ def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, 
         first, stride: which beams free space.
         reach: farther points free space up to there.
     """
-    levels = odds.shape[2]
+    levels, moments = odds.shape[2], np.empty(6)
     for i in range(first, len(points), stride):
         dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -79,6 +80,7 @@ def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, 
                 mx = (ix + 0.5) * cell + sums[a, b, 1] / count - origin[0]
                 my = (iy + 0.5) * cell + sums[a, b, 2] / count - origin[1]
                 passes, takes = abs(mx * dy - my * dx) < _BESIDE_M * flat, THROUGH
+                passes = passes and not _runs_along(key, sums, a, b, cell, dx / flat, dy / flat, moments)
             if passes:
                 z0 = math.floor((origin[2] + t * dz - low) / cell)
                 z1 = math.floor((origin[2] + leave * dz - low) / cell)
@@ -113,6 +115,17 @@ def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, 
             sums[a, b, 3] += u * u
             sums[a, b, 4] += u * v
             sums[a, b, 5] += v * v
+
+
+@njit(cache=True)
+def _runs_along(key, sums, a, b, cell, dx, dy, moments):  # type: ignore[no-untyped-def]
+    """Whether a beam of horizontal direction (``dx``, ``dy``) runs along the surface of a column's points.
+
+    Such a beam passes beside the surface for many columns: a centimetre decides, which no pose has.
+    """
+    _moments(key, sums, a, b, cell, 1, moments)
+    along = moments[2] * dx * dx + 2 * moments[3] * dx * dy + moments[4] * dy * dy
+    return along > _GRAZING * (moments[2] + moments[4] - along)
 
 
 @njit(cache=True)

@@ -126,6 +126,27 @@ def test_a_side_is_as_high_as_the_rest_of_the_thing() -> None:
     assert 1.2 + 2.0 * np.tan(elevation[of_thing].max()) == pytest.approx(0.9, abs=0.06)  # a voxel is 0.05 m
 
 
+def test_a_beam_along_a_surface_frees_nothing_and_one_across_it_does() -> None:
+    """A side at y = -0.485 m, 1 m long, in 20 columns of 5 cm; voxels are solid from odds of 3 on, 12 at most."""
+    model, x = LocalModel(LocalModelConfig(behind_m=0.0)), np.arange(2.005, 3.0, 0.01)
+    side = np.stack(np.meshgrid(x, [-0.485], np.arange(0.125, 0.9, 0.05)), -1).reshape(-1, 3)
+    for _ in range(3):
+        model.add(side, np.array([2.5, -3.0, 0.825]), stride=1)
+
+    def solid() -> list[float]:
+        points = model.points()
+        ours = (np.abs(points - [2.5, -0.485, 0.825]) < [0.5, 0.01, 0.01]).all(axis=1)
+        return sorted(points[ours][:, 0].round(3).tolist())
+
+    assert len(solid()) == 20
+    # One centimetre beside the surface, in its voxels all along it, as a pose that is off by a centimetre has it.
+    model.add(np.tile([6.0, -0.475, 0.825], (50, 1)), np.array([0.0, -0.475, 0.825]), stride=1)
+    assert len(solid()) == 20
+    # Through it: ten beams take 20 of the odds of one column.
+    model.add(np.tile([2.525, 1.0, 0.825], (10, 1)), np.array([2.525, -2.0, 0.825]), stride=1)
+    assert len(solid()) == 19 and not np.isclose(solid(), 2.525).any()
+
+
 def test_what_has_gone_vanishes() -> None:
     """Somebody stands 2 m ahead for a second, then leaves; the robot stands."""
     person = (np.array([2.0, -0.2, 0.0]), np.array([2.3, 0.2, 1.7]))
