@@ -79,7 +79,7 @@ def test_installed_wheel_finds_its_files(installed, tmp_path):
 
 
 @pytest.mark.system
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)
 def test_installed_wheel_runs_the_simulated_stack(installed, tmp_path):
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     ports = [f"{name}:={value}" for name, value in free_ports().items()]
@@ -91,7 +91,7 @@ def test_installed_wheel_runs_the_simulated_stack(installed, tmp_path):
         env=environment, cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
     )  # fmt: skip
     try:
-        deadline_s = time.monotonic() + 240
+        deadline_s = time.monotonic() + 1200  # it compiles all kernels: a minute, or many on a busy machine
         while not {node.name for node in registry.list_nodes(run_dir)} >= NODES:
             assert launch.poll() is None and time.monotonic() < deadline_s, Path(log.name).read_text()
             time.sleep(0.2)
