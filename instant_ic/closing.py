@@ -25,11 +25,15 @@ class Closing(ABC):
 
 @contextmanager
 def on_signals(handler: Callable[..., Any], *numbers: signal.Signals) -> Iterator[None]:
-    """Handle signals inside the block; outside the main thread, where Python has no handlers, do nothing."""
+    """Handle signals inside the block; outside the main thread, where Python has no handlers, do nothing.
+
+    A hangup that ``nohup`` ignores stays ignored.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = [(number, signal.signal(number, handler)) for number in numbers]
+    handled = [n for n in numbers if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
+    before = [(number, signal.signal(number, handler)) for number in handled]
     try:
         yield
     finally:

@@ -63,12 +63,17 @@ class _Terminated(KeyboardInterrupt):
 
 
 def _clean_end(launches: bool) -> AbstractContextManager[None]:
-    """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up."""
+    """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up.
+
+    A script's ``ic bag record &`` inherits SIGINT as ignored; it ends on ``kill -INT`` all the same.
+    """
 
     def end(signum: int, frame: FrameType | None) -> None:
-        raise SystemExit(0) if launches else _Terminated
+        if launches:
+            raise SystemExit(0)
+        raise KeyboardInterrupt if signum == signal.SIGINT else _Terminated
 
-    return on_signals(end, signal.SIGTERM, signal.SIGHUP, *([signal.SIGINT] if launches else []))
+    return on_signals(end, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def _main(argv: Sequence[str] | None) -> int:

@@ -31,13 +31,37 @@ sys.exit(cli.main())
 """
 
 
+def waiting(ignored: signal.Signals | None = None) -> subprocess.Popen[str]:
+    """A command that waits, started by a shell that ignores a signal."""
+
+    def ignore() -> None:
+        if ignored:
+            signal.signal(ignored, signal.SIG_IGN)
+
+    process = subprocess.Popen([sys.executable, "-c", WAITS], stdout=subprocess.PIPE, text=True, preexec_fn=ignore)
+    assert process.stdout is not None and process.stdout.readline() == "waiting\n"
+    return process
+
+
 @pytest.mark.parametrize(("signum", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 143), (signal.SIGINT, 130)])
 def test_a_command_cleans_up_and_reports_the_signal(signum: int, status: int) -> None:
-    process = subprocess.Popen([sys.executable, "-c", WAITS], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None and process.stdout.readline() == "waiting\n"
+    process = waiting()
     process.send_signal(signum)
     out, _ = process.communicate(timeout=60)
     assert (out, process.returncode) == ("removed\n", status)
+
+
+def test_a_script_ends_a_command_in_the_background_by_sigint() -> None:
+    process = waiting(ignored=signal.SIGINT)  # as sh starts `COMMAND &`
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 130
+
+
+def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
+    process = waiting(ignored=signal.SIGHUP)
+    process.send_signal(signal.SIGHUP)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(60) == 130  # 143, had the hangup counted
 
 
 class Status:
