@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,17 @@ from typing import Any
 from instant_ic import paths
 from instant_ic.launch.process import dies_with_us
 
-PARTS = ("control", "vspace", "slam", "sim", "mapping", "lidar")
-"""The packages with kernels, the longest compilation first. Each is compiled in a process of its own."""
+PARTS = {
+    "control": ("warmup",),
+    "vspace": ("warm_up",),
+    "slam": ("grid_slam", "loop_search"),
+    "sim": ("simulation",),
+    "mapping": ("local_model",),
+    "lidar": ("flatscan",),
+}
+"""Packages with kernels, the longest compilation first, and the modules whose ``warm_up()`` runs every kernel.
+
+Each package is compiled in a process of its own."""
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -132,43 +142,8 @@ def _key() -> str:
 
 def _compile(part: str) -> None:
     """Run every kernel of a part once, as its node does before its first message."""
-    if part == "control":
-        from instant_ic.control.warmup import warm_up
-
-        warm_up()
-    elif part == "vspace":
-        from instant_ic.vspace.config import VirtualSpaceConfig
-        from instant_ic.vspace.warm_up import warm_up as warm_up_space
-
-        warm_up_space(VirtualSpaceConfig())
-    elif part == "slam":
-        import numpy as np
-
-        from instant_ic.slam.config import FieldConfig
-        from instant_ic.slam.grid_slam import warm_up as warm_up_slam
-        from instant_ic.slam.likelihood_field import LikelihoodField
-        from instant_ic.slam.loop_search import COARSE_POINTS, find_place
-
-        warm_up_slam()
-        field = LikelihoodField(FieldConfig())
-        field.values[:] = 0.5
-        # More points than the coarse search takes: of these it takes every second.
-        find_place(field, np.zeros((2 * COARSE_POINTS, 2)), np.zeros(3), reach_m=0.5, reach_rad=0.1)
-    elif part == "sim":
-        from instant_ic.sim.simulation import Simulation, SimulationConfig
-
-        simulation = Simulation(SimulationConfig())
-        simulation.panorama(64, 32)
-        simulation.step(0.2)
-        simulation.scanner.make(simulation.scanner.due(simulation.time_s))
-    elif part == "mapping":
-        from instant_ic.mapping.local_model import warm_up as warm_up_model
-
-        warm_up_model()
-    else:
-        from instant_ic.lidar.flatscan import warm_up as warm_up_lidar
-
-        warm_up_lidar()
+    for module in PARTS[part]:
+        import_module(f"instant_ic.{part}.{module}").warm_up()
 
 
 def main() -> None:

@@ -174,3 +174,11 @@ class Simulation:
     def _remember(self) -> None:
         # A new array instead of a shift in place, because another thread may be reading the old one.
         self._history = np.vstack([self._history[1:], [self.time_s, *self.robot.pose]])
+
+
+def warm_up() -> None:
+    """Compile the kernels of the renderer and of the simulated lidar."""
+    simulation = Simulation(SimulationConfig())
+    simulation.panorama(64, 32)
+    simulation.step(0.2)
+    simulation.scanner.make(simulation.scanner.due(simulation.time_s))

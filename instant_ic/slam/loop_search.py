@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import wrap_angle
+from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.likelihood_field import LikelihoodField
 from instant_ic.slam.matcher import correlate, refine
 from instant_ic.slam.scan import FloatArray
@@ -193,3 +194,11 @@ def spread(points: FloatArray, cell_m: float, max_points: int) -> FloatArray:
     if len(kept) > max_points:
         kept = kept[(np.arange(max_points) * len(kept)) // max_points]
     return np.ascontiguousarray(kept)
+
+
+def warm_up() -> None:
+    """Compile the kernels of the search."""
+    field = LikelihoodField(FieldConfig())
+    field.values[:] = 0.5
+    # More points than the coarse search takes: of these it takes every second.
+    find_place(field, np.zeros((2 * COARSE_POINTS, 2)), np.zeros(3), reach_m=0.5, reach_rad=0.1)

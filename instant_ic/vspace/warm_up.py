@@ -12,11 +12,12 @@ from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.space import VirtualSpace
 
 
-def warm_up(config: VirtualSpaceConfig) -> None:
+def warm_up(config: VirtualSpaceConfig | None = None) -> None:
     """Render a scratch space of the same kind once, trained where the kind is: numba's kernels are compiled and cached.
 
     About 8 s of CPU on the first run of an installation, below 1 s after it.
     """
+    config = config or VirtualSpaceConfig()
     if config.source == "mesh":  # renders its first image as it is made
         return
     leave_out_blas()

@@ -47,8 +47,9 @@ def run(args: argparse.Namespace) -> int:
             raise UserError(f"-p {word}: expected NODE.KEY:=VALUE, NODE being one of {', '.join(names)}", 2)
     if Path(args.output).exists():
         raise UserError(f"{args.output} exists already: choose another name with -o")
-    if args.compare and not Path(args.compare).exists():
-        raise UserError(f"bag {args.compare} does not exist")
+    for bag in filter(None, (args.bag, args.compare)):
+        if not Path(bag).exists():
+            raise UserError(f"bag {bag} does not exist")
 
     from instant_ic.bag.compare import compare
     from instant_ic.bag.replay import make_node, replay
