@@ -5,10 +5,10 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from two_machines import TwoMachines, drive_and_cut, missing
 
 from instant_ic.bus import registry
 from instant_ic.experiments.stack import processes_of
-from instant_ic.experiments.two_machines import TwoMachines, drive_and_cut, missing
 
 pytestmark = [
     pytest.mark.system,
