@@ -96,7 +96,8 @@ class LocalTransport:
             RegistryError: the node already publishes the topic, or the path is too long.
         """
         publisher = LocalPublisher(self._host, registry.check_topic(topic), type_name, qos)
-        self._writers = [*(writer for writer in self._writers if not writer.closed), publisher]
+        with self._read_lock:
+            self._writers = [*(writer for writer in self._writers if not writer.closed), publisher]
         os.eventfd_write(self._poke, 1)
         return publisher
 
@@ -143,12 +144,13 @@ class LocalTransport:
         self._driver, self._waiting = threading.get_ident(), True
         self._read(self._unread)
         timeout = 0.0 if self._set else timeout
-        if self.patient:
+        patient = self.patient
+        if patient:
             ready = [*_readable([self._wake], timeout), *self._readers]
         else:
             ready = [fd for fd, _ in self._inputs.poll(timeout, 64)]
-        self._read(ready, one=not self.patient)
-        self._unread = ready
+        self._read(ready, one=not patient)
+        self._unread = [] if patient else ready
         if self._wake in ready:  # left as it is, it would end every later wait
             with contextlib.suppress(BlockingIOError):
                 os.eventfd_read(self._wake)
@@ -179,10 +181,9 @@ class LocalTransport:
                         publisher.serve()
                 if not self._waiting:
                     self._read(ready)
-            except OSError as error:  # the run directory is gone
-                log.error("%s: %s", self.node, error)
-            except Exception:  # one bad event must not stop the bus
-                log.exception("%s: fault on the bus thread", self.node)
+            except Exception as error:  # one bad event must not stop the bus
+                expected = isinstance(error, OSError)  # the run directory is gone
+                log.error("%s: fault on the bus thread: %s", self.node, error, exc_info=not expected)
                 self._stop.wait(_AWAY_S)
 
     def _look(self) -> None:
