@@ -75,7 +75,7 @@ def compare_recorded(bag: Path, settings: VspaceSettings, number: int) -> Compar
         known = one.sigma[np.isfinite(one.sigma)]
         middle = float(np.median(known)) if known.size else 1.0
         depth = DepthResult(one.depth_m, one.sigma, True, 1.0, 0.0, 1.0, middle, 0, "", "recorded")
-        shots.append(Shot(one.pose, one.rgb, one.depth_m, one.depth_m, depth, one.depth_m[one.depth_m > 0]))
+        shots.append(Shot(one.pose, one.rgb, one.depth_m, one.depth_m, depth, one.depth_m))
     config = VirtualSpaceConfig(source="auto", panorama_width=settings.panorama_width)
     nowhere: Any = None
     place = Place(nowhere, nowhere, nowhere, (0.0, 0.0, 0.0), config, None)

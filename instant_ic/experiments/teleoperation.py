@@ -114,7 +114,9 @@ def section(results: Sequence[Result], options: Options) -> Section:
     command = f"ic experiment teleoperation {quick} -o REPORT"
     parts: list[Part] = [Text("All nodes in one process in simulated time; the operator drives straight on.")]
     for one in results:
-        parts += [Figure(name, address, command) for name, address in one.data.get("images", {}).items()]
+        images = one.data.get("images", {})
+        # The command stands under the last still, the film and the plot.
+        parts += [Figure(name, images[name], "" if name[0] in "1234" else command) for name in images]
     done = [one for one in results if one.data]
     lines: list[list[Any]] = [
         ["time, s", [one.data["drive"]["seconds"] for one in done]],

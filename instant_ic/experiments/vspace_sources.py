@@ -98,8 +98,8 @@ class Shot:
     true_depth_m: NDArray[np.float32]
     raw: NDArray[np.float32]
     result: DepthResult
-    range_m: NDArray[np.floating]
-    """LiDAR ranges, (N,)."""
+    paper_depth_m: NDArray[np.float32]
+    """The model's depth scaled by the 99.5 % maxima, over the LiDAR's directions."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,9 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
         raise ValueError(
             f"depth of the panorama at ({pose[0, 3]:.2f}, {pose[1, 3]:.2f}) cannot be scaled: {result.message}"
         )
-    return Shot(pose, rgb, true, raw, result, np.linalg.norm(points, axis=1))
+    maxima = DepthSource(SourceConfig("network", replace(scaler, method="max_ratio")))
+    paper = maxima.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M)
+    return Shot(pose, rgb, true, raw, result, paper.depth_m)
 
 
 def train(space: Any, cpu_seconds: float) -> None:
@@ -202,7 +204,6 @@ def make_space(shots: list[Shot], source: str, settings: VspaceSettings, config:
     The last keyframe is untrained. The others are trained until they are ready, as during a drive (at most
     ``settings.seconds``).
     """
-    from instant_ic.depth.scale_rules import solid_angle_quantile
     from instant_ic.vspace import VirtualSpace
 
     space = VirtualSpace(config)
@@ -211,8 +212,7 @@ def make_space(shots: list[Shot], source: str, settings: VspaceSettings, config:
         if source in ("no-scale", "paper-no-scale"):
             space.set_keyframe(rgb, shot.raw, shot.pose, shot.result.relative_sigma)
         elif source == "paper":
-            scale = np.quantile(shot.range_m, 0.995) / solid_angle_quantile(shot.raw, 0.995)
-            space.set_keyframe(rgb, shot.raw * np.float32(scale), shot.pose, shot.result.relative_sigma)
+            space.set_keyframe(rgb, shot.paper_depth_m, shot.pose, shot.result.relative_sigma)
         elif source in ("true-depth", "exact-fill"):
             space.set_keyframe(rgb, shot.true_depth_m, shot.pose, 0.02)
         else:
@@ -263,8 +263,8 @@ def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: P
 
         quality = replace(QUALITIES["tripod"], older=0.0)
         renderer = EquirectRenderer(aged(place.before, quality, np.random.default_rng([73, settings.seed])))
-        truth, aged_view = (one.render(last.pose, 256, 128).rgb / 255 + 1e-3 for one in (place.renderer, renderer))
-        gain = np.median(truth / aged_view, axis=(0, 1))  # as ``MeshSpace`` fits its colours
+        theirs, seen = (one.render(last.pose, 256, 128).rgb / 255 + 1e-3 for one in (place.renderer, renderer))
+        gain = np.median(theirs / seen, axis=(0, 1))  # as ``MeshSpace`` fits its colours
 
         def draw_mesh(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
             rgb = renderer.render_perspective(pose, width, height, fov, supersample=2).rgb
