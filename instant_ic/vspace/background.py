@@ -56,7 +56,7 @@ class Background:
 
     @classmethod
     def of(cls, prior: PanoramaPrior) -> Background:
-        """The background of a keyframe. Needs numba."""
+        """The background of a keyframe."""
         from instant_ic.vspace.background_kernels import in_front
 
         step = max(1, prior.inverse_depth.shape[0] // _ROWS)
@@ -65,7 +65,7 @@ class Background:
         height, width = inverse.shape
         sky = content == SKY
         inverse[sky] = 1 / _SKY_M
-        directions = equirect_directions(width, height)
+        directions = _directions(width, height)
         rise = np.einsum("ijk,k->ij", directions, prior.map_from_camera[2, :3]).astype(np.float32)
         levels = level_planes(inverse, rise, content == ROOM)
         kind = np.zeros(inverse.shape, np.uint8)  # 1 floor, 2 ceiling, 0 all else

@@ -43,7 +43,7 @@ def draw(
 
     Args:
         rays: of a perspective view; of any where ``shown`` is None.
-        shown: the keyframes; None: the field alone, nothing is warped. Warping needs numba.
+        shown: the keyframes; None: the field alone, nothing is warped.
         field: the view as the field has it, as ``field.Device.draw`` gives it; None: the panoramas.
         layers: in and out, the warps of keyframes that have been rendered for this view.
     """
@@ -66,7 +66,6 @@ def _warped(rays: Rays, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawi
     """Compose the keyframes' panoramas, warped by their depth."""
     drawn = []
     for keyframe, gain in _nearest_first(shown, rays):
-        assert keyframe.warp is not None
         if id(keyframe.warp) not in layers:
             layers[id(keyframe.warp)] = keyframe.warp.draw(rays)
         drawn.append(Layer(keyframe.prior, gain, *layers[id(keyframe.warp)]))

@@ -48,7 +48,6 @@ def trials(shown: KeyframeSet) -> tuple[Trial, ...]:
     """
     newest, found = shown.keyframes[0], []
     for older in spread((newest, *shown.kept), TRIALS):
-        assert older.warp is not None, "keyframes are kept for warping only"
         pose = newest.prior.map_from_camera.copy()
         pose[:3, 3] = older.prior.map_from_camera[:3, 3]
         rays = perspective_rays(pose, *_SIZE, _FOV)

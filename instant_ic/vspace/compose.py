@@ -34,7 +34,7 @@ OTHER_SIDE_RAD = 0.8
 SAME_COLOUR = 30.0
 """Grey levels in which two keyframes' images of a place that stands still may differ."""
 _VOTE_ROWS = 256  # of the pixels that are asked whether they have moved
-_STEP_ROWS = 128  # of the pixels that an exposure is fitted on
+_STEP_ROWS = 64  # of the pixels that an exposure is fitted on
 _MIN_SAMPLES = 200
 _MAX_GAIN = 2.5
 _LEAST_GAIN = 0.03  # logarithm of a gain that differs from none
@@ -63,7 +63,7 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     is an error of its depth. Nor does it show what is beside its own edges, where its depth may be of either side, or
     what a newer one has seen itself and renders elsewhere: that would stand there twice. These two do not hold for what
     it sees from nearer than the newest (``NEARER``) or from another side (``OTHER_SIDE_RAD``): its edges count there as
-    the newest's do. What nobody has seen is as the newest has it. Needs numba.
+    the newest's do. What nobody has seen is as the newest has it.
     """
     from instant_ic.vspace.compose_kernels import blend
 
@@ -91,7 +91,7 @@ def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
     Each keyframe that knows says whether there is a surface at a pixel's place or whether it has looked through it; the
     majority counts, and where there is none the newest: of two keyframes the newer wins. What of the newest another's
     image shows in the same colour at that place still stands there, and only the depths disagree: it is left in, and
-    so are single pixels. Needs numba.
+    so are single pixels.
     """
     from instant_ic.vspace.compose_kernels import outvoted
 

@@ -56,13 +56,9 @@ def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
         elif wants_gpu:
             raise DeviceError(f"device is {config.device}, but torch finds no CUDA device; use auto or cpu")
     if config.device != "torch-cpu":
-        try:
-            from instant_ic.vspace.nerf.numba_device import NumbaDevice
-        except ImportError:
-            if config.device == "cpu":
-                raise
-        else:
-            return NumbaDevice(config.field, config.train), warning
+        from instant_ic.vspace.nerf.numba_device import NumbaDevice
+
+        return NumbaDevice(config.field, config.train), warning
     from instant_ic.vspace.nerf.torch_device import TorchDevice
 
     return TorchDevice(config.field, config.train, "cpu"), warning

@@ -50,8 +50,6 @@ def layer_mesh(
         shown: (h, w) false where the layer has no surface.
         tolerance: largest error of the inverse depth, in 1/m.
 
-    Needs numba.
-
     Raises:
         ValueError: shapes that do not fit, or values that are not finite and positive.
     """

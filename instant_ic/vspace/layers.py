@@ -166,7 +166,6 @@ def _marks(keyframe: Keyframe) -> NDArray[np.uint8]:
     for here, there in _OF_PRIOR.items():
         content[prior.content == here] = there
     confidence = np.where(prior.known == 1, _SURE, _FILLED).astype(np.uint8)
-    assert keyframe.warp is not None
     return content | confidence << 3 | _EDGE * np.minimum(keyframe.warp.depth_edge[1:-1], 1)
 
 
@@ -230,7 +229,7 @@ def decode_layer(layer: Layer) -> DecodedLayer:
 
 
 def decode(layers: Layers, panorama_width: int, geometry: GeometryConfig | None = None) -> KeyframeSet:
-    """The keyframes of whole layers, to be rendered as the space's own (``VirtualSpace.show``). Needs numba.
+    """The keyframes of whole layers, to be rendered as the space's own (``VirtualSpace.show``).
 
     Args:
         layers: a whole version.

@@ -141,11 +141,9 @@ def prepare(
 def _cut_tops(
     inverse: NDArray[np.float32], sigma: NDArray[np.float32], rgb: NDArray[np.uint8], room: NDArray[np.bool_]
 ) -> None:
-    """End assumed tops of things where the image does, in place; without numba they stay."""
-    try:
-        from instant_ic.vspace.fill_kernels import cut_tops
-    except ImportError:
-        return
+    """End assumed tops of things where the image does, in place."""
+    from instant_ic.vspace.fill_kernels import cut_tops
+
     height, width = inverse.shape
     colours = area_average(rgb, height, width).astype(np.float32)
     reach = max(2, round(_TOP_RAD / np.pi * height))
@@ -226,10 +224,8 @@ def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.boo
     sky = np.zeros(unknown.shape, bool)
     if least_share >= 1 or float(unknown.sum(axis=1) @ area) < least_share:
         return sky
-    try:
-        from scipy.ndimage import find_objects, label
-    except ImportError:  # then it is filled from around
-        return sky
+    from scipy.ndimage import find_objects, label
+
     labels, count = label(unknown)
     for row in range(height):  # a region may go on over the seam
         first, last = labels[row, 0], labels[row, -1]
@@ -247,17 +243,8 @@ def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.boo
 
 
 def shrunk(rgb: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    """A panorama (H, 2 H, 3) area-averaged to ``width`` where it is wider.
-
-    By OpenCV where it is installed: ten times as fast for ratios that are not integers.
-    """
-    if rgb.shape[1] <= width:
-        return rgb
-    try:
-        import cv2
-    except ImportError:
-        return area_average(rgb, width // 2, width)
-    return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_AREA), np.uint8)
+    """A panorama (H, 2 H, 3) area-averaged to ``width`` where it is wider."""
+    return rgb if rgb.shape[1] <= width else area_average(rgb, width // 2, width)
 
 
 def _checked_sigma(
@@ -281,25 +268,11 @@ def _checked_sigma(
 
 def area_average(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
     """Each target pixel is the mean over its area of the source, (H, W, C) → (height, width, C)."""
-    result = image.astype(np.float32)
-    for axis, target in ((0, height), (1, width)):
-        source = result.shape[axis]
-        if source == target:
-            continue
-        if source % target == 0:
-            shape = (*result.shape[:axis], target, source // target, *result.shape[axis + 1 :])
-            result = result.reshape(shape).mean(axis=axis + 1, dtype=np.float32)
-            continue
-        # Integral along the axis, read at the (fractional) edges of the target's pixels.
-        lines = np.moveaxis(result, axis, 0)
-        integral = np.zeros((source + 1, *lines.shape[1:]), np.float64)
-        np.cumsum(lines, axis=0, dtype=np.float64, out=integral[1:])
-        edges = np.arange(target + 1) * (source / target)
-        low = np.minimum(edges.astype(np.intp), source - 1)
-        share = (edges - low).reshape(-1, *([1] * (lines.ndim - 1)))
-        at_edges = integral[low] * (1 - share) + integral[low + 1] * share
-        result = np.moveaxis(np.diff(at_edges, axis=0) * (target / source), 0, axis).astype(np.float32)
-    return np.clip(np.rint(result), 0, 255).astype(np.uint8)
+    import cv2
+
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8).reshape(
+        height, width, -1
+    )
 
 
 def fill_holes(
@@ -312,56 +285,14 @@ def fill_holes(
         valid: (H, W); where nothing is valid at all, zeros come back.
         weight: (H, W) positive weights of the valid values, 1 where None.
     """
+    from instant_ic.vspace.fill_kernels import fill
+
     if valid.all():
         return values
     channels = values if values.ndim == 3 else values[..., None]
     w = valid.astype(np.float32) if weight is None else np.where(valid, weight, 0).astype(np.float32)
-    try:
-        from instant_ic.vspace.fill_kernels import fill
-    except ImportError:  # no numba
-        filled = _fill(channels, w)
-    else:
-        filled = fill(channels, w)
+    filled = fill(channels, w)
     return filled if values.ndim == 3 else filled[..., 0]
-
-
-def _fill(channels: NDArray[np.float32], w: NDArray[np.float32]) -> NDArray[np.float32]:
-    """``fill_holes`` in numpy: (H, W, C), and weights (H, W) that are 0 in the holes."""
-    valid = w > 0
-    total = channels * w[..., None]
-    levels = [(total, w)]
-    while min(levels[-1][1].shape) > 1:
-        total, w = levels[-1]
-        levels.append((_halve(total), _halve(w)))
-    # Sums and weights go down together, so that where two sides meet the heavier counts more.
-    total, w = levels[-1]
-    for finer_total, finer_w in reversed(levels[:-1]):
-        known = finer_w > 0
-        total = np.float32(0.25) * _double(total, known.shape)
-        w = np.float32(0.25) * _double(w, known.shape)
-        total[known], w[known] = finer_total[known], finer_w[known]
-    coarse = (total / np.maximum(w, np.float32(1e-30))[..., None]).astype(np.float32)
-    coarse[valid] = channels[valid]
-    return coarse
-
-
-def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    height, width = values.shape[:2]
-    if height % 2 or width % 2:
-        pad = ((0, height % 2), (0, width % 2), *([(0, 0)] * (values.ndim - 2)))
-        values = np.pad(values, pad)
-    return values[::2, ::2] + values[1::2, ::2] + values[::2, 1::2] + values[1::2, 1::2]
-
-
-def _double(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Bilinear enlargement (weights 3/4 and 1/4), so that fills have no blocks."""
-    for axis in (0, 1):
-        before = np.concatenate([values.take([0], axis), values.take(range(values.shape[axis] - 1), axis)], axis)
-        after = np.concatenate([values.take(range(1, values.shape[axis]), axis), values.take([-1], axis)], axis)
-        pair = np.stack([0.75 * values + 0.25 * before, 0.75 * values + 0.25 * after], axis + 1)
-        merged = (*values.shape[:axis], 2 * values.shape[axis], *values.shape[axis + 1 :])
-        values = pair.reshape(merged)
-    return np.ascontiguousarray(values[: shape[0], : shape[1]], np.float32)
 
 
 _ABRUPT = 0.75  # of the change over five pixels: a step that makes up less of it is a slope with noise on it

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import enum
 import functools
-import importlib.util
 import itertools
 import math
 import time
@@ -132,9 +131,8 @@ class VirtualSpace(Drawn):
             raise ValueError("source is mesh: nothing is learnt there; use make_space, which renders the mesh")
         self._robot = robot
         self._device, self._warning = make_device(self.config)
-        self._can_warp = importlib.util.find_spec("numba") is not None
         if self.config.source == "auto":
-            source = "warp" if self._can_warp and not self._device.on_gpu else "field"
+            source = "field" if self._device.on_gpu else "warp"
             self.config = dataclasses.replace(self.config, source=source)
         # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
         self._store = KeyframeStore(self.config.keyframes + 2 + (RECENT - 1 if self.config.older else 0))
@@ -230,7 +228,7 @@ class VirtualSpace(Drawn):
         prior = prepare(
             rgb, depth_m, map_from_camera, relative_sigma, config.geometry, config.panorama_width, self._robot
         )
-        newest = self._store.put(prior, self._can_warp)
+        newest = self._store.put(prior)
         before = () if self._shown is None else (*self._shown.keyframes, *self._shown.kept)
         size = (newest.prior.rgb.shape, newest.prior.inverse_depth.shape)
         before = tuple(one for one in before if (one.prior.rgb.shape, one.prior.inverse_depth.shape) == size)
@@ -251,9 +249,8 @@ class VirtualSpace(Drawn):
         if len(keyframes) == 1:
             alone = keyframes[0].prior.without(np.zeros_like(keyframes[0].prior.content, bool))
             return KeyframeSet((_renewed(keyframes[0], alone),), np.ones((1, 3), np.float32))
-        if self._can_warp:
-            gone = moved([keyframe.prior for keyframe in keyframes])
-            keyframes = tuple(_renewed(one, one.prior.without(mask)) for one, mask in zip(keyframes, gone, strict=True))
+        gone = moved([keyframe.prior for keyframe in keyframes])
+        keyframes = tuple(_renewed(one, one.prior.without(mask)) for one, mask in zip(keyframes, gone, strict=True))
         return KeyframeSet(keyframes, exposure_gains([keyframe.prior for keyframe in keyframes]))
 
     def show(self, prepared: KeyframeSet, dissolve: bool = False) -> None:
@@ -406,7 +403,7 @@ class VirtualSpace(Drawn):
         self._learn_what_is_drawn(around=False)
 
         def draw(device: Device) -> Painted:
-            picture = self._drawn(device, rays, shown, self._can_warp, {})
+            picture = self._drawn(device, rays, shown, True, {})
             return canvas.painted(picture, picture.colour)
 
         _, depth, confidence = self._on_device(draw)
@@ -438,14 +435,14 @@ class VirtualSpace(Drawn):
 
     def _learn_what_is_drawn(self, around: bool) -> None:
         """Train on the shown keyframes if the field is rendered too and has no scene yet."""
-        if self._scene is None and (self._panorama_share < 1 or around or not self._can_warp):
+        if self._scene is None and (self._panorama_share < 1 or around):
             assert self._shown is not None
             self.learn(self.scene_of(self._shown))
 
     def _painted(self, device: Device, rays: Rays, around: bool) -> Painted:
         """Render the shown keyframes, blended with those shown before; ``around``: a panorama, not warped."""
         assert self._shown is not None
-        warps = self._can_warp and not around
+        warps = not around
         layers: dict[int, Drawing] = {}  # a keyframe of both sets is rendered once
         picture = self._drawn(device, rays, self._shown, warps, layers)
         image = canvas.continued(picture, rays.shape, around)
@@ -534,7 +531,7 @@ class VirtualSpace(Drawn):
         """
         saved = read(path)
         space = cls(saved.config if device is None else dataclasses.replace(saved.config, device=device))
-        shown = KeyframeSet(tuple(space._store.put(prior, space._can_warp) for prior in saved.priors), saved.gains)
+        shown = KeyframeSet(tuple(space._store.put(prior) for prior in saved.priors), saved.gains)
         occupancy = build_occupancy(saved.priors, saved.config.geometry)
         space._device.load(saved.parameters)
         space.learn(Prepared(Scene(shown.priors, saved.lattice, occupancy, saved.gains), shown))
@@ -554,7 +551,7 @@ def _renewed(keyframe: Keyframe, prior: PanoramaPrior) -> Keyframe:
     """The keyframe with another prior of the same panorama."""
     if prior is keyframe.prior:
         return keyframe
-    return ready(keyframe.place, prior, None if keyframe.warp is None else keyframe.warp.pyramid)
+    return ready(keyframe.place, prior, keyframe.warp.pyramid)
 
 
 def _field_alone(rays: Rays, depth_share: float, device: Device) -> Drawing:

@@ -22,11 +22,11 @@ those of 3.6 m."""
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A keyframe prepared for rendering; ``warp`` and ``background`` are None without numba. ``place``: its slot."""
+    """A keyframe prepared for rendering; ``place``: its slot; ``background`` is None where decoded layers have none."""
 
     place: int
     prior: PanoramaPrior
-    warp: PanoramaWarp | None
+    warp: PanoramaWarp
     background: Background | None
 
 
@@ -88,8 +88,8 @@ class KeyframeStore:
         self._arrays: list[dict[str, NDArray[Any]]] = []
         self._held: set[int] = set()
 
-    def put(self, prior: PanoramaPrior, draws: bool) -> Keyframe:
-        """Copy a keyframe into a free slot and prepare it for rendering (``draws``: by the warp, with numba)."""
+    def put(self, prior: PanoramaPrior) -> Keyframe:
+        """Copy a keyframe into a free slot and prepare it for rendering."""
         names = [field.name for field in fields(prior) if isinstance(getattr(prior, field.name), np.ndarray)]
         arrays = self._free({name: getattr(prior, name) for name in names})
         for name in names:
@@ -98,7 +98,7 @@ class KeyframeStore:
         pyramid = Pyramid.of(prior.rgb, arrays["texels"])
         stored: dict[str, Any] = {name: arrays[name] for name in names}
         prior = replace(prior, **stored)
-        return ready(int(arrays["place"]), prior, pyramid if draws else None)
+        return ready(int(arrays["place"]), prior, pyramid)
 
     def _free(self, like: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """The arrays of a free place; another one is made where all are held."""
@@ -117,10 +117,8 @@ class KeyframeStore:
             self._held = {keyframe.place for keyframe in keyframes}
 
 
-def ready(place: int, prior: PanoramaPrior, pyramid: Pyramid | None) -> Keyframe:
-    """Prepare a keyframe for rendering: by the warp if it has a pyramid."""
-    if pyramid is None:
-        return Keyframe(place, prior, None, None)
+def ready(place: int, prior: PanoramaPrior, pyramid: Pyramid) -> Keyframe:
+    """Prepare a keyframe for rendering."""
     return Keyframe(place, prior, PanoramaWarp.of_prior(prior, pyramid), Background.of(prior))
 
 
