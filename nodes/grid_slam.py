@@ -54,7 +54,10 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.subscribe("/slam/save", msg.String, self.on_save, qos=RELIABLE)
         self.subscribe("/initialpose", msg.PoseWithCovarianceStamped, self.on_initial_pose, qos=RELIABLE)
         self.timer(self.config.map_period_s, self.publish_map)
-        self.timer(1.0, lambda: self.diagnose_all(self.queue.watch(self.clock.steady_ns())))
+        self.timer(1.0, self.watch)
+
+    def watch(self) -> None:
+        self.diagnose_all(self.queue.watch(self.clock.steady_ns()))
 
     def reconfigure(self, config: GridSlamConfig) -> None:
         super().reconfigure(config)

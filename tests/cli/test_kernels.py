@@ -119,8 +119,7 @@ def test_what_the_first_drive_needs_is_compiled_ahead_in_one_variant() -> None:
     """A later variant, for a map that may not be written or arrays in another order, would hold up the robot."""
     kernels._compile("slam")
     kernels._compile("control")
-    for kernel in (loop_search.pool, loop_search.peaks, loop_search.score_volume):
-        assert kernel.signatures
+    assert loop_search.score_volume.signatures
     read_only = np.zeros((20, 20), np.int8)
     read_only.flags.writeable = False
     for occupancy in (read_only, read_only.copy()):

@@ -202,7 +202,7 @@ def test_the_same_seed_gives_the_same_drive(drive: tuple[dict, Path]) -> None:
 def test_what_cannot_be_done_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["evaluate", "follow", "--episodes", "0"]) == 1
     assert "at least 1" in capsys.readouterr().err
-    assert main(["evaluate", "follow", "--json", str(tmp_path / "none" / "f.json")]) == 1
+    assert main(["evaluate", "follow", "--json", str(tmp_path / "none" / "f.json")]) == 2
     assert "does not exist" in " ".join(capsys.readouterr().err.split())
 
 

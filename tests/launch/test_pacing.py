@@ -193,6 +193,7 @@ def test_delays_and_stale_sources_come_from_the_simulated_stack(tmp_path):
             late.send(serialize(Float32(1.5)))
             stale = ControlState.REASON_SCAN_STALE if count % 2 else ControlState.REASON_STARTING
             state.send(serialize(control(stale)))
+            monitor.poll()
             found.add(monitor.take_late())
             if {(1.5, True), (1.5, False)} <= found:
                 break
