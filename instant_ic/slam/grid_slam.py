@@ -31,6 +31,8 @@ NEAR_M, NEAR_RAD = 1.5, 0.4
 """A session found this close to where odometry says needs no second finding."""
 AGREE_M, AGREE_RAD, CONFIRM_AFTER = 0.3, 0.1, 1.0
 """Two findings of a session agree within the first two; metres and radians between them, together."""
+PROVISIONAL_KEYFRAMES = 8
+"""Number of keyframes after a sign of a loss that are provisional. Over a longer way a right pose drifts, too."""
 MAX_ODOMETRY_GAP_S = 5.0
 """The encoders keep counting across a shorter gap; after a longer one they may have been reset."""
 
@@ -76,6 +78,21 @@ class SlamResult:
         return self.status.matched and self.localized and self.integrity.trusted
 
 
+@dataclass
+class _Before:
+    """The state before a sign of a loss.
+
+    Attributes:
+        map: as it was.
+        keyframes: number of them.
+        since: number of keyframes since.
+    """
+
+    map: OccupancyMap
+    keyframes: int
+    since: int = 0
+
+
 class GridSlam:
     """Online SLAM with a planar laser.
 
@@ -108,6 +125,7 @@ class GridSlam:
         self._reach_m = math.inf  # distance from odometry within which the robot is searched for
         self._found_before: tuple[FloatArray, FloatArray] | None = None
         self._saved_cells: tuple[SavedMap, OccupancyMap] | None = None  # a saved map, to compare scans with
+        self._before: _Before | None = None  # until a sign of a loss has been examined
         self.map_from_base: FloatArray = np.zeros(3)
         self.odom_from_base: FloatArray = np.zeros(3)
         self.map_from_odom: FloatArray = np.zeros(3)
@@ -154,8 +172,7 @@ class GridSlam:
         else:
             track = self.front_end.dead_reckon(guess)
             self.monitor.unmatched(False, self._elapsed_s(scan.stamp_ns))
-        if track.keyframe is not None:
-            self.map.insert(track.keyframe.map_from_base, track.keyframe.scan)
+        self._extend_map(track)
         self._follow(track, odometry, scan.stamp_ns)
         anchor = self.front_end.trajectory.last
         covariance = track.covariance + anchor.drift
@@ -194,11 +211,11 @@ class GridSlam:
             return files  # this map was loaded, and its graph, if any, exists where it came from
         return [*files, save_graph(stem, *self._graph())]
 
-    def _graph(self) -> tuple[list[Keyframe], list[Edge]]:
-        """The keyframes that have not been removed, and the edges between them."""
-        keyframes = self.front_end.trajectory.keyframes
-        known = max((edge.b for edge in self._edges), default=0) + 1
-        edges = list(self._edges)
+    def _graph(self, count: int | None = None) -> tuple[list[Keyframe], list[Edge]]:
+        """The first ``count`` keyframes, or all, that have not been removed, and the edges between them."""
+        keyframes = self.front_end.trajectory.keyframes[:count]
+        edges = [edge for edge in self._edges if max(edge.a, edge.b) < len(keyframes)]
+        known = max((edge.b for edge in edges), default=0) + 1
         for k in range(known, len(keyframes)):  # keyframes that the loop closure has not processed yet
             edges.append(Edge(k - 1, k, keyframes[k].step, keyframes[k].step_covariance))
         kept = [k for k, keyframe in enumerate(keyframes) if keyframe.merged_into is None]
@@ -271,6 +288,7 @@ class GridSlam:
         """After the last scan: optimise with all loops, and rebuild the map from the result."""
         if not self.localized or self._broken or self.front_end.in_known_map:
             return
+        self._settle()
         new = self.front_end.trajectory.keyframes[self._handed_over :]
         if self.config.loop.enabled and self.front_end.trajectory.keyframes:
             self._handed_over += len(new)
@@ -287,6 +305,10 @@ class GridSlam:
     def _take_over_loops(self, outcome: Outcome) -> None:
         """Apply optimised poses, the rebuilt map and merged keyframes."""
         keyframes = self.front_end.trajectory.keyframes
+        if self._before is not None:
+            first = self._before.keyframes
+            if outcome.poses is not None or any(edge.robust and edge.b >= first for edge in outcome.edges):
+                self._settle()  # a loop has recognized the place
         moved = outcome.apply(keyframes)
         if moved is not None:
             self.front_end.rebuild_field()
@@ -298,6 +320,7 @@ class GridSlam:
 
     def _join(self, saved: SavedMap, moved: FloatArray, covariance: FloatArray, built: OccupancyMap | None) -> None:
         """Join the current map to the saved one: ``moved`` transforms everything mapped so far into the saved map."""
+        self._settle()
         own = self.front_end.trajectory.keyframes
         for keyframe in own:
             keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
@@ -323,6 +346,23 @@ class GridSlam:
 
     # -- integrity ------------------------------------------------------------------------------
 
+    def _extend_map(self, track: Track) -> None:
+        """Add a keyframe's scan to the map. At a sign of a loss the map before it is kept for some metres."""
+        keyframe = track.keyframe
+        if self._before is None and self.monitor.sign and not self.front_end.in_known_map:
+            self._before = _Before(self.map.copy(), len(self.front_end.trajectory) - (keyframe is not None))
+        if keyframe is not None:
+            self.map.insert(keyframe.map_from_base, keyframe.scan)
+        if self._before is not None:
+            self._before.since += keyframe is not None
+            if self._before.since >= PROVISIONAL_KEYFRAMES and not self.monitor.doubts:
+                self._settle()
+
+    def _settle(self) -> None:
+        """Make the scans since the sign of a loss part of the map for good."""
+        self._before = None
+        self.monitor.settled()
+
     def _track(self, points: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
         """Match a scan. While the pose is in doubt no scan enters the map; a lost robot starts a new session."""
         elapsed_s = self._elapsed_s(stamp_ns)
@@ -330,6 +370,11 @@ class GridSlam:
         def accept(pose: FloatArray, score: float, recovered: bool) -> bool:
             contradicted = self._compared_map().contradiction(pose, points)
             self.monitor.matched(contradicted, score, elapsed_s, recovered)
+            if self._before is not None:
+                # What is older than the local map may contradict a right pose, which has drifted.
+                before = self._before.map.contradiction(pose, points, self.config.field.keyframes)
+                step = relative2(self.map_from_base, pose)
+                self.monitor.compared(before - contradicted, math.hypot(step[0], step[1]) + 0.5 * abs(float(step[2])))
             return not self.monitor.doubts
 
         track = self.front_end.track(points, guess, stamp_ns, accept)
@@ -354,12 +399,14 @@ class GridSlam:
         """Leave the map as it is and map apart from it, until the robot is found in it."""
         if self.localized and not self.front_end.in_known_map:
             try:
-                self.saved = SavedMap(self.config, self.map.grid(), self._graph())
+                before = self._before or _Before(self.map, len(self.front_end.trajectory))
+                self.saved = SavedMap(self.config, before.map.grid(), self._graph(before.keyframes))
                 self._apart = True
             except ValueError:
                 self.saved = None  # a map without a wall or a free cell: nothing to find the robot in
         elif self.saved is not None:
             self.saved.located = False
+        self._before = None
         self.loop_closure = LoopClosure(self.config)
         version, self.map = self.map.version, OccupancyMap(self.config.map)
         self.map.version = version + 1

@@ -8,6 +8,10 @@ contradicts new scans too, but gradually, and at a good score.
 `IntegrityMonitor` is a Bayes filter on one bit, lost or not. The log-likelihood ratio of a scan was chosen on the Intel
 log and a generated office, with robots put down elsewhere; docs/benchmarks.md has the figures on other logs. While the
 monitor doubts, the map must not grow: otherwise the scan agrees with its own copy.
+
+A robot that is put down in a place that looks the same fits at a good score, and each scan contradicts little. After a
+weak sign (`IntegrityMonitor.sign`) scans are therefore provisional for some metres, and the map before them is kept. If
+the next ones contradict it and agree with the map that has the provisional ones, metre after metre, the robot is lost.
 """
 
 from __future__ import annotations
@@ -39,6 +43,11 @@ EVIDENCE = 2.0
 """Limit of a scan's log-likelihood ratio: no single scan decides."""
 EVIDENCE_S = 0.1
 """Scans closer in time see the same scene: their evidence counts in proportion to the time between them."""
+PER_M, AGREES = 100.0, 0.1
+"""Evidence of a metre in which all rays contradict the map before the sign and none the map since, and the difference
+of the two shares that is no evidence. 0.3 m at a difference of 0.3 make a sign a loss."""
+LONGEST_STEP_M = 0.25
+"""Way between two scans that counts at most."""
 LEVEL_SHARE = 0.1
 """Weight of a new scan in the levels."""
 FLOOR = -6.0
@@ -62,12 +71,15 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 10.0, math.pi / math.sqrt(3.0)
 
 
 @njit(cache=True)
-def compare_rays(cells, seen, origin, resolution, pose, laser, points, reach, slack, occupied):  # type: ignore[no-untyped-def]
+def compare_rays(  # type: ignore[no-untyped-def]
+    cells, seen, since, origin, resolution, pose, laser, points, reach, slack, occupied
+):
     """Count how the rays of a scan agree with a map.
 
     Args:
         cells: float32 (H, W) log-odds.
-        seen: int32 (H, W), 0 where the map is unknown.
+        seen: int32 (H, W), number of the scan that last changed a cell; 0 where the map is unknown.
+        since: > 0; cells that only scans before this one have changed count as unknown.
         origin: (2,) corner of cell (0, 0).
         resolution: metres per cell.
         pose: map_from_base (3,).
@@ -95,14 +107,14 @@ def compare_rays(cells, seen, origin, resolution, pose, laser, points, reach, sl
         crossed = False
         for k in range(int(length - slack / resolution)):
             u, v = math.floor(x0 + (x - x0) * k / length), math.floor(y0 + (y - y0) * k / length)
-            if 0 <= u < width and 0 <= v < height and seen[v, u] != 0 and cells[v, u] > occupied:
+            if 0 <= u < width and 0 <= v < height and seen[v, u] >= since and cells[v, u] > occupied:
                 crossed = True
                 break
         wall = unknown = False
         ix, iy = math.floor(x), math.floor(y)
         for v in range(iy - r, iy + r + 1):
             for u in range(ix - r, ix + r + 1):
-                if u < 0 or v < 0 or u >= width or v >= height or seen[v, u] == 0:
+                if u < 0 or v < 0 or u >= width or v >= height or seen[v, u] < since:
                     unknown = True
                 elif cells[v, u] > 0.0:
                     wall = True
@@ -122,22 +134,24 @@ def contradiction(
     resolution: float,
     pose: FloatArray,
     scan: ScanPoints,
+    since: int = 1,
 ) -> float:
     """Share of a scan's rays, 0..1, that contradict a map: through its walls, or ending in its free space.
 
     Args:
         cells: log-odds (H, W).
-        seen: (H, W), 0 where the map is unknown.
+        seen: (H, W), number of the scan that last changed a cell; 0 where the map is unknown.
         origin: (2,) corner of cell (0, 0).
         resolution: metres per cell.
         pose: map_from_base (3,).
         scan: of the robot at that pose.
+        since: cells that only scans before this one have changed count as unknown.
     """
     points = scan.points
     if len(points) > POINTS:
         points = np.ascontiguousarray(points[(np.arange(POINTS) * len(points)) // POINTS])
     known, through, free = compare_rays(
-        cells, seen, origin, resolution, pose, scan.origin, points, RANGE_M, SLACK_M, OCCUPIED_LOG_ODDS
+        cells, seen, since, origin, resolution, pose, scan.origin, points, RANGE_M, SLACK_M, OCCUPIED_LOG_ODDS
     )
     return min(1.0, (through + free) / max(known, LEAST_KNOWN))
 
@@ -169,12 +183,13 @@ class IntegrityMonitor:
     Attributes:
         contradiction: of the last scan.
         after_gap: whether the doubt began with a time without matched scans.
+        sign: whether the last scan is evidence, however weak, of another place.
     """
 
     def __init__(self) -> None:
         self.contradiction = 0.0
-        self.after_gap = False
-        self._log_odds = FLOOR
+        self.after_gap = self.sign = False
+        self._log_odds = self._provisional_log_odds = FLOOR
         self._suspicious = False  # the last scan, whatever the time since the one before
         self._unseen_s = 0.0
         self._doubtful_scans = 0
@@ -192,12 +207,12 @@ class IntegrityMonitor:
     @property
     def lost(self) -> bool:
         """Whether the pose must no longer be used, and the map be left as it is."""
-        return self._log_odds >= LOST
+        return max(self._log_odds, self._provisional_log_odds) >= LOST
 
     @property
     def lost_probability(self) -> float:
         """Probability of being lost, 0..1."""
-        return 1.0 / (1.0 + math.exp(-self._log_odds))
+        return 1.0 / (1.0 + math.exp(-max(self._log_odds, self._provisional_log_odds)))
 
     def matched(self, contradicted: float, score: float, elapsed_s: float, recovered: bool = False) -> None:
         """Take in a scan that fits somewhere.
@@ -229,6 +244,22 @@ class IntegrityMonitor:
             self._contradiction_level += LEVEL_SHARE * (contradicted - self._contradiction_level)
             self._usual_contradiction = max(self._contradiction_level, contradicted)
 
+    def compared(self, excess: float, moved_m: float) -> None:
+        """Take in a scan that was compared with the map before a sign and with the map since.
+
+        Scans of one place agree or disagree together, so evidence counts by the way driven.
+
+        Args:
+            excess: share of its rays that contradict the map before, less the share that contradicts the map since.
+            moved_m: since the scan before; a radian counts as half a metre.
+        """
+        evidence = PER_M * (excess - AGREES) * min(moved_m, LONGEST_STEP_M)
+        self._provisional_log_odds = min(max(self._provisional_log_odds + evidence, FLOOR), LOST + EVIDENCE)
+
+    def settled(self) -> None:
+        """Forget the comparison: the provisional scans have become part of the map."""
+        self._provisional_log_odds = FLOOR
+
     def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:
         """Take in a scan without a match: one that fits nowhere near, or one without points."""
         if fits_nowhere:
@@ -257,7 +288,7 @@ class IntegrityMonitor:
         return Integrity(lost, BOUND_SIGMAS * sigma_m, min(heading, math.pi))
 
     def _weigh(self, evidence: float, elapsed_s: float) -> None:
-        self._suspicious = evidence >= SUSPICIOUS
+        self._suspicious, self.sign = evidence >= SUSPICIOUS, evidence > 0.0
         self._log_odds += evidence * min(1.0, max(elapsed_s, 0.0) / EVIDENCE_S)
         self._log_odds = min(max(self._log_odds, FLOOR), LOST + EVIDENCE)
         self._doubtful_scans = self._doubtful_scans + 1 if self.doubts else 0

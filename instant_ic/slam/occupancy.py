@@ -6,6 +6,7 @@ rays of the same scan that pass through the cell, so that walls seen at a grazin
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import NamedTuple
 
@@ -181,9 +182,16 @@ class OccupancyMap:
         made._seen = (grid.values >= 0).astype(np.int32)
         return made
 
-    def contradiction(self, map_from_base: FloatArray, scan: ScanPoints) -> float:
-        """Share of a scan's rays, 0..1, that contradict the map: see `integrity.contradiction`."""
-        return contradiction(self._cells, self._seen, self.origin, self.config.resolution_m, map_from_base, scan)
+    def copy(self) -> OccupancyMap:
+        """A copy that later scans leave as it is."""
+        made = copy.copy(self)
+        made._cells, made._seen = self._cells.copy(), self._seen.copy()
+        return made
+
+    def contradiction(self, map_from_base: FloatArray, scan: ScanPoints, newest: int | None = None) -> float:
+        """Share of a scan's rays, 0..1, that contradict the map or its ``newest`` scans (`integrity.contradiction`)."""
+        resolution, since = self.config.resolution_m, 1 if newest is None else max(1, self._mark - newest + 1)
+        return contradiction(self._cells, self._seen, self.origin, resolution, map_from_base, scan, since)
 
     def grid(self) -> OccupancyGrid:
         """Return the current map; 0×0 before the first scan."""

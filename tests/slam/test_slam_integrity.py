@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments.slam_faults import evaluate_faults
+from instant_ic.experiments.slam_faults import evaluate_faults, kidnap
 from instant_ic.experiments.slam_sim import round_trip
 from instant_ic.sim.worlds import make_world
+from instant_ic.slam import GridSlam
 from instant_ic.slam.integrity import (
     BOUND_SIGMAS,
     LOST_SIGMA_M,
@@ -55,6 +56,15 @@ def test_share_of_rays_that_contradict_the_map(points: tuple[tuple[float, float]
     assert contradiction(cells, seen, np.zeros(2), 0.05, np.array([1.0, 2.0, 0.0]), hits(*points)) == share
 
 
+def test_cells_that_only_older_scans_have_seen_count_as_unknown() -> None:
+    cells, seen = wall_map()
+    seen[seen > 0] = 7
+    seen[:, 80] = 6  # the wall
+    pose, through = np.array([1.0, 2.0, 0.0]), hits((5.5, 0.0))
+    assert contradiction(cells, seen, np.zeros(2), 0.05, pose, through, since=6) == 1.0
+    assert contradiction(cells, seen, np.zeros(2), 0.05, pose, through, since=7) == 0.0
+
+
 def steady(scans: int = 30) -> IntegrityMonitor:
     monitor = IntegrityMonitor()
     for _ in range(scans):
@@ -91,6 +101,30 @@ def test_neither_alone_takes_the_trust(contradicted: float, score: float) -> Non
     for _ in range(50):
         monitor.matched(contradicted, score, 0.1)
     assert monitor.lost_probability < 0.01
+
+
+def test_scans_that_agree_with_the_provisional_map_alone_take_the_trust_by_the_way_driven() -> None:
+    # -6 + 100 a metre · (0.3 - 0.1) · 0.1 m = -4, -2, 0.
+    monitor = steady()
+    lost = []
+    for _ in range(3):
+        monitor.compared(0.3, 0.1)
+        monitor.compared(0.3, 0.0)  # a robot that stands learns nothing new
+        monitor.matched(0.02, 0.9, 0.1)  # fits, by the score
+        lost.append(monitor.lost)
+    assert lost == [False, False, True]
+    monitor.settled()
+    assert not monitor.lost
+    monitor.compared(0.1, 1.0)
+    assert monitor.lost_probability == pytest.approx(1 / (1 + math.exp(6.0)))
+
+
+@pytest.mark.parametrize(("contradicted", "score", "sign"), [(0.02, 0.9, False), (0.15, 0.65, True)])
+def test_a_contradiction_with_a_drop_of_the_score_is_a_sign(contradicted: float, score: float, sign: bool) -> None:
+    # sqrt(0.13 / 0.25 · 1) = 0.72: more than half of the full evidence.
+    monitor = steady()
+    monitor.matched(contradicted, score, 0.1)
+    assert monitor.sign is sign
 
 
 def test_a_doubt_ends_with_scans_that_fit() -> None:
@@ -143,6 +177,21 @@ def test_a_robot_carried_off_is_noticed_and_found_again(log: list[LogEntry]) -> 
         assert figures["trusted_wrong_scans_max"] <= 10
         assert figures["recovered"] == 2, figures
         assert figures["end_error_m_max"] < 0.1
+
+
+def test_scans_since_the_sign_of_a_loss_leave_no_copy_in_the_map(log: list[LogEntry]) -> None:
+    slam = GridSlam()
+    for entry in log[:250]:
+        slam.process(entry.scan, entry.odom_pose)
+    before = slam.grid().values
+    there = kidnap(log, 250, 300, 60, np.random.default_rng(0))
+    for entry in there.entries:
+        slam.process(entry.scan, entry.odom_pose)
+        if not slam.localized:
+            break
+    assert slam.saved is not None and not slam.localized
+    np.testing.assert_array_equal(slam.saved.grid.values, before)
+    assert all(keyframe.stamp_ns <= log[249].scan.stamp_ns for keyframe in slam.saved.keyframes)
 
 
 def test_a_heading_that_jumps_leaves_no_turned_map(log: list[LogEntry]) -> None:
