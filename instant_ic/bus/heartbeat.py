@@ -59,10 +59,10 @@ class Heartbeat:
 
 
 def from_message(message: Any) -> Heartbeat:
-    """Heartbeat from a NodeStatus message."""
-    flows = zip(message.inputs, message.input_rates_hz, message.input_ages_s, strict=True)
-    sent = zip(message.outputs, message.output_rates_hz, message.output_ages_s, strict=True)
-    lost = zip(message.lost_topics, message.lost_publishers, message.lost_counts, strict=True)
+    """Heartbeat from a NodeStatus message; of lists of different lengths, which any program can send, the shorter."""
+    flows = zip(message.inputs, message.input_rates_hz, message.input_ages_s, strict=False)
+    sent = zip(message.outputs, message.output_rates_hz, message.output_ages_s, strict=False)
+    lost = zip(message.lost_topics, message.lost_publishers, message.lost_counts, strict=False)
     return Heartbeat(
         message.node,
         int(message.pid),

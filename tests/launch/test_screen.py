@@ -170,6 +170,25 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
         transport.close()
 
 
+def test_a_heartbeat_with_lists_of_different_lengths_does_not_end_the_launcher(tmp_path: Path) -> None:
+    transport = LocalTransport(tmp_path, "test", lambda: 1)
+    monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
+    wrong = beat("my_slam")
+    wrong.outputs = [*wrong.outputs, "/more"]
+    try:
+        publisher = transport.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE)
+        for _ in range(2000):  # until the subscription is connected
+            publisher.send(serialize(wrong))
+            monitor.poll()
+            if "my_slam" in monitor.nodes:
+                break
+            time.sleep(0.01)
+        assert monitor.nodes["my_slam"].state == "running" and "/more" not in monitor.nodes["my_slam"].outputs
+    finally:
+        monitor.close()
+        transport.close()
+
+
 def test_one_message_reaches_a_milestone(tmp_path: Path) -> None:
     monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
     try:
