@@ -7,6 +7,7 @@ These modules import their dependencies inside their functions, which keeps ``ic
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import os
 import pkgutil
@@ -33,6 +34,8 @@ _EPILOG = """examples:
   ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again
   ic doctor                             check this machine
 """
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -106,6 +109,9 @@ def _call(args: argparse.Namespace) -> int:
     except Exception as error:
         if isinstance(error, OSError) and error.filename:  # a file that cannot be read or written
             print(f"ic: {error.filename}: {error.strerror}", file=sys.stderr)
+            return 1
+        if isinstance(error, OSError) and error.errno in _FULL:  # a write reports no name
+            print(f"ic: a file could not be written: {error.strerror}. Free some space.", file=sys.stderr)
             return 1
         if type(error) in (FileNotFoundError, FileExistsError):  # raised by us: by the system, it has a file name
             print(f"ic: {error}", file=sys.stderr)

@@ -312,6 +312,15 @@ def test_replay_mistakes(capsys: pytest.CaptureFixture[str]) -> None:
     assert status == 1 and "bag x does not exist" in error
 
 
+def test_a_full_disk_is_reported_in_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def write(args: object) -> None:
+        Path("/dev/full").write_text("figures")  # the error of a write has no file name
+
+    monkeypatch.setattr("instant_ic.cli.commands.completion.show", write)
+    status, _, error = ic(capsys, "completion", "bash")
+    assert (status, error) == (1, "ic: a file could not be written: No space left on device. Free some space.\n")
+
+
 def test_usage_is_status_two(capsys: pytest.CaptureFixture[str]) -> None:
     for words in ((), ("warp",), ("topic",), ("topic", "hz"), ("topic", "hz", "/a", "--duration", "0")):
         assert ic(capsys, *words)[0] == 2, words
