@@ -41,7 +41,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
         means = {key: _means(results, name, key) for key in ("psnr_db", "ssim")}
         lines = [[source, means["psnr_db"][source], means["ssim"][source]] for source in means["psnr_db"]]
         title = f"{name}: mean over all distances above 0"
-        parts.append(Table(title, ("source", "PSNR, dB", "SSIM"), lines, command.format(world=name)))
+        parts.append(Table(title, ("source", "PSNR, dB", "SSIM"), lines, command))
         for better, worse, claim in (
             (options.method, "no-depth", "the depth prior improves the view (paper)"),
             ("paper", "paper-no-scale", "scaling improves the paper's own field (paper)"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from instant_ic.experiments import recorded
-from instant_ic.experiments.lab import Options, Result, Unit
+from instant_ic.experiments.lab import Options, Result, Unit, kind_of
 from instant_ic.experiments.pictures import Series, curves_svg, image_strip, jpeg
 from instant_ic.experiments.report import Figure, Part, Table, image_address
 from instant_ic.experiments.vspace import compare
@@ -20,8 +21,6 @@ TABLE_M = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Distances of the tables."""
 LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
 _TILE_PX = 240
-_SHOWN_SEED = 0
-"""Seed whose images are kept."""
 
 
 def view_units(
@@ -48,6 +47,8 @@ def view_units(
         count = recorded.count_keyframes(options.bag) - 1
         chosen = sorted({round(at) for at in np.linspace(0, count - 1, min(options.seeds, count))})
         return [Unit(experiment, {**common, "number": k, "images": keep_images and k == chosen[0]}) for k in chosen]
+    cases = options.cases(worlds)
+    shown = {kind_of(world): (world, seed) for world, seed in reversed(cases)}  # the first of each kind
     return [
         Unit(
             experiment,
@@ -56,15 +57,15 @@ def view_units(
                 "seed": _number(world, seed),
                 "start_seed": seed,
                 **common,
-                "images": keep_images and _number(world, seed) == _SHOWN_SEED,
+                "images": keep_images and shown[kind_of(world)] == (world, seed),
             },
         )
-        for world, seed in options.cases(worlds)
+        for world, seed in cases
     ]
 
 
 def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Compare the sources in one world; the rows, and one image strip a path for the shown seed."""
+    """Compare the sources in one world; the rows, and one image strip a path for the first of each kind of world."""
     given: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in arguments.items()
@@ -89,9 +90,9 @@ def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def family(result: Result) -> str:
-    """World without its seed: results of one family are averaged."""
+    """World without its seed, or the recording: results of one family are averaged."""
     given = result.unit.arguments
-    return Path(given["bag"] if "bag" in given else given["world"].partition(":")[0]).name
+    return str(given["bag"]) if "bag" in given else kind_of(given["world"])
 
 
 def rows(results: Sequence[Result], of_family: str, path: str) -> Iterator[dict[str, Any]]:
@@ -114,30 +115,32 @@ def curves_and_tables(results: Sequence[Result], command: str) -> list[Part]:
     parts: list[Part] = []
     for name in dict.fromkeys(family(one) for one in results if one.data):
         paths = [path for path in (*PATHS, "recorded") if any(True for _ in rows(results, name, path))]
-        own = command.format(world=name)
         panels = [
             (f"{path}: distance from the panorama, m", label, series(results, name, path, key))
             for path in paths
             for key, label in LABELS.items()
         ]
-        parts.append(Figure(f"{name}: PSNR and SSIM by distance", curves_svg(panels), own))
+        parts.append(Figure(f"{name}: PSNR and SSIM by distance", curves_svg(panels), command))
         for path in paths:
             for key, label in LABELS.items():
-                parts.append(_table(f"{name}, {path}: {label}", series(results, name, path, key), own))
+                parts.append(_table(f"{name}, {path}: {label}", series(results, name, path, key), command))
         for one in results:
             if family(one) == name:
                 for path, address in one.data.get("images", {}).items():
                     title = f"{one.unit.arguments.get('world', name)}, {path}"
-                    parts.append(Figure(f"Views, {title}", address, own))
+                    parts.append(Figure(f"Views, {title}", address, command))
     return parts
 
 
 def command_of(options: Options, experiment: str) -> str:
-    """The command that measures again what a table shows; ``{world}`` is its world."""
+    """The command that measures again what a section shows."""
     quick = " --quick" if options.quick else f" --seeds {options.seeds}"
     method = "" if options.method == "ours" else f" --method {options.method}"
-    where = "--world {world}" if options.bag is None else "--bag {world}"
-    return f"ic experiment {experiment} {where}{quick}{method} -o REPORT"
+    size = "" if options.size is None else f" --size {options.size[0]}x{options.size[1]}"
+    where = "".join(f" --world {shlex.quote(world)}" for world in options.worlds)
+    if options.bag is not None:
+        where = f" --bag {shlex.quote(str(options.bag))}"
+    return f"ic experiment {experiment}{where}{quick}{method}{size} -o REPORT"
 
 
 def _table(caption: str, found: Series, command: str) -> Table:

@@ -58,11 +58,11 @@ def section(results: Sequence[Result], options: Options) -> Section:
                 "depth error",
             ),
             lines,
-            command.format(world="WORLD"),
+            command,
         ),
     ]
     for one in results:
         for path, address in one.data.get("images", {}).items():
             world = one.unit.arguments["world"]
-            parts.append(Figure(f"Views, {world}, {path}", address, command.format(world=world)))
+            parts.append(Figure(f"Views, {world}, {path}", address, command))
     return Section("Environments (V.F, Fig. 11)", parts)

@@ -13,6 +13,7 @@ import json
 import os
 import platform
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -74,11 +75,17 @@ class Options:
         for world in self.worlds or worlds:
             if world in GENERATED:
                 found += [(f"{world}:{seed}", 0) for seed in numbers]
-            elif world.partition(":")[0] in GENERATED:
+            elif kind_of(world) in GENERATED:
                 found.append((world, 0))
             else:
                 found += [(world, seed) for seed in numbers]
-        return found
+        return list(dict.fromkeys(found))
+
+
+def kind_of(world: str) -> str:
+    """A world of the simulator without its seed; a mesh file as it is."""
+    name = world.partition(":")[0]
+    return name if name in GENERATED else world
 
 
 @dataclass(frozen=True)
@@ -87,6 +94,11 @@ class Unit:
 
     experiment: str
     arguments: dict[str, Any]
+
+    @property
+    def place(self) -> str:
+        """World or recording, for people."""
+        return str(self.arguments.get("world") or self.arguments.get("bag", ""))
 
     @property
     def key(self) -> str:
@@ -164,8 +176,12 @@ def _measure(unit: Unit, folder: Path) -> Result:
     began, cpu = time.monotonic(), time.process_time()
     try:
         data = finite(module(unit.experiment).measure(unit.arguments))
-    except (ValueError, RuntimeError) as error:
-        return Result(unit, {}, time.monotonic() - began, time.process_time() - cpu, str(error))
+    except Exception as error:  # noqa: BLE001 - one unit must not end a run of hours
+        text = str(error)
+        if not isinstance(error, ValueError | RuntimeError):  # a fault of the program, or of the system
+            traceback.print_exc()
+            text = f"{type(error).__name__}: {error}"
+        return Result(unit, {}, time.monotonic() - began, time.process_time() - cpu, text)
     result = Result(unit, data, round(time.monotonic() - began, 2), round(time.process_time() - cpu, 2))
     save_json(folder / f"{unit.key}.json", asdict(result))
     return result

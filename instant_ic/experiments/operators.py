@@ -9,6 +9,7 @@ from functools import reduce
 from pathlib import Path
 from typing import Any
 
+from instant_ic.experiments.compared import command_of
 from instant_ic.experiments.illusion_truth import without
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.report import Part, Section, Table, Text
@@ -74,15 +75,14 @@ def section(results: Sequence[Result], options: Options) -> Section:
                         sum(drive["contacts"] for drive in own),
                         [drive["obedience"] for drive in own],
                         [drive["seconds"] for drive in own if drive["completed"]],
-                        [drive["driven_m"] / drive["way_m"] for drive in own if drive["completed"]],
+                        [drive["driven_m"] / drive["way_m"] for drive in own if drive["completed"] and drive["way_m"]],
                         psnr,
                     ]
                 )
     columns = ("manner, method", "completed", "contacts", "obedience", "time, s", "path ratio", "PSNR at switches, dB")
-    quick = "--quick" if options.quick else f"--seeds {options.seeds}"
     manners = ", ".join(f"{name}: {manner}" for name, manner in MANNERS.items())
     parts: list[Part] = [
         Text(f"Simulated operators; nothing is claimed about people. {manners}."),
-        Table("Drives", columns, lines, f"ic experiment operators {quick} -o REPORT"),
+        Table("Drives", columns, lines, command_of(options, "operators")),
     ]
     return Section("Operators (V.E, simulated)", parts)

@@ -68,7 +68,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
         columns = ("scan", *(f"{path}, {key}" for path in PATHS for key in ("SSIM", "PSNR")))
         title = f"{name}: metres from the panorama up to which {options.method} is above"
         if lines:
-            parts.append(Table(title, columns, lines, command.format(world=name)))
+            parts.append(Table(title, columns, lines, command))
     return Section(
         "Reconstruction accuracy (V.A, Figs. 3, 4, 7)", [*parts, *curves_and_tables(results, command)], verdict
     )

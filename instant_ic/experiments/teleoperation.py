@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments import illusion, teleop_results
+from instant_ic.experiments.compared import command_of
 from instant_ic.experiments.illusion_stack import SOURCES, FilmedStack
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.pictures import jpeg
@@ -80,8 +81,8 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
     (drive,) = run_episode(settings, 0, methods=("ic",), make_stack=make_stack)
     film.completed = drive.completed
     images = {}
-    if arguments["images"]:
-        frames = stacks[0].frames
+    frames = stacks[0].frames
+    if arguments["images"] and frames:
         for number, frame in enumerate(stills(frames), 1):
             what = "virtual" if frame.virtual else "real"
             images[f"{number}: {frame.time_s:.1f} s, {what}"] = image_address(jpeg(frame.image))
@@ -110,8 +111,7 @@ def stills(frames: Sequence[_Frame]) -> list[_Frame]:
 
 def section(results: Sequence[Result], options: Options) -> Section:
     """Figures of the shown drive, and a table over all drives."""
-    quick = "--quick" if options.quick else f"--seeds {options.seeds}"
-    command = f"ic experiment teleoperation {quick} -o REPORT"
+    command = command_of(options, "teleoperation")
     parts: list[Part] = [Text("All nodes in one process in simulated time; the operator drives straight on.")]
     for one in results:
         images = one.data.get("images", {})

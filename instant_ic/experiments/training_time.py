@@ -65,12 +65,12 @@ def section(results: Sequence[Result], options: Options) -> Section:
                 times = sorted({x for values in found.values() for x in values})
                 lines = [[source, *(values.get(x, []) for x in times)] for source, values in found.items()]
                 columns = ("source", *(f"{x:g} s" for x in times))
-                parts.append(Table(f"{name}, {at:g} m ahead: {label}", columns, lines, command.format(world=name)))
+                parts.append(Table(f"{name}, {at:g} m ahead: {label}", columns, lines, command))
                 if at == 0 and key == "psnr_db":
                     for source, values in found.items():
                         claim = f"{name}: {source} has converged within 4 s (paper: 3-4 s on its GPU)"
                         verdict[claim] = _settled(values)
-        parts.insert(1, Figure(f"{name}: by training time", curves_svg(panels), command.format(world=name)))
+        parts.insert(1, Figure(f"{name}: by training time", curves_svg(panels), command))
     return Section("Training time (V.B, Fig. 5)", parts, verdict)
 
 

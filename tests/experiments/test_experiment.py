@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus import LATCHED
 from instant_ic.cli.main import main
-from instant_ic.experiments import box_room, lab, reconstruction, report
+from instant_ic.experiments import box_room, compared, lab, reconstruction, report
 from instant_ic.experiments.illusion_truth import moved_by, things
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.pictures import curves_svg, image_strip
@@ -119,6 +120,7 @@ def test_cases_of_worlds_and_seeds() -> None:
     assert Options(2, ("corridor", "random:7", "house.glb")).cases() == [
         ("corridor:0", 0), ("corridor:1", 0), ("random:7", 0), ("house.glb", 0), ("house.glb", 1),
     ]  # fmt: skip
+    assert Options(2, ("random:0", "random")).cases() == [("random:0", 0), ("random:1", 0)]
     for wrong in ({"seeds": 0}, {"method": "theirs"}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Options(**wrong)
@@ -144,6 +146,27 @@ def test_finished_units_are_kept_and_failed_ones_tried_again(tmp_path, monkeypat
     assert calls == [1, 2, 2, 1]
 
 
+def test_an_unexpected_error_ends_its_unit_only(tmp_path, monkeypatch) -> None:
+    def measure(arguments):
+        return {"share": 1 / arguments["n"]}
+
+    monkeypatch.setattr(reconstruction, "measure", measure)
+    found = lab.run([Unit("reconstruction", {"n": n}) for n in (0, 1)], tmp_path, 1)
+    assert [one.error for one in found] == ["ZeroDivisionError: division by zero", ""]
+
+
+def test_two_meshes_of_one_name_are_not_averaged_and_each_kind_of_world_shows_images() -> None:
+    options = Options(2, ("a/house.glb", "b/house.glb", "random:7", "random:9"), size=(64, 32))
+    units = compared.view_units("ablation", options, ("ours",), ())
+    shown = [compared.family(Result(unit, {}, 0.0, 0.0)) for unit in units if unit.arguments["images"]]
+    assert shown == ["a/house.glb", "b/house.glb", "random"]
+    worlds = "--world a/house.glb --world b/house.glb --world random:7 --world random:9"
+    command = f"ic experiment ablation {worlds} --seeds 2 --size 64x32 -o REPORT"
+    assert compared.command_of(options, "ablation") == command
+    recording = Options(2, bag=Path("my {drive}"))
+    assert compared.command_of(recording, "ablation") == "ic experiment ablation --bag 'my {drive}' --seeds 2 -o REPORT"
+
+
 def test_the_report_needs_no_other_file(tmp_path) -> None:
     assert report.spread([1.0, 3.0, None]) == "2.00 ± 1.41" and report.spread([]) == "–"
     tile = np.zeros((9, 16, 3), np.uint8)
@@ -162,21 +185,30 @@ def test_the_report_needs_no_other_file(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words", "status"),
+    ("arguments", "words"),
     [
-        (["--seeds", "0"], "seeds must be at least 1", 1),
-        (["--size", "big"], "WIDTHxHEIGHT", 2),
-        (["--jobs", "0"], "jobs must be at least 1", 1),
+        (["--seeds", "0"], "--seeds: must be > 0"),
+        (["--size", "big"], "--size: must look like 640x360"),
+        (["--size", "8x640"], "at least 16 pixels"),
+        (["--jobs", "0"], "--jobs: must be > 0"),
+        (["--timeout", "nan"], "--timeout: must be > 0"),
+        (["--timeout", "inf"], "--timeout: must be finite"),
+        (["--bag", "drive", "--world", "random"], "leave out --world"),
+        (["--bag", "drive", "--method", "paper"], "in ablation only"),
     ],
 )
-def test_mistakes_are_reported_in_a_line(arguments, words, status, tmp_path, capsys) -> None:
-    assert main(["experiment", "ablation", "-o", str(tmp_path), *arguments]) == status
-    assert words in capsys.readouterr().err
+def test_wrong_options_are_reported_before_anything_is_measured(arguments, words, tmp_path, capsys) -> None:
+    try:
+        status = main(["experiment", "reconstruction", "-o", str(tmp_path), *arguments])
+    except SystemExit as end:
+        status = end.code
+    assert status == 2 and words in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_a_world_that_is_not_there_is_reported_with_the_rest(tmp_path, capsys) -> None:
     assert main(["experiment", "ablation", "--quick", "--jobs", "1", "--world", "no.glb", "-o", str(tmp_path)]) == 1
-    assert "no.glb" in capsys.readouterr().err and "no.glb" in (tmp_path / "report.html").read_text()
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ic: ")]
+    assert len(errors) == 1 and "no.glb" in errors[0] and "no.glb" in (tmp_path / "report.html").read_text()
 
 
 def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import shlex
 import sys
@@ -10,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from instant_ic.cli.arguments import positive, positive_int, size
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import counted, errors_for_the_user, use_one_thread_for_matrices
 
@@ -31,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
     add = parser.add_argument
     add("name", choices=_NAMES, metavar="NAME", help=", ".join(_NAMES))
     add("-o", "--out", type=Path, required=True, metavar="REPORT", help="output folder")
-    add("--seeds", type=int, default=5, metavar="N", help="number of seeds (default: %(default)s)")
+    add("--seeds", type=positive_int, default=5, metavar="N", help="number of seeds (default: %(default)s)")
     add(
         "--world",
         action="append",
@@ -46,9 +48,10 @@ def add_parser(subparsers: Any) -> None:
         help="recording with /keyframe, for reconstruction and ablation: later panoramas are the truth",
     )
     add("--quick", action="store_true", help="two seeds, small images, short training: does everything work?")
-    add("--size", metavar="WxH", help="size of the views (default: 320x180)")
-    add("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="units in parallel (default: %(default)s)")
-    add("--timeout", type=float, default=86400.0, metavar="S", help="time limit (default: %(default)g s)")
+    add("--size", type=_size, metavar="WxH", help="size of the views (default: 320x180)")
+    text = "units in parallel (default: %(default)s)"
+    add("--jobs", type=positive_int, default=os.cpu_count() or 1, metavar="N", help=text)
+    add("--timeout", type=_limit, default=86400.0, metavar="S", help="time limit (default: %(default)g s)")
     parser.set_defaults(func=run)
 
 
@@ -64,18 +67,20 @@ def _experiment(args: argparse.Namespace) -> int:
 
     began = time.monotonic()
     names = list(lab.EXPERIMENTS) if args.name == "all" else [args.name]
-    size = _size(args.size) if args.size else None
-    options = lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, size)
+    options = lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, args.size)
     if args.bag is not None and not {*names} <= {"reconstruction", "ablation"}:
         raise UserError("--bag works with reconstruction and ablation only: the others need a world", 2)
+    if args.bag is not None and args.world:
+        raise UserError("--bag needs no world: leave out --world", 2)
+    if args.bag is not None and args.method == "paper" and "reconstruction" in names:
+        raise UserError("--bag works with --method paper in ablation only", 2)
     modules = {name: lab.module(name) for name in names}
     units = [unit for module in modules.values() for unit in module.units(options)]
     with counted("measuring", len(units)) as advance:
 
         def show_progress(result: lab.Result) -> None:
-            world = result.unit.arguments.get("world", "")
             how = f"failed: {result.error}" if result.error else f"{result.wall_s:.0f} s"
-            advance(result.unit.experiment, f"{result.unit.experiment}, {world}: {how}")
+            advance(result.unit.experiment, f"{result.unit.experiment}, {result.unit.place}: {how}")
 
         results = lab.run(units, args.out / "units", args.jobs, show_progress, args.timeout)
     sections = {
@@ -90,14 +95,21 @@ def _experiment(args: argparse.Namespace) -> int:
     }
     report.write(args.out, sections, results, conditions)
     print(args.out / "report.html")
-    failed = [one for one in results if one.error]
-    for one in failed:
-        print(f"ic: {one.unit.experiment} {one.unit.arguments.get('world', '')}: {one.error}", file=sys.stderr)
+    failed = dict.fromkeys(f"{one.unit.experiment} {one.unit.place}: {one.error}" for one in results if one.error)
+    for line in failed:
+        print(f"ic: {line}", file=sys.stderr)
     return 1 if failed else 0
 
 
 def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and min(int(width), int(height)) >= 16):
-        raise UserError(f"--size must be WIDTHxHEIGHT in pixels, each at least 16 (got {text!r})", 2)
-    return int(width), int(height)
+    width, height = size(text)
+    if min(width, height) < 16:
+        raise argparse.ArgumentTypeError(f"each side must be at least 16 pixels (got {text!r})")
+    return width, height
+
+
+def _limit(text: str) -> float:
+    value = positive(text)
+    if value == math.inf:
+        raise argparse.ArgumentTypeError("must be finite")
+    return value
