@@ -58,7 +58,7 @@ class LayerSource:
 
 
 class LayerMeshes:
-    """Makes the page's layers; what has not changed since the last call is not made again. Needs numba."""
+    """Makes the page's layers; what has not changed since the last call is not made again."""
 
     def __init__(self) -> None:
         self._before: dict[Hashable, PageLayer] = {}

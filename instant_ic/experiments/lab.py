@@ -44,7 +44,7 @@ class Options:
     Attributes:
         seeds: number of seeds, 0 first.
         worlds: names of ``sim.worlds.make_world``. A world of the simulator without a seed gets each seed; a mesh file
-            gets a random free start for each. Empty: the experiment's own.
+            gets its own start, then random free ones. Empty: the experiment's own.
         method: ``ours`` or ``paper``: the virtual space that is compared.
         bag: recording to use instead of worlds, for experiments that compare views; None: none.
         quick: small images, two seeds and short training, to see whether everything works.
