@@ -78,6 +78,16 @@ def test_frame_of_another_version_says_so() -> None:
         unpack_header(b"/x\0" + MAGIC + bytes([VERSION + 1]) + bytes(43))
 
 
+def test_a_publisher_of_wire_format_3_is_refused_in_words_that_say_what_to_do(stranger: Stranger, caplog) -> None:
+    """A node of the release before, still running: topic, header of 48 bytes and body were parts of their own."""
+    header = struct.pack("<4sBBHQq8s8sQ", MAGIC, 3, 0, 0, 1, 5, stranger.out._id, type_digest(BYTES), 3)
+    for _ in range(2):
+        stranger.send(b"/x\0", header, b"abc")
+    assert stranger.reader.stats.rejected == 2 and stranger.reader.poll() == []
+    (told,) = caplog.messages
+    assert told == "/x: wire format 3, not 4: start all nodes again with one Instant IC; the message is dropped"
+
+
 def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Stranger, caplog) -> None:
     header, reader = good(stranger), stranger.reader
     bad = [
