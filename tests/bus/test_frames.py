@@ -1,5 +1,6 @@
 """What a reader does with messages from outside, whole and wrong; the slots behind large ones."""
 
+import fcntl
 import mmap
 import os
 import socket
@@ -212,6 +213,27 @@ def test_writer_killed_in_a_slot_leaves_no_message_in_it() -> None:
     assert not mapping.lease(5, LARGE)  # being written
     slot.close()  # as at a kill: the kernel releases the lock
     assert not mapping.lease(5, LARGE) and mapping.sequence == 0
+
+
+def test_a_slot_can_be_leased_again_as_soon_as_it_is_unlocked(monkeypatch) -> None:
+    """A node's thread unlocks it; before that call returns, the next message is in it and the bus thread reads it."""
+    slot = Slot.create(1, LARGE, ID)
+    slot.finish(1)
+    reader = Slot.open(os.getpid(), slot.fd, ID)
+    assert reader.lease(1, LARGE)
+    flock, leased = fcntl.flock, []
+
+    def refill(fd: int, kind: int) -> None:
+        flock(fd, kind)
+        monkeypatch.undo()
+        assert slot.lock()
+        slot.finish(2)
+        slot.unlock()
+        leased.append(reader.lease(2, LARGE))
+
+    monkeypatch.setattr("instant_ic.bus.shm.fcntl.flock", refill)
+    reader.unlock()
+    assert leased == [True] and reader.held and not slot.lock()
 
 
 def test_progress_is_seen_by_the_publisher() -> None:
