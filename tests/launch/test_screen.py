@@ -170,6 +170,27 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
         transport.close()
 
 
+def test_a_heartbeat_that_cannot_be_read_does_not_end_the_launcher(tmp_path: Path) -> None:
+    transport = LocalTransport(tmp_path, "test", lambda: 1)
+    monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
+    try:
+        publisher = transport.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE)
+        uneven = beat("my_slam")
+        uneven.output_ages_s = uneven.output_ages_s[:0]
+        for _ in range(2000):  # until the subscription is connected
+            publisher.send(b"no CDR")
+            publisher.send(serialize(uneven))
+            publisher.send(serialize(beat("other")))
+            monitor.poll()
+            if "other" in monitor.nodes:
+                break
+            time.sleep(0.01)
+        assert list(monitor.nodes) == ["other"]
+    finally:
+        monitor.close()
+        transport.close()
+
+
 def test_one_message_reaches_a_milestone(tmp_path: Path) -> None:
     monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
     try:
