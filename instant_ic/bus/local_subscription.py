@@ -17,7 +17,18 @@ import numpy as np
 import zmq
 
 from instant_ic.bus import registry
-from instant_ic.bus.frame import INLINE, KEY_COPY, REFERENCE, SHARED, FrameError, Header, type_digest, unpack_header
+from instant_ic.bus.frame import (
+    INLINE,
+    KEY_COPY,
+    MAGIC,
+    REFERENCE,
+    SHARED,
+    VERSION,
+    FrameError,
+    Header,
+    type_digest,
+    unpack_header,
+)
 from instant_ic.bus.host import Host
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.shm import Slot, progress_page, store_progress
@@ -149,10 +160,13 @@ class LocalSubscription:
                 else:
                     self._message(header, receive(_NOBLOCK, copy=False).buffer.toreadonly())
             except (FrameError, zmq.Again) as error:
+                text = str(error) or "message in parts"
                 while socket.getsockopt(zmq.RCVMORE):
-                    receive(_NOBLOCK)
+                    part = receive(_NOBLOCK)
+                    if part.startswith(MAGIC) and part[4:5] < bytes([VERSION]):  # the header was a part of its own
+                        text = f"wire format {part[4]}, not {VERSION}: start all nodes again with one Instant IC"
                 self.stats.rejected += 1
-                self._complain(str(error)[:40], f"{str(error) or 'message in parts'}; the message is dropped")
+                self._complain(text[:40], f"{text}; the message is dropped")
             if one:
                 return
 

@@ -192,14 +192,20 @@ class LocalTransport:
         Raises:
             OSError: the run directory is gone.
         """
+        fault: Exception | None = None
         for publisher in self._writers:
             publisher.serve()
         for fd, subscription in list(self._readers.items()):
             with self._read_lock:
                 if self._readers.get(fd) is subscription:  # not just closed
-                    subscription.discover()
+                    try:
+                        subscription.discover()
+                    except Exception as error:  # noqa: BLE001 - raised below: other topics do not wait for this one
+                        fault = error
                     if not self.patient:  # a patient node reads all sockets when it wakes
                         subscription.read()
+        if fault is not None:
+            raise fault
 
 
 def _readable(fds: Iterable[int], timeout_s: float) -> list[int]:

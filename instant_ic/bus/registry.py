@@ -354,9 +354,13 @@ class TopicFolder:
         """Read the entries if they may have changed; returns whether it did.
 
         Raises:
-            OSError: the folder is gone.
+            OSError: the run directory is gone.
         """
-        mtime = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - five times a second for each topic
+        try:
+            mtime = os.stat(self._folder).st_mtime_ns  # noqa: PTH116 - five times a second for each topic
+        except FileNotFoundError:  # swept while it was empty; the next publisher makes it again
+            os.stat(os.path.dirname(self._folder))  # noqa: PTH116, PTH120
+            mtime = 0
         now = time.monotonic()
         same = mtime == self._seen_mtime
         if same and now < self._next_look_s:

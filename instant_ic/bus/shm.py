@@ -141,8 +141,8 @@ class Slot(Memory):
         return True
 
     def unlock(self) -> None:
+        self.held = False  # first: as soon as it is unlocked, the publisher may fill it and another thread lease it
         fcntl.flock(self.fd, fcntl.LOCK_UN)
-        self.held = False
 
     def begin(self, size: int) -> memoryview:
         """Memory for the next message of ``size`` bytes, under the lock; the previous message becomes invalid."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 
 from instant_ic.bus import registry
@@ -36,8 +37,9 @@ class Heartbeats:
         for batch in self._observer.batches(seconds, 0.1):
             for received in batch:
                 if received.type_name == TYPE:
-                    beat = from_message(deserialize(received.payload, received.type_name))
-                    self.newest[beat.node] = beat
+                    with suppress(ValueError):  # it cannot be read: the node counts as silent
+                        beat = from_message(deserialize(received.payload, received.type_name))
+                        self.newest[beat.node] = beat
             if until and all(node in self.newest for node in until):
                 break
         return self.newest

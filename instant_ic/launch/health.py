@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import ERROR, OK, WARN
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.topics import nominal_rate
-from instant_ic.msg import deserialize, header, message_type, serialize
+from instant_ic.msg import MessageError, deserialize, header, message_type, serialize
 from instant_ic.paths import sign_in_file
 
 FAULT_HOLDS_S = 3.0
@@ -109,12 +110,11 @@ class HealthMonitor:
         for transport in self._transports.values():
             transport.wait(0.0)
         for group, subscription in self._beats:
-            for received in subscription.take():
-                beat = from_message(deserialize(received.payload, received.type_name))
+            for message in _taken([subscription]):
+                beat = from_message(message)
                 self.nodes[f"{group}/{beat.node}" if group else beat.node] = beat
         for label, subscription in self._vspace:
-            for received in subscription.take():
-                status = deserialize(received.payload, received.type_name)
+            for status in _taken([subscription]):
                 self._vspace_text[label] = status.message
                 if status.state == _VSPACE_READY:
                     self._reached.add(label)
@@ -235,9 +235,11 @@ class HealthMonitor:
 
 
 def _taken(subscriptions: Iterable[Any]) -> Iterable[Any]:
+    """The messages that have arrived. One that cannot be read must not end the stack: its node counts as silent."""
     for subscription in subscriptions:
         for received in subscription.take():
-            yield deserialize(received.payload, received.type_name)
+            with suppress(MessageError):
+                yield deserialize(received.payload, received.type_name)
 
 
 def _labelled(spec: NodeSpec, word: str) -> str:

@@ -1,5 +1,6 @@
 """What a reader does with messages from outside, whole and wrong; the slots behind large ones."""
 
+import fcntl
 import mmap
 import os
 import socket
@@ -76,6 +77,16 @@ def test_foreign_bytes_are_a_header_or_an_error(data: bytes) -> None:
 def test_frame_of_another_version_says_so() -> None:
     with pytest.raises(FrameError, match=f"not a frame of version {VERSION} .version {VERSION + 1}"):
         unpack_header(b"/x\0" + MAGIC + bytes([VERSION + 1]) + bytes(43))
+
+
+def test_a_publisher_of_wire_format_3_is_refused_in_words_that_say_what_to_do(stranger: Stranger, caplog) -> None:
+    """A node of the release before, still running: topic, header of 48 bytes and body were parts of their own."""
+    header = struct.pack("<4sBBHQq8s8sQ", MAGIC, 3, 0, 0, 1, 5, stranger.out._id, type_digest(BYTES), 3)
+    for _ in range(2):
+        stranger.send(b"/x\0", header, b"abc")
+    assert stranger.reader.stats.rejected == 2 and stranger.reader.poll() == []
+    (told,) = caplog.messages
+    assert told == "/x: wire format 3, not 4: start all nodes again with one Instant IC; the message is dropped"
 
 
 def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Stranger, caplog) -> None:
@@ -202,6 +213,27 @@ def test_writer_killed_in_a_slot_leaves_no_message_in_it() -> None:
     assert not mapping.lease(5, LARGE)  # being written
     slot.close()  # as at a kill: the kernel releases the lock
     assert not mapping.lease(5, LARGE) and mapping.sequence == 0
+
+
+def test_a_slot_can_be_leased_again_as_soon_as_it_is_unlocked(monkeypatch) -> None:
+    """A node's thread unlocks it; before that call returns, the next message is in it and the bus thread reads it."""
+    slot = Slot.create(1, LARGE, ID)
+    slot.finish(1)
+    reader = Slot.open(os.getpid(), slot.fd, ID)
+    assert reader.lease(1, LARGE)
+    flock, leased = fcntl.flock, []
+
+    def refill(fd: int, kind: int) -> None:
+        flock(fd, kind)
+        monkeypatch.undo()
+        assert slot.lock()
+        slot.finish(2)
+        slot.unlock()
+        leased.append(reader.lease(2, LARGE))
+
+    monkeypatch.setattr("instant_ic.bus.shm.fcntl.flock", refill)
+    reader.unlock()
+    assert leased == [True] and reader.held and not slot.lock()
 
 
 def test_progress_is_seen_by_the_publisher() -> None:

@@ -348,3 +348,27 @@ def test_messages_do_not_wake_a_patient_node_and_are_all_read_when_it_wakes(bus)
     waker.clear()
     threading.Timer(0.05, waker.set).start()
     waker.wait(3600.0)  # ended by the event
+
+
+def test_a_topic_whose_empty_folder_was_swept_is_heard_and_holds_up_no_other(bus, caplog):
+    """Each start and end of a stack sweeps its run directory, also beside a reader that waits for the next stack."""
+    swept, other = bus.reader("/swept"), bus.reader("/other")
+    wait_for(lambda: (bus.run_dir / "topics" / "other").is_dir())
+    registry.sweep(bus.run_dir)
+    publishers = [bus.publisher("/other")]
+    wait_for(lambda: publishers[0].subscriber_count, 10.0)
+    publishers.append(bus.publisher("/swept"))
+    wait_for(lambda: publishers[1].subscriber_count, 10.0)
+    for publisher in publishers:
+        publisher.send(b"heard")
+    wait_for(lambda: swept.poll() and other.poll())
+    assert not caplog.records
+
+
+def test_a_fault_with_one_topic_holds_up_no_other(bus, monkeypatch):
+    broken, other = bus.reader("/broken"), bus.reader("/other")
+    monkeypatch.setattr(broken.raw, "discover", lambda: 1 / 0)
+    publisher = bus.publisher("/other")
+    wait_for(lambda: publisher.subscriber_count, 10.0)
+    publisher.send(b"heard")
+    wait_for(other.poll)
