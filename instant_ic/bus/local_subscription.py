@@ -96,11 +96,11 @@ class LocalSubscription:
         self._sources: dict[bytes, _Source] = {}  # by identity; a connection to each
         self._next_search_s = 0.0
         self._told: set[object] = set()
+        self._page, self._announcement = progress_page(newest_only=qos.depth == 1)
         self._socket = host.context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
         self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
-        self._page, self._announcement = progress_page(newest_only=qos.depth == 1)
         self._socket.setsockopt(zmq.SUBSCRIBE, self._announcement)
         self._socket.setsockopt(zmq.SUBSCRIBE, self._name)
         self.fd = int(self._socket.getsockopt(zmq.FD))

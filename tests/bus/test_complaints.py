@@ -396,6 +396,20 @@ def test_full_memory_is_told_in_diagnostics(bus: Bus, monkeypatch: pytest.Monkey
     )
 
 
+def test_full_memory_is_not_logged_with_every_image(bus: Bus, monkeypatch: pytest.MonkeyPatch, caplog) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    out, reader = bus.publisher(qos=LATCHED), bus.reader()
+    monkeypatch.setattr("instant_ic.bus.shm.os.posix_fallocate", full)
+    with pytest.raises(OSError):
+        bus.reader("/y")  # it leaves no socket open, for which the end would wait for ever
+    for extra in range(8):  # compressed images differ in size
+        out.send(numbered(extra, LARGE + 8 * extra))
+    assert caplog.text.count("no shared memory for") == 1 and out.stats.not_shared == 8
+    wait_for(lambda: reader.poll() and number(reader.received[-1]) == 7)
+
+
 @pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("unshare"), reason="mounting a small /dev/shm needs root")
 def test_full_dev_shm_does_not_matter(bus: Bus) -> None:
     """/dev/shm of 64 kB, as in a container: large messages still go through shared memory."""
