@@ -451,6 +451,10 @@ def _bus_frames() -> list[bytes]:
     return [b"".join(len(part).to_bytes(4, "little") + part for part in parts) for parts in messages]
 
 
+_KEPT: list[object] = []
+"""Hosts of the bus until the process ends: collected before its sockets, a ZeroMQ context waits for them for ever."""
+
+
 def _parse_bus() -> Callable[[bytes], object]:
     """Give parts to a subscription; it counts what is wrong and stays usable."""
     import zmq
@@ -461,6 +465,7 @@ def _parse_bus() -> Callable[[bytes], object]:
     from instant_ic.bus.qos import RELIABLE
 
     host = Host(_folder() / "run", "fuzz", lambda: 0, lambda: 0)
+    _KEPT.append(host)
     subscription = LocalSubscription(host, "/topic", "std_msgs/msg/String", RELIABLE, lambda: None)
     stem = host.run_dir / "topics" / "topic" / "stranger"
     claim = registry.Claim(stem, "fuzz")
