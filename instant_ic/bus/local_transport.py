@@ -28,7 +28,7 @@ from instant_ic.bus.qos import QoS
 
 _LOOK_S = 0.2
 _IDLE_S = 1.0
-_AWAY_S = 0.015  # a longer callback is noticed at the next look
+_AWAY_S = 0.015  # a longer callback is noticed at the next look, or at once if the last one was as long
 _CLOSE_S = 5.0
 
 log = logging.getLogger(__name__)
@@ -171,9 +171,14 @@ class LocalTransport:
                     self._look()
                     self._next_look_s = min(self._next_look_s, now + (_LOOK_S if self._readers else _IDLE_S))
                 writers = {writer.fd: writer for writer in self._writers if not writer.closed}
-                away = not (self._waiting or self.patient) and now - self._left_s > _AWAY_S
-                inputs = list(self._readers) if away else []
-                ready = _readable([self._poke, *writers, *inputs], max(0.0, self._next_look_s - now))
+                inputs: list[int] = []
+                timeout_s = self._next_look_s - now
+                if not (self._waiting or self.patient):
+                    if (away_in_s := self._left_s + _AWAY_S - now) > 0:
+                        timeout_s = min(timeout_s, away_in_s)
+                    else:
+                        inputs = list(self._readers)
+                ready = _readable([self._poke, *writers, *inputs], max(0.0, timeout_s))
                 if self._poke in ready:
                     os.eventfd_read(self._poke)
                 for fd in ready:

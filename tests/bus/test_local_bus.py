@@ -372,3 +372,22 @@ def test_a_fault_with_one_topic_holds_up_no_other(bus, monkeypatch):
     wait_for(lambda: publisher.subscriber_count, 10.0)
     publisher.send(b"heard")
     wait_for(other.poll)
+
+
+def test_a_program_that_seldom_waits_hears_each_message_at_once(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a loop of another library does, which only takes what has come: not at the bus thread's next look."""
+    out, reader = (LocalTransport(run_dir, name, time.time_ns) for name in ("talker", "reader"))
+    try:
+        publisher = out.advertise("/x", "std_msgs/msg/String", RELIABLE)
+        subscription = reader.subscribe("/x", "std_msgs/msg/String", RELIABLE, lambda: None)
+        wait_for(lambda: publisher.subscriber_count)
+        for name in ("_LOOK_S", "_IDLE_S"):
+            monkeypatch.setattr(f"instant_ic.bus.local_transport.{name}", 1000.0)
+        wait_for(lambda: reader._next_look_s > time.monotonic() + 100)
+        for number in range(5):
+            reader.wait(0.0)
+            publisher.send(serialize(String(str(number))))
+            wait_for(subscription.take, 10)
+    finally:
+        for transport in (out, reader):
+            transport.close()
