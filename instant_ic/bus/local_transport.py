@@ -28,7 +28,7 @@ from instant_ic.bus.qos import QoS
 
 _LOOK_S = 0.2
 _IDLE_S = 1.0
-_AWAY_S = 0.015  # a longer callback is noticed at the next look, or at once if the last one was as long
+_AWAY_S = 0.015  # without a wait for longer, the bus thread reads: from when it is next awake
 _CLOSE_S = 5.0
 
 log = logging.getLogger(__name__)
