@@ -47,9 +47,9 @@ def load(path: Path, settings: TeleopSettings) -> list[Drive]:
         ValueError: the file is not readable, is not such a report, or has other settings; names the differences.
     """
     try:
-        told = json.loads(path.read_text())
-        rows, tracks = told["each"], {(index, method): one for index, method, one in told["tracks"]}
-        found = {key: told[key] for key in _conditions(settings)}
+        saved = json.loads(path.read_text())
+        rows, tracks = saved["each"], {(index, method): one for index, method, one in saved["tracks"]}
+        found = {key: saved[key] for key in _conditions(settings)}
         drives = [
             Drive(
                 **_with_nan({key: value for key, value in row.items() if key != "switches"}),

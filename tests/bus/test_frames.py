@@ -85,8 +85,8 @@ def test_a_publisher_of_wire_format_3_is_refused_in_words_that_say_what_to_do(st
     for _ in range(2):
         stranger.send(b"/x\0", header, b"abc")
     assert stranger.reader.stats.rejected == 2 and stranger.reader.poll() == []
-    (told,) = caplog.messages
-    assert told == "/x: wire format 3, not 4: start all nodes again with one Instant IC; the message is dropped"
+    (warning,) = caplog.messages
+    assert warning == "/x: wire format 3, not 4: start all nodes again with one Instant IC; the message is dropped"
 
 
 def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Stranger, caplog) -> None:

@@ -169,15 +169,15 @@ def test_figures_by_hand() -> None:
     assert behind["0.5"] == 20.0 and behind["0.5 to 2"] == 23.0 and math.isnan(behind["2.5"]) and len(behind) == 7
     ready = illusion.readiness(frames)  # errors 5, 1, −3, 1
     assert ready["mean_error_db"] == 1.0 and ready["rms_error_db"] == 3.0 and ready["share_within_2_db"] == 0.5
-    told = illusion.report([illusion.Film(0, True, [frame(None, 24.0)])], illusion.TeleopSettings(methods=("ic",)))
-    assert told["by_distance"] == [] and told["frames_without_obstacle"] == 1
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    figures = illusion.report([illusion.Film(0, True, [frame(None, 24.0)])], illusion.TeleopSettings(methods=("ic",)))
+    assert figures["by_distance"] == [] and figures["frames_without_obstacle"] == 1
+    assert json.loads(json.dumps(figures, allow_nan=False)) == figures
     with pytest.raises(ValueError, match="virtual space was not shown"):
         illusion.report([illusion.Film(0)], illusion.TeleopSettings())
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["--episodes", "0"], "episodes must be at least 1"),
         (["--world", "nowhere"], "neither corridor"),
@@ -188,9 +188,9 @@ def test_figures_by_hand() -> None:
         (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),
     ],
 )
-def test_wrong_arguments_are_reported(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments_are_reported(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "illusion", "--episodes", "1", *words]) in (1, 2)
-    assert told in " ".join(capsys.readouterr().err.split())
+    assert message in " ".join(capsys.readouterr().err.split())
 
 
 # -- a short film
@@ -216,26 +216,26 @@ def film(corridor: teleop_worlds.Course) -> illusion.Film:
 def test_a_short_film(corridor: teleop_worlds.Course, tmp_path: Path) -> None:
     first, second = film(corridor), film(corridor)
     settings = illusion.TeleopSettings(1, 0, "corridor", ("ic",), "lidar")
-    told = illusion.report([first], settings)
-    assert told == illusion.report([second], settings)  # the same seed, the same figures
-    assert told["frames"] >= 8 and told["frames_without_obstacle"] == 0
-    rows = [row["distance_m"] for row in told["by_distance"]]
+    figures = illusion.report([first], settings)
+    assert figures == illusion.report([second], settings)  # the same seed, the same figures
+    assert figures["frames"] >= 8 and figures["frames_without_obstacle"] == 0
+    rows = [row["distance_m"] for row in figures["by_distance"]]
     assert rows[0] < 0 <= rows[-1]
     # The page alone loses least; with true depth nothing is lost to depth.
-    assert told[TRUE_VIEW]["psnr_mean_db"] > told["with_true_depth_and_fill"]["psnr_mean_db"] > 20
-    assert told["with_true_depth_and_fill"]["psnr_mean_db"] > told["psnr_mean_db"] > 12
-    assert told["webgl_with_true_depth"]["psnr_mean_db"] > told["webgl"]["psnr_mean_db"] > 12
-    assert told[TRUE_VIEW]["floor_fog_share"] < 0.01 and 0 < told["unseen_share_mean"] < 0.5
-    for each in told["each"]:
+    assert figures[TRUE_VIEW]["psnr_mean_db"] > figures["with_true_depth_and_fill"]["psnr_mean_db"] > 20
+    assert figures["with_true_depth_and_fill"]["psnr_mean_db"] > figures["psnr_mean_db"] > 12
+    assert figures["webgl_with_true_depth"]["psnr_mean_db"] > figures["webgl"]["psnr_mean_db"] > 12
+    assert figures[TRUE_VIEW]["floor_fog_share"] < 0.01 and 0 < figures["unseen_share_mean"] < 0.5
+    for each in figures["each"]:
         assert each["with_obstacle"] == (each["distance_m"] < 0)
         both = each["psnr_with_db"], each["psnr_without_db"]
         assert each["scores"][LIVE]["psnr_db"] == both[0 if each["with_obstacle"] else 1]
-    save_json(tmp_path / "film.json", told)
-    assert json.loads((tmp_path / "film.json").read_text()) == told
+    save_json(tmp_path / "film.json", figures)
+    assert json.loads((tmp_path / "film.json").read_text()) == figures
     save_strip(tmp_path / "strip.png", [first])
     strip = cv2.imread(str(tmp_path / "strip.png"))
     assert strip.shape == (24 + 225 * len(rows), 64 + 5 * 400, 3) and strip.std() > 20
-    save_plot(tmp_path / "plot.png", told)
+    save_plot(tmp_path / "plot.png", figures)
     assert cv2.imread(str(tmp_path / "plot.png")).std() > 10
     with pytest.raises(ValueError, match="no obstacle was passed"):
         save_strip(tmp_path / "strip.png", [illusion.Film(0)])
