@@ -141,9 +141,10 @@ class LocalTransport:
 
     def wait(self, timeout: float) -> None:
         """Read the node's sockets until a message arrives, the event is set, or the time is over."""
-        self._driver, self._waiting = threading.get_ident(), True
-        self._read(self._unread)
+        self._driver = threading.get_ident()
         timeout = 0.0 if self._set else timeout
+        self._waiting = timeout > 0.0  # a mere look leaves the reading to the bus thread, if that has taken over
+        self._read(self._unread)
         patient = self.patient
         if patient:
             ready = [*_readable([self._wake], timeout), *self._readers]
@@ -178,6 +179,7 @@ class LocalTransport:
                         timeout_s = min(timeout_s, away_in_s)
                     else:
                         inputs = list(self._readers)
+                        self._read(self._unread)  # their descriptors will not report what is there already
                 ready = _readable([self._poke, *writers, *inputs], max(0.0, timeout_s))
                 if self._poke in ready:
                     os.eventfd_read(self._poke)

@@ -391,3 +391,28 @@ def test_a_program_that_seldom_waits_hears_each_message_at_once(run_dir: Path, m
     finally:
         for transport in (out, reader):
             transport.close()
+
+
+def test_a_wait_that_read_one_of_two_messages_leaves_the_other_to_the_bus_thread(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second gives no event of its own: the socket's descriptor reported both at once."""
+    out, reader = (LocalTransport(run_dir, name, time.time_ns) for name in ("talker", "reader"))
+    try:
+        publisher = out.advertise("/x", "std_msgs/msg/String", RELIABLE)
+        subscription = reader.subscribe("/x", "std_msgs/msg/String", RELIABLE, lambda: None)
+        wait_for(lambda: publisher.subscriber_count)
+        for name in ("_LOOK_S", "_IDLE_S"):
+            monkeypatch.setattr(f"instant_ic.bus.local_transport.{name}", 1000.0)
+        reader._left_s = time.monotonic() + 1000.0  # the bus thread does not read yet
+        wait_for(lambda: reader._next_look_s > time.monotonic() + 100)
+        for text in ("first", "second"):
+            publisher.send(serialize(String(text)))
+        time.sleep(0.1)  # both are in the socket
+        reader.wait(10.0)
+        heard = subscription.take()
+        os.eventfd_write(reader._poke, 1)  # the bus thread looks who waits
+        wait_for(lambda: heard.extend(subscription.take()) or len(heard) == 2, 10.0)
+    finally:
+        for transport in (out, reader):
+            transport.close()

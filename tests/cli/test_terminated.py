@@ -32,9 +32,10 @@ sys.exit(cli.main())
 
 
 def waiting(ignored: signal.Signals | None = None) -> subprocess.Popen[str]:
-    """A command that waits, started by a shell that ignores a signal."""
+    """A command that waits, started by a shell that ignores a signal, or none (``nohup make test`` ignores one)."""
 
     def ignore() -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
         if ignored:
             signal.signal(ignored, signal.SIG_IGN)
 
