@@ -129,12 +129,13 @@ def test_nobody_runs_here_but_in_a_folder_of_it(ic, talker, tmp_path, monkeypatc
 def test_busy_node_is_told_and_nothing_is_changed(ic, tmp_path_factory, monkeypatch):
     run_dir = tmp_path_factory.mktemp("r")
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
-    with talking(run_dir):
+    with talking(run_dir, "-p", "sleep_s:=600.0") as process:
         assert ic("topic", "pub", "--once", "/sleep", "Bool", "{data: true}")[0] == 0
         wait_until(lambda: NodeControl(run_dir, "talker").status()["busy"] == "callback of /sleep", "the long callback")
         status, out, error = ic("param", "set", "talker", "label", "x")
         assert status == 1 and out == "" and re.search(r"talker is busy \(callback of /sleep has been running", error)
         assert ic("param", "get", "talker", "label")[1] == "hello\n"
+        process.kill()  # its callback would hold up the end
 
 
 def test_dora_2152_own_file_leaves_at_once_whatever_threads_are_left(tmp_path_factory):
