@@ -94,7 +94,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         # A late timer must not make the view jump.
         dt_s = min((steady_ns - self.stepped_ns) / 1e9, 0.2)
         self.stepped_ns = steady_ns
-        state = self.state.message
+        state = self.state.fresh
         if state is None:
             self.diagnose("state", WARN, "the arbiter is silent: the v-bot stands still")
             self.robot.place(self.robot.pose, (0.0, 0.0))
@@ -131,11 +131,9 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
 
     def operator(self) -> tuple[float, float]:
-        """The operator's command; zero when stale, by arrival or by stamp."""
-        message = self.command.message
-        if message is None or self.command.stamp_age_s > self.config.command_timeout_s:
-            return 0.0, 0.0
-        return twist_values(message)
+        """The operator's command; zero when stale."""
+        message = self.command.fresh
+        return (0.0, 0.0) if message is None else twist_values(message)
 
 
 if __name__ == "__main__":

@@ -316,3 +316,29 @@ class ControllerThread(threading.Thread):
         if self.is_alive():
             self.join(timeout_s)
         return not self.is_alive()
+
+
+class SteppedController:
+    """Steps a controller where it is called, for lockstep; otherwise like :class:`ControllerThread`."""
+
+    def __init__(
+        self,
+        controller: BaseController,
+        on_state: Callable[[BaseState], None],
+        on_end: Callable[[BaseException | None, str], None],
+    ) -> None:
+        self._controller = controller
+        self._on_state = on_state
+        self._on_end = on_end
+
+    def start(self) -> None:
+        """Do nothing: the caller steps."""
+
+    def hurry(self) -> None:
+        """Run a step."""
+        self._on_state(self._controller.step())
+
+    def end(self) -> bool:
+        """Stop the motors; return True."""
+        self._on_end(None, self._controller.close())
+        return True
