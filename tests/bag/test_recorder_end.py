@@ -32,8 +32,8 @@ def test_messages_in_the_sockets_at_the_end_are_in_the_bag(
     transport = LocalTransport(run_dir, "bag_recorder", clock.now_ns)
     node = BagRecorderNode(BagRecorderConfig(path=str(tmp_path / "bag"), topics=("/a",)), transport, clock)
     try:
+        node.be_patient(True)  # only a wait of the node's own thread reads its sockets
         node.start()
-        node.be_patient(True)  # only a wait of the node's own thread reads its sockets from here on
         subscription = node.subscriptions[-1].raw
         assert isinstance(subscription, LocalSubscription) and subscription.topic == "/a"
         wait_for(lambda: publisher.subscriber_count == 1)
