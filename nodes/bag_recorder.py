@@ -92,9 +92,10 @@ class BagRecorderNode(Node[BagRecorderConfig]):
 
     def _discover(self) -> None:
         topics, nodes = self._live.look()
-        for recorder in filter(None, (self.recorder, self.on_demand)):
-            recorder.discover(topics, nodes)
-            recorder.tick()
+        for recorder in (self.recorder, self.on_demand):
+            if recorder is not None:
+                recorder.discover(topics, nodes)
+                recorder.tick()
 
     def _snapshot(self, reason: str = "") -> dict[str, Any]:
         made = self.recorder.snapshot(reason, self.config.snapshot_after_s)
