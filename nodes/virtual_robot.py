@@ -65,9 +65,9 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.action: VbotAction | None = None
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
-        self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
         self.times = StepTimes()
-        self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
+        timeout_s = self.config.command_timeout_s
+        self.command = self.latest("/operator/cmd_vel", TwistStamped, timeout_s, callback=self.on_command)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
         if self.config.walls_block:
             finder = WallFinder(self.config.wall_min_length_m)
