@@ -44,12 +44,10 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.diagnose("link", WARN, f"connecting to {config.roboclaw.port}")
         self.diagnose_all(self.latch.diagnosis, self.gate.publishers)
         self.timer(1.0, self.watch)
+        loop_class = SteppedController if self.lockstep else ControllerThread
+        self.loop = loop_class(self.controller, config.rate_hz, self.on_step, self.on_end)
         if self.lockstep:
-            self.loop: ControllerThread | SteppedController
-            self.loop = SteppedController(self.controller, self.on_step, self.on_end)
             self.timer(1.0 / config.rate_hz, self.loop.hurry)
-        else:
-            self.loop = ControllerThread(self.controller, config.rate_hz, self.on_step, self.on_end)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/cmd_vel", self.on_command, qos=SENSOR)

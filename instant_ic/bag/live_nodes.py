@@ -86,38 +86,13 @@ def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Ma
         )
 
 
-def missing_readers(
-    wait_for: Collection[str], nodes: Collection[NodeInfo], publishers: Mapping[str, tuple[str, int]]
-) -> list[str]:
-    """Describe what is missing before nodes receive everything that is played.
-
-    Args:
-        wait_for: names of the nodes, which must subscribe to at least one played topic.
-        nodes: running nodes.
-        publishers: topic in the bag → (topic on the bus, number of connected subscribers).
-
-    Returns:
-        The missing nodes and connections as text; empty when all are there.
-    """
-    running = {node.name: node for node in nodes if node.name in wait_for}
-    played = {topic for topic, _ in publishers.values()}
-    # A recorder subscribes only after it has found the topics: it is ready once it subscribes to one of them.
-    absent = [name for name in wait_for if name not in running or played.isdisjoint(running[name].subscribes)]
-    readers = [topic for node in running.values() for topic in node.subscribes]
-    unread = [name for name, (topic, connected) in publishers.items() if connected < readers.count(topic)]
-    return [f"node {name} to read what is played" for name in absent] + [f"a reader of {name}" for name in unread]
-
-
 def wait_for_readers(
-    wait_for: Collection[str],
-    run_dir: Path,
-    publishers: Mapping[str, Publisher],
-    wait: Callable[[float], bool],
+    wait_for: Collection[str], run_dir: Path, publishers: Mapping[str, Publisher], wait: Callable[[float], bool]
 ) -> None:
     """Wait until nodes are connected to everything that is played.
 
     Args:
-        wait_for: names of the nodes.
+        wait_for: names of the nodes, which must subscribe to at least one played topic.
         run_dir: where they run.
         publishers: topic in the bag → its publisher.
         wait: waits for some seconds; returns True to give up.
@@ -128,8 +103,17 @@ def wait_for_readers(
     deadline_s = time.monotonic() + _WAIT_S
     missing: list[str] = []
     while time.monotonic() < deadline_s:
-        connected = {topic: (one.topic, one.subscriber_count) for topic, one in publishers.items()}
-        missing = missing_readers(wait_for, list_nodes(run_dir), connected)
+        missing = _missing(wait_for, list_nodes(run_dir), publishers)
         if not missing or wait(0.1):
             return
     raise BagError(f"waited {_WAIT_S:.0f} s for {', '.join(missing)}")
+
+
+def _missing(wait_for: Collection[str], nodes: Collection[NodeInfo], publishers: Mapping[str, Publisher]) -> list[str]:
+    running = {node.name: node for node in nodes if node.name in wait_for}
+    played = {out.topic for out in publishers.values()}
+    # A recorder subscribes only after it has found the topics: it is ready once it subscribes to one of them.
+    absent = [name for name in wait_for if name not in running or played.isdisjoint(running[name].subscribes)]
+    readers = [topic for node in running.values() for topic in node.subscribes]
+    unread = [name for name, out in publishers.items() if out.subscriber_count < readers.count(out.topic)]
+    return [f"node {name} to read what is played" for name in absent] + [f"a reader of {name}" for name in unread]

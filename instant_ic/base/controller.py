@@ -318,27 +318,17 @@ class ControllerThread(threading.Thread):
         return not self.is_alive()
 
 
-class SteppedController:
-    """Steps a controller where it is called, for lockstep; otherwise like :class:`ControllerThread`."""
-
-    def __init__(
-        self,
-        controller: BaseController,
-        on_state: Callable[[BaseState], None],
-        on_end: Callable[[BaseException | None, str], None],
-    ) -> None:
-        self._controller = controller
-        self._on_state = on_state
-        self._on_end = on_end
+class SteppedController(ControllerThread):
+    """Steps the controller in the caller's thread, at each :meth:`hurry`: for lockstep."""
 
     def start(self) -> None:
-        """Do nothing: the caller steps."""
+        """Start no thread."""
 
     def hurry(self) -> None:
         """Run a step."""
         self._on_state(self._controller.step())
 
-    def end(self) -> bool:
+    def end(self, timeout_s: float = 0.0) -> bool:
         """Stop the motors; return True."""
         self._on_end(None, self._controller.close())
         return True
