@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from instant_ic.control.kinematics import extrapolate
 from instant_ic.control.operator_view import OperatorView, PageReport
 from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Vspace
 from instant_ic.control.states import Mode
+from instant_ic.control.static_map import StaticMap
 from instant_ic.control.surroundings import Cloud, Scan, Surroundings
 from instant_ic.control.walls import WallMap
 from instant_ic.msg import (
@@ -26,6 +28,7 @@ from instant_ic.msg import (
     ShownPictures,
     VspaceStatus,
     cloud_array,
+    grid_message,
     header,
     matrix_from_pose,
     pose2_from_message,
@@ -53,6 +56,7 @@ class ArbiterInbox:
     """Trust in the pose; None: not used."""
     button_ns: int | None = None
     """Last report of the robot's own emergency stop, steady clock."""
+    _was_gone: bool = False  # at the page's last report
 
     def scan(self) -> Scan | None:
         """The newest scan."""
@@ -79,6 +83,22 @@ class ArbiterInbox:
         """Whether the robot stands and nobody wants it to move: nothing then depends on the newest scan."""
         still = self._twist("command") == NO_MOTION == self._twist("odometry")
         return still and mode in (Mode.REAL, Mode.STOPPED)
+
+    def report_shown(self, message: ShownPictures, mode: Mode) -> bool:
+        """Take a page's report; return whether to step at once: a switch waits for it, or the driver was lost."""
+        wanted = mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
+        new = self.view.report(page_report(message), wanted, self.clock.now_ns(), self.clock.steady_ns())
+        before, self._was_gone = self._was_gone, self.operator_gone()
+        return (new and mode in (Mode.ENTERING, Mode.RETURNING)) or (self._was_gone and not before)
+
+    def update_costmap(self, static: StaticMap | None) -> Any:
+        """Take the newest scan and points into the costmap; return its message if it is due, else None."""
+        scan = self.scan()
+        costmap = self.surroundings.update_costmap(scan, self.cloud(), static)
+        if costmap is None or scan is None or not self.surroundings.publish_due(self.clock.steady_ns()):
+            return None
+        x, y = costmap.origin.tolist()
+        return grid_message(costmap.occupancy(), costmap.resolution, (x, y), "map", scan.stamp_ns)
 
     def operator_gone(self) -> bool:
         """Whether the console has lost its driver since the newest command."""

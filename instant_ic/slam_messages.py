@@ -14,13 +14,17 @@ from instant_ic.msg import (
     PoseIntegrity,
     PoseWithCovariance,
     PoseWithCovarianceStamped,
+    TFMessage,
+    grid_message,
     header,
+    pose2_from_message,
     stamp_ns,
+    transform_matrix,
 )
 from instant_ic.msg import pose_message as _pose
-from instant_ic.slam import Scan
+from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.grid_slam import SlamResult
-from instant_ic.slam.map_updates import MapPart
+from instant_ic.slam.map_updates import MapUpdates
 from instant_ic.slam.scan import FloatArray
 from instant_ic.slam.scan_queue import ScanError, level_mount
 
@@ -62,8 +66,33 @@ def pose_message(result: SlamResult, map_frame: str, stamp: int) -> Any:
     return PoseWithCovarianceStamped(header=header(map_frame, stamp), pose=pose)
 
 
-def part_message(part: MapPart, map_frame: str, stamp: int) -> Any:
-    """OccupancyGridUpdate of a changed part of the map."""
-    (height, width), data = part.values.shape, np.ascontiguousarray(part.values).reshape(-1)
-    place = {"x": part.x, "y": part.y, "width": width, "height": height}
-    return OccupancyGridUpdate(header=header(map_frame, stamp), data=data, **place)
+def read_mounts(message: TFMessage, mounts: TransformBuffer) -> None:
+    """Put the fixed transforms of a TFMessage into a buffer."""
+    for mount in message.transforms:
+        parent, child = mount.header.frame_id, mount.child_frame_id
+        mounts.set(parent, child, stamp_ns(mount), transform_matrix(mount), static=True)
+
+
+def read_initial_pose(message: PoseWithCovarianceStamped, map_frame: str) -> FloatArray:
+    """Pose (3,) that was set from outside.
+
+    Raises:
+        ValueError: it is in another frame than the map's.
+    """
+    if message.header.frame_id not in ("", map_frame):
+        raise ValueError(f"it is in frame {message.header.frame_id!r}, not {map_frame!r}")
+    return pose2_from_message(message)
+
+
+def map_messages(updates: MapUpdates, slam: GridSlam, map_frame: str, stamp: int, steady_ns: int) -> tuple[Any, Any]:
+    """OccupancyGridUpdate of the changed part and OccupancyGrid of the whole map; None for what is not to be sent."""
+    part, whole = updates.update(slam.map_version, slam.grid, steady_ns)
+    update = grid = None
+    if part is not None:
+        (height, width), data = part.values.shape, np.ascontiguousarray(part.values).reshape(-1)
+        place = {"x": part.x, "y": part.y, "width": width, "height": height}
+        update = OccupancyGridUpdate(header=header(map_frame, stamp), data=data, **place)
+    if whole is not None:
+        origin = (float(whole.origin[0]), float(whole.origin[1]))
+        grid = grid_message(whole.values, whole.resolution, origin, map_frame, stamp)
+    return update, grid

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from instant_ic import msg
-from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, main
+from instant_ic.bus import LATCHED, SENSOR, Node, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
@@ -11,13 +11,11 @@ from instant_ic.control.estop import KeptEstop
 from instant_ic.control.operator_view import OperatorView
 from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.sources import STEP_AFTER_S
-from instant_ic.control.states import Mode
 from instant_ic.control.step_times import REST_COSTMAP_S, REST_STEP_S, StepTimes
 from instant_ic.control.surroundings import Surroundings
 from instant_ic.control.walls import WallFinder, WallSearch
 from instant_ic.control.warmup import warm_up
-from instant_ic.control_messages import ArbiterInbox, control_state, page_report
-from instant_ic.estop_state import EstopStateError
+from instant_ic.control_messages import ArbiterInbox, control_state
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import ControlState, twist_values
 
@@ -45,8 +43,6 @@ class ArbiterNode(Node[ArbiterConfig]):
         if self.latch.pressed:
             self.log.warning("emergency stop: %s", self.latch.why or "still pressed from before this start")
         self.times = StepTimes()
-        self.was_gone = False  # a step was made for the loss of the driver
-        self.ticks = 0
         self.cmd_vel = self.publisher("/cmd_vel", msg.TwistStamped, qos=SENSOR)
         self.state = self.publisher("/ic/state", ControlState, qos=LATCHED)
         self.subgoal = self.publisher("/ic/subgoal", msg.PoseStamped, qos=SENSOR)
@@ -70,9 +66,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=msg.Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=msg.Bool)
         # Only its age matters: the image is never decoded here.
-        self.subscribe_raw(
-            "/camera/image/compressed", lambda *_: self.view.camera_image(self.clock.steady_ns()), qos=SENSOR
-        )
+        self.subscribe_received("/camera/image/compressed", lambda r: self.view.camera_image(r.published_ns), SENSOR)
         self.timer(c.wall_period_s, self.walls.update)
         self.timer(1.0 / c.costmap.update_frequency, self.update_costmap)
         self.cancel_extra = lambda: None  # cancels a step between two timers
@@ -97,18 +91,14 @@ class ArbiterNode(Node[ArbiterConfig]):
     def on_button(self, received: Received) -> None:
         """Obey the robot's own emergency stop; its release ends nothing: the operator must release the stop."""
         pressed = bool(msg.deserialize(received.payload, received.type_name).data)
-        self.inbox.button_ns = self.clock.steady_ns()
+        self.inbox.button_ns = received.published_ns
         self.latch.hear_button(pressed, received.publisher, received.publish_ns)
         self.step_and_save()
 
     def step_and_save(self) -> None:
         """Step at once, then save the emergency stop, so that no restart of a node or of the machine ends it."""
         self.tick()
-        try:
-            if self.latch.save():
-                self.diagnose("estop", OK, "")
-        except EstopStateError as error:
-            self.diagnose("estop", ERROR, str(error))
+        self.diagnose_all(self.latch.save())
 
     def on_command(self, message: msg.TwistStamped) -> None:
         if self.times.command_steps(twist_values(message)):
@@ -119,27 +109,15 @@ class ArbiterNode(Node[ArbiterConfig]):
             self.tick()
 
     def on_shown(self, message: msg.ShownPictures) -> None:
-        """Step at once if a switch waits for the new images, or the driver was lost."""
-        mode, was_gone = self.arbiter.mode, self.was_gone
-        wanted = mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
-        new = self.view.report(page_report(message), wanted, self.clock.now_ns(), self.clock.steady_ns())
-        self.was_gone = gone = self.inbox.operator_gone()
-        if (new and mode in (Mode.ENTERING, Mode.RETURNING)) or (gone and not was_gone):
+        if self.inbox.report_shown(message, self.arbiter.mode):
             self.tick()
 
     def update_costmap(self) -> None:
-        if not self.times.costmap_due(self.clock.steady_ns(), self.inbox.rests(self.arbiter.mode)):
-            return
-        scan = self.inbox.scan()
-        costmap = self.surroundings.update_costmap(scan, self.inbox.cloud(), self.walls.map)
-        self.diagnose_all(*self.surroundings.findings.values())
-        if costmap is None or scan is None:
-            return
-        if self.surroundings.map_jumped:
-            self.log.info("the map has jumped: the marks of scans are cleared from the costmap")
-        if self.surroundings.publish_due(self.clock.steady_ns()):
-            grid, (x, y) = costmap.occupancy(), costmap.origin.tolist()
-            self.costmap_out.publish(msg.grid_message(grid, costmap.resolution, (x, y), "map", scan.stamp_ns))
+        if self.times.costmap_due(self.clock.steady_ns(), self.inbox.rests(self.arbiter.mode)):
+            grid = self.inbox.update_costmap(self.walls.map)
+            self.diagnose_all(*self.surroundings.findings.values())
+            if grid is not None:
+                self.costmap_out.publish(grid)
 
     def tick(self) -> None:
         rests = self.inbox.rests(self.arbiter.mode)
@@ -165,11 +143,9 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.state.publish(control_state(decision, inputs, now_ns))
         if decision.changed:
             self.log.info("%s: %s", decision.mode.label, decision.reason)
-        level = WARN if decision.mode == Mode.STOPPED or decision.blocked else OK
-        self.diagnose("control", level, decision.reason, mode=decision.mode.name, reason=decision.reason_code.name)
-        self.ticks += 1
-        if self.ticks % 2 and not decision.changed:
-            return  # 10 Hz is enough for display and planning
+        self.diagnose_all(decision.diagnosis)
+        if not (self.times.shown or decision.changed):
+            return
         if decision.subgoal is not None:
             self.subgoal.publish(msg.pose_stamped(matrix_from_pose2(decision.subgoal.pose), "map", now_ns))
         if self.trajectory.subscriber_count or self.lockstep:

@@ -9,7 +9,7 @@ from typing import Any
 
 from instant_ic.bag import BagError, BagMessage
 from instant_ic.bag.config import BagPlayerConfig
-from instant_ic.bag.live_nodes import missing_readers, refuse_base
+from instant_ic.bag.live_nodes import refuse_base, wait_for_readers
 from instant_ic.bag.player import BagPlayer
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
@@ -17,7 +17,6 @@ from instant_ic.bus.clock import ManualClock
 from instant_ic.msg import message_type, register_type, to_time
 
 _BASE_PERIOD_S = 0.5
-_WAIT_S = 60.0  # for the nodes of wait_for
 
 
 class BagPlayerNode(Node[BagPlayerConfig]):
@@ -122,22 +121,18 @@ class BagPlayerNode(Node[BagPlayerConfig]):
 
     def _wait_for_readers(self) -> None:
         """Let subscribers find the topics, then wait until the nodes of ``wait_for`` are connected to all of them."""
-        if self.run_dir is None or self.player is None:
-            return
+        assert self.player is not None
+        start_ns = self.player.start_ns
+
+        def wait(seconds: float) -> bool:  # the time stands still
+            self._publish_time(start_ns)
+            return self._stop.wait(seconds)
+
         begin_s = time.monotonic() + self.config.delay_s
-        while time.monotonic() < begin_s and not self._stop.wait(1.0 / self.config.clock_hz):
-            self._publish_time(self.player.start_ns)
-        if not self.config.wait_for:
-            return
-        deadline_s = time.monotonic() + _WAIT_S
-        missing: list[str] = []
-        while time.monotonic() < deadline_s:
-            self._publish_time(self.player.start_ns)
-            publishers = {name: (out.topic, out.subscriber_count) for name, out in self._out.items()}
-            missing = missing_readers(self.config.wait_for, registry.list_nodes(self.run_dir), publishers)
-            if not missing or self._stop.wait(0.1):
-                return
-        raise NodeError(f"waited {_WAIT_S:.0f} s for {', '.join(missing)}")
+        while self.run_dir is not None and time.monotonic() < begin_s and not wait(1.0 / self.config.clock_hz):
+            pass
+        if self.run_dir is not None and self.config.wait_for:
+            wait_for_readers(self.config.wait_for, self.run_dir, self._out, wait)
 
     def teardown(self) -> None:
         """End the thread and close the bag."""

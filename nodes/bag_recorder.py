@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,10 @@ from typing import Any
 from instant_ic.bag import BagError
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.config import BagRecorderConfig
+from instant_ic.bag.live_nodes import LiveTopics
 from instant_ic.bag.on_demand import OnDemand
-from instant_ic.bag.recorder import Recorder, RecordOptions, Subscribe, TakeMessage
-from instant_ic.bus import RECORD, Node, NodeError, main, registry
-from instant_ic.bus.node import Subscription
-from instant_ic.bus.topic_watch import TopicWatch
+from instant_ic.bag.recorder import Recorder, RecordOptions, TakeMessage
+from instant_ic.bus import RECORD, Node, NodeError, main
 from instant_ic.bus.transport import Received, Stats
 from instant_ic.msg import Bool, ControlState
 
@@ -26,18 +26,17 @@ class BagRecorderNode(Node[BagRecorderConfig]):
 
     name = "bag_recorder"
     live_parameters = ("duration_s", "snapshot_after_s")
-    recorder: Recorder | None = None
+    recorder: Recorder
     on_demand: OnDemand | None = None
-    _next_nodes_s = 0.0
 
     def setup(self) -> None:
         """Create the bag and start discovery."""
         if self.run_dir is None:
             raise NodeError("the recorder needs the real bus; lockstep replay records by itself")
-        self._watch = TopicWatch(self.run_dir)
+        self._live = LiveTopics(self.run_dir)
         self._choice = TopicChoice(self.config.topics, self.config.exclude)
         try:
-            self.recorder = self._recorder(self.config.folder(), self._listen, self.config)
+            self.recorder = self._recorder(self.config.folder(), self.config, ExitStack())
         except BagError as error:
             raise NodeError(str(error)) from None
         if self.config.start_paused:
@@ -75,58 +74,42 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             if self.config.duration_s and time.monotonic() >= self._began_s + self.config.duration_s:
                 self.stop()
 
-    def _recorder(self, path: Path, listen: Subscribe, options: RecordOptions) -> Recorder:
+    def _recorder(self, path: Path, options: RecordOptions, taken: ExitStack) -> Recorder:
+        def listen(topic: str, take: TakeMessage) -> Stats:
+            def forward(message: Received) -> None:
+                take(message.topic, message.type_name, message.payload, message.publish_ns, message.publisher)
+
+            subscription = self.subscribe_received(topic, forward, RECORD)
+            taken.callback(self.drop, subscription)
+            return subscription.raw.stats
+
         return Recorder(path, self._choice, listen, self.clock.now_ns if self.use_sim_time else None, options)
-
-    def _listen(self, topic: str, take: TakeMessage) -> Stats:
-        return self._take_in(topic, take).raw.stats
-
-    def _take_in(self, topic: str, take: TakeMessage) -> Subscription:
-        def forward(message: Received) -> None:
-            take(message.topic, message.type_name, message.payload, message.publish_ns, message.publisher)
-
-        return self.subscribe_received(topic, forward, RECORD)
 
     def _begin(self, path: Path) -> tuple[Recorder, Callable[[], None]]:
         """Return a recorder with its own subscriptions, which get the latched messages, and a function to end them."""
-        taken: list[Subscription] = []
-
-        def listen(topic: str, take: TakeMessage) -> Stats:
-            taken.append(self._take_in(topic, take))
-            return taken[-1].raw.stats
-
-        def drop() -> None:
-            for subscription in taken:
-                self.drop(subscription)
-
-        return self._recorder(path, listen, replace(self.config, snapshot=False)), drop
+        taken = ExitStack()
+        return self._recorder(path, replace(self.config, snapshot=False), taken), taken.close
 
     def _discover(self) -> None:
-        assert self.recorder is not None and self.run_dir is not None
-        nodes: list[registry.NodeInfo] = []
-        if time.monotonic() >= self._next_nodes_s:
-            self._next_nodes_s = time.monotonic() + 2.0
-            nodes = registry.list_nodes(self.run_dir)
+        topics, nodes = self._live.look()
         for recorder in (self.recorder, self.on_demand):
             if recorder is not None:
-                recorder.discover(self._watch.topics(), nodes)
+                recorder.discover(topics, nodes)
                 recorder.tick()
 
     def _snapshot(self, reason: str = "") -> dict[str, Any]:
-        assert self.recorder is not None
         made = self.recorder.snapshot(reason, self.config.snapshot_after_s)
         self.log.info("snapshot %s in %.1f s", made.path, max(0.0, made.due_s - time.monotonic()))
         return {"path": str(made.path)}
 
     def _record(self, name: str = "") -> dict[str, Any]:
-        assert self.run_dir is not None
         if self.on_demand is None:
             raise NodeError("this recorder records all the time; only one with snapshot: true records on request")
         try:
             path = self.on_demand.start(name)
         except BagError as error:
             raise NodeError(str(error)) from None
-        self.on_demand.discover(registry.list_topics(self.run_dir), registry.list_nodes(self.run_dir))
+        self.on_demand.discover(*self._live.look(again=True))
         self.log.info("recording into %s", path)
         return {"path": str(path)}
 
@@ -136,7 +119,6 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         return {"path": str(self.on_demand.stop())}
 
     def _status(self) -> dict[str, Any]:
-        assert self.recorder is not None
         status = self.recorder.status()
         return status if self.on_demand is None else status | {"recording": self.on_demand.status()}
 
@@ -148,13 +130,12 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             self._snapshot("estop")
 
     def _report(self) -> None:
-        assert self.recorder is not None
         self.diagnose_all(*self.recorder.diagnoses(self.on_demand.trouble() if self.on_demand else ""))
 
     def teardown(self) -> None:
-        if self.recorder is None:
+        if not hasattr(self, "recorder"):
             return
-        self.spin_once()  # messages already in the queues belong to the bag
+        self.read_all()  # what was published before the end belongs to the bag
         try:
             if self.on_demand is not None:
                 self.on_demand.close()

@@ -5,25 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from instant_ic import msg
-from instant_ic.bus import ERROR, LATCHED, RELIABLE, SENSOR, WARN, Node, NodeError, QoS, main
-from instant_ic.geometry.poses import matrix_from_pose2
+from instant_ic import msg, slam_messages
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, WARN, Node, NodeError, QoS, main
 from instant_ic.geometry.transforms import TransformBuffer
-from instant_ic.slam import GridSlam
 from instant_ic.slam.config import GridSlamConfig
-from instant_ic.slam.grid_slam import make_slam, run_job, warm_up
+from instant_ic.slam.grid_slam import JobResult, make_slam, run_job, save_answer, transforms, warm_up
 from instant_ic.slam.map_updates import MapUpdates
 from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.report import diagnoses
+from instant_ic.slam.scan import FloatArray
 from instant_ic.slam.scan_queue import QueuedScan, ScanError, ScanQueue
-from instant_ic.slam_messages import integrity_message, part_message, pose_message, read_scan
 
 ODOMETRY_QUEUE = QoS("sensor", depth=100)
 """Deep, because scans are placed between two odometry messages."""
-_POLL_S = 0.05
-"""Odometry comes more often than this. Where it does not, a scan is placed up to this much after its wait."""
+_POLL_S = 0.05  # odometry comes more often; where it does not, a scan is placed up to this much after its wait
 
 
 class GridSlamNode(Node[GridSlamConfig]):
@@ -47,7 +42,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.restart()
         # The laser's mount is fixed: /tf, which carries a message per odometry, is not needed.
         self.mounts = TransformBuffer()
-        self.subscribe("/tf_static", msg.TFMessage, self.on_mounts, qos=LATCHED)
+        self.subscribe("/tf_static", msg.TFMessage, lambda m: slam_messages.read_mounts(m, self.mounts), LATCHED)
         if self.config.use_wheel_odom:
             self.subscribe("/wheel/odom", msg.Odometry, self.on_odometry, qos=ODOMETRY_QUEUE)
         self.subscribe("/scan", msg.LaserScan, self.on_scan, qos=SENSOR)
@@ -68,19 +63,13 @@ class GridSlamNode(Node[GridSlamConfig]):
     def restart(self) -> None:
         config = self.config
         try:
-            map_file = Path(config.map_file).expanduser() if config.map_file else None
-            self.slam = make_slam(config, map_file, config.mode == "localization")
+            self.slam = make_slam(config, config.saved_map, config.mode == "localization")
         except ValueError as error:  # MapError is one
             raise NodeError(str(error)) from None
         self.updates = MapUpdates(config.map_full_period_s)
         self.placed_ns: int | None = None
         self.queue.restart()
         self.limiter.reset()
-
-    def on_mounts(self, message: Any) -> None:
-        for mount in message.transforms:
-            parent, child = mount.header.frame_id, mount.child_frame_id
-            self.mounts.set(parent, child, msg.stamp_ns(mount), msg.transform_matrix(mount), static=True)
 
     def on_odometry(self, message: Any) -> None:
         if self.queue.add_odometry(msg.stamp_ns(message), msg.pose2_from_message(message)):
@@ -95,7 +84,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             if back_s > 0:
                 self.diagnose("time", WARN, f"time went back by {back_s:.1f} s: a new map begins")
                 self.restart()
-            scan, mount = read_scan(message, self.mounts, self.config.base_frame)
+            scan, mount = slam_messages.read_scan(message, self.mounts, self.config.base_frame)
             self.queue.add(scan, mount, now_ns, self.clock.steady_ns())
         except ScanError as error:
             self.queue.drop(str(error))
@@ -112,66 +101,53 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.poll.cancel()
             self.poll = None
 
-    def place(self, queued: QueuedScan, odometry: np.ndarray | None) -> None:
+    def place(self, queued: QueuedScan, odometry: FloatArray | None) -> None:
         """Call the library for one scan and publish the result."""
         config, slam, stamp = self.config, self.slam, queued.scan.stamp_ns
         result = slam.process(queued.scan, odometry, queued.base_from_laser)
         self.diagnose_all(*diagnoses(slam, result, odometry is not None, config.use_wheel_odom))
         self.placed_ns = stamp
-        if odometry is None:
-            self.tf_broadcast(config.odom_frame, config.base_frame, matrix_from_pose2(slam.odom_from_base), stamp)
-        self.integrity_out.publish(integrity_message(result, config.map_frame, stamp))
-        # A robot that is lost keeps the frames that it had: it may drive on, slowly, until its place is recognized.
+        self.integrity_out.publish(slam_messages.integrity_message(result, config.map_frame, stamp))
+        for parent, child, matrix in transforms(slam, self.limiter, config, stamp, odometry is not None):
+            self.tf_broadcast(parent, child, matrix, stamp)
         if slam.in_map_frame:
-            map_from_odom = self.limiter.follow(slam.map_from_odom, slam.odom_from_base, stamp)
-            self.tf_broadcast(config.map_frame, config.odom_frame, matrix_from_pose2(map_from_odom), stamp)
-            self.pose_out.publish(pose_message(result, config.map_frame, stamp))
+            self.pose_out.publish(slam_messages.pose_message(result, config.map_frame, stamp))
             if self.updates.grid is None:
                 self.publish_map()
-        else:
-            self.limiter.reset()
         job = slam.background_job()
         if job is not None:
             self.worker.submit((slam, job))
 
-    def take_over(self, result: tuple[GridSlam, Any, str]) -> None:
+    def take_over(self, result: JobResult) -> None:
         """Apply the worker's result, unless its map has been discarded since."""
-        slam, outcome, fault = result
-        if fault:
-            self.diagnose("loops", ERROR, f"loop closure failed and is off until the node restarts: {fault}")
-        if slam is self.slam:
-            slam.take_over(outcome)
+        self.diagnose_all(result.diagnosis)
+        if result.slam is self.slam:
+            self.slam.take_over(result.outcome)
 
     def on_initial_pose(self, message: Any) -> None:
         """Set the robot's pose in the saved map from outside (RViz's "2D pose estimate")."""
         try:
-            if message.header.frame_id not in ("", self.config.map_frame):
-                raise ValueError(f"it is in frame {message.header.frame_id!r}, not {self.config.map_frame!r}")
-            self.slam.set_pose(msg.pose2_from_message(message))
+            self.slam.set_pose(slam_messages.read_initial_pose(message, self.config.map_frame))
             self.limiter.reset()
         except ValueError as error:
             self.log.warning("/initialpose is not used: %s", error)
 
     def on_save(self, message: Any) -> None:
         """Write the map to the path in the message; the answer goes to /slam/saved."""
-        try:
-            answer = "saved: " + ", ".join(str(file) for file in self.slam.save(Path(message.data)))
-        except ValueError as error:
-            answer = f"error: {error}"
+        answer = save_answer(self.slam, Path(message.data))
         self.log.info("%s", answer)
         self.saved_out.publish(msg.String(data=answer))
 
     def publish_map(self) -> None:
         """Publish a changed map: in parts on /map_updates, whole at most every ``map_full_period_s``."""
-        stamp, frame = self.placed_ns, self.config.map_frame
-        if stamp is None:
+        if self.placed_ns is None:
             return
-        part, whole = self.updates.update(self.slam.map_version, self.slam.grid, self.clock.steady_ns())
-        if part is not None:
-            self.update_out.publish(part_message(part, frame, stamp))
-        if whole is not None:
-            origin = (float(whole.origin[0]), float(whole.origin[1]))
-            self.map_out.publish(msg.grid_message(whole.values, whole.resolution, origin, frame, stamp))
+        which = self.updates, self.slam, self.config.map_frame, self.placed_ns
+        update, grid = slam_messages.map_messages(*which, self.clock.steady_ns())
+        if update is not None:
+            self.update_out.publish(update)
+        if grid is not None:
+            self.map_out.publish(grid)
 
 
 if __name__ == "__main__":

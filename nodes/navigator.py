@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.config.ranges import Positive, check_ranges
@@ -14,7 +13,7 @@ from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, extrapolate
-from instant_ic.control.navigator import Navigator, RecoveryConfig, meeting_pose
+from instant_ic.control.navigator import Navigator, RecoveryConfig, moving_subgoal
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
@@ -108,7 +107,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.diagnose("follow", OK, "waiting: the operator drives the robot")
 
     def tick(self) -> None:
-        state = self.state.message
+        state = self.state.fresh
         if state is None:
             self.rest()
             return
@@ -118,7 +117,7 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     def command(self, state: ControlState) -> tuple[float, float]:
         """Twist for the r-bot; zero, with a diagnosis, while an input is missing."""
-        grid, goal = self.costmap.message, self.subgoal.message
+        grid, goal = self.costmap.fresh, self.subgoal.fresh
         if grid is None or goal is None:
             missing = "costmap" if grid is None else "subgoal"
             self.diagnose("follow", WARN, f"robot stands: no {missing} within its time-out")
@@ -128,24 +127,15 @@ class NavigatorNode(Node[NavigatorConfig]):
         if self.grid[0] is not grid:
             occupancy, resolution, origin = grid_array(grid)
             self.grid = grid, Costmap.from_occupancy(occupancy, resolution, np.array(origin))
-        subgoal, velocity = self.moving(pose2_from_message(goal), state)
+        shown, robot = (pose2_from_message(one) for one in (state.vbot_target, state.robot_pose))
+        vbot = self.vbot.fresh
+        own = None if vbot is None else (pose2_from_message(vbot), twist_values(vbot))
+        subgoal, velocity = moving_subgoal(pose2_from_message(goal), own, shown, robot)
         step = self.navigator.step(pose, self.speed, subgoal, self.grid[1], self.clock.steady_ns(), velocity)
         if step.replanned and (self.path.subscriber_count or self.lockstep):
             self.path.publish(path_message(step.plan.poses, "map", self.clock.now_ns()))
         self.diagnose("follow", OK if step.plan.reached else WARN, step.plan.reason or step.state, state=step.state)
         return step.command
-
-    def moving(
-        self, subgoal: NDArray[np.float64], state: ControlState
-    ) -> tuple[NDArray[np.float64], tuple[float, float]]:
-        """Subgoal and its velocity; if it is the v-bot, the v-bot's own newer pose and twist."""
-        vbot = self.vbot.message
-        if vbot is not None:
-            pose = pose2_from_message(vbot)
-            if float(np.linalg.norm(pose[:2] - subgoal[:2])) < 0.15:
-                shown, robot = (pose2_from_message(one) for one in (state.vbot_target, state.robot_pose))
-                return meeting_pose(pose, shown, robot), twist_values(vbot)
-        return subgoal, (0.0, 0.0)
 
 
 if __name__ == "__main__":

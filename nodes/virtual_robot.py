@@ -65,9 +65,9 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.action: VbotAction | None = None
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
-        self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
         self.times = StepTimes()
-        self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
+        timeout_s = self.config.command_timeout_s
+        self.command = self.latest("/operator/cmd_vel", TwistStamped, timeout_s, callback=self.on_command)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
         if self.config.walls_block:
             finder = WallFinder(self.config.wall_min_length_m)
@@ -94,7 +94,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         # A late timer must not make the view jump.
         dt_s = min((steady_ns - self.stepped_ns) / 1e9, 0.2)
         self.stepped_ns = steady_ns
-        state = self.state.message
+        state = self.state.fresh
         if state is None:
             self.diagnose("state", WARN, "the arbiter is silent: the v-bot stands still")
             self.robot.place(self.robot.pose, (0.0, 0.0))
@@ -131,11 +131,9 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
 
     def operator(self) -> tuple[float, float]:
-        """The operator's command; zero when stale, by arrival or by stamp."""
-        message = self.command.message
-        if message is None or self.command.stamp_age_s > self.config.command_timeout_s:
-            return 0.0, 0.0
-        return twist_values(message)
+        """The operator's command; zero when stale."""
+        message = self.command.fresh
+        return (0.0, 0.0) if message is None else twist_values(message)
 
 
 if __name__ == "__main__":

@@ -2,34 +2,22 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Any
 
-import numpy as np
-
-from instant_ic.bus import OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.bus import SENSOR, Node, NodeError, main
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar.capture import CaptureError
 from instant_ic.lidar.compensation import compensated_scan
 from instant_ic.lidar.config import Vlp16DriverConfig
 from instant_ic.lidar.feed import PacketFeed, Packets
-from instant_ic.lidar.flatscan import check_level, coverage, warm_up
+from instant_ic.lidar.flatscan import check_level, warm_up
 from instant_ic.lidar.packets import DATA_PACKET_BYTES
 from instant_ic.lidar.player import CapturePlayer
-from instant_ic.lidar.receiver import PacketReceiver, ReceiverError
+from instant_ic.lidar.receiver import PacketReceiver, Received, ReceiverError, ReceiverThread
 from instant_ic.lidar.report import LidarReport
 from instant_ic.lidar.stream import Revolution
-from instant_ic.msg import (
-    LaserScan,
-    PointCloud2,
-    VelodynePacket,
-    VelodyneScan,
-    cloud_message,
-    header,
-    scan_message,
-    stamp_ns,
-    to_time,
-)
+from instant_ic.lidar_messages import flat_scan_message, packets_message
+from instant_ic.msg import LaserScan, PointCloud2, VelodyneScan, cloud_message, stamp_ns
 
 _MAX_WAITING = 5
 """Revolutions that may wait for the node's thread; with more the machine is too slow for the sensor."""
@@ -43,8 +31,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         """Create the topics, the mount and the packet source."""
         config = self.config
         warm_up()
-        self.ending = threading.Event()
-        self.thread: threading.Thread | None = None
+        self.thread: ReceiverThread | None = None
         self.feed = PacketFeed(config.decoder, config.sensor, self.clock.steady_ns())
         self.report = LidarReport(self.feed)
         self.waiting = 0
@@ -72,21 +59,12 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
                 self.receiver.connect()
             except ReceiverError as error:
                 raise NodeError(str(error)) from error
-            self.thread = threading.Thread(target=self.receive, name="vlp16 receiver", daemon=True)
+            self.thread = ReceiverThread(self.receiver, self.on_datagram, self.on_fault)
             self.thread.start()
 
-    def receive(self) -> None:
-        """Receive and decode until the node ends; runs on the receiver's own thread."""
-        try:
-            while not self.ending.is_set():
-                for stamp, payload, is_data in self.receiver.read(timeout_s=0.2):
-                    if is_data:
-                        self.take(payload, stamp)
-                    else:
-                        self.call_soon(self.diagnose_all, self.report.position(payload))
-        except Exception as error:  # noqa: BLE001 - nothing else reports what ends a thread
-            self.call_soon(self.fault, "receiver", error)
-            self.call_soon(self.stop)
+    def on_fault(self, error: Exception) -> None:
+        self.call_soon(self.fault, "receiver", error)
+        self.call_soon(self.stop)
 
     def on_packets(self, message: Any) -> None:
         """Take the packets of a bag."""
@@ -106,20 +84,24 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         if self.player.ended:
             return
         for stamp, port, payload in self.player.due(self.clock.steady_ns()):
-            if port == self.config.position_port and len(payload) != DATA_PACKET_BYTES:
-                self.diagnose_all(self.report.position(payload))
-            else:
-                self.take(payload, stamp)
+            is_data = port != self.config.position_port or len(payload) == DATA_PACKET_BYTES
+            self.on_datagram(Received(stamp, payload, is_data))
         if not self.player.ended:
             return
         if (last := self.feed.finish()) is not None:
             self.hand_on(*last)
-        skipped = self.player.skipped
-        text = f"{self.player.played} datagrams played" + (f"; left out: {skipped}" if skipped else "")
-        self.diagnose("capture", WARN if skipped else OK, text)
-        self.log.info("%s: %s", self.config.pcap, text)
+        found = self.player.diagnosis
+        self.diagnose_all(found)
+        self.log.info("%s: %s", self.config.pcap, found.text)
         if self.config.loop:
             self.open_capture()
+
+    def on_datagram(self, received: Received) -> None:
+        """Take a datagram, on whichever thread it arrives."""
+        if received.is_data:
+            self.take(received.payload, received.stamp_ns)
+        else:
+            self.call_soon(self.diagnose_all, self.report.position(received.payload))
 
     def take(self, payload: bytes, stamp: int) -> None:
         """Take one data packet, on whichever thread packets arrive."""
@@ -143,26 +125,15 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         if self.thread is not None:
             self.waiting -= 1
         if self.packets is not None and (self.lockstep or self.packets.subscriber_count):
-            stamp = packets[0][1] if packets else revolution.stamp_ns
-            data = [VelodynePacket(stamp=to_time(at), data=np.frombuffer(raw, np.uint8)) for raw, at in packets]
-            self.packets.publish(VelodyneScan(header=header(config.frame_id, stamp), packets=data))
-        if self.feed.sources.doubt(self.clock.steady_ns()) is not None:
-            # Without a scan the robot stops; a forged one could drive it into a wall.
-            self.report.withheld += 1
+            self.packets.publish(packets_message(packets, revolution, config.frame_id))
+        if not self.report.trusts(self.clock.steady_ns()):
             self.diagnose_all(self.report.source(self.clock.steady_ns()))
             return
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))
-        if coverage(revolution) < config.scan.min_coverage:
-            # Half blind: it would mislead map matching, and the scan itself does not show the fault to other nodes.
-            self.report.partial += 1
-            return
-        scan, state = compensated_scan(revolution, self.base_from_lidar, config.scan, self.tf)
-        self.diagnose_all(state)
-        angles, limits = (scan.angle_min, scan.angle_increment), (config.scan.range_min, config.scan.range_max)
-        duration_s = (revolution.end_ns - revolution.stamp_ns) * 1e-9
-        self.scan.publish(
-            scan_message(scan.ranges, *angles, *limits, config.frame_id, scan.stamp_ns, scan_time=duration_s)
-        )
+        if self.report.covers(revolution, config.scan.min_coverage):
+            scan, state = compensated_scan(revolution, self.base_from_lidar, config.scan, self.tf)
+            self.diagnose_all(state)
+            self.scan.publish(flat_scan_message(scan, revolution, config))
 
     def check(self) -> None:
         """Report silence and losses; each second."""
@@ -171,13 +142,8 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.diagnose_all(*self.report.check(self.clock.steady_ns(), config.silence_s, config.source, where))
 
     def teardown(self) -> None:
-        if hasattr(self, "ending"):
-            self.ending.set()
-        if getattr(self, "thread", None) is not None:
-            assert self.thread is not None
-            self.thread.join(2.0)
-        if hasattr(self, "receiver"):
-            self.receiver.close()
+        if (thread := getattr(self, "thread", None)) is not None:
+            thread.end()
 
 
 if __name__ == "__main__":

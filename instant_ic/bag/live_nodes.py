@@ -3,19 +3,41 @@
 from __future__ import annotations
 
 import fnmatch
-from collections.abc import Collection, Mapping
+import time
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 from instant_ic.bag.errors import BagError
 from instant_ic.bus.heartbeat import EVERY_NODES
-from instant_ic.bus.registry import NodeInfo
+from instant_ic.bus.node import Publisher
+from instant_ic.bus.registry import NodeInfo, TopicInfo, list_nodes
+from instant_ic.bus.topic_watch import TopicWatch
 
+_NODES_S = 2.0  # period of the search for nodes, which costs more than that for topics
+_WAIT_S = 60.0
 _BASE = "crawler_base"
 _COMMAND = "/cmd_vel"
 _ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
 """Topics that a robot's nodes act on, in the namespace of its base."""
 _HARMLESS = {"/clock", *EVERY_NODES}
 """On any other topic a second publisher would mix the bag with the live robot."""
+
+
+class LiveTopics:
+    """Topics of a run directory, and from time to time its nodes."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._watch = TopicWatch(run_dir)
+        self._next_nodes_s = 0.0
+
+    def look(self, again: bool = False) -> tuple[list[TopicInfo], list[NodeInfo]]:
+        """Topics with a publisher; and the nodes, if they are due or ``again`` is set, otherwise none."""
+        nodes: list[NodeInfo] = []
+        if again or time.monotonic() >= self._next_nodes_s:
+            self._next_nodes_s = time.monotonic() + _NODES_S
+            nodes = list_nodes(self._run_dir)
+        return self._watch.topics(), nodes
 
 
 def reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tuple[str, list[str]] | None:
@@ -64,23 +86,34 @@ def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Ma
         )
 
 
-def missing_readers(
-    wait_for: Collection[str], nodes: Collection[NodeInfo], publishers: Mapping[str, tuple[str, int]]
-) -> list[str]:
-    """Describe what is missing before nodes receive everything that is played.
+def wait_for_readers(
+    wait_for: Collection[str], run_dir: Path, publishers: Mapping[str, Publisher], wait: Callable[[float], bool]
+) -> None:
+    """Wait until nodes are connected to everything that is played.
 
     Args:
         wait_for: names of the nodes, which must subscribe to at least one played topic.
-        nodes: running nodes.
-        publishers: topic in the bag → (topic on the bus, number of connected subscribers).
+        run_dir: where they run.
+        publishers: topic in the bag → its publisher.
+        wait: waits for some seconds; returns True to give up.
 
-    Returns:
-        The missing nodes and connections as text; empty when all are there.
+    Raises:
+        BagError: they are not after a minute.
     """
+    deadline_s = time.monotonic() + _WAIT_S
+    missing: list[str] = []
+    while time.monotonic() < deadline_s:
+        missing = _missing(wait_for, list_nodes(run_dir), publishers)
+        if not missing or wait(0.1):
+            return
+    raise BagError(f"waited {_WAIT_S:.0f} s for {', '.join(missing)}")
+
+
+def _missing(wait_for: Collection[str], nodes: Collection[NodeInfo], publishers: Mapping[str, Publisher]) -> list[str]:
     running = {node.name: node for node in nodes if node.name in wait_for}
-    played = {topic for topic, _ in publishers.values()}
+    played = {out.topic for out in publishers.values()}
     # A recorder subscribes only after it has found the topics: it is ready once it subscribes to one of them.
     absent = [name for name in wait_for if name not in running or played.isdisjoint(running[name].subscribes)]
     readers = [topic for node in running.values() for topic in node.subscribes]
-    unread = [name for name, (topic, connected) in publishers.items() if connected < readers.count(topic)]
+    unread = [name for name, out in publishers.items() if out.subscriber_count < readers.count(out.topic)]
     return [f"node {name} to read what is played" for name in absent] + [f"a reader of {name}" for name in unread]

@@ -316,3 +316,19 @@ class ControllerThread(threading.Thread):
         if self.is_alive():
             self.join(timeout_s)
         return not self.is_alive()
+
+
+class SteppedController(ControllerThread):
+    """Steps the controller in the caller's thread, at each :meth:`hurry`: for lockstep."""
+
+    def start(self) -> None:
+        """Start no thread."""
+
+    def hurry(self) -> None:
+        """Run a step."""
+        self._on_state(self._controller.step())
+
+    def end(self, timeout_s: float = 0.0) -> bool:
+        """Stop the motors; return True."""
+        self._on_end(None, self._controller.close())
+        return True

@@ -28,7 +28,7 @@ SLOTS_A_READER = 5
 _QUEUE_BYTES = 128 << 20
 """What may wait for a blocked reader: of messages through the socket, and of large ones that no slot had room for."""
 LINGER_S = 0.2  # lets a last zero command leave when a node shuts down
-_WARNING_EVERY_S = 5.0
+_NO_MEMORY_S = 5.0  # after a try for memory that failed
 _MORE = int(zmq.SNDMORE)
 _NOBLOCK = int(zmq.NOBLOCK)
 
@@ -68,7 +68,7 @@ class LocalPublisher:
         self._progress: dict[bytes, PeerProgress] = {}
         self._pool = SlotPool(self._id)
         self._inlined: deque[tuple[int, int]] = deque()  # sequence and size of large messages through the socket
-        self._next_warning_s = 0.0
+        self._no_memory_until_s = 0.0
         self._last: _Message | None = None  # the latched value
         self.closed = False
         self._claim, self._path = registry.claim_socket(host.run_dir, topic, host.node)
@@ -218,16 +218,17 @@ class LocalPublisher:
     def _slot(self, size: int) -> Slot | None:
         """A locked slot, or None when this message must go through the socket."""
         why = "readers hold all slots"
+        most = LEAST_SLOTS + SLOTS_A_READER * self.subscriber_count
+        if time.monotonic() < self._no_memory_until_s:  # a try takes as long as a message, and what memory there is
+            why, most = self.stats.not_shared_why, 0
         try:
             keep = self._last[4] if self._last else None
-            most = LEAST_SLOTS + SLOTS_A_READER * self.subscriber_count
             if (slot := self._pool.acquire(size, most, *self._read_by_all(), keep)) is not None:
                 return slot
         except OSError as error:
             why = f"no shared memory for {size} bytes: {error.strerror or error}"
-            if time.monotonic() >= self._next_warning_s:  # images differ in size, and so in the text
-                self._next_warning_s = time.monotonic() + _WARNING_EVERY_S
-                log.warning("%s: %s; large messages go through the socket, slower", self.topic, why)
+            self._no_memory_until_s = time.monotonic() + _NO_MEMORY_S
+            log.warning("%s: %s; large messages go through the socket, slower", self.topic, why)
         self.stats.not_shared += 1
         self.stats.not_shared_why = why
         return None

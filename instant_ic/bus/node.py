@@ -119,6 +119,14 @@ class Latest:
         return self._message if self.age_s <= self.max_age_s else None
 
     @property
+    def fresh(self) -> Any:
+        """The newest message, or None when it was measured or commanded more than ``max_age_s`` ago.
+
+        For what a robot drives by: a message that waited while this node was busy counts as newly arrived.
+        """
+        return self._message if self.stamp_age_s <= self.max_age_s else None
+
+    @property
     def age_s(self) -> float:
         """Seconds since the message arrived; inf before the first."""
         return self._since_s(self._received_ns)
@@ -647,6 +655,12 @@ class Node(Generic[ConfigT]):
             self._guard(subscription.label, subscription.callback, received)
             ran = True
         return self._fire_timers() or ran
+
+    def read_all(self) -> None:
+        """Run the callbacks of all messages that have arrived, also of those that are still in the sockets."""
+        for _ in range(2):  # the first wait may read only one message of each socket, the next one the rest
+            self._wake.wait(0.0)
+        self.spin_once()
 
     def _fire_timers(self) -> bool:
         fired = False

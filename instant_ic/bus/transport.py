@@ -46,6 +46,11 @@ class Received(NamedTuple):
         """
         return self.steady_ns - max(0, self.received_ns - stamp_ns)
 
+    @property
+    def published_ns(self) -> int:
+        """Time on the node's steady clock when it was published: it may have waited for this node."""
+        return self.given_ns(self.publish_ns)
+
 
 _TOLERANCE_S = 0.1  # simulated time may go back a little
 

@@ -24,6 +24,7 @@ from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Snapshot, Twis
 from instant_ic.control.sources import SourceMonitor
 from instant_ic.control.states import TRANSITIONS, Mode, Reason, Transition, VbotAction
 from instant_ic.control.subgoal import Subgoal, choose_subgoal
+from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import wrap_angle
 
 _PASSAGE_PERIOD_S = 0.2
@@ -63,6 +64,12 @@ class Decision:
     """Speed limit of the v-bot that follows from the rate of the views, in m/s."""
     hard: bool = False
     """The command is zero because a source is lost or an obstacle is near: the base must brake hard."""
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """Mode and reason; a warning while the robot is stopped or blocked."""
+        level = Level.WARN if self.mode == Mode.STOPPED or self.blocked else Level.OK
+        return Diagnosis("control", level, self.reason, {"mode": self.mode.name, "reason": self.reason_code.name})
 
 
 class Arbiter:

@@ -113,16 +113,19 @@ class KeptEstop(EstopLatch):
     def why(self) -> str:
         return "" if self._kept is None else self._kept.why
 
-    def save(self) -> bool:
-        """Save a press, or delete a released one; return whether anything had to be written. The disk may be slow.
+    def save(self) -> Diagnosis | None:
+        """Save a press, or delete a released one; the disk may be slow.
 
-        Raises:
-            estop_state.EstopStateError: the folder cannot be written.
+        Returns:
+            Whether it could be written; None if nothing had to be.
         """
         before, now = self._kept, estop_state.KeptStop(self.publisher, self.pressed_ns) if self.pressed else None
         same = before is not None and now is not None and before.pressed_ns == now.pressed_ns
         if self._run_dir is None or same or now == before:
-            return False
-        estop_state.write(self._run_dir, now)
+            return None
+        try:
+            estop_state.write(self._run_dir, now)
+        except estop_state.EstopStateError as error:
+            return Diagnosis("estop", Level.ERROR, str(error))
         self._kept = now
-        return True
+        return Diagnosis("estop", Level.OK, "")

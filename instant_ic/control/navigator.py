@@ -14,6 +14,7 @@ from instant_ic.control.follower import FollowerCommand, PathFollower
 from instant_ic.control.kinematics import move
 from instant_ic.control.planner import HybridPlanner, Plan, no_plan
 from instant_ic.control.progress import Progress
+from instant_ic.control.snapshot import Twist2
 from instant_ic.geometry.poses import relative2
 
 
@@ -176,6 +177,22 @@ def meeting_pose(
     """
     ahead = float(relative2(shown_pose, robot_pose)[0])
     return move(vbot_pose, min(max(ahead, -_MOST_AHEAD_M), _MOST_AHEAD_M), 0.0, 1.0)
+
+
+_AT_VBOT_M = 0.15
+"""A subgoal this near to the v-bot is the v-bot."""
+
+
+def moving_subgoal(
+    subgoal: NDArray[np.float64],
+    vbot: tuple[NDArray[np.float64], Twist2] | None,
+    shown_pose: NDArray[np.float64],
+    robot_pose: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], Twist2]:
+    """Subgoal (3,) and its velocity; if it is the v-bot, from the v-bot's own newer pose and twist."""
+    if vbot is None or float(np.linalg.norm(vbot[0][:2] - subgoal[:2])) >= _AT_VBOT_M:
+        return subgoal, (0.0, 0.0)
+    return meeting_pose(vbot[0], shown_pose, robot_pose), vbot[1]
 
 
 def _with_end(plan: Plan, subgoal: NDArray[np.float64]) -> Plan:

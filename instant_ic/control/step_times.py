@@ -13,10 +13,12 @@ class StepTimes:
 
     Attributes:
         obeyed: the operator's command of the last step.
+        shown: the last step is one to show: every second one is enough for display and planning.
     """
 
     def __init__(self) -> None:
         self.obeyed = (0.0, 0.0)
+        self.shown = True
         self._early = False  # a step was made ahead of its time since the last timer
         self._rests = False  # at the last step
         self._stepped_ns = self._costmap_ns = 0
@@ -45,4 +47,5 @@ class StepTimes:
     def begin_step(self, now_ns: int, rests: bool) -> bool:
         """Note a step; returns whether a rest ends with it."""
         before, self._rests, self._stepped_ns = self._rests, rests, now_ns
+        self.shown = not self.shown
         return before and not rests

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,8 @@ from instant_ic.control.static_map import StaticMap
 from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
+
+log = logging.getLogger(__name__)
 
 _MOTION_SAMPLES = 9
 """Poses of the sensor over a sweep of points; between them its motion counts as even."""
@@ -69,8 +72,6 @@ class Surroundings:
         """Motion of map → odom between two updates above which the map has jumped."""
         self.costmap: Costmap | None = None
         self.points_seen = False
-        self.map_jumped = False
-        """At the last update."""
         self.findings: dict[str, Diagnosis] = {}
         """By input: scan, points, costmap, pose."""
         if not config.points.enabled:
@@ -163,8 +164,8 @@ class Surroundings:
         except TransformError as error:
             self._find("costmap", False, f"costmap is not updated: {error}")
             return None
-        self.map_jumped = self._map_from_odom is not None and self._jumped(self._map_from_odom, map_from_odom)
-        if self.map_jumped:
+        if self._map_from_odom is not None and self._jumped(self._map_from_odom, map_from_odom):
+            log.info("the map has jumped: the marks of scans are cleared from the costmap")
             self._rolling.reset()
         self._map_from_odom = map_from_odom
         rays = scan_rays(*scan.beams, map_from_lidar, self.config)

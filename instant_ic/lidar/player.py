@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.lidar.capture import CaptureError, CaptureReader, Datagram
 
 
@@ -54,3 +55,9 @@ class CapturePlayer:
     def played(self) -> int:
         """Number of datagrams of the capture read so far."""
         return self._reader.counters.datagrams
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """What has been played and what was left out."""
+        text = f"{self.played} datagrams played" + (f"; left out: {self.skipped}" if self.skipped else "")
+        return Diagnosis("capture", Level.WARN if self.skipped else Level.OK, text)

@@ -4,6 +4,7 @@ import ipaddress
 import selectors
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -166,6 +167,43 @@ class PacketReceiver(Closing):
         assert self._selector is not None
         self._selector.register(bound, selectors.EVENT_READ)
         return bound
+
+
+class ReceiverThread(threading.Thread):
+    """Reads a connected receiver on a thread of its own.
+
+    Args:
+        receiver: closed at the end.
+        on_datagram: called on this thread with each datagram.
+        on_fault: called on this thread with the exception that ended it.
+    """
+
+    def __init__(
+        self,
+        receiver: PacketReceiver,
+        on_datagram: Callable[[Received], None],
+        on_fault: Callable[[Exception], None],
+    ) -> None:
+        super().__init__(name="vlp16 receiver", daemon=True)
+        self.receiver = receiver
+        self._on_datagram = on_datagram
+        self._on_fault = on_fault
+        self.ending = threading.Event()
+
+    def run(self) -> None:
+        """Read until `end`."""
+        try:
+            while not self.ending.is_set():
+                for received in self.receiver.read(timeout_s=0.2):
+                    self._on_datagram(received)
+        except Exception as error:  # noqa: BLE001 - nothing else reports what ends a thread
+            self._on_fault(error)
+
+    def end(self) -> None:
+        """End the thread and close the receiver."""
+        self.ending.set()
+        self.join(2.0)
+        self.receiver.close()
 
 
 def _stamp_ns(ancillary: list[tuple[int, int, bytes]]) -> int:

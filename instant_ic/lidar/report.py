@@ -6,7 +6,9 @@ from collections.abc import Iterator
 
 from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.lidar.feed import PacketFeed
+from instant_ic.lidar.flatscan import coverage
 from instant_ic.lidar.packets import PacketError, decode_position_packet
+from instant_ic.lidar.stream import Revolution
 
 _SILENT = {
     "topic": "no /lidar/packets for {silent_s:.1f} s",
@@ -32,6 +34,20 @@ class LidarReport:
         self._feed = feed
         self._reported = (0, 0, 0)
         self._partial_reported = 0
+
+    def trusts(self, steady_ns: int) -> bool:
+        """Whether a revolution that ends now may be published; one of a doubtful sender counts as withheld."""
+        # Without a scan the robot stops; a forged one could drive it into a wall.
+        trusted = self._feed.sources.doubt(steady_ns) is None
+        self.withheld += not trusted
+        return trusted
+
+    def covers(self, revolution: Revolution, min_coverage: float) -> bool:
+        """Whether a revolution gives a scan; an incomplete one counts as partial."""
+        # Half blind: it would mislead map matching, and the scan itself does not show the fault to other nodes.
+        covered = coverage(revolution) >= min_coverage
+        self.partial += not covered
+        return covered
 
     def position(self, payload: bytes) -> Diagnosis:
         """State of the sensor's clock from a position packet."""

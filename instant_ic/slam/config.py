@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from instant_ic.config.ranges import NotNegative, Positive, PositiveInt, Range, check_ranges
@@ -220,3 +221,8 @@ class GridSlamConfig(SlamConfig, QueueConfig):
         super().__post_init__()
         if self.mode == "localization" and not self.map_file:
             raise ValueError("mode localization needs map_file, the map to drive in")
+
+    @property
+    def saved_map(self) -> Path | None:
+        """The saved map's file; None starts a new map."""
+        return Path(self.map_file).expanduser() if self.map_file else None

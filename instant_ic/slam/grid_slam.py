@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from instant_ic.geometry.poses import compose2, inverse2, relative2
+from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.geometry.poses import Matrix, compose2, inverse2, matrix_from_pose2, relative2
 from instant_ic.jit import leave_out_blas
-from instant_ic.slam.config import SlamConfig
+from instant_ic.slam.config import GridSlamConfig, SlamConfig
 from instant_ic.slam.front_end import FrontEnd, Guess, SlamStatus, Track
 from instant_ic.slam.integrity import Integrity, IntegrityMonitor, mixture
 from instant_ic.slam.keyframes import Keyframe
@@ -22,6 +23,7 @@ from instant_ic.slam.loop_closure import QUERY_KEYFRAMES, LoopClosure, Outcome, 
 from instant_ic.slam.map_files import load_graph, load_grid, save_graph, save_grid
 from instant_ic.slam.motion import MotionMonitor
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
+from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.pose_graph import Edge
 from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
 
@@ -519,10 +521,47 @@ def warm_up(config: SlamConfig | None = None) -> None:
     slam.grid()
 
 
-def run_job(item: tuple[GridSlam, Callable[[], Any]]) -> tuple[GridSlam, Any, str]:
-    """Run a ``background_job``, on any thread; returns the SLAM, the outcome, and the text of an error."""
+def save_answer(slam: GridSlam, stem: Path) -> str:
+    """Save the map; return which files were written, or the error."""
+    try:
+        return "saved: " + ", ".join(str(file) for file in slam.save(stem))
+    except ValueError as error:
+        return f"error: {error}"
+
+
+def transforms(
+    slam: GridSlam, limiter: CorrectionLimiter, config: GridSlamConfig, stamp_ns: int, with_odometry: bool
+) -> Iterator[tuple[str, str, Matrix]]:
+    """Transforms to broadcast after a scan: parent, child and parent_from_child (4, 4)."""
+    if not with_odometry:
+        yield config.odom_frame, config.base_frame, matrix_from_pose2(slam.odom_from_base)
+    # A robot that is lost keeps the frames that it had: it may drive on, slowly, until its place is recognized.
+    if slam.in_map_frame:
+        map_from_odom = limiter.follow(slam.map_from_odom, slam.odom_from_base, stamp_ns)
+        yield config.map_frame, config.odom_frame, matrix_from_pose2(map_from_odom)
+    else:
+        limiter.reset()
+
+
+@dataclass(frozen=True)
+class JobResult:
+    """Outcome of a background job of one SLAM, None if it failed; ``fault`` is the text of the error, if any."""
+
+    slam: GridSlam
+    outcome: Place | Outcome | None
+    fault: str = ""
+
+    @property
+    def diagnosis(self) -> Diagnosis | None:
+        """None when it did not fail."""
+        text = f"loop closure failed and is off until the node restarts: {self.fault}"
+        return Diagnosis("loops", Level.ERROR, text) if self.fault else None
+
+
+def run_job(item: tuple[GridSlam, Callable[[], Place | Outcome]]) -> JobResult:
+    """Run a ``background_job``, on any thread."""
     slam, job = item
     try:
-        return slam, job(), ""
+        return JobResult(slam, job())
     except Exception as error:  # noqa: BLE001 - scans go on
-        return slam, None, f"{type(error).__name__}: {error}"
+        return JobResult(slam, None, f"{type(error).__name__}: {error}")

@@ -396,16 +396,23 @@ def test_full_memory_is_told_in_diagnostics(bus: Bus, monkeypatch: pytest.Monkey
     )
 
 
-def test_full_memory_is_not_logged_with_every_image(bus: Bus, monkeypatch: pytest.MonkeyPatch, caplog) -> None:
-    def full(*_: object) -> None:
+def test_full_memory_is_not_tried_and_logged_with_every_image(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    tries: list[int] = []
+
+    def full(_descriptor: int, _at: int, size: int) -> None:
+        tries.append(size)
         raise OSError(errno.ENOSPC, "No space left on device")
 
     out, reader = bus.publisher(qos=LATCHED), bus.reader()
     monkeypatch.setattr("instant_ic.bus.shm.os.posix_fallocate", full)
     with pytest.raises(OSError):
         bus.reader("/y")  # it leaves no socket open, for which the end would wait for ever
+    tries.clear()
     for extra in range(8):  # compressed images differ in size
         out.send(numbered(extra, LARGE + 8 * extra))
+    assert len(tries) == 1
     assert caplog.text.count("no shared memory for") == 1 and out.stats.not_shared == 8
     wait_for(lambda: reader.poll() and number(reader.received[-1]) == 7)
 

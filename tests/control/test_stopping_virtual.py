@@ -8,6 +8,7 @@ import pytest
 from control_world import rectangle
 from test_control_nodes import Stack
 
+from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.msg import HARD_STOP, ControlState, twist_values
 from nodes.navigator import NavigatorNode
 from nodes.virtual_robot import VirtualRobotNode
@@ -50,3 +51,18 @@ def test_each_loss_in_virtual_commands_a_hard_zero_within_0_3_s(loss: str) -> No
     stopped = [(record.stamp_ns, message) for record, message in sent if record.stamp_ns > max(moving, default=0)]
     assert (stopped[0][0] - began_ns) / 1e9 <= 0.3
     assert {message.header.frame_id for _, message in stopped} == {HARD_STOP}
+
+
+@pytest.mark.parametrize(("late_s", "drives"), [(0.0, True), (0.55, False)])
+def test_what_waited_while_a_node_was_busy_is_as_old_as_its_stamp(late_s: float, drives: bool) -> None:
+    """All messages arrive only now, and are ``late_s`` older: the arbiter's state may be 0.3 s old, and 0.5 s."""
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    stack.drive(1.5, None)
+    assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
+    with LockstepBus(stack.now + round(late_s * 1e9)) as bus:
+        nodes = [bus.add(node) for node in (VirtualRobotNode, NavigatorNode)]
+        for topic in ("/costmap", "/ic/subgoal", "/operator/cmd_vel", "/ic/state"):
+            bus.publish(topic, stack.bus.last(topic))
+        bus.advance(0.06)
+        assert bool(bus.messages("/nav/cmd_vel")) is drives
+        assert (nodes[0].diagnoses()["state"][1] == "the arbiter is silent: the v-bot stands still") is not drives

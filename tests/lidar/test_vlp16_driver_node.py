@@ -201,8 +201,8 @@ def test_udp_over_real_sockets(run_dir: Path) -> None:
         np.testing.assert_allclose(ranges[np.isfinite(ranges)], 3.0, atol=2e-3)
         assert np.isfinite(ranges).sum() > 300
         assert probe.clouds[-1].point_step == 22
-        driver.ending.set()  # packets that wait in the socket would end the silence
         assert driver.thread is not None
+        driver.thread.ending.set()  # packets that wait in the socket would end the silence
         driver.thread.join(10.0)
         driver.feed.last_ns -= SECOND
         driver.check()

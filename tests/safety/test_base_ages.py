@@ -7,11 +7,23 @@ import numpy as np
 import pytest
 from base_line import SetClock
 
-from instant_ic.bus import ERROR
+from instant_ic.bus import ERROR, SENSOR
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.camera.files import FileCamera
+from instant_ic.control.arbiter_config import ArbiterConfig
+from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.msg import TFMessage, odometry_message, scan_message, transform_message, twist_stamped
+from instant_ic.msg import (
+    Bool,
+    TFMessage,
+    compressed_image_message,
+    odometry_message,
+    scan_message,
+    serialize,
+    transform_message,
+    twist_stamped,
+    type_name,
+)
 from nodes.arbiter import ArbiterNode
 from nodes.grid_slam import GridSlamNode
 from nodes.virtual_robot import VirtualRobotNode
@@ -93,6 +105,19 @@ def test_images_from_files_go_on_when_the_clock_is_set_back(tmp_path: Path) -> N
         camera.read()
         camera.read()
     assert max(waits, default=0.0) <= 1.0 / camera.config.rate_hz
+
+
+def test_images_and_the_button_count_from_their_publication() -> None:
+    """They are not decoded, or have no stamp; a busy arbiter reads them up to 0.2 s after their publication."""
+    bus, clock = clocked()
+    arbiter = bus.add(ArbiterNode, ArbiterConfig(timeouts=TimeoutConfig(estop_input=1.0)))
+    image = compressed_image_message(b"jpeg", "camera", clock.now_ns() - S)
+    for topic, message in (("/camera/image/compressed", image), ("/robot/estop", Bool(data=False))):
+        payload = bytes(serialize(message))
+        bus.route(topic, type_name(message), payload, "device", SENSOR, clock.now_ns() - S // 5)
+    bus.advance(0.0)
+    ages = arbiter.inbox.ages(arbiter.config.timeouts)
+    assert (ages["camera"], ages["estop_input"]) == (pytest.approx(0.2), pytest.approx(0.2))
 
 
 def test_a_command_without_a_stamp_is_stale_from_the_start() -> None:
