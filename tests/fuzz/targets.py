@@ -14,7 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest import mock
 
 from tests.fuzz.harness import Target
 
@@ -311,9 +310,10 @@ def _http_replies() -> list[bytes]:
 
 
 def _parse_http() -> Callable[[bytes], object]:
-    import urllib3.connection
+    from urllib3.util import connection
 
     from instant_ic.camera.config import ThetaConfig
+    from instant_ic.camera.http import _Digest
     from instant_ic.camera.theta import ThetaClient
 
     content = b""
@@ -329,16 +329,18 @@ def _parse_http() -> Callable[[bytes], object]:
         return here
 
     kept: list[socket.socket] = []
-    config = ThetaConfig(busy_retries=0)
+    client = ThetaClient("http://theta", ThetaConfig(busy_retries=0), "user", "password")
 
     def parse(data: bytes) -> None:
         nonlocal content
         content = data
-        client = ThetaClient("http://theta", config, "user", "password")
+        client._session.auth = _Digest("user", "password")  # what one camera asks for is nothing to the next
+        client._session.cookies.clear()
+        real, connection.create_connection = connection.create_connection, connected
         try:
-            with mock.patch.object(urllib3.connection.connection, "create_connection", connected):
-                client.state()
+            client.state()
         finally:
+            connection.create_connection = real
             client.close()
             for other in kept:
                 other.close()
