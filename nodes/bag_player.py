@@ -66,7 +66,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         """
         assert self.player is not None
         if self.run_dir is not None and not self.config.force:
-            nodes = [node for node in registry.list_nodes(self.run_dir) if node.name != self.name]
+            nodes = [node for node in registry.list_nodes(self.run_dir) if node.name != self.node_name]
             played = {self.resolve(topic.topic): topic.topic for topic in self.player.topics}
             refuse_base(self.config.bag, self.run_dir, nodes, played)
 

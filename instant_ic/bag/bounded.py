@@ -10,7 +10,10 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, BinaryIO
 
+import yaml
+
 from instant_ic.bag.errors import BagError
+from instant_ic.config.yaml_text import compose_yaml
 
 if TYPE_CHECKING:
     import apsw
@@ -57,14 +60,21 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
 
 
 def guard_rosbags() -> None:
-    """Add size limits to `rosbags`, which has none: MCAP and ROS 1 chunks, messages, whole files, SQLite values.
+    """Add size limits to `rosbags`, which has none: MCAP and ROS 1 chunks, messages, whole files, SQLite values, YAML.
 
-    This replaces the decompressor tables of `rosbags`; a test checks that `rosbags` uses the replacements.
+    This replaces the decompressor tables and YAML readers of `rosbags`; a test checks that `rosbags` uses the
+    replacements.
     """
     import apsw
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader as ros2
-    from rosbags.rosbag2 import storage_mcap
+    from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+
+    from instant_ic.bag.metadata import profiles_of
+
+    ros2.YAML = _BoundedYaml  # type: ignore[assignment,misc]
+    for module in (ros2, storage_mcap, storage_sqlite3):
+        module.parse_qos = profiles_of  # type: ignore[attr-defined]
 
     storage_mcap.DECOMPRESSORS["zstd"] = lambda data, size: decompress(data, "zstd", size)
     storage_mcap.DECOMPRESSORS["lz4"] = lambda data, size: decompress(data, "lz4", size)
@@ -73,15 +83,40 @@ def guard_rosbags() -> None:
     ros2.zstd = SimpleNamespace(  # type: ignore[assignment]
         decompress=lambda data: decompress(data, "zstd"), open=_open_zstd
     )
-    # A column may be computed: the 20 bytes of zeroblob(1000000000) yield a gigabyte.
-    if _limit_values not in apsw.connection_hooks:
-        apsw.connection_hooks.append(_limit_values)
+    if _limit_schema not in apsw.connection_hooks:
+        apsw.connection_hooks.append(_limit_schema)
 
 
-def _limit_values(connection: apsw.Connection) -> None:
+class _BoundedYaml:
+    """Reads ``metadata.yaml`` in the YAML version of `rosbags`, unless its aliases stand for too many values."""
+
+    def __init__(self, typ: str) -> None:
+        from ruamel.yaml import YAML
+
+        self._yaml = YAML(typ=typ)
+
+    def load(self, text: str) -> object:
+        """The value of a document.
+
+        Raises:
+            BagError: it has too many values, or is not YAML.
+        """
+        if "*" in text:  # no alias without it
+            try:
+                compose_yaml(text)
+            except yaml.YAMLError as error:
+                raise BagError(f"metadata.yaml: {error}") from None
+        return self._yaml.load(text)
+
+
+def _limit_schema(connection: apsw.Connection) -> None:
+    """Limit what the schema of a database may compute, since it comes with the file."""
     import apsw
 
+    # A column may be computed: the 20 bytes of zeroblob(1000000000) yield a gigabyte.
     connection.limit(apsw.SQLITE_LIMIT_LENGTH, MOST_CHUNK_BYTES)
+    # A view may have rows without end.
+    connection.config(apsw.SQLITE_DBCONFIG_ENABLE_VIEW, 0)
 
 
 @contextmanager

@@ -16,6 +16,8 @@ from instant_ic.bus.topic_watch import TopicWatch
 _NODES_S = 2.0  # period of the search for nodes, which costs more than that for topics
 _WAIT_S = 60.0
 _BASE = "crawler_base"
+_BRIDGES = ("host_bridge", "zenoh_gateway")
+"""Pass what they subscribe to on to a robot on another machine."""
 _COMMAND = "/cmd_vel"
 _ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
 """Topics that a robot's nodes act on, in the namespace of its base."""
@@ -41,21 +43,24 @@ class LiveTopics:
 
 
 def reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tuple[str, list[str]] | None:
-    """Find a base, real or simulated, that could obey the played messages.
+    """Find a base, real or simulated, that could obey the played messages, or a bridge that passes them to one.
 
     Args:
         nodes: running nodes, without the player.
         played: topic on the bus → topic in the bag.
 
     Returns:
-        Name of the base and the topics of the bag that would reach it; None where there is none.
+        Name of the base or bridge and the topics of the bag that would reach the robot; None where there is none.
     """
     live = {topic for node in nodes for topic in node.publishes} - _HARMLESS
     for base in nodes:
-        if base.executable != _BASE:
+        if base.executable == _BASE:
+            spaces = {"", *(topic.removesuffix(_COMMAND) for topic in base.subscribes if topic.endswith(_COMMAND))}
+            acted_on = {*live, *base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}
+        elif base.executable in _BRIDGES:
+            acted_on = {t for t in base.subscribes if any(fnmatch.fnmatchcase(t, f"*{each}") for each in _ACTED_ON)}
+        else:
             continue
-        spaces = {"", *(topic.removesuffix(_COMMAND) for topic in base.subscribes if topic.endswith(_COMMAND))}
-        acted_on = {*live, *base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}
         found = [
             played[topic]
             for topic in sorted(played)
@@ -74,7 +79,7 @@ def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Ma
         nodes, played: see :func:`reached_base`.
 
     Raises:
-        BagError: there is one.
+        BagError: there is one, or a bridge to one.
     """
     if reached := reached_base(nodes, played):
         base, topics = reached

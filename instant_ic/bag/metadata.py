@@ -22,11 +22,13 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 from rosbags.typesys import TypesysError
 
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
+from instant_ic.config.yaml_text import dump_yaml, read_yaml
 from instant_ic.msg import MessageError, message_type, type_hash, typestore
 from instant_ic.private import open_file
 
@@ -111,7 +113,7 @@ def write_metadata(
         "custom_data": custom or None,
         "ros_distro": "jazzy",
     }
-    text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False, width=1000)
+    text = dump_yaml({"rosbag2_bagfile_information": information}, width=1000)
     scratch = folder / f"{METADATA_FILE}.tmp"
     try:
         with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8") as file:
@@ -184,7 +186,7 @@ def schema_of(connection: Connection) -> Schema:
 
 def channel_metadata(qos: QoS) -> dict[str, str]:
     """Return the metadata that rosbag2 stores with a topic in an MCAP file."""
-    return {"offered_qos_profiles": yaml.safe_dump(dump_qos_v9([ros_qos(qos)]), sort_keys=False).strip()}
+    return {"offered_qos_profiles": dump_yaml(dump_qos_v9([ros_qos(qos)])).strip()}
 
 
 def ros_qos(qos: QoS) -> Qos:
@@ -202,11 +204,34 @@ def ros_qos(qos: QoS) -> Qos:
     )
 
 
-@functools.lru_cache(maxsize=200)  # asked once per message; the YAML parser takes a millisecond
+def profiles_of(profiles: list[Any] | str) -> list[Qos]:
+    """Return the profiles of a topic, for `rosbags`, whose own YAML parser takes milliseconds for each topic of a file.
+
+    Args:
+        profiles: YAML, as MCAP and SQLite files hold it, or what ``metadata.yaml`` holds.
+
+    Raises:
+        ReaderError: the text is not a list in YAML.
+    """
+    return list(_profiles(profiles)) if isinstance(profiles, str) else parse_qos(profiles)
+
+
+@functools.lru_cache(maxsize=200)
+def _profiles(text: str) -> tuple[Qos, ...]:
+    try:
+        found = read_yaml(text)
+    except yaml.YAMLError as error:
+        raise ReaderError(f"offered_qos_profiles is not YAML: {error}") from None
+    if not isinstance(found, list | None):
+        raise ReaderError("offered_qos_profiles is not a list")
+    return tuple(parse_qos(found or []))
+
+
+@functools.lru_cache(maxsize=200)  # asked once per message
 def preset_of_text(profiles: str) -> QoS:
     """As :func:`preset_of`, from the text in an MCAP file; ``reliable`` where the text is damaged."""
     try:
-        return preset_of(parse_qos(profiles))
+        return preset_of(profiles_of(profiles))
     except Exception:  # noqa: BLE001 - a parser may raise anything on damaged YAML
         return RELIABLE
 

@@ -26,6 +26,7 @@ from instant_ic.bus.node import Node
 from instant_ic.bus.node_files import node_class
 from instant_ic.bus.process import load_config
 from instant_ic.config.params import SHARED
+from instant_ic.config.yaml_text import read_yaml
 from instant_ic.msg import deserialize
 
 BROADCASTS: Mapping[str, tuple[str, ...]] = {
@@ -101,7 +102,7 @@ def shipped_parameter_files(name: str) -> list[Path]:
 @functools.lru_cache(maxsize=64)
 def _sections(file: Path, changed_ns: int) -> frozenset[str]:
     """Return the nodes that a parameter file configures. Cached by time of change: parsing is slow."""
-    content = yaml.safe_load(file.read_text())
+    content = read_yaml(file.read_text())
     return frozenset(content) if isinstance(content, dict) else frozenset()
 
 

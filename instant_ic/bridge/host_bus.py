@@ -13,11 +13,10 @@ from typing import Any
 from instant_ic.bridge.host_link import HostLink
 from instant_ic.bridge.host_protocol import Announce
 from instant_ic.bridge.host_session import Arrived
-from instant_ic.bridge.host_topics import TopicRule
+from instant_ic.bridge.host_topics import TopicRule, releases
 from instant_ic.bus import RELIABLE, SENSOR, Node, Publisher, QoS, RegistryError, registry
 from instant_ic.bus.qos import PRESETS
 from instant_ic.bus.transport import Received, TransportError
-from instant_ic.msg import MessageError, deserialize
 
 BRIDGES = ("host_bridge", "zenoh_gateway")
 """Nodes that republish messages from elsewhere. Their messages are not exported, to avoid echoes."""
@@ -90,15 +89,6 @@ class ExportedTopics:
             self._on_trouble(name, str(error))
 
 
-def _releases(arrived: Arrived) -> bool:
-    """Whether a message on a shared state releases the emergency stop."""
-    kind = arrived.announce.type_name
-    try:
-        return kind == "std_msgs/msg/Bool" and not deserialize(arrived.payload, kind).data
-    except MessageError:  # not a readable message; the subscriber refuses and reports it
-        return False
-
-
 def _fields(qos: QoS) -> tuple[str, bool, bool]:
     return qos.name, qos.latched, qos.reliable
 
@@ -150,7 +140,7 @@ class ImportedTopics:
         with topic.lock:
             if topic.qos.latched:
                 if self._rules[announce.topic].shared:  # one state set by several hosts: only the latest message counts
-                    grace_ns = 0 if _releases(arrived) else OLD_NEWS_NS
+                    grace_ns = 0 if releases(announce.type_name, arrived.payload) else OLD_NEWS_NS
                     if arrived.born_ns < topic.newest_ns - grace_ns:
                         self._node.log.warning("dropped %s of %s: outdated", announce.topic, announce.origin)
                         return

@@ -29,7 +29,7 @@ from instant_ic.bridge.host_protocol import (
     Welcome,
     decode,
 )
-from instant_ic.bridge.host_topics import TopicCounts, TopicRule
+from instant_ic.bridge.host_topics import TopicCounts, TopicRule, releases
 from instant_ic.config.ranges import Range, check_ranges
 
 MAX_MESSAGE = 64 << 20
@@ -519,9 +519,10 @@ class Session:
         if not 0 <= publish_ns < 1 << 63:
             raise ProtocolError(f"{announce.topic}: time of publication {publish_ns} ns is impossible")
         arrived = Arrived(announce, payload, publish_ns, age_ns, born_ns)
-        if not (self.drives or rule.shared):
+        if not self.drives and (not rule.shared or releases(announce.type_name, payload)):
             counts.not_driving += 1
-            if announce.qos == "latched":
+            # A refused release is gone: the lease must not end an emergency stop when it is handed over.
+            if announce.qos == "latched" and not rule.shared:
                 incoming.kept = arrived, data.born_ns
             return []
         return self._deliver(incoming, arrived, data.born_ns)

@@ -8,8 +8,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 
 from instant_ic.bridge.host_protocol import LANES
+from instant_ic.msg import MessageError, deserialize
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
+
+
+def releases(type_name: str, payload: bytes | bytearray) -> bool:
+    """Whether a message on a shared state releases the emergency stop."""
+    try:
+        return type_name == "std_msgs/msg/Bool" and not deserialize(payload, type_name).data
+    except MessageError:  # not a readable message; the subscriber refuses and reports it
+        return False
 
 
 @dataclass(frozen=True)
@@ -21,7 +30,8 @@ class TopicRule:
         rate_hz: most messages per second, keeping the newest; 0 sends all.
         lane: priority class, one of :data:`~.host_protocol.LANES`.
         max_age_s: messages older than this since publication are dropped and counted, on either side; 0 keeps all.
-        shared: accept the topic from every driver's host, not only from the one that drives.
+        shared: accept the topic from every driver's host, not only from the one that drives. A false Bool, which
+            releases an emergency stop, is accepted from the driving host only.
     """
 
     topic: str

@@ -26,7 +26,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import yaml
 
 from instant_ic.config.ranges import Range, check_ranges, range_of
-from instant_ic.config.yaml_text import checked, compose_yaml, read_yaml
+from instant_ic.config.yaml_text import compose_yaml, construct, read_yaml
 
 ConfigT = TypeVar("ConfigT")
 
@@ -184,8 +184,6 @@ def load_sections(path: Path) -> dict[str, Values]:
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise ParameterError(Problem(f"not YAML: {getattr(error, 'problem', error)}", where)) from error
-    except RecursionError:
-        raise ParameterError(f"{path}: nested endlessly: does an anchor contain itself?") from None
 
 
 def _sections(root: yaml.Node, path: Path) -> dict[str, Values]:
@@ -212,10 +210,11 @@ def _items(node: yaml.Node, path: Path) -> list[tuple[str, yaml.Node]]:
     if not isinstance(node, yaml.MappingNode):
         raise ParameterError(Problem("expected a mapping (node name: ros__parameters: key: value)", _where(path, node)))
     items = [(str(key.value), value) for key, value in node.value]
-    keys = [key for key, _ in items]
-    for (key, value), at in zip(items, range(len(keys)), strict=True):
-        if key in keys[:at]:
+    seen: set[str] = set()
+    for key, value in items:
+        if key in seen:
             raise ParameterError(Problem(f"{key!r} is given twice", _where(path, value)))
+        seen.add(key)
     return items
 
 
@@ -229,13 +228,10 @@ def _flatten(node: yaml.Node, prefix: str, path: Path, out: Values, shared: bool
 
 
 def _construct(node: yaml.Node, key: str, where: str) -> Any:
-    loader = yaml.SafeLoader("")
     try:
-        return checked(lambda: loader.construct_object(node, deep=True))
+        return construct(node)
     except yaml.YAMLError as error:
         raise ParameterError(Problem(f"{key}: the value is not YAML: {_one_line(error)}", where, key)) from error
-    finally:
-        loader.dispose()
 
 
 def _one_line(error: BaseException) -> str:

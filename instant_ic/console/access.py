@@ -28,7 +28,7 @@ SIGN_IN = ("auto", "always", "never")
 MIN_TOKEN = 16
 FIRST_WAIT_S = 0.25  # before a token is checked, once its address has sent too many wrong ones
 MAX_WAIT_S = 4.0  # bounds the wait of a user who shares his address with an attacker
-_MOST_SESSIONS = 256
+_MOST_SESSIONS = 256  # of one role
 _MOST_ADDRESSES = 1024
 _MOST_DOUBLINGS = 8
 logger = logging.getLogger("instant_ic.console")
@@ -176,11 +176,12 @@ class Access:
         return min(MAX_WAIT_S, FIRST_WAIT_S * 2.0**too_many) if too_many >= 0 else 0.0
 
     def open_session(self, role: Role, now_s: float) -> str:
-        """Open a session and return the value of its cookie."""
+        """Open a session and return the value of its cookie; of too many of one role, the oldest ends."""
         value = secrets.token_urlsafe(32)
+        same = [digest for digest, (other, _) in self._sessions.items() if other is role]
+        if len(same) >= _MOST_SESSIONS:
+            del self._sessions[same[0]]
         self._sessions[_digest(value)] = (role, now_s + self.config.session_hours * 3600.0)
-        while len(self._sessions) > _MOST_SESSIONS:
-            self._sessions.popitem(last=False)
         return value
 
     def role_of_session(self, cookie: str, now_s: float) -> Role | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from instant_ic.config.yaml_text import checked, read_yaml
+from instant_ic.config.yaml_text import compose_yaml, construct
 
 OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
 """``metric``: metres. ``scale_invariant``: metres up to one factor. ``relative``: metres up to factor and shift.
@@ -177,8 +177,8 @@ def load_manifest(path: str | Path) -> ModelManifest:
         raise ManifestError(f"{path}: no manifest; a depth model needs one beside it (docs/depth.md)")
     try:
         text = path.read_text(encoding="utf-8")
-        root = checked(lambda: yaml.compose(text, yaml.SafeLoader))
-        values = read_yaml(text)
+        root = compose_yaml(text)
+        values = None if root is None else construct(root)
     except (yaml.YAMLError, ValueError) as error:
         raise ManifestError(f"{path}: not YAML: {error}") from error
     except OSError as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from instant_ic.config.yaml_text import checked, compose_yaml
+from instant_ic.config.yaml_text import compose_yaml, construct
 
 _NO_VALUE = "tag:yaml.org,2002:null"
 
@@ -116,14 +116,11 @@ class Value:
 
     def plain(self) -> object:
         """The value as plain Python objects; None, with the problem noted, if it does not fit its type."""
-        loader = yaml.SafeLoader("")
         try:
-            return checked(lambda: loader.construct_document(self.node))
+            return construct(self.node)
         except yaml.YAMLError as error:
             self.problem(f"not YAML: {error}")
             return None
-        finally:
-            loader.dispose()
 
 
 def load(file: Path, problems: list[Problem]) -> Value | None:

@@ -38,6 +38,8 @@ _NOT_HERE = {
     "exec-in-pkg": "give the program's path, or $(find-exec NAME)",
     "optenv": "use $(env NAME default)",
 }
+_MOST_TEXT = 1 << 17
+"""Most characters after substitution; Linux takes no longer argument of a program."""
 _anonymous = itertools.count(1)
 
 
@@ -71,7 +73,7 @@ def substitute(text: str, context: Context) -> str:
 
     Raises:
         SubstitutionError: unknown substitution or variable, unset environment variable without default, a
-            missing file, an unclosed parenthesis.
+            missing file, an unclosed parenthesis, or too long a result.
     """
     parts: list[str] = []
     position = 0
@@ -85,6 +87,8 @@ def substitute(text: str, context: Context) -> str:
         parts.append(_evaluate(text[start + 2 : end], context))
         position = end + 1
     parts.append(text[position:])
+    if sum(map(len, parts)) > _MOST_TEXT:  # each of 40 variables may hold its predecessor twice
+        raise SubstitutionError(f"the text has more than {_MOST_TEXT} characters after substitution")
     return "".join(parts)
 
 

@@ -32,7 +32,9 @@ def replaced(text: str, value: Value, context: Context) -> str | None:
         return substitute(text, context)
     except SubstitutionError as error:
         value.problem(str(error))
-        return None
+    except RecursionError:
+        value.problem("substitutions or parentheses are nested too deeply")
+    return None
 
 
 def flag_of(value: Value | None, context: Context, default: bool = False) -> bool:

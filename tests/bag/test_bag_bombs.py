@@ -160,6 +160,26 @@ def test_computed_column_of_an_sqlite_bag_is_limited(tmp_path: Path, small_limit
         list(bag.messages())
 
 
+@pytest.mark.timeout(300)
+def test_sqlite_table_that_is_a_view_without_end_is_not_read(tmp_path: Path) -> None:
+    import sqlite3
+
+    path = ros2_bag(CompressionMode.NONE, StoragePlugin.SQLITE3)(tmp_path)
+    file = next(path.glob("*.db3"))
+    with sqlite3.connect(file) as database:
+        database.execute("DROP TABLE messages")
+        database.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
+            "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
+        )
+        # rosbags counts what the schema calls tables.
+        database.execute("PRAGMA writable_schema = ON")
+        database.execute("UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'")
+    database.close()
+    with pytest.raises(BagError, match="cannot be read"):
+        BagReader(file)
+
+
 def test_sqlite_topic_without_a_type_is_an_error_with_the_bag(tmp_path: Path) -> None:
     import sqlite3
 

@@ -122,6 +122,22 @@ def test_what_a_live_node_publishes_is_not_played_beside_a_running_base(bag, bas
     player(bag("/rosout", "/played"))
 
 
+@pytest.mark.parametrize("bridge", ["host_bridge", "zenoh_gateway"])
+def test_a_bridge_passes_no_emergency_stop_release_of_a_bag_to_a_robot_elsewhere(bag, base, player, bridge):
+    base("link", namespace="/robot1", executable=bridge, command="/operator/estop", publishes=("/scan",))
+    player(bag("/operator/estop", "/scan"))  # not in the robot's namespace, or not sent on
+    with pytest.raises(NodeError, match="/operator/estop would reach the robot of link"):
+        player(bag("/played", "/operator/estop"), namespace="robot1")
+    player(bag("/played", "/operator/estop"), namespace="robot1", force=True)
+
+
+def test_a_renamed_player_does_not_take_itself_for_a_live_node(bag, base, player):
+    base()
+    node = player(bag("/played"))
+    assert node.node_name != type(node).name
+    node.check_base()
+
+
 def test_namespaces_and_renamed_commands_count(bag, base, player):
     base(namespace="/robot1")
     with pytest.raises(NodeError, match="would reach the robot"):

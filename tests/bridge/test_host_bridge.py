@@ -354,7 +354,7 @@ def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
     hosts.host("robot")
     hosts.host("station")
     hosts.host("tablet")
-    a = hosts.bridge("robot")
+    a = hosts.bridge("robot", driver="station")  # only the driving host may release
     stations = {name: hosts.bridge(name) for name in ("station", "tablet")}
     hands = {name: hosts.neighbour(name, f"hand_{name}") for name in stations}
     outs = {name: hand.publisher("/operator/estop", Bool, LATCHED) for name, hand in hands.items()}

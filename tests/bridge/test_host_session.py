@@ -6,6 +6,7 @@ from simulated_link import DIGEST, MS, Way, World
 from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Notice, Ping, decode
 from instant_ic.bridge.host_session import ClockStepped, Ended, LinkTimes, Refused, Up
 from instant_ic.bridge.host_topics import TopicRule
+from instant_ic.msg import Bool, serialize
 
 COMMAND = TopicRule("/operator/cmd_vel", lane="command", max_age_s=0.25)
 PICTURE = TopicRule("/camera/image/compressed", lane="bulk")
@@ -438,6 +439,28 @@ def test_only_the_driving_host_is_taken_in_and_its_latched_values_come_with_the_
     events = world.sessions["robot"].set_drives(True)
     assert [e.announce.topic for e in events] == [status.topic]
     assert world.sessions["robot"].set_drives(True) == []
+
+
+def test_every_drivers_host_sets_the_emergency_stop_and_only_the_driving_one_releases_it():
+    estop = TopicRule("/operator/estop", lane="command", shared=True)
+    world = World([], [estop])
+    robot = world.sessions["robot"]
+    robot.drives = False
+    world.run(0.1)
+    robot.receive(Announce(9, estop.topic, "console", "std_msgs/msg/Bool", DIGEST, "latched").encode())
+
+    def press(number, payload):
+        born_ns = world.now - 1000 + number  # each is a new one
+        events = robot.receive(
+            Data(9, number, 1_700_000_000 * 1000 * MS, born_ns, born_ns, len(payload), 0, payload).encode()
+        )
+        return [bytes(event.payload) for event in events]
+
+    stop, release = bytes(serialize(Bool(data=True))), bytes(serialize(Bool(data=False)))
+    assert press(1, stop) == [stop]
+    assert press(2, release) == []
+    assert robot.set_drives(True) == []  # nor when the lease is handed to it later
+    assert press(3, release) == [release]
 
 
 @pytest.mark.parametrize(

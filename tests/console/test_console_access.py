@@ -108,6 +108,15 @@ def test_tokens_are_told_apart_and_sessions_end(files):
     assert access.role_of_session(cookie, 200.0) is None
 
 
+def test_sign_ins_of_watchers_displace_no_driver(files):
+    access = Access(AccessConfig(**files), "0.0.0.0")
+    driver = access.open_session(Role.DRIVE, 0.0)
+    watchers = [access.open_session(Role.WATCH, 0.0) for _ in range(257)]
+    assert access.role_of_session(driver, 1.0) is Role.DRIVE
+    roles = [access.role_of_session(cookie, 1.0) for cookie in watchers]
+    assert roles == [None] + 256 * [Role.WATCH]  # a bounded number, and the oldest goes
+
+
 def test_guessing_is_slowed_down_for_each_address_and_a_right_token_never_refused(files):
     access = Access(AccessConfig(tries_per_minute=3, **files), "0.0.0.0")
     for second in (0.0, 1.0, 2.0):

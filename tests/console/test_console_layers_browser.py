@@ -131,20 +131,20 @@ def test_the_cameras_image_is_shown_from_where_the_robot_is_now_until_a_key_swit
         page = open_layers(open_page, demo, "?quality=full")  # on the CPU it is off at first
         wait_until(lambda: not demo.server.needs_views(), page, "the layers")
         expect_body(page, "image", "live")
-        page.wait_for_timeout(600)  # an image of the keyframe's place
+        wait_until(lambda: np.allclose(demo._panorama_camera[:2, 3], KEYFRAME[:2]), page, "an image from there")
         demo.images = False
-        page.wait_for_timeout(400)
+        image, camera = demo._panorama, demo._panorama_camera
         room_there = room_seen(there, 0.0, demo.look.pitch)
         demo.place(*there)
         header = {
-            "q": quaternion_from_matrix(demo._panorama_camera).tolist(),
-            "p": demo._panorama_camera[:3, 3].tolist(),
+            "q": quaternion_from_matrix(camera).tolist(),
+            "p": camera[:3, 3].tolist(),
         }
 
         def shown_db():
             """PSNR of an image as if it had just been taken at the keyframe's place."""
             now_ms = demo.server.now_ms()
-            demo.server.send_frame(FrameKind.PANORAMA, {"captured_ms": now_ms} | header, demo._panorama)
+            demo.server.send_frame(FrameKind.PANORAMA, {"captured_ms": now_ms} | header, image)
             page.wait_for_timeout(100)
             return psnr_db(picture_of(page), room_there)
 

@@ -74,8 +74,7 @@ def test_bookmarks_by_key_and_by_name_and_the_robot_is_held_while_one_is_typed(d
     assert re.match(r"\d\d:\d\d:\d\d  door was stuck", first) and second.endswith("  Mark 1")
     assert not shared_demo.estop and not moving(shared_demo)
     # Nobody counts as at the controls: the zeros of an idle driver end.
-    count = len(shared_demo.commands)
-    driver.wait_for_timeout(500)  # beat_timeout_s
+    wait_until(lambda: not shared_demo.server._operator, driver, "nobody at the controls")
     count = len(shared_demo.commands)
     driver.wait_for_timeout(300)  # three zeros of an idle driver
     assert len(shared_demo.commands) == count

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest import mock
 
 from tests.fuzz.harness import Target
 
@@ -311,9 +310,10 @@ def _http_replies() -> list[bytes]:
 
 
 def _parse_http() -> Callable[[bytes], object]:
-    import urllib3.connection
+    from urllib3.util import connection
 
     from instant_ic.camera.config import ThetaConfig
+    from instant_ic.camera.http import _Digest
     from instant_ic.camera.theta import ThetaClient
 
     content = b""
@@ -329,16 +329,18 @@ def _parse_http() -> Callable[[bytes], object]:
         return here
 
     kept: list[socket.socket] = []
-    config = ThetaConfig(busy_retries=0)
+    client = ThetaClient("http://theta", ThetaConfig(busy_retries=0), "user", "password")
 
     def parse(data: bytes) -> None:
         nonlocal content
         content = data
-        client = ThetaClient("http://theta", config, "user", "password")
+        client._session.auth = _Digest("user", "password")  # what one camera asks for is nothing to the next
+        client._session.cookies.clear()
+        real, connection.create_connection = connection.create_connection, connected
         try:
-            with mock.patch.object(urllib3.connection.connection, "create_connection", connected):
-                client.state()
+            client.state()
         finally:
+            connection.create_connection = real
             client.close()
             for other in kept:
                 other.close()
@@ -622,20 +624,25 @@ def _bridge_errors() -> tuple[type[BaseException], ...]:
 
 def _bags(compressed: bool) -> list[bytes]:
     from instant_ic.bag import BagWriter
+
+    folder = _folder() / "bag"
+    _fill(BagWriter(folder, compressed))
+    content = next(folder.glob("*.mcap")).read_bytes()
+    shutil.rmtree(folder)
+    return [content]
+
+
+def _fill(bag: Any) -> None:
     from instant_ic.bus.qos import LATCHED, SENSOR
     from instant_ic.msg import message_type, serialize
 
-    folder = _folder() / "bag"
     text = message_type("String")
-    with BagWriter(folder, compressed) as writer:
+    with bag as writer:
         for stamp in range(5):
             payload = bytes(serialize(text(f"message {stamp}")))
             writer.write("/text", "std_msgs/msg/String", payload, 1000 + stamp, SENSOR)
         writer.write("/map", "std_msgs/msg/String", bytes(serialize(text("map"))), 2000, LATCHED)
         writer.set_custom("note", "x")
-    content = next(folder.glob("*.mcap")).read_bytes()
-    shutil.rmtree(folder)
-    return [content]
 
 
 def _mcaps() -> list[bytes]:
@@ -678,6 +685,28 @@ def _parse_bag() -> Callable[[bytes], object]:
     return _by_file("bag.mcap", _read_bag)
 
 
+def _metadata_files() -> list[bytes]:
+    from instant_ic.bag import BagWriter
+
+    folder = _folder() / "bag"
+    _fill(BagWriter(folder))
+    return [(folder / "metadata.yaml").read_bytes()]
+
+
+def _parse_metadata() -> Callable[[bytes], object]:
+    """The metadata of a folder whose message file is good."""
+    from instant_ic.bag import BagWriter
+
+    folder = _folder() / "bag"
+    _fill(BagWriter(folder))
+
+    def parse(data: bytes) -> None:
+        (folder / "metadata.yaml").write_bytes(data)
+        _read_bag(folder)
+
+    return parse
+
+
 def _parse_reindex() -> Callable[[bytes], object]:
     from instant_ic.bag.recover import reindex
 
@@ -716,11 +745,16 @@ def _parse_ros1() -> Callable[[bytes], object]:
 def _sqlite_bags() -> list[bytes]:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
+    from instant_ic.bag.metadata import ros_qos
+    from instant_ic.bus.qos import SENSOR
     from instant_ic.msg import typestore
 
     folder = _folder() / "bag"
     with Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        connection = writer.add_connection("/text", "std_msgs/msg/String", typestore=typestore())
+        profiles = [ros_qos(SENSOR)]
+        connection = writer.add_connection(
+            "/text", "std_msgs/msg/String", typestore=typestore(), offered_qos_profiles=profiles
+        )
         writer.write(connection, 1, b"\0\1\0\0\6\0\0\0hello\0")
     content = next(folder.glob("*.db3")).read_bytes()
     return [content]
@@ -802,6 +836,9 @@ _LAUNCH = b"""launch:
 - timer: {period: 2.0, children: [{node: {exec: navigator}}]}
 - shutdown: {reason: over}
 """
+_BOMB_LAUNCH = b"launch:\n- set_parameter:\n    name: p\n    value:\n" + b"".join(
+    b"      " + line + b"\n" for line in _BOMB.splitlines()
+)
 _SMALL_LAUNCH = b"launch:\n- arg: {name: a, default: b}\n- node: {exec: arbiter, name: $(var a)}\n"
 
 
@@ -1061,12 +1098,13 @@ TARGETS = {
         Target("mcap-recover", _mcaps, _parse_recover, _bag_errors(), fix=fix_chunk, share=30),
         Target("mcap-read", _mcaps, _parse_bag, _bag_errors(), fix=fix_chunk, share=150),
         Target("mcap-reindex", _mcaps, _parse_reindex, _bag_errors(), fix=fix_chunk, share=100),
+        Target("bag-metadata", _metadata_files, _parse_metadata, _bag_errors(), _YAML_WORDS, share=20),
         Target("ros1-bag", _ros1_bags, _parse_ros1, _bag_errors(), share=6),
         Target("sqlite-bag", _sqlite_bags, _parse_sqlite, _bag_errors(), share=100),
         Target("parameters", _parameter_samples, _parse_parameters, _parameter_errors(), _YAML_WORDS, share=100),
         Target(
             "launch",
-            lambda: [_LAUNCH, _SMALL_LAUNCH],
+            lambda: [_LAUNCH, _SMALL_LAUNCH, _BOMB_LAUNCH],
             _parse_launch,
             _launch_errors(),
             (*_YAML_WORDS, b"$(var ", b"$(eval ", b")", b"$(config ", b"include:", b"if: "),

@@ -78,8 +78,10 @@ def _is_launch_file(file: Path) -> bool:
     """Whether the top level has the key ``launch``; False also for what is not YAML, which the check then reports."""
     import yaml
 
+    from instant_ic.config.yaml_text import compose_yaml
+
     try:
-        root = yaml.compose(file.read_text(), Loader=yaml.SafeLoader)
+        root = compose_yaml(file.read_text())
     except (OSError, ValueError, yaml.YAMLError):
         return False
     return isinstance(root, yaml.MappingNode) and any(key.value == "launch" for key, _ in root.value)

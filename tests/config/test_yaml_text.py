@@ -1,0 +1,141 @@
+"""YAML of a few hundred bytes may stand for more than a machine holds, by aliases or by its depth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag.metadata import profiles_of
+from instant_ic.config.params import ParameterError, load_file, parse_override
+from instant_ic.config.yaml_text import _most_levels, compose_yaml, dump_yaml, read_yaml
+from instant_ic.depth.manifest import ManifestError, load_manifest
+from instant_ic.launch import LaunchFileError, read_launch_file
+from instant_ic.slam.map_files import MapError, load_grid
+
+# 9 ** 9 values: each list holds the one before nine times.
+BOMB = "[&a [x,x,x,x,x,x,x,x,x]" + "".join(
+    f", &{chr(98 + n)} [{','.join(9 * ['*' + chr(97 + n)])}]" for n in range(8)
+) + "]"  # fmt: skip
+MANY = "stand for more than 100000 values"
+pytestmark = pytest.mark.timeout(300)
+
+
+def test_a_million_values_by_aliases_are_refused() -> None:
+    with pytest.raises(yaml.MarkedYAMLError, match=MANY) as caught:
+        compose_yaml("a: 1\nb: " + BOMB)
+    assert caught.value.problem_mark is not None and caught.value.problem_mark.line == 1
+
+
+def test_aliases_are_counted_where_they_are_used() -> None:
+    # 1 + (1 + 300) + 301 + ...: 331 lists of 300 values are 99 632 values in all, 333 are more than 100 000.
+    text = "[&a [" + ",".join(300 * "x") + "]" + "{}]"
+    assert len(read_yaml(text.format(330 * ", *a"))) == 331
+    with pytest.raises(yaml.YAMLError, match=MANY):
+        read_yaml(text.format(332 * ", *a"))
+
+
+@pytest.mark.parametrize("text", ["&a [*a]", "&a {b: [*a]}", "{&a x: &b {y: *b}}"])
+def test_an_anchor_that_contains_itself_is_refused(text: str) -> None:
+    with pytest.raises(yaml.YAMLError, match="contains itself"):
+        read_yaml(text)
+
+
+@pytest.mark.parametrize("levels", [101, 5000])
+def test_depth_is_limited(levels: int) -> None:
+    assert read_yaml("[" * 100 + "]" * 100) == read_yaml("- " * 99 + "[]")
+    with pytest.raises(yaml.YAMLError, match="too deeply"):
+        read_yaml("[" * (levels + 1) + "]" * (levels + 1))
+
+
+@pytest.mark.parametrize(
+    ("text", "levels"),
+    [
+        ("a: 1\n" * 4000, 1),
+        ("- " * 5000 + "a", 5000),
+        ("-\n" + "".join(" " * n + "-\n" for n in range(1, 150)), 150),
+        ("a: [" * 3000, 3000),
+        ("a:\n- a:\n  - a: 1\n" + "#" * 9000, 6),  # list and mapping share a column
+        ("- a: 1\r- b: 2\x85" + "x" * 9000, 2),
+    ],
+)
+def test_levels_of_a_long_text_are_not_underestimated(text: str, levels: int) -> None:
+    assert levels <= _most_levels(text) <= 2 * levels + 20
+
+
+def test_depth_counts_through_aliases() -> None:
+    text = f"[&a {'[' * 60}{']' * 60}, &b {'[' * 30}*a{']' * 30}, {'[' * 30}*b{']' * 30}]"
+    with pytest.raises(yaml.YAMLError, match="too deeply"):
+        read_yaml(text)
+
+
+@pytest.mark.parametrize(
+    "value", [{"b": 1, "a": [1.5, None, True, "x: y", "\u00e4", "1", "2026-11-23"]}, "half a pair \ud800", []]
+)
+def test_what_is_dumped_is_read_back(value: object) -> None:
+    assert yaml.safe_load(dump_yaml(value)) == value
+
+
+def test_parameters(tmp_path: Path) -> None:
+    path = tmp_path / "p.yaml"
+    path.write_text(f"node:\n  ros__parameters:\n    rate: {BOMB}\n")
+    with pytest.raises(ParameterError, match=rf"p\.yaml:3: .*{MANY}"):
+        load_file(path, "node")
+    with pytest.raises(ParameterError, match=MANY):
+        parse_override("rate:=" + BOMB)
+
+
+def test_map(tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(f"image: map.pgm\nresolution: 0.05\norigin: {BOMB}\n")
+    with pytest.raises(MapError, match=MANY):
+        load_grid(tmp_path / "map.yaml")
+
+
+def test_manifest(tmp_path: Path) -> None:
+    (tmp_path / "m.yaml").write_text(f"name: {BOMB}\n")
+    with pytest.raises(ManifestError, match=MANY):
+        load_manifest(tmp_path / "m.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("- set_parameter: {name: a, value: " + BOMB + "}", MANY),
+        ("- set_parameter: {name: a, value: &a [*a]}", "contains itself"),
+        ("- " + "{group: [" * 300 + "]}" * 300, "nested too deeply"),
+        ("- let: {name: a, value: $(eval " + "(" * 400 + "1" + ")" * 400 + ")}", "2: .* nested too deeply"),
+        ("- let: {name: a, value: " + "$(if 1 " * 600 + "1" + ")" * 600 + "}", "2: .* nested too deeply"),
+        (
+            "- let: {name: v0, value: xx}\n"
+            + "\n".join(f"- let: {{name: v{n + 1}, value: $(var v{n})$(var v{n})}}" for n in range(40)),
+            "19: the text has more than 131072 characters",  # v17 has 2 ** 18 characters; v16, with 2 ** 17, has room
+        ),
+    ],
+)
+def test_launch_file(tmp_path: Path, text: str, why: str) -> None:
+    (tmp_path / "l.yaml").write_text(f"launch:\n{text}\n")
+    with pytest.raises(LaunchFileError, match=why):
+        read_launch_file(tmp_path / "l.yaml", {}, tmp_path)
+
+
+@pytest.mark.parametrize("key", ["storage_identifier", "version", "custom_data"])
+def test_metadata_of_a_bag(tmp_path: Path, key: str) -> None:
+    with BagWriter(tmp_path / "bag"):
+        pass
+    path = tmp_path / "bag" / "metadata.yaml"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(f"  {key}: {BOMB}" if line.startswith(f"  {key}:") else line for line in lines))
+    with pytest.raises(BagError, match=MANY):
+        BagReader(tmp_path / "bag")
+
+
+def test_profiles_of_a_topic() -> None:
+    from rosbags.rosbag2 import ReaderError
+
+    with pytest.raises(ReaderError, match=MANY):
+        profiles_of(BOMB)
+    with pytest.raises(ReaderError, match="not a list"):
+        profiles_of("a: 1")
+    assert profiles_of("") == profiles_of("[]") == []
