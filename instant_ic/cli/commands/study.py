@@ -56,6 +56,7 @@ def _new(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     use_one_thread_for_matrices()
+    from instant_ic.cli.kernels import compile_all
     from instant_ic.experiments.study.plan import load
     from instant_ic.experiments.study.record import OPEN, Record, only_one
     from instant_ic.experiments.study.server import StudyServer
@@ -66,7 +67,8 @@ def _run(args: argparse.Namespace) -> int:
     if record.state != OPEN or record.simulated:
         raise UserError(f"{record.code} is {'simulated' if record.simulated else record.state}: take another code", 2)
     with only_one(study, "start the next participant"):
-        print("preparing the worlds (up to some minutes, once) ...", flush=True)
+        print("preparing programs and worlds (up to some minutes, once) ...", flush=True)
+        compile_all(lambda share: None)  # not while the participant waits
         make_scans(study, record.code)
         server = StudyServer(record, args.port)
         server.start()

@@ -34,6 +34,7 @@ _STATE = ("type", "at_ms", "mode", "shown", "robot", "vbot", "twist", "estop", "
 _HEADERS = {
     **console.SECURITY_HEADERS,
     "Cache-Control": "no-store",
+    "Referrer-Policy": "same-origin",  # with no-referrer a form has no Origin to check
 }
 logger = logging.getLogger("instant_ic.study")
 
@@ -59,7 +60,8 @@ def from_page(text: str) -> bool:
         message = json.loads(text)
     except (ValueError, RecursionError):
         return False
-    return isinstance(message, dict) and message.get("type") in TO_ROBOT
+    kind = message.get("type") if isinstance(message, dict) else None
+    return isinstance(kind, str) and kind in TO_ROBOT
 
 
 def drive_page(step: str, bar: str, end: str, title: str) -> str:
@@ -164,7 +166,7 @@ class StudyServer:
 
     def _page(self, body: str, refresh_s: int = 0, status: int = 200) -> web.Response:
         texts = self.record.study.texts
-        if not self._last and self.record.state == OPEN:
+        if not self._last and self.record.state == OPEN and self.record.step != "consent":
             body += f'<p class=leave><a href="/withdraw">{forms._e(texts["withdraw"])}</a></p>'
         page = forms.page(texts["title"], body, refresh_s)
         return web.Response(text=page, content_type="text/html", status=status)
