@@ -108,10 +108,10 @@ class Pair:
     p_holm: float
 
 
-def hodges_lehmann(differences: Floats) -> float:
-    """Median of the means of all pairs of differences, each with itself too."""
-    i, j = np.triu_indices(len(differences))
-    return float(np.median((differences[i] + differences[j]) / 2))
+def hodges_lehmann(differences: Floats) -> Floats:
+    """Median of the means of all pairs of differences (..., n), each with itself too: (...)."""
+    i, j = np.triu_indices(differences.shape[-1])
+    return np.asarray(np.median((differences[..., i] + differences[..., j]) / 2, axis=-1))
 
 
 def rank_biserial(differences: Floats) -> float:
@@ -132,10 +132,10 @@ def pairs(values: Mapping[str, Floats], seed: int = 0) -> list[Pair]:
         n = len(differences)
         if n < 2:
             return []
-        drawn = [hodges_lehmann(differences[rows]) for rows in rng.integers(0, n, (999, n))]
+        drawn = hodges_lehmann(differences[rng.integers(0, n, (999, n))])
         low, high = np.quantile(drawn, (ALPHA / 2, 1 - ALPHA / 2))
         p = float(stats.wilcoxon(differences).pvalue) if differences.any() else 1.0
-        shift, r = hodges_lehmann(differences), rank_biserial(differences)
+        shift, r = float(hodges_lehmann(differences)), rank_biserial(differences)
         found.append(Pair(first, second, n, shift, float(low), float(high), r, p, p))
     corrected = holm([one.p for one in found])
     return [Pair(**{**vars(one), "p_holm": p}) for one, p in zip(found, corrected, strict=True)]
