@@ -72,6 +72,7 @@ WRONG = [
     (lambda raw: raw["questionnaires"][3]["items"].pop(), "score sus needs ten scales"),
     (lambda raw: raw["questionnaires"][1]["items"][0].update(kind="slider"), r"\[1\].items\[0\]: kind must be one of"),
     (lambda raw: raw["questionnaires"][1].update(id="drive"), "needs an id of its own"),
+    (lambda raw: raw["arguments"].update(params="mine.yaml"), "arguments.params is set by the study itself"),
     (lambda raw: raw.update(questionnaires="none"), "questionnaires must be a list"),
 ]
 

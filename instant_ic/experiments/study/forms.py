@@ -10,7 +10,7 @@ from typing import Any
 from instant_ic.experiments.study.plan import Item, Questionnaire
 
 MOST_CHARACTERS = 2000
-_e = html.escape
+escape = html.escape
 
 
 def page(title: str, body: str, refresh_s: int = 0) -> str:
@@ -19,24 +19,24 @@ def page(title: str, body: str, refresh_s: int = 0) -> str:
     return (
         f'<!doctype html>\n<html><head><meta charset="utf-8">{again}'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<title>{_e(title)}</title><link rel="icon" href="data:,"><link rel="stylesheet" href="/study/page.css">'
+        f'<title>{escape(title)}</title><link rel="icon" href="data:,"><link rel="stylesheet" href="/study/page.css">'
         f"</head><body><main>{body}</main></body></html>\n"
     )
 
 
 def paragraphs(text: str) -> str:
     """Text with empty lines between paragraphs, as HTML."""
-    return "".join(f"<p>{_e(' '.join(part.split()))}</p>" for part in text.split("\n\n") if part.strip())
+    return "".join(f"<p>{escape(' '.join(part.split()))}</p>" for part in text.split("\n\n") if part.strip())
 
 
 def form(step: str, content: str, *buttons: tuple[str, str]) -> str:
     """A form of a step; buttons are (value, label), the first one is the main one."""
     row = "".join(
-        f'<button name="action" value="{_e(value)}"{"" if number else " class=main"}>{_e(label)}</button>'
+        f'<button name="action" value="{escape(value)}"{"" if number else " class=main"}>{escape(label)}</button>'
         for number, (value, label) in enumerate(buttons)
     )
     return (
-        f'<form method="post" action="/" autocomplete="off"><input type="hidden" name="step" value="{_e(step)}">'
+        f'<form method="post" action="/" autocomplete="off"><input type="hidden" name="step" value="{escape(step)}">'
         f"{content}<p class=buttons>{row}</p></form>"
     )
 
@@ -45,21 +45,21 @@ def questions(
     found: Questionnaire, drives: int, texts: Mapping[str, str], given: Mapping[str, str], faults: Mapping[str, str]
 ) -> str:
     """Fields of a questionnaire, with the answers given so far and what is wrong with them."""
-    parts = [f"<h1>{_e(found.title)}</h1>{paragraphs(found.intro)}"]
+    parts = [f"<h1>{escape(found.title)}</h1>{paragraphs(found.intro)}"]
     for item in found.items:
-        fault = f'<p class=fault role="alert">{_e(texts[faults[item.id]])}</p>' if item.id in faults else ""
+        fault = f'<p class=fault role="alert">{escape(texts[faults[item.id]])}</p>' if item.id in faults else ""
         field = _field(item, drives, texts, given.get(item.id, ""))
-        parts.append(f"<fieldset><legend>{_e(item.text)}</legend>{fault}{field}</fieldset>")
+        parts.append(f"<fieldset><legend>{escape(item.text)}</legend>{fault}{field}</fieldset>")
     return "".join(parts)
 
 
 def _field(item: Item, drives: int, texts: Mapping[str, str], given: str) -> str:
-    name = _e(item.id)
+    name = escape(item.id)
     if item.kind == "text":
-        return f'<textarea name="{name}" rows="3" maxlength="{MOST_CHARACTERS}">{_e(given)}</textarea>'
+        return f'<textarea name="{name}" rows="3" maxlength="{MOST_CHARACTERS}">{escape(given)}</textarea>'
     if item.kind == "number":
         limits = f'min="{item.low:g}" max="{item.high:g}"'
-        return f'<input type="number" name="{name}" step="any" {limits} value="{_e(given)}">'
+        return f'<input type="number" name="{name}" step="any" {limits} value="{escape(given)}">'
     if item.kind == "scale":
         points = [f"{value:g}" for value in item.points()]
         dots = "".join(
@@ -68,13 +68,13 @@ def _field(item: Item, drives: int, texts: Mapping[str, str], given: str) -> str
             for value in points
         )
         left, right = item.ends or ("", "")
-        return f"<div class=scale><i>{_e(left)}</i><span class=points>{dots}</span><i>{_e(right)}</i></div>"
+        return f"<div class=scale><i>{escape(left)}</i><span class=points>{dots}</span><i>{escape(right)}</i></div>"
     choices = [(text, text) for text in item.options]
     if item.kind == "drive":
         choices = [(str(n), f"{texts['drive_title']} {n}") for n in range(1, drives + 1)] + [("0", texts["none"])]
     return "".join(
-        f'<label class=choice><input type="radio" name="{name}" value="{_e(value)}"'
-        f"{' checked' if value == given else ''}> {_e(label)}</label>"
+        f'<label class=choice><input type="radio" name="{name}" value="{escape(value)}"'
+        f"{' checked' if value == given else ''}> {escape(label)}</label>"
         for value, label in choices
     )
 

@@ -20,6 +20,8 @@ KINDS = ("scale", "number", "choice", "drive", "text")
 SCORES = ("mean", "sus", "none")
 WHEN = ("before", "drive", "after")
 MOST_PARTICIPANTS = 999
+RESERVED = frozenset({"arbiter", "console_port", "params", "record", "recorder", "seed", "vspace_mesh_pose", "world"})
+"""Launch arguments that differ between drives."""
 TEMPLATE = Path(__file__).with_name("template.yaml")
 
 
@@ -225,6 +227,8 @@ def _check(study: Study, path: Path) -> None:
     wanted = set(_yaml_texts())
     if missing := sorted(wanted - study.texts.keys()):
         raise StudyError(f"{path}: texts.{missing[0]} is missing; the template of `ic study new` has it")
+    if taken := sorted(study.arguments.keys() & RESERVED):
+        raise StudyError(f"{path}: arguments.{taken[0]} is set by the study itself")
     if study.starts_m[0] > study.starts_m[1]:
         raise StudyError(f"{path}: starts_m must be [lowest, highest] (got {list(study.starts_m)})")
 

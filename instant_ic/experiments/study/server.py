@@ -21,7 +21,7 @@ from aiohttp import WSMsgType, web
 from instant_ic.console import server as console
 from instant_ic.experiments.study import forms
 from instant_ic.experiments.study.plan import StudyError
-from instant_ic.experiments.study.record import DONE, OPEN, WITHDRAWN, Record
+from instant_ic.experiments.study.record import OPEN, WITHDRAWN, Record
 from instant_ic.experiments.study.trial import Drive, Trial
 from instant_ic.web_access import host_allowed
 
@@ -71,9 +71,11 @@ def drive_page(step: str, bar: str, end: str, title: str) -> str:
     # Before the page's own script, so that it sees the keys first.
     page = page.replace('  <script type="module"', f'  {head}  <script type="module"', 1)
     start, _, rest = page.partition("<title>")
-    page = f"{start}<title>{forms._e(title)}</title>{rest.partition('</title>')[2]}"
-    text = f'<div id="study-bar"><span>{forms._e(bar)}</span><button id="study-end">{forms._e(end)}</button></div>'
-    return page.replace("<body>", f'<body data-step="{forms._e(step)}">\n  {text}', 1)
+    page = f"{start}<title>{forms.escape(title)}</title>{rest.partition('</title>')[2]}"
+    text = (
+        f'<div id="study-bar"><span>{forms.escape(bar)}</span><button id="study-end">{forms.escape(end)}</button></div>'
+    )
+    return page.replace("<body>", f'<body data-step="{forms.escape(step)}">\n  {text}', 1)
 
 
 class StudyServer:
@@ -167,7 +169,7 @@ class StudyServer:
     def _page(self, body: str, refresh_s: int = 0, status: int = 200) -> web.Response:
         texts = self.record.study.texts
         if not self._last and self.record.state == OPEN and self.record.step != "consent":
-            body += f'<p class=leave><a href="/withdraw">{forms._e(texts["withdraw"])}</a></p>'
+            body += f'<p class=leave><a href="/withdraw">{forms.escape(texts["withdraw"])}</a></p>'
         page = forms.page(texts["title"], body, refresh_s)
         return web.Response(text=page, content_type="text/html", status=status)
 
@@ -180,9 +182,9 @@ class StudyServer:
         if self._last or record.state != OPEN or (step := record.step) is None:
             self._loop.call_later(1.0, self.over.set)
             key = self._last or ("withdrawn" if record.state == WITHDRAWN else "done")
-            return self._page(f"<h1>{forms._e(texts['title'])}</h1>{forms.paragraphs(texts[key])}")
+            return self._page(f"<h1>{forms.escape(texts['title'])}</h1>{forms.paragraphs(texts[key])}")
         if step == "consent":
-            content = f"<h1>{forms._e(texts['consent_title'])}</h1>{forms.paragraphs(texts['consent'])}"
+            content = f"<h1>{forms.escape(texts['consent_title'])}</h1>{forms.paragraphs(texts['consent'])}"
             return self._page(forms.form(step, content, ("agree", texts["agree"]), ("refuse", texts["refuse"])))
         if step == "practice" or step.startswith("drive"):
             return self._drive(step)
@@ -196,7 +198,7 @@ class StudyServer:
         trial = self._trial
         if trial is None:
             title = texts["practice_title"] if practice else f"{texts['drive_title']} {step.removeprefix('drive')}"
-            content = f"<h1>{forms._e(title)}</h1>{forms.paragraphs(texts['practice' if practice else 'task'])}"
+            content = f"<h1>{forms.escape(title)}</h1>{forms.paragraphs(texts['practice' if practice else 'task'])}"
             return self._page(forms.form(step, content, ("start", texts["start"])))
         if trial.status == "ready":
             bar = texts["bar_practice" if practice else "bar_drive"]
@@ -270,21 +272,29 @@ class StudyServer:
         return self._trial.console
 
     async def _estop(self, request: web.Request) -> web.StreamResponse:
-        async with aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(total=2)) as http:
-            async with http.post(f"{self._console()}/estop") as answer:
-                return web.Response(status=answer.status)
+        address = f"{self._console()}/estop"
+        try:
+            async with aiohttp.ClientSession(timeout=aiohttp.ClientTimeout(total=2)) as http:
+                async with http.post(address) as answer:
+                    return web.Response(status=answer.status)
+        except (aiohttp.ClientError, TimeoutError) as error:
+            raise web.HTTPBadGateway(text="the robot's server does not answer\n") from error
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
         address = self._console().replace("http", "ws", 1) + "/ws"
         page = web.WebSocketResponse(max_msg_size=console.MAX_CLIENT_MESSAGE, compress=False, timeout=1.0)
-        async with aiohttp.ClientSession() as http, http.ws_connect(address, max_msg_size=0, compress=0) as robot:
-            await page.prepare(request)
-            ways = [asyncio.create_task(_forward(page, robot)), asyncio.create_task(_back(robot, page))]
-            _, open_ways = await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
-            for way in open_ways:
-                way.cancel()
-            await asyncio.gather(*ways, return_exceptions=True)
-            await page.close()
+        try:
+            async with aiohttp.ClientSession() as http, http.ws_connect(address, max_msg_size=0, compress=0) as robot:
+                await page.prepare(request)
+                ways = [asyncio.create_task(_forward(page, robot)), asyncio.create_task(_back(robot, page))]
+                await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+                for way in ways:
+                    way.cancel()
+                await asyncio.gather(*ways, return_exceptions=True)
+                await page.close()
+        except (aiohttp.ClientError, TimeoutError) as error:  # the stack has just ended
+            if not page.prepared:
+                raise web.HTTPBadGateway(text="the robot's server does not answer\n") from error
         return page
 
 
@@ -300,6 +310,3 @@ async def _back(robot: aiohttp.ClientWebSocketResponse, page: web.WebSocketRespo
             await page.send_bytes(message.data)
         elif message.type is WSMsgType.TEXT and (text := to_page(message.data)) is not None:
             await page.send_str(text)
-
-
-__all__ = ["DONE", "StudyServer", "drive_page", "from_page", "to_page"]
