@@ -142,31 +142,42 @@ def curves_svg(panels: Sequence[tuple[str, str, Series]]) -> str:
         panels: label of x, label of y, and the curves; the same name has the same colour in all panels.
     """
     names = list(dict.fromkeys(name for _, _, series in panels for name in series))
-    colours = {name: _COLOURS[number % len(_COLOURS)] for number, name in enumerate(names)}
+    colours = {name: series_colour(number) for number, name in enumerate(names)}
     return "".join(_curves_svg(*panel, colours) for panel in panels)
 
 
 def _curves_svg(x_label: str, y_label: str, series: Series, colours: dict[str, str]) -> str:
+    figure, axes = new_figure(1, 1, (4.8, 3.7))
+    axis = axes[0, 0]
+    for name, points in series.items():
+        at = sorted(points)
+        mean, wide = (np.array([of(points[x]) for x in at]) for of in (np.mean, np.std))
+        axis.plot(at, mean, color=colours[name], linewidth=1.6, marker="o", markersize=2.5, label=name)
+        axis.fill_between(at, mean - wide, mean + wide, color=colours[name], alpha=0.15, linewidth=0)
+    axis.set_xlabel(x_label, color=_INK)
+    axis.set_ylabel(y_label)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=7, frameon=False, labelcolor=_INK)
+    return figure_svg(figure, axis)
+
+
+def series_colour(number: int) -> str:
+    """Colour of a curve or a group, by its number."""
+    return _COLOURS[number % len(_COLOURS)]
+
+
+def figure_svg(figure: Any, axis: Any) -> str:
+    """A figure with one pair of axes as SVG text that follows the page's light or dark colours."""
     import io
 
     import matplotlib
 
+    axis.yaxis.label.set_color(_INK)
+    axis.tick_params(colors=_INK)
+    axis.grid(alpha=0.25)
+    for spine in axis.spines.values():
+        spine.set_color(_INK)
+    out = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "instant-ic"}):
-        figure, axes = new_figure(1, 1, (4.8, 3.7))
-        axis = axes[0, 0]
-        for name, points in series.items():
-            at = sorted(points)
-            mean, wide = (np.array([of(points[x]) for x in at]) for of in (np.mean, np.std))
-            axis.plot(at, mean, color=colours[name], linewidth=1.6, marker="o", markersize=2.5, label=name)
-            axis.fill_between(at, mean - wide, mean + wide, color=colours[name], alpha=0.15, linewidth=0)
-        axis.set_xlabel(x_label, color=_INK)
-        axis.set_ylabel(y_label, color=_INK)
-        axis.tick_params(colors=_INK)
-        axis.grid(alpha=0.25)
-        for spine in axis.spines.values():
-            spine.set_color(_INK)
-        figure.legend(loc="outside lower center", ncols=4, fontsize=7, frameon=False, labelcolor=_INK)
-        out = io.StringIO()
         figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
     text = out.getvalue()
     return text[text.index("<svg") :].replace(_INK, "currentColor")

@@ -72,13 +72,30 @@ def image_address(jpeg_or_other: bytes, kind: str = "image/jpeg") -> str:
     return f"data:{kind};base64,{base64.b64encode(jpeg_or_other).decode()}"
 
 
-def write(folder: Path, sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> None:
-    """Write ``report.html`` and ``report.json``; ``conditions`` are machine, versions, command and times."""
-    save_text(folder / "report.html", _page(sections, results, conditions))
+def write(
+    folder: Path,
+    sections: dict[str, Section],
+    results: Sequence[Result],
+    conditions: dict[str, Any],
+    title: str = "Instant IC: the paper's experiments",
+    more: dict[str, Any] | None = None,
+) -> None:
+    """Write ``report.html`` and ``report.json``.
+
+    Args:
+        folder: existing.
+        sections: by name.
+        results: of the experiments' units; empty for a report without units.
+        conditions: machine, versions, command and times.
+        title: of the page.
+        more: further entries of the JSON.
+    """
+    save_text(folder / "report.html", _page(title, sections, results, conditions))
     save_json(
         folder / "report.json",
         finite(
             {
+                **(more or {}),
                 "conditions": conditions,
                 "verdict": {name: section.verdict for name, section in sections.items()},
                 "tables": {
@@ -129,16 +146,16 @@ a { color: inherit; }
 """
 
 
-def _page(sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> str:
+def _page(title: str, sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> str:
     links = "".join(f'<a href="#{name}">{html.escape(name)}</a>' for name in sections)
     bodies = "".join(_section(name, section, results) for name, section in sections.items())
+    seeds = "<p>Numbers are mean ± standard deviation over the seeds.</p>" if results else ""
     facts = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(str(v))}</dd>" for k, v in conditions.items())
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Instant IC: experiments</title><style>{_STYLE}</style></head><body>"
-        f"<h1>Instant IC: the paper's experiments</h1><nav>{links}</nav>"
-        f"<p>Numbers are mean ± standard deviation over the seeds.</p>{bodies}"
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>"
+        f"<h1>{html.escape(title)}</h1><nav>{links}</nav>{seeds}{bodies}"
         f"<h2>Conditions</h2><dl>{facts}</dl></body></html>\n"
     )
 
@@ -158,6 +175,8 @@ def _section(name: str, section: Section, results: Sequence[Result]) -> str:
     if failed:
         rows = "".join(f"<li>{html.escape(str(one.unit.arguments))}: {html.escape(one.error)}</li>" for one in failed)
         parts.append(f"<p>Failed:</p><ul>{rows}</ul>")
+    if not results:
+        return "".join(parts)
     wall, cpu = (sum(getattr(one, key) for one in own) for key in ("wall_s", "cpu_s"))
     parts.append(f"<p>{len(own)} units, {wall:.0f} s of wall time, {cpu:.0f} s of CPU time.</p>")
     return "".join(parts)

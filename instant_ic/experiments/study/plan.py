@@ -1,0 +1,336 @@
+"""The study as its researcher writes it: ``study.yaml``, checked; and the order of the conditions."""
+
+from __future__ import annotations
+
+import re
+import string
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from instant_ic.private import make_folder, open_file
+
+CONDITIONS = ("ic", "stop", "shared", "mesh")
+"""Illusory control as shipped; the robot stops at obstacles; it drives around them; illusory control with a scan."""
+KINDS = ("scale", "number", "choice", "drive", "text")
+SCORES = ("mean", "sus", "none")
+WHEN = ("before", "drive", "after")
+MOST_PARTICIPANTS = 999
+RESERVED = frozenset({"arbiter", "console_port", "params", "record", "recorder", "seed", "vspace_mesh_pose", "world"})
+"""Launch arguments that differ between drives."""
+TEMPLATE = Path(__file__).with_name("template.yaml")
+
+
+class StudyError(ValueError):
+    """A study cannot be read, or does not allow what was asked; the text says what is wrong, where and what to do."""
+
+
+@dataclass(frozen=True)
+class Item:
+    """One question.
+
+    Attributes:
+        id: name of the answer.
+        kind: of ``KINDS``; ``drive`` asks for one of the drives, or for none of them.
+        text: the question.
+        low, high, step: range of ``scale`` and ``number``.
+        ends: labels of both ends of a scale.
+        options: of a ``choice``.
+        reverse: a high answer means a low score.
+        required: whether it must be answered.
+        truth: for ``number``: the measure that it estimates; empty: none.
+    """
+
+    id: str
+    kind: str
+    text: str
+    low: float = 1.0
+    high: float = 7.0
+    step: float = 1.0
+    ends: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()
+    reverse: bool = False
+    required: bool = True
+    truth: str = ""
+
+    def points(self) -> list[float]:
+        """Values of a scale."""
+        return [round(float(x), 6) for x in np.arange(self.low, self.high + self.step / 2, self.step)]
+
+
+@dataclass(frozen=True)
+class Questionnaire:
+    """Questions of one page; ``when`` is of ``WHEN``, ``score`` of ``SCORES``."""
+
+    id: str
+    title: str
+    intro: str
+    when: str
+    score: str
+    items: tuple[Item, ...]
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study, as in its folder.
+
+    Attributes:
+        folder: with ``study.yaml``.
+        seed: of orders and starts.
+        participants: code → conditions in the order of the drives.
+        worlds: one a drive, the same for all participants; drives have different conditions, so none has its own world.
+        starts_m: start of each drive along the corridor is drawn from this range, metres.
+        goal_m: distance to drive, metres along the start's heading.
+        limit_s, practice_s: longest drive and practice, seconds of the stack.
+        practice_world: without obstacles.
+        arguments: of ``launch/sim.yaml``, the same in all conditions.
+        texts: what the participant reads, by name.
+        questionnaires: in order.
+    """
+
+    folder: Path
+    seed: int
+    participants: dict[str, tuple[str, ...]]
+    worlds: tuple[str, ...]
+    starts_m: tuple[float, float]
+    goal_m: float
+    limit_s: float
+    practice_s: float
+    practice_world: str
+    arguments: dict[str, Any]
+    texts: dict[str, str]
+    questionnaires: tuple[Questionnaire, ...]
+
+    def steps(self) -> list[str]:
+        """Names of the participant's pages in order; none names a condition."""
+        before, each, after = ([q.id for q in self.questionnaires if q.when == when] for when in WHEN)
+        drives = [name for n in range(1, len(self.worlds) + 1) for name in (f"drive{n}", *(f"{q}.{n}" for q in each))]
+        return ["consent", *before, "practice", *drives, *after]
+
+    def questionnaire(self, step: str) -> Questionnaire:
+        """Questionnaire of a step."""
+        return next(q for q in self.questionnaires if q.id == step.partition(".")[0])
+
+    def start_x_m(self, code: str, drive: int) -> float:
+        """Start of a participant's drive (from 1) along the world's x axis."""
+        rng = np.random.default_rng([self.seed, drive, *code.encode()])
+        return round(float(rng.uniform(*self.starts_m)), 2)
+
+
+def balanced_square(conditions: int) -> list[list[int]]:
+    """Orders in which each condition has each place, and each other before it, equally often (Williams, 1949).
+
+    Args:
+        conditions: number of conditions, from 2.
+
+    Returns:
+        ``conditions`` orders, or twice as many if the number is odd.
+    """
+    if conditions < 2:
+        raise ValueError(f"a balanced order needs at least 2 conditions (got {conditions})")
+    first = [0] + [(k + 1) // 2 if k % 2 else conditions - k // 2 for k in range(1, conditions)]
+    rows = [[(place + shift) % conditions for place in first] for shift in range(conditions)]
+    return rows if conditions % 2 == 0 else rows + [row[::-1] for row in rows]
+
+
+def orders(count: int, conditions: Sequence[str], seed: int) -> dict[str, list[str]]:
+    """Participant codes and the order of each: whole squares, in random sequence, with randomly assigned letters."""
+    rng = np.random.default_rng([89, seed])
+    letters = [str(name) for name in rng.permutation(list(conditions))]
+    square, rows = balanced_square(len(letters)), list[list[int]]()
+    while len(rows) < count:
+        rows += [square[row] for row in rng.permutation(len(square))]
+    return {f"P{n + 1:02d}": [letters[one] for one in rows[n]] for n in range(count)}
+
+
+def create(folder: Path, participants: int, seed: int) -> Study:
+    """Write the study's folder from the shipped template.
+
+    Raises:
+        StudyError: it exists, or the number of participants is out of range.
+    """
+    if not 1 <= participants <= MOST_PARTICIPANTS:
+        raise StudyError(f"--participants must be from 1 to {MOST_PARTICIPANTS} (got {participants})")
+    try:
+        make_folder(folder)
+    except FileExistsError:
+        raise StudyError(f"{folder} exists: choose a new folder for the study") from None
+    rows = (f"  {code}: [{', '.join(order)}]" for code, order in orders(participants, CONDITIONS, seed).items())
+    text = string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(seed=seed, participants="\n".join(rows))
+    save(folder / "study.yaml", text)
+    return load(folder)
+
+
+def save(path: Path, text: str) -> None:
+    """Write a file that only its owner can read, atomically."""
+    import os
+
+    beside = path.with_name(f".{path.name}.new")
+    with os.fdopen(open_file(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8") as file:
+        file.write(text)
+    beside.replace(path)
+
+
+def load(folder: Path) -> Study:
+    """Read and check a study.
+
+    Raises:
+        StudyError: a value is missing or wrong.
+    """
+    path = folder / "study.yaml"
+    try:
+        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise StudyError(f"{path} does not exist: create a study with `ic study new {folder}`") from None
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise StudyError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
+    root = _Fields(raw, str(path))
+    low, high = root.floats("starts_m", 2)
+    participants = root.mapping("participants")
+    questionnaires = tuple(
+        _questionnaire(one, f"{path}: questionnaires[{n}]") for n, one in root.rows("questionnaires")
+    )
+    study = Study(
+        folder,
+        int(root.number("seed", 0, 2**31)),
+        {str(code): tuple(str(one) for one in order or ()) for code, order in participants.items()},
+        root.strings("worlds"),
+        (low, high),
+        root.number("goal_m", 0.5, 1000),
+        root.number("limit_s", 1, 36000),
+        root.number("practice_s", 1, 36000),
+        root.string("practice_world"),
+        root.mapping("arguments"),
+        {str(key): str(value) for key, value in root.mapping("texts").items()},
+        questionnaires,
+    )
+    _check(study, path)
+    return study
+
+
+def _check(study: Study, path: Path) -> None:
+    for code, order in study.participants.items():
+        if not re.fullmatch(r"[A-Z][0-9]{2,3}", code):
+            raise StudyError(f"{path}: participants.{code}: a code is a letter and two or three digits, never a name")
+        if len(order) != len(study.worlds) or not set(order) <= set(CONDITIONS):
+            raise StudyError(
+                f"{path}: participants.{code} must list {len(study.worlds)} conditions, one a world, of "
+                f"{', '.join(CONDITIONS)} (got {', '.join(order)})"
+            )
+    names = [one.id for one in study.questionnaires]
+    if len({*names}) < len(names) or {*names} & {"consent", "practice"} or any(n.startswith("drive") for n in names):
+        raise StudyError(f"{path}: questionnaires: each needs an id of its own, not consent, practice or drive...")
+    wanted = set(_yaml_texts())
+    if missing := sorted(wanted - study.texts.keys()):
+        raise StudyError(f"{path}: texts.{missing[0]} is missing; the template of `ic study new` has it")
+    if taken := sorted(study.arguments.keys() & RESERVED):
+        raise StudyError(f"{path}: arguments.{taken[0]} is set by the study itself")
+    if study.starts_m[0] > study.starts_m[1]:
+        raise StudyError(f"{path}: starts_m must be [lowest, highest] (got {list(study.starts_m)})")
+
+
+def _yaml_texts() -> dict[str, str]:
+    text = string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(seed=0, participants="  P01: []")
+    return dict(yaml.safe_load(text)["texts"])
+
+
+def _questionnaire(raw: Any, where: str) -> Questionnaire:
+    fields = _Fields(raw, where)
+    items = tuple(_item(one, f"{where}.items[{n}]") for n, one in fields.rows("items"))
+    if len({one.id for one in items}) < len(items):
+        raise StudyError(f"{where}.items: two items have the same id")
+    found = Questionnaire(
+        fields.name("id"),
+        fields.string("title"),
+        fields.string("intro", ""),
+        fields.one_of("when", WHEN),
+        fields.one_of("score", SCORES, "none"),
+        items,
+    )
+    if found.score == "sus" and [(one.low, one.high) for one in items] != [(1.0, 5.0)] * 10:
+        raise StudyError(f"{where}: score sus needs ten scales from 1 to 5")
+    if found.score != "none" and any(one.kind != "scale" or not one.required for one in items):
+        raise StudyError(f"{where}: score {found.score} needs required items of the kind scale only")
+    return found
+
+
+def _item(raw: Any, where: str) -> Item:
+    fields = _Fields(raw, where)
+    item = Item(
+        fields.name("id"),
+        fields.one_of("kind", KINDS),
+        fields.string("text"),
+        fields.number("low", default=1.0),
+        fields.number("high", default=7.0),
+        fields.number("step", 1e-6, default=1.0),
+        fields.strings("ends", ()),
+        fields.strings("options", ()),
+        fields.flag("reverse", False),
+        fields.flag("required", True),
+        fields.string("truth", ""),
+    )
+    if not item.low < item.high or len(item.ends) not in (0, 2) or len(item.points()) > 101:
+        raise StudyError(f"{where}: low must be below high, ends two texts, and a scale has at most 101 points")
+    if item.kind == "choice" and len(item.options) < 2:
+        raise StudyError(f"{where}.options: a choice needs at least two")
+    return item
+
+
+class _Fields:
+    """A mapping of the YAML file; each method returns a checked value or raises StudyError."""
+
+    def __init__(self, raw: Any, where: str) -> None:
+        if not isinstance(raw, dict):
+            raise StudyError(f"{where} must be a mapping (got {type(raw).__name__})")
+        self.raw, self.where = raw, where
+
+    def _get(self, key: str, kind: type | tuple[type, ...], what: str, default: Any = None) -> Any:
+        value = self.raw.get(key, default)
+        wrong_flag = isinstance(value, bool) and kind is not bool
+        if not isinstance(value, kind) or wrong_flag:
+            raise StudyError(f"{self.where}: {key} must be {what} (got {value!r:.60})")
+        return value
+
+    def string(self, key: str, default: str | None = None) -> str:
+        return str(self._get(key, str, "a text", default))
+
+    def name(self, key: str) -> str:
+        value = self.string(key)
+        if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", value):
+            raise StudyError(f"{self.where}: {key} must be a name of lower-case letters, digits and _ (got {value!r})")
+        return value
+
+    def one_of(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
+        value = self.string(key, default)
+        if value not in allowed:
+            raise StudyError(f"{self.where}: {key} must be one of {', '.join(allowed)} (got {value!r})")
+        return value
+
+    def number(self, key: str, low: float = -1e9, high: float = 1e9, default: float | None = None) -> float:
+        value = float(self._get(key, (int, float), "a number", default))
+        if not low <= value <= high:
+            raise StudyError(f"{self.where}: {key} must be in [{low:g}, {high:g}] (got {value:g})")
+        return value
+
+    def flag(self, key: str, default: bool) -> bool:
+        return bool(self._get(key, bool, "true or false", default))
+
+    def mapping(self, key: str) -> dict[Any, Any]:
+        return dict(self._get(key, dict, "a mapping"))
+
+    def rows(self, key: str) -> list[tuple[int, Any]]:
+        return list(enumerate(self._get(key, list, "a list")))
+
+    def strings(self, key: str, default: tuple[str, ...] | None = None) -> tuple[str, ...]:
+        value = self._get(key, (list, tuple), "a list of texts", default)
+        return tuple(str(one) for one in value)
+
+    def floats(self, key: str, count: int) -> list[float]:
+        value = self._get(key, list, f"{count} numbers")
+        if len(value) != count or any(isinstance(one, bool) or not isinstance(one, int | float) for one in value):
+            raise StudyError(f"{self.where}: {key} must be {count} numbers (got {value!r:.60})")
+        return [float(one) for one in value]

@@ -1,0 +1,256 @@
+"""One drive of a participant: the stack of its condition, its bag, and the measures from that bag."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import math
+import shutil
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from instant_ic.bag import BagReader
+from instant_ic.bus import LATCHED, RELIABLE
+from instant_ic.experiments import teleop_figures
+from instant_ic.experiments.stack import Stack, free_ports
+from instant_ic.experiments.study.plan import Study, StudyError, save
+from instant_ic.experiments.teleop_stack import Log
+from instant_ic.msg import ControlState, String, VspaceStatus, pose2_from_message, stamp_ns, twist_values
+from instant_ic.private import make_folder
+
+READY_S = 240.0
+"""Longest start of a stack, seconds of its own time."""
+STOP_S = 60.0
+STATE, EVENTS, CONTACT, SCAN = "/ic/state", "/study/event", "/ground_truth/contact", "/scan"
+AHEAD_RAD = math.radians(3.0)
+"""Half the sector whose median range is the distance ahead."""
+ARBITERS = {name: Path(__file__).with_name(f"arbiter_{name}.py") for name in ("stop", "shared")}
+log = logging.getLogger("instant_ic.study")
+
+
+def scan_of(study: Study, world: str) -> Path:
+    """File of the scan of a world, for the condition ``mesh``."""
+    return study.folder / "scans" / f"{''.join(c if c.isalnum() else '_' for c in world)}.glb"
+
+
+def make_scans(study: Study, code: str) -> None:
+    """Scan the worlds that a participant drives by a scan: as ``ic experiment operators``, without the obstacles.
+
+    Raises:
+        StudyError: a world does not exist or has no obstacle course.
+    """
+    from instant_ic.experiments.illusion_truth import without
+    from instant_ic.experiments.scan import QUALITIES, scan_world
+    from instant_ic.experiments.teleop_worlds import straight_ahead
+    from instant_ic.sim.worlds import make_world
+
+    for number, (world, method) in enumerate(zip(study.worlds, study.participants[code], strict=True)):
+        file = scan_of(study, world)
+        if method != "mesh" or file.exists():
+            continue
+        try:
+            course = straight_ahead(make_world(world))
+            free = functools.reduce(without, course.obstacles, course.world)
+            make_folder(file.parent, exist_ok=True)
+            beside = file.with_suffix(".part")
+            scan_world(free, course.world.spawn, QUALITIES["tripod"], study.seed + number, beside)
+            beside.replace(file)
+        except ValueError as error:
+            raise StudyError(f"{study.folder / 'study.yaml'}: worlds: {world}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive to make; ``number`` 0 is the practice."""
+
+    study: Study
+    code: str
+    number: int
+
+    @property
+    def method(self) -> str:
+        return "stop" if self.number == 0 else self.study.participants[self.code][self.number - 1]
+
+    @property
+    def limit_s(self) -> float:
+        return self.study.limit_s if self.number else self.study.practice_s
+
+    def arguments(self, bag: Path, run_dir: Path) -> dict[str, Any]:
+        """Arguments of ``launch/sim.yaml``."""
+        study = self.study
+        world = study.worlds[self.number - 1] if self.number else study.practice_world
+        start_x_m = study.start_x_m(self.code, self.number) if self.number else 0.0
+        params = run_dir / "study.yaml"
+        start = {"simulator": {"ros__parameters": {"start": [start_x_m, 0.0, 0.0]}}}
+        save(params, yaml.safe_dump(start))
+        found = {**study.arguments, **free_ports(), "world": world, "record": bag.absolute(), "recorder": False}
+        found |= {"seed": study.seed + self.number, "params": params}
+        if self.method in ARBITERS:
+            found["arbiter"] = ARBITERS[self.method]
+        if self.method == "mesh":
+            file = scan_of(study, world).absolute()
+            # The map's origin is the robot's start; the scan has the world's.
+            found |= {"vspace_source": "mesh", "vspace_mesh": file, "vspace_mesh_pose": f"{-start_x_m},0,0,0"}
+        return found
+
+
+class Trial:
+    """A drive on its own thread, from the stack's start to the measures.
+
+    Attributes:
+        status: ``starting``, ``ready``, ``saving``, ``done`` or ``failed``.
+        console: address of the stack's page while ``ready``; empty before.
+        result: measures, once ``done``.
+    """
+
+    def __init__(self, drive: Drive, bag: Path) -> None:
+        self.drive, self.bag = drive, bag
+        self.status, self.console = "starting", ""
+        self.result: dict[str, Any] = {}
+        self._end = threading.Event()
+        self._why = "participant"
+        self._thread = threading.Thread(target=self._guarded, name="drive", daemon=True)
+        self._thread.start()
+
+    def end(self, why: str = "participant", wait_s: float = 0.0) -> None:
+        """End the drive; with ``wait_s`` wait until its stack has stopped."""
+        if not self._end.is_set():
+            self._why = why
+        self._end.set()
+        if wait_s:
+            self._thread.join(wait_s)
+
+    def _guarded(self) -> None:
+        run_dir = Path(tempfile.mkdtemp(prefix="ic-s-"))
+        try:
+            self._run(run_dir)
+            self.status = "done"
+        except Exception:
+            log.exception("drive %d of %s failed", self.drive.number, self.drive.code)
+            self.status = "failed"
+        finally:
+            shutil.rmtree(run_dir, ignore_errors=True)
+
+    def _run(self, run_dir: Path) -> None:
+        arguments = self.drive.arguments(self.bag, run_dir)
+        slowest, state, reached_s = math.inf, list[Any](), 0.0
+        with Stack("sim.yaml", run_dir, arguments, pace=None) as stack:
+            events = stack.observer.publisher(EVENTS, String, qos=LATCHED)
+            spaces = stack.collect("/vspace/status", VspaceStatus, LATCHED)
+            stack.observer.subscribe(
+                STATE, ControlState, lambda message: state.__setitem__(slice(None), [message]), RELIABLE
+            )
+            without_space = arguments.get("vspace") is False
+
+            def ready() -> bool:
+                space = without_space or any(one.state == one.READY for one in spaces[-1:])
+                return self._end.is_set() or (space and bool(state) and state[0].mode == ControlState.REAL)
+
+            stack.wait_for(ready, READY_S, "robot that is ready to drive")
+            self.console = f"http://127.0.0.1:{arguments['console_port']}"
+            self.status = "ready"
+            events.publish(String(data="begin"))
+            began_ns = stamp_ns(state[0]) if state else 0
+            while not self._end.wait(0.01):
+                stack.observer.spin_once()
+                stack.check_alive("the end of the drive")
+                slowest = min(slowest, stack.pace)
+                passed_s = (stamp_ns(state[0]) - began_ns) / 1e9
+                if passed_s > self.drive.limit_s:
+                    self.end("limit")
+                reached_s = passed_s if not self._arrived(state[0]) else reached_s
+                if passed_s - reached_s > 1.0:
+                    self.end("arrived")
+            self.status = "saving"
+            events.publish(String(data=self._why))
+            time.sleep(0.3)  # for the recorder to take the event
+            stack.stop(STOP_S)
+        self.result = {"end": self._why, "slowest_pace": slowest, "bag": self.bag.name}
+        if self.drive.number:
+            self.result |= measures(self.bag)
+
+    def _arrived(self, state: Any) -> bool:
+        """Whether the r-bot has driven far enough, and is the robot shown."""
+        x, _, _ = pose2_from_message(state.robot_pose)
+        return bool(self.drive.number and state.mode == ControlState.REAL and x >= self.drive.study.goal_m)
+
+
+def measures(bag: Path) -> dict[str, Any]:
+    """Measures of a recorded drive, from its first command to its end.
+
+    Returns:
+        ``time_s``; ``driven_m`` of the shown robot; ``obedience`` and ``longest_stall_s`` as in
+        :mod:`~instant_ic.experiments.teleop_figures`; ``switches`` into the virtual space; ``virtual_s`` in it;
+        ``contacts``; ``ahead_m``: free distance ahead at the end, None if unknown. Only ``contacts`` without a command.
+
+    Raises:
+        BagError: the bag cannot be read.
+    """
+    with BagReader(bag) as reader:
+        decoders = {
+            one.topic: reader.decoder(one) for one in reader.topics if one.topic in (STATE, EVENTS, CONTACT, SCAN)
+        }
+        rows = [(one.topic, one.stamp_ns, decoders[one.topic](one.payload)) for one in reader.messages([*decoders])]
+    ends = [at for topic, at, message in rows if topic == EVENTS and message.data != "begin"]
+    end_ns = ends[-1] if ends else rows[-1][1] if rows else 0
+    rows = [row for row in rows if row[1] <= end_ns]
+    touching = [bool(message.data) for topic, _, message in rows if topic == CONTACT]
+    found: dict[str, Any] = {
+        "contacts": sum(now and not was for was, now in zip([False, *touching], touching, strict=False))
+    }
+    states = [message for topic, _, message in rows if topic == STATE]
+    commanded = [n for n, one in enumerate(states) if any(twist_values(one.operator_command))]
+    if not commanded or len(states) - commanded[0] < 3:
+        return found
+    drive = log_of(states[commanded[0] :])
+    steps = np.diff(teleop_figures.shown_poses(drive)[:, :2], axis=0)
+    virtual = np.array(drive.virtual)
+    lengths = np.linalg.norm(steps, axis=1) * (virtual[1:] == virtual[:-1])
+    scans = [message for topic, _, message in rows if topic == SCAN]
+    return found | {
+        "time_s": drive.time_s[-1] - drive.time_s[0],
+        "driven_m": float(lengths.sum()),
+        "obedience": teleop_figures.obedience(drive),
+        "longest_stall_s": teleop_figures.longest_stall_s(drive),
+        "switches": int((virtual[1:] & ~virtual[:-1]).sum()),
+        "virtual_s": float(virtual.sum()) * teleop_figures.STEP_S,
+        "ahead_m": ahead_m(scans[-1]) if scans else None,
+    }
+
+
+def log_of(states: list[Any]) -> Log:
+    """The log of ``ic evaluate teleop`` from recorded ControlState messages, which arrive at uneven times."""
+    stamps = np.array([stamp_ns(one) for one in states])
+    at = (stamps - stamps[0]) / 1e9
+    grid = np.arange(0.0, at[-1] + 1e-9, teleop_figures.STEP_S)
+    last = np.clip(np.searchsorted(at, grid, side="right") - 1, 0, None)
+
+    def poses(name: str) -> list[Any]:
+        found = np.array([pose2_from_message(getattr(one, name)) for one in states])
+        found[:, 2] = np.unwrap(found[:, 2])
+        return list(np.stack([np.interp(grid, at, column) for column in found.T], axis=1))
+
+    held = [states[n] for n in last]
+    return Log(
+        time_s=grid.tolist(),
+        mode=[int(one.mode) for one in held],
+        virtual=[one.shown == ControlState.SHOWN_VIRTUAL for one in held],
+        robot=poses("robot_pose"),
+        vbot=poses("vbot_pose"),
+        command=[(float(v), float(w)) for v, w in (twist_values(one.operator_command) for one in held)],
+    )
+
+
+def ahead_m(scan: Any) -> float | None:
+    """Median range straight ahead in a LaserScan; None if nothing was hit."""
+    ranges = np.asarray(scan.ranges, np.float64)
+    angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges))
+    seen = ranges[(np.abs(np.angle(np.exp(1j * angles))) < AHEAD_RAD) & np.isfinite(ranges) & (ranges > 0)]
+    return float(np.median(seen)) if seen.size else None

@@ -1,0 +1,433 @@
+"""``ic study``: orders, checks of study.yaml and of answers, scores and statistics by hand, the pages."""
+
+import asyncio
+import json
+import math
+import stat
+from pathlib import Path
+
+import aiohttp
+import numpy as np
+import pytest
+import yaml
+from study_pages import FakeTrial, fake_console, filled, finished_study, served
+
+from instant_ic.bag.writer import BagWriter
+from instant_ic.bus import LATCHED
+from instant_ic.cli.main import main
+from instant_ic.experiments.study import forms, stats, trial
+from instant_ic.experiments.study.plan import CONDITIONS, Study, StudyError, balanced_square, create, load, orders, save
+from instant_ic.experiments.study.record import DONE, OPEN, WITHDRAWN, Record
+from instant_ic.experiments.study.report import rows, values_of
+from instant_ic.experiments.study.server import StudyServer, drive_page, from_page, to_page
+from instant_ic.experiments.study.trial import Drive, ahead_m, measures
+from instant_ic.msg import Bool, ControlState, String, header, pose2_message, scan_message, serialize, twist_message
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Study:
+    return create(tmp_path / "study", 8, 3)
+
+
+# ---- the plan
+
+
+def test_the_square_for_four_is_that_of_williams():
+    assert balanced_square(4) == [[0, 1, 3, 2], [1, 2, 0, 3], [2, 3, 1, 0], [3, 0, 2, 1]]
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7])
+def test_each_condition_has_each_place_and_follows_each_other_equally_often(count):
+    square = np.array(balanced_square(count))
+    times = len(square) // count
+    for column in square.T:
+        assert np.bincount(column).tolist() == [times] * count
+    after = np.zeros((count, count), int)
+    np.add.at(after, (square[:, :-1].ravel(), square[:, 1:].ravel()), 1)
+    assert (after == times * (1 - np.eye(count, dtype=int))).all()
+
+
+def test_every_four_participants_are_a_whole_square():
+    found = list(orders(10, CONDITIONS, 1).values())
+    for first in (0, 4):
+        assert all({*column} == {*CONDITIONS} for column in zip(*found[first : first + 4], strict=True))
+    assert orders(10, CONDITIONS, 1) == orders(10, CONDITIONS, 1) != orders(10, CONDITIONS, 2)
+
+
+def test_a_new_study_is_private_and_reads_back(study):
+    assert stat.S_IMODE(study.folder.stat().st_mode) == 0o700
+    assert stat.S_IMODE((study.folder / "study.yaml").stat().st_mode) == 0o600
+    assert load(study.folder) == study
+    with pytest.raises(StudyError, match="exists: choose a new folder"):
+        create(study.folder, 8, 3)
+
+
+WRONG = [
+    (lambda raw: raw.pop("goal_m"), "goal_m must be a number"),
+    (lambda raw: raw.update(goal_m=math.nan), r"goal_m must be in \[0.5, 1000\]"),
+    (lambda raw: raw.update(starts_m=[1, "x"]), "starts_m must be 2 numbers"),
+    (lambda raw: raw["participants"].update(P01=["ic", "ic"]), "participants.P01 must list 4 conditions"),
+    (lambda raw: raw["participants"].update({"../x": ["ic"] * 4}), "a code is a letter and two or three digits"),
+    (lambda raw: raw["texts"].pop("withdraw"), "texts.withdraw is missing"),
+    (lambda raw: raw["questionnaires"][3]["items"].pop(), "score sus needs ten scales"),
+    (lambda raw: raw["questionnaires"][1]["items"][0].update(kind="slider"), r"\[1\].items\[0\]: kind must be one of"),
+    (lambda raw: raw["questionnaires"][1].update(id="drive"), "needs an id of its own"),
+    (lambda raw: raw["arguments"].update(params="mine.yaml"), "arguments.params is set by the study itself"),
+    (lambda raw: raw.update(questionnaires="none"), "questionnaires must be a list"),
+]
+
+
+@pytest.mark.parametrize(("change", "text"), WRONG, ids=[text for _, text in WRONG])
+def test_a_wrong_study_is_refused_with_its_place(study, change, text):
+    raw = yaml.safe_load((study.folder / "study.yaml").read_text())
+    change(raw)
+    save(study.folder / "study.yaml", yaml.safe_dump(raw))
+    with pytest.raises(StudyError, match=text):
+        load(study.folder)
+
+
+# ---- scores and statistics
+
+
+def test_sus_by_hand(study):
+    sus = study.questionnaire("sus.1")
+    # odd items 4, 5, 4, 4, 5: 3+4+3+3+4 = 17; even items 2, 1, 2, 3, 2: 3+4+3+2+3 = 15; 2.5 * 32 = 80
+    answers = dict(zip([f"s{n}" for n in range(1, 11)], [4, 2, 5, 1, 4, 2, 4, 3, 5, 2], strict=True))
+    assert stats.score(sus, answers) == 80.0
+    assert stats.score(sus, dict.fromkeys(answers, 3)) == 50.0
+
+
+def test_tlx_and_agency_by_hand(study):
+    tlx = {"mental": 70, "physical": 10, "temporal": 40, "performance": 25, "effort": 55, "frustration": 40}
+    assert stats.score(study.questionnaire("tlx.1"), tlx) == 40.0  # 240 / 6
+    agency = {"command": 6, "cause": 7, "control": 5, "other": 2, "ignored": 1}  # reversed on 1..7: 6 and 7
+    assert stats.score(study.questionnaire("agency.1"), agency) == pytest.approx((6 + 7 + 5 + 6 + 7) / 5)
+
+
+def test_friedman_by_hand():
+    # Ranks of three participants: (1, 2, 3), (1, 3, 2), (1, 2, 3); sums 3, 7, 8.
+    # chi2 = 12 / (3 * 3 * 4) * (9 + 49 + 64) - 3 * 3 * 4 = 4.667; W = chi2 / (3 * 2) = 0.778.
+    # Of the 216 equally likely rankings, 42 give this sum of squares or more (Friedman's table: p = 0.194).
+    found = stats.friedman(np.array([[1.0, 2, 3], [10, 30, 20], [5, 6, 7]]))
+    assert found is not None
+    assert (found.chi2, found.w) == (pytest.approx(14 / 3), pytest.approx(7 / 9))
+    assert found.p == pytest.approx(math.exp(-7 / 3))  # chi-square with two degrees of freedom
+    assert found.p_exact == pytest.approx(42 / 216, abs=0.02)
+    assert found.w_low <= found.w <= found.w_high
+
+
+def test_friedman_agrees_with_scipy_where_there_are_ties():
+    from scipy.stats import friedmanchisquare
+
+    values = np.random.default_rng(3).integers(1, 6, (14, 4)).astype(float)
+    found, oracle = stats.friedman(values), friedmanchisquare(*values.T)
+    assert found is not None
+    assert (found.chi2, found.p) == (pytest.approx(oracle.statistic), pytest.approx(oracle.pvalue))
+    assert found.p_exact == pytest.approx(found.p, abs=0.05)
+
+
+def test_nothing_is_tested_with_one_participant_or_equal_values():
+    assert stats.friedman(np.ones((5, 4))) is None
+    assert stats.friedman(np.array([[1.0, 2, 3, 4]])) is None
+    assert stats.pairs({"a": np.ones(1), "b": np.ones(1)}) == []
+
+
+def test_pairs_by_hand():
+    # Differences 1, 2, 3, 4, 5, -6: rank sums 15 and 6 of 21, r = 9 / 21. W = 6 of 6: p = 0.4375 (exact).
+    a, b = np.array([1.0, 2, 3, 4, 5, 0]), np.array([0.0, 0, 0, 0, 0, 6])
+    (found,) = stats.pairs({"a": a, "b": b})
+    assert found.r == pytest.approx(9 / 21)
+    assert found.p == found.p_holm == pytest.approx(0.4375)
+    assert stats.hodges_lehmann(np.array([1.0, 2, 6])) == 2.75  # of 1, 1.5, 2, 3.5, 4, 6
+    assert found.low <= found.shift <= found.high
+
+
+def test_holm_and_the_least_number_of_participants_by_hand():
+    assert stats.holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])
+    assert stats.least_participants(1) == 6  # 2 / 2**6 = 0.031
+    assert stats.least_participants(6) == 8  # 6 * 2 / 2**8 = 0.047
+    assert stats.mean_interval(np.array([1.0, 2, 3])) == pytest.approx((2.0, 2 - 2.4841, 2 + 2.4841), abs=1e-3)
+    assert stats.share_interval(3, 5) == pytest.approx((0.2307, 0.8824), abs=1e-3)  # Wilson
+
+
+# ---- answers
+
+
+def test_what_a_browser_sends_is_checked(study):
+    distance = study.questionnaire("distance.1")
+    right, faults = forms.answers(distance, 4, {"driven": " 6,5 ", "ahead": "3"})
+    assert (right, faults) == ({"driven": 6.5, "ahead": 3.0, "noticed": None}, {})
+    for wrong in ("nan", "inf", "-1", "1e9", "six", "9" * 400, b"6", ["6"]):
+        assert forms.answers(distance, 4, {"driven": wrong, "ahead": "3"})[1] == {"driven": "wrong"}
+    assert forms.answers(distance, 4, {})[1] == {"driven": "missing", "ahead": "missing"}
+    long = {"driven": "1", "ahead": "1", "noticed": "x" * 2001}
+    assert forms.answers(distance, 4, long)[1] == {"noticed": "wrong"}
+    tlx = study.questionnaire("tlx.1")
+    assert forms.answers(tlx, 4, dict.fromkeys([i.id for i in tlx.items], "35"))[1] == {}
+    assert forms.answers(tlx, 4, dict.fromkeys([i.id for i in tlx.items], "36"))[1]["mental"] == "wrong"
+    compare = study.questionnaire("compare")
+    assert forms.answers(compare, 4, {"appearance": "5", "usability": "0"})[1] == {"appearance": "wrong"}
+
+
+def test_text_of_a_participant_is_no_html(study):
+    found = study.questionnaire("distance.1")
+    page = forms.questions(found, 4, study.texts, {"noticed": "<script>x</script>"}, {})
+    assert "<script>" not in page and "&lt;script&gt;" in page
+
+
+# ---- the measures
+
+
+def control_state(pose, speed, stamp_ns):
+    poses = dict.fromkeys(("robot_pose", "vbot_start", "vbot_pose", "vbot_target"), pose2_message(pose))
+    twists = dict.fromkeys(("applied_command", "robot_twist"), twist_message(speed, 0.0))
+    numbers = dict.fromkeys(("transitions", "vbot_action", "reason_code"), 0)
+    numbers |= dict.fromkeys(("pose_gap_m", "yaw_gap_rad", "time_to_obstacle_s", "vbot_limit_m_s"), 0.0)
+    return ControlState(
+        header=header("map", stamp_ns), mode=ControlState.REAL, shown=ControlState.SHOWN_REAL, reason="", estop=False,
+        blocked=False, operator_command=twist_message(speed, 0.0), **poses, **twists, **numbers,
+    )  # fmt: skip
+
+
+def test_measures_of_a_drive_by_hand(tmp_path):
+    """Ten seconds of commands at 0.4 m/s; the robot stands in the fifth to the seventh second. One contact."""
+    bag = tmp_path / "bag"
+    with BagWriter(bag) as writer:
+
+        def put(topic, message, at_s):
+            kind = message.__msgtype__
+            writer.write(topic, kind, serialize(message), round(at_s * 1e9) + 10**18, LATCHED)
+
+        for n in range(240):
+            at = n / 20  # a second without a command before
+            driving = min(max(at - 1, 0), 10)
+            x = 0.4 * (driving - min(max(driving - 4, 0), 2))
+            command, stamp_ns = 0.4 if 1 <= at < 11 else 0.0, round(at * 1e9) + 10**18
+            put("/ic/state", control_state((x, 0.0, 0.0), command, stamp_ns), at)
+        for at_s, touching in ((0.1, False), (5.0, True), (5.5, False)):
+            put("/ground_truth/contact", Bool(data=touching), at_s)
+        put("/scan", scan_message(np.full(360, 2.5), -math.pi, math.pi / 180, 0.1, 30.0, "velodyne", 10**18), 10.9)
+        put("/study/event", String(data="begin"), 0.2)
+        put("/study/event", String(data="arrived"), 11.0)
+        put("/ground_truth/contact", Bool(data=True), 11.5)  # after the end
+    found = measures(bag)
+    assert found["contacts"] == 1
+    assert found["time_s"] == pytest.approx(10.0, abs=0.11)
+    assert found["driven_m"] == pytest.approx(3.2, abs=0.02)
+    assert found["longest_stall_s"] == pytest.approx(2.0, abs=0.2)
+    assert found["ahead_m"] == pytest.approx(2.5)
+    assert (found["switches"], found["virtual_s"]) == (0, 0.0)
+    assert 0.7 < found["obedience"] < 0.9
+
+
+def test_nothing_ahead_is_unknown():
+    nothing = scan_message(np.full(360, np.inf), -math.pi, math.pi / 180, 0.1, 30.0, "velodyne", 10**18)
+    assert ahead_m(nothing) is None
+
+
+def test_each_condition_has_its_arguments_and_no_other_difference(study, tmp_path):
+    found = {}
+    for number in range(1, 5):
+        drive = Drive(study, "P01", number)
+        found[drive.method] = drive.arguments(tmp_path / "bag", tmp_path)
+    own = {"arbiter", "vspace_source", "vspace_mesh", "vspace_mesh_pose"}
+    assert {name: {*arguments} & own for name, arguments in found.items()} == {
+        "ic": set(),
+        "stop": {"arbiter"},
+        "shared": {"arbiter"},
+        "mesh": {"vspace_source", "vspace_mesh", "vspace_mesh_pose"},
+    }
+    start_m = study.start_x_m("P01", study.participants["P01"].index("mesh") + 1)
+    assert found["mesh"]["vspace_mesh_pose"] == f"{-start_m},0,0,0"
+    assert all(file.is_file() for file in trial.ARBITERS.values())
+    assert Drive(study, "P01", 0).method == "stop"
+
+
+# ---- blindness
+
+
+def test_the_page_of_a_drive_is_the_same_in_all_conditions(study):
+    """It is made of the step and the study's texts alone; no name of a condition is in it or in its address."""
+    texts = study.texts
+    page = drive_page("drive1", texts["bar_drive"], texts["finish"], texts["title"])
+    assert "<title>Driving a robot</title>" in page and "Instant IC" not in page
+    words = {*page.lower().replace("-", " ").split()}
+    assert not words & {"ic", "shared", "mesh"}
+    steps = " ".join(study.steps())
+    assert not any(name in steps.replace("distance", "").replace("practice", "") for name in CONDITIONS)
+
+
+def test_messages_to_the_page_name_no_mode_of_control():
+    state = {"type": "state", "at_ms": 1, "mode": "real", "shown": "real", "robot": [0, 0, 0], "vbot": None}
+    state |= {"twist": [0, 0], "reason": "the robot goes round by itself", "blocked": True, "transitions": 3}
+    passed = json.loads(to_page(json.dumps(state)) or "")
+    assert not passed.keys() & {"reason", "blocked", "transitions"} and passed["mode"] == "real"
+    plan = {"type": "plan", "trajectory": [[0, 0]], "path": [[1, 1]], "subgoal": [1, 2, 3]}
+    assert json.loads(to_page(json.dumps(plan)) or "") == {
+        "type": "plan",
+        "trajectory": [],
+        "path": [],
+        "subgoal": None,
+    }
+    health = {"type": "health", "vspace": {"state": "ready"}, "faults": [{"text": "nerf"}], "nodes": [1], "pace": "x"}
+    assert json.loads(to_page(json.dumps(health)) or "")["vspace"] is None
+    assert to_page('{"type": "recording", "path": "x"}') is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"type": "record", "on": true}', '{"type": ["drive"]}', "[" * 9000])
+def test_only_driving_messages_go_to_the_robot(text):
+    assert not from_page(text)
+    assert from_page('{"type": "drive", "linear": 0.1}')
+
+
+# ---- the pages over a socket
+
+
+async def _post(http, url, **fields):
+    async with http.post(url, data=fields, headers={"Origin": url.rstrip("/")}) as answer:
+        return answer.status, await answer.text()
+
+
+def test_consent_can_be_refused_and_nothing_is_kept(study):
+    record = Record(study, "P01")
+    with served(record) as server:
+
+        async def go():
+            async with aiohttp.ClientSession() as http:
+                assert "Welcome" in (await _post(http, server.url, step="consent", action="maybe"))[1]
+                return await _post(http, server.url, step="consent", action="refuse")
+
+        assert "nothing was stored" in asyncio.run(go())[1]
+        assert server.over.wait(10)
+    assert not record.folder.exists()
+
+
+def test_old_pages_wrong_origins_and_wrong_answers_change_nothing(study):
+    record = Record(study, "P01")
+    record.finish("consent", {"agreed": True})
+    with served(record) as server:
+
+        async def go():
+            async with aiohttp.ClientSession() as http:
+                elsewhere = {"Origin": "http://evil.example"}
+                async with http.post(server.url, data={"step": "background"}, headers=elsewhere) as answer:
+                    assert answer.status == 403
+                async with http.get(server.url, headers={"Host": "evil.example"}) as answer:
+                    assert answer.status == 403
+                await _post(http, server.url, step="compare", appearance="1", usability="1")
+                await _post(http, server.url, step="drive1", action="start")
+                status, text = await _post(http, server.url, step="background", age="<b>", robots="never")
+                assert status == 422 and "This answer is not possible." in text
+                assert [*record.steps] == ["consent"]
+                await _post(http, server.url, step="background", robots="never")
+                async with http.get(f"{server.url}ws") as answer:
+                    assert answer.status == 503  # no drive
+
+        asyncio.run(go())
+    kept = json.loads(record.path.read_text())
+    assert kept["steps"]["background"]["answers"] == {"age": None, "robots": "never", "games": None}
+    assert stat.S_IMODE(record.path.stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize(("action", "left"), [("keep", True), ("delete", False)])
+def test_a_participant_can_leave_in_the_middle_of_a_drive(study, action, left):
+    record = Record(study, "P02")
+    for step in study.steps()[: study.steps().index("drive1")]:
+        record.finish(step, filled(study, step))
+    with served(record) as server:
+
+        async def go():
+            async with aiohttp.ClientSession() as http:
+                await _post(http, server.url, step="drive1", action="start")
+                return await _post(http, server.url, step="withdraw", action=action)
+
+        assert "Thank you" in asyncio.run(go())[1]
+    assert record.folder.exists() is left
+    assert Record(study, "P02").state == (WITHDRAWN if left else OPEN)
+
+
+def test_a_participant_continues_where_the_computer_went_off(study):
+    record = Record(study, "P03")
+    for step in study.steps()[:6]:
+        record.finish(step, filled(study, step))
+    assert Record(study, "P03").step == study.steps()[6]
+    record.path.write_text("{")
+    with pytest.raises(StudyError, match="is damaged"):
+        Record(study, "P03")
+    assert main(["study", "delete", str(study.folder), "P03"]) == 0
+    assert not record.folder.exists()
+
+
+def test_the_operators_page_goes_through_the_server(study):
+    """Commands arrive at the console, and its messages come back without what names a condition."""
+    record = Record(study, "P01")
+    for step in study.steps()[: study.steps().index("drive1")]:
+        record.finish(step, filled(study, step))
+
+    async def go():
+        async with fake_console() as (address, heard):
+            FakeTrial.console = address
+            with served(record) as server:
+                async with aiohttp.ClientSession() as http:
+                    await _post(http, server.url, step="drive1", action="start")
+                    async with http.ws_connect(f"{server.url}ws", origin=server.url.rstrip("/")) as page:
+                        await page.send_str('{"type": "record", "on": true}')
+                        await page.send_str('{"type": "drive", "linear": 0.1}')
+                        state = await page.receive_json(timeout=20)
+                        image = await page.receive_bytes(timeout=20)
+                    async with http.post(f"{server.url}estop", headers={"Origin": server.url.rstrip("/")}) as answer:
+                        assert answer.status == 204
+                    await _post(http, server.url, step="drive1", action="finish")
+            return state, image, heard
+
+    state, image, heard = asyncio.run(go())
+    assert "reason" not in state and image == b"image"
+    assert heard == ['{"type": "drive", "linear": 0.1}', "estop"]
+    assert record.steps["drive1"]["end"] == "participant"
+
+
+# ---- the report
+
+
+def test_rows_join_answers_with_the_condition(study):
+    finished_study(study, ["P01"])
+    record = Record(study, "P01")
+    found = rows(study, [record])
+    assert [row["condition"] for row in found] == list(study.participants["P01"])
+    assert found[0]["sus"] == 50.0  # all in the middle
+    assert found[0]["distance.driven.error"] == pytest.approx(abs(5 - 7) / 7)
+    codes, values = values_of(found, "sus", CONDITIONS)
+    assert (codes, values.tolist()) == (["P01"], [[50.0] * 4])
+
+
+def test_the_report_of_few_says_so_and_of_none_is_written(study, tmp_path):
+    assert main(["study", "report", str(study.folder), "-o", str(tmp_path / "none")]) == 0
+    finished_study(study, ["P01", "P02", "P03"])
+    out = tmp_path / "report"
+    assert main(["study", "report", str(study.folder), "-o", str(out)]) == 0
+    page = (out / "report.html").read_text()
+    assert "Too few participants: with 3" in page and "At least 8 are needed" in page
+    assert "are programs that answer at random" in page
+    data = json.loads((out / "report.json").read_text())
+    assert data["participants"]["finished"] == 3 and len(data["drives"]) == 12
+    assert page.count("<svg") >= 5
+
+
+def test_participants_are_known_by_code_only(study):
+    with pytest.raises(StudyError, match="has no participant 'Alice'"):
+        Record(study, "Alice")
+    assert main(["study", "delete", str(study.folder), "../x"]) == 2
+
+
+def test_a_finished_participant_is_not_run_again(study, capsys):
+    finished_study(study, ["P01"], simulated=False)
+    assert Record(study, "P01").state == DONE
+    assert main(["study", "run", str(study.folder), "P01"]) == 2
+    assert "P01 is done: take another code" in capsys.readouterr().err
+
+
+def test_a_taken_port_is_named(study):
+    with served(Record(study, "P01")) as server:
+        second = StudyServer(Record(study, "P02"), server.port)
+        with pytest.raises(StudyError, match=f"cannot listen on 127.0.0.1:{server.port}"):
+            second.start()
