@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.control.states import Mode
 from instant_ic.depth.chain import DepthChain
 from instant_ic.depth.inference import Inference
 from instant_ic.depth.inputs import HeldImage, Revolution
@@ -20,6 +21,7 @@ from instant_ic.keyframe_messages import keyframe_message
 from instant_ic.mapping.local_model import warm_up
 from instant_ic.msg import (
     CompressedImage,
+    ControlState,
     DepthModelInfo,
     Header,
     Image,
@@ -36,11 +38,14 @@ from instant_ic.msg import (
 )
 
 _LOCAL_MAP_S = 2.0
+_STATE_S = 1.0  # an older /ic/state does not count
+_VIRTUAL = (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
 
 
 class DepthScalerNode(Node[DepthScalerConfig]):
     """``/camera/image/compressed``, ``/tf`` → ``/depth/request``; with ``/depth/raw`` and ``/lidar/points`` →
-    ``/depth/scaled``, ``/keyframe``, and the local 3D model as ``/map/local`` where someone subscribes.
+    ``/depth/scaled``, ``/keyframe``, and the local 3D model as ``/map/local`` where someone subscribes. ``/ic/state``
+    says whether the operator sees the virtual space.
     """
 
     name = "depth_scaler"
@@ -65,6 +70,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.chain = DepthChain(config, self.tf, self.diagnose, completion)
         self.local_map = self.publisher("/map/local", PointCloud2, qos=SENSOR)
         self.timer(_LOCAL_MAP_S, self.on_local_map)
+        self.state = self.latest("/ic/state", ControlState, _STATE_S, qos=LATCHED)
         self.subscribe("/depth/model", DepthModelInfo, lambda m: self.chain.adopt(m.name, m.output_kind), qos=LATCHED)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_image, qos=SENSOR)
         self.subscribe("/lidar/points", PointCloud2, self.on_cloud, qos=SENSOR)
@@ -84,6 +90,8 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         image = HeldImage(message.header.frame_id, stamp_ns(message))
         if (back_s := self.chain.add_image(image, message)) > 0:
             self.log.warning("time went back by %.1f s: restarting", back_s)
+        state = self.state.message
+        self.chain.selector.virtual = state is not None and state.mode in _VIRTUAL
         if not self.chain.due(image):
             return
         if self.config.of_lidar:

@@ -425,16 +425,17 @@ class SimulatedStack:
         """Whether depth would make a keyframe of an image taken now, because there is none near this position."""
         if self.time_s < self._next_depth_s - 1e-9:
             return False
-        self._next_depth_s = self.time_s + 1.0 / self._depth_hz
         now_ns = START_NS + round(self.time_s * 1e9)
         wait_ns = (self.config.depth_latency_s + _OVERDUE_S) * 1e9
         while self._drawn and now_ns - next(iter(self._drawn)) > wait_ns:  # not used
             del self._drawn[next(iter(self._drawn))]
-        rule = self.nodes["depth_scaler"].config.keyframes
+        selector = self.nodes["depth_scaler"].chain.selector
+        distance_m, angle_rad = selector.distance_m + 0.01, math.radians(selector.config.angle_deg + 0.5)
         places = [*self._drawn.values(), *([] if self._keyframe_at is None else [self._keyframe_at])]
-        return all(
-            _moved(self.robot, place, rule.distance_m + 0.01, math.radians(rule.angle_deg + 0.5)) for place in places
-        )
+        worth = all(_moved(self.robot, place, distance_m, angle_rad) for place in places)
+        if worth:
+            self._next_depth_s = self.time_s + 1.0 / self._depth_hz
+        return worth
 
     def _draw(self) -> bytes:
         import cv2

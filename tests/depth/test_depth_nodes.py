@@ -18,6 +18,7 @@ from instant_ic.geometry.poses import inverse, pose_matrix, transform_points
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.msg import (
+    ControlState,
     DepthModelInfo,
     PointCloud2,
     TFMessage,
@@ -28,8 +29,10 @@ from instant_ic.msg import (
     image_array,
     image_message,
     matrix_from_pose,
+    pose_message,
     stamp_ns,
     transform_message,
+    twist_message,
 )
 from instant_ic.training.completion import CompletionConfig, CompletionNet
 from instant_ic.training.export import export_model
@@ -339,6 +342,43 @@ def test_a_standing_robot_needs_one_depth_and_a_moving_one_at_once(model_file: P
         assert estimator.diagnoses()["depth"][0] == 0
 
 
+def control_state(mode: int, stamp: int) -> ControlState:
+    """A state of which only the mode counts."""
+    pose, still = pose_message(np.eye(4)), twist_message()
+    fields = dict.fromkeys(("robot_pose", "vbot_start", "vbot_pose", "vbot_target"), pose)
+    fields |= dict.fromkeys(("operator_command", "applied_command", "robot_twist"), still)
+    fields |= dict.fromkeys(("pose_gap_m", "yaw_gap_rad", "time_to_obstacle_s", "vbot_limit_m_s"), 0.0)
+    fields |= dict.fromkeys(("estop", "blocked"), False)
+    fields |= dict.fromkeys(("transitions", "shown", "vbot_action", "reason_code"), 0)
+    return ControlState(header=header("map", stamp), mode=mode, reason="", **fields)
+
+
+def test_only_a_recent_state_in_which_the_virtual_space_is_shown_brings_keyframes_closer() -> None:
+    depth = room_depth(BASE_FROM_CAMERA)
+    with LockstepBus(START) as bus:
+        bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated")))
+        publish_mounts(bus)
+
+        def taken(x: float, second: int, mode: int | None = None) -> bool:
+            begin = START + second * S
+            if mode is not None:
+                bus.publish("/ic/state", control_state(mode, begin), stamp_ns=begin)
+            keyframes = len(bus.messages("/keyframe"))
+            (stamp,) = images(bus, [x], begin)
+            bus.publish("/depth/raw", image_message(depth, "32FC1", "camera", stamp), stamp_ns=stamp + 1)
+            return len(bus.messages("/keyframe")) > keyframes
+
+        assert taken(0.0, 1)
+        assert not taken(0.4, 2)
+        assert not taken(0.4, 3, ControlState.REAL)
+        assert not taken(0.4, 4, ControlState.STOPPED)
+        assert not taken(0.4, 5, 250)  # no mode
+        assert taken(0.4, 6, ControlState.VIRTUAL)
+        assert taken(0.8, 7, ControlState.ENTERING)
+        assert taken(1.2, 8, ControlState.RETURNING)
+        assert not taken(1.6, 11)  # the state is 3 s old
+
+
 def test_what_moves_around_a_standing_robot_is_seen_after_a_while(model_file: Path) -> None:
     config = DepthScalerConfig(keyframes=KeyframeSelectionConfig(refresh_s=2.0), scaler=ScalerConfig("as_estimated"))
     with LockstepBus(START) as bus:
@@ -601,6 +641,18 @@ def test_selector_by_hand() -> None:
     selector.restart()
     assert selector.take(away, True, 15 * S)
     assert selector.count == 6
+
+
+def test_keyframes_are_closer_together_while_the_operator_sees_the_virtual_space() -> None:
+    near, far = pose_matrix(0.29), pose_matrix(0.31)
+    for virtual_m, (in_real, in_virtual) in {0.3: (False, True), 0.6: (False, False), 2.0: (False, False)}.items():
+        selector = KeyframeSelector(KeyframeSelectionConfig(distance_m=0.6, virtual_distance_m=virtual_m))
+        assert selector.take(np.eye(4), True, 0)
+        assert selector.due(far, S) is in_real
+        selector.virtual = True
+        assert not selector.due(near, S)
+        assert selector.due(far, S) is in_virtual
+        assert selector.due(pose_matrix(0.61), S)  # never farther apart than in the real space
 
 
 def test_shipped_configuration_is_the_default() -> None:
