@@ -135,7 +135,8 @@ def run_all(
             left_s()
             take(function(*task))
         return results
-    waiting, idle = list(reversed(range(len(tasks)))), []
+    waiting = list(reversed(range(len(tasks))))
+    idle: list[Connection] = []
     busy: dict[Connection, tuple[int, float]] = {}  # task and the time at which it must be done
     with ProcessPool(prepare) as pool:
         while waiting or busy:
@@ -147,9 +148,10 @@ def run_all(
             next_s = min(due for _, due in busy.values()) - time.monotonic()
             ready = wait(list(busy), max(0.0, min(left_s(), next_s)))
             for pipe, (number, due) in list(busy.items()):
+                answer: tuple[Any, Exception | None]
                 try:
                     if pipe in ready:
-                        result, error = pipe.recv()
+                        answer = pipe.recv()
                         idle.append(pipe)
                     elif time.monotonic() > due:
                         raise LostError(f"it took longer than {call_timeout_s:.0f} s and was ended")
@@ -160,8 +162,9 @@ def run_all(
                     found = LostError("its process died (out of memory?)") if not isinstance(lost, LostError) else lost
                     if on_lost is None:
                         raise LostError(f"task {number}: {found}; try --jobs 1") from None
-                    result, error = on_lost(number, found), None
+                    answer = on_lost(number, found), None
                 del busy[pipe]
+                result, error = answer
                 if error is not None:
                     raise error
                 take(result)
@@ -175,6 +178,7 @@ def _serve(pipe: Connection, prepare: Callable[[], None]) -> None:
     prepare()
     while True:
         function, arguments = pipe.recv()
+        answer: tuple[Any, Exception | None]
         try:
             answer = function(*arguments), None
         except Exception as error:  # noqa: BLE001 - the parent raises it again
