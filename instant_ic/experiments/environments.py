@@ -86,10 +86,10 @@ def section(results: Sequence[Result], options: Options) -> Section:
                 NAMES.get(name, name),
                 shown,
                 [near_mean([one], options.method, "ssim") for one in own],
-                *([losts[key] for losts in lost] for key in LOSSES),
-                [near_mean([one], "panorama") for one in own],
                 f"{len(failed)} of {len(own)}",
                 ", ".join(f"{why} ({count})" for why, count in reasons.most_common()),
+                *([losts[key] for losts in lost] for key in LOSSES),
+                [near_mean([one], "panorama") for one in own],
             ]
         )
         for one, psnr, losts in zip(own, shown, lost, strict=True):
@@ -115,7 +115,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
         ),
         Table(
             "Kinds of places, the worst first",
-            ("place", "PSNR, dB", "SSIM", *lost_columns, "panorama, dB", "fails", "main reason (seeds)"),
+            ("place", "PSNR, dB", "SSIM", "fails", "main reason (seeds)", *lost_columns, "panorama, dB"),
             kinds,
             command,
         ),

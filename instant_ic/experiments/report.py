@@ -200,8 +200,9 @@ figure { margin: 0; }
 img { width: 100%; } .strip { min-width: 44rem; }
 code { display: block; overflow-x: auto; background: var(--soft); padding: .3rem .5rem; font-size: .78rem;
   margin: .3rem 0 1.2rem; white-space: pre; }
-.yes { color: var(--good); } .no { color: var(--bad); } nav a { margin-right: 1rem; }
-dl { display: grid; grid-template-columns: auto 1fr; gap: 0 1rem; font-size: .85rem; } dd { margin: 0; }
+.yes { color: var(--good); } .no { color: var(--bad); } nav { display: flex; flex-wrap: wrap; gap: 0 1rem; }
+dl { display: grid; grid-template-columns: auto 1fr; gap: 0 1rem; font-size: .85rem; }
+dd { margin: 0; overflow-wrap: anywhere; }
 a { color: inherit; }
 """
 
