@@ -19,6 +19,7 @@ from instant_ic.experiments.teleop_stack import Log
 from instant_ic.geometry.poses import pose_matrix
 
 STATE, MAP, CAMERA, KEYFRAME = "/ic/state", "/map", "/camera/image/compressed", "/keyframe"
+TYPES = {STATE: "ControlState", MAP: "OccupancyGrid", CAMERA: "CompressedImage", KEYFRAME: "Keyframe"}
 SIZE = (320, 180)
 AROUND_S, MOST_S = 2.0, 60.0
 """The film begins and ends this long before and after the virtual space, and is no longer."""
@@ -62,18 +63,23 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
 
     try:
         with BagReader(bag) as reader:
-            names = {one.topic for one in reader.topics}
+            types = {one.topic: one.type_name.rpartition("/")[2] for one in reader.topics}
+            names = types.keys()
             missing = [topic for topic in (STATE, CAMERA, KEYFRAME) if topic not in names]
             if missing:
                 has = ", ".join(sorted(names)) or "no topics"
                 raise ValueError(
                     f"{bag}: {', '.join(missing)} missing; it has {has}. Record a drive with the whole stack"
                 )
+            wrong = [f"{topic} has the type {types[topic]}, not {kind}" for topic, kind in TYPES.items()
+                     if types.get(topic, kind) != kind]  # fmt: skip
+            if wrong:
+                raise ValueError(f"{bag}: {'; '.join(wrong)}")
             begin_ns = 0
             states: list[tuple[float, Any]] = []
             keyframes: list[tuple[float, Any]] = []
             grid = None
-            for one in reader.messages([STATE, KEYFRAME, *({MAP} & names)]):
+            for one in reader.messages([STATE, KEYFRAME, *([MAP] if MAP in names else [])]):
                 message = deserialize(one.payload, one.type_name)
                 if one.topic == MAP:
                     grid = message

@@ -403,6 +403,11 @@ def test_a_recorded_drive_is_shown(tmp_path) -> None:
         with BagWriter(tmp_path / "other") as writer:
             writer.write("/keyframe", kinds["key"], bytes(serialize(key)), start, LATCHED)
         teleoperation.measure({"bag": str(tmp_path / "other")})
+    with pytest.raises(ValueError, match="/ic/state has the type Keyframe, not ControlState"):
+        with BagWriter(tmp_path / "wrong") as writer:
+            for topic in ("/ic/state", "/camera/image/compressed", "/keyframe"):
+                writer.write(topic, kinds["key"], bytes(serialize(key)), start, LATCHED)
+        teleoperation.measure({"bag": str(tmp_path / "wrong")})
 
 
 @pytest.mark.parametrize(
