@@ -140,6 +140,19 @@ def test_a_good_scan_shows_the_room_and_a_bad_one_less(tmp_path) -> None:
     assert seen["fine"] > 22 and seen["fine"] > seen["phone"] + 3
 
 
+def test_a_scan_in_the_frame_of_a_start_shows_the_same(tmp_path) -> None:
+    coarse = dataclasses.replace(FINE, cell_m=0.2, width=256)
+    origin, pose = (0.5, 0.3, 1.0), pose_matrix(-0.5, 0.2, 1.2)
+    views = []
+    for name, start in (("map", (0.0, 0.0, 0.0)), ("start", origin)):
+        scan_world(box_world(1.5), (0.0, 0.0, 0.0), coarse, 0, tmp_path / f"{name}.glb", start)
+        mesh = str(tmp_path / f"{name}.glb")
+        space = MeshSpace(VirtualSpaceConfig(source="mesh", mesh=mesh, mesh_fit_colours=False))
+        map_from_start = pose_matrix(start[0], start[1], yaw=start[2])
+        views.append(space.render(np.linalg.inv(map_from_start) @ pose, 64, 36, math.pi / 2).rgb)
+    assert psnr_db(*views) > 35
+
+
 def test_cases_of_worlds_and_seeds() -> None:
     assert Options(2, ("corridor", "random:7", "house.glb")).cases() == [
         ("corridor:0", 0), ("corridor:1", 0), ("random:7", 0), ("house.glb", 0), ("house.glb", 1),
