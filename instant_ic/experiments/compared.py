@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from instant_ic.experiments import recorded
-from instant_ic.experiments.lab import Options, Result, Unit, kind_of
+from instant_ic.experiments.lab import WORLD, Options, Result, Unit, kind_of
 from instant_ic.experiments.pictures import Series, curves_svg, image_strip, jpeg
 from instant_ic.experiments.report import Figure, Part, Table, image_address
 from instant_ic.experiments.vspace import compare
@@ -19,8 +19,13 @@ from instant_ic.experiments.vspace_sources import PATHS, VspaceSettings
 
 TABLE_M = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Distances of the tables."""
+UNSHOWN = ("fill", "slam-pose", "still")
+"""Sources left out of the strips: they look like others."""
 LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
 _TILE_PX = 240
+_COST_S = {"survey": 16.0, "tripod": 12.0, "mobile": 5.0, "phone": 3.0}
+_TRAINED = ("field", "no-depth", "paper", "paper-no-scale")
+_BASE_COST_S = 7.0
 
 
 def view_units(
@@ -30,9 +35,11 @@ def view_units(
     worlds: Sequence[str],
     paths: Sequence[str] = PATHS,
     keep_images: bool = True,
+    **settings: Any,
 ) -> list[Unit]:
-    """A unit for each world and seed."""
+    """A unit for each world and seed; ``settings`` are further ones of ``VspaceSettings``."""
     common: dict[str, Any] = {
+        "method": options.method,
         "sources": list(sources),
         "paths": list(paths),
         "size": list(options.view_size),
@@ -40,13 +47,20 @@ def view_units(
         "seconds": 0.5 if options.quick else 8.0,
         "step_m": 0.5 if options.quick else 0.25,
         "reach_m": 2.0 if options.quick else 4.0,
+        **settings,
     }
+    cost_s = _BASE_COST_S + sum(
+        _COST_S.get(name, 1.0) + (common["seconds"] if name in _TRAINED else 0.0) for name in sources
+    )
+    if options.quick:
+        cost_s *= 0.4
     if options.bag is not None:
         common |= {"bag": str(options.bag), "paths": ["straight"], "seed": 0}
         common["sources"] = [name for name in sources if name in recorded.SOURCES]
         count = recorded.count_keyframes(options.bag) - 1
         chosen = sorted({round(at) for at in np.linspace(0, count - 1, min(options.seeds, count))})
-        return [Unit(experiment, {**common, "number": k, "images": keep_images and k == chosen[0]}) for k in chosen]
+        shown_first = {k: keep_images and k == chosen[0] for k in chosen}
+        return [Unit(experiment, {**common, "number": k, "images": shown_first[k]}, cost_s) for k in chosen]
     cases = options.cases(worlds)
     shown = {kind_of(world): (world, seed) for world, seed in reversed(cases)}  # the first of each kind
     return [
@@ -59,6 +73,7 @@ def view_units(
                 **common,
                 "images": keep_images and shown[kind_of(world)] == (world, seed),
             },
+            cost_s,
         )
         for world, seed in cases
     ]
@@ -78,12 +93,14 @@ def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
         comparison = compare(arguments["world"], settings)
     images = {}
     for path, strip in comparison.strips.items() if arguments["images"] else ():
-        columns = ["truth", *settings.sources]
+        first = next(iter(strip.values()))
+        columns = [name for name in ("truth", *settings.sources) if name in first and name not in UNSHOWN]
         rows = [(f"{at:g} m", [strip[at][name] for name in columns]) for at in sorted(strip)]
         images[path] = image_address(jpeg(image_strip(columns, rows, _TILE_PX)))
     return {
         "start": list(comparison.start),
         "depth": comparison.depth,
+        "slam_error_m": comparison.slam_error_m,
         "rows": [asdict(row) for row in comparison.rows],
         "images": images,
     }
@@ -128,8 +145,25 @@ def curves_and_tables(results: Sequence[Result], command: str) -> list[Part]:
             if family(one) == name:
                 for path, address in one.data.get("images", {}).items():
                     title = f"{one.unit.arguments.get('world', name)}, {path}"
-                    parts.append(Figure(f"Views, {title}", address, command))
+                    parts.append(Figure(f"Views, {title}", address, command, wide=True))
     return parts
+
+
+def of_the_paper(results: Sequence[Result]) -> list[Result]:
+    """Results in corridors, the paper's kind of place; all results where there are none."""
+    done = [one for one in results if one.data]
+    return [one for one in done if family(one) == WORLD] or done
+
+
+def near_mean(results: Sequence[Result], source: str, key: str = "psnr_db") -> float | None:
+    """Mean of a source over all paths from 0.5 to 2 m; None without any."""
+    found = [
+        row[key]
+        for one in results
+        for row in one.data.get("rows", ())
+        if row["source"] == source and 0.5 <= row["distance_m"] <= 2.0
+    ]
+    return float(np.mean(found)) if found else None
 
 
 def command_of(options: Options, experiment: str) -> str:
@@ -140,6 +174,8 @@ def command_of(options: Options, experiment: str) -> str:
     where = "".join(f" --world {shlex.quote(world)}" for world in options.worlds)
     if options.bag is not None:
         where = f" --bag {shlex.quote(str(options.bag))}"
+    if experiment == "environments":
+        where += "".join(f" --meshes {shlex.quote(mesh)}" for mesh in options.meshes)
     return f"ic experiment {experiment}{where}{quick}{method}{size} -o REPORT"
 
 

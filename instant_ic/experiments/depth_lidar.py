@@ -104,16 +104,23 @@ def measure_world(
     lidar_height_m: float,
     camera_height_m: float,
     errors: Errors | None = None,
+    through_glass: bool = False,
 ) -> NDArray[np.float32]:
-    """Simulate a revolution by ray casting, also behind visible surfaces; (N, 3) in the camera's frame, metres."""
+    """Simulate a revolution by ray casting, also behind visible surfaces; (N, 3) in the camera's frame, metres.
+
+    With ``through_glass``, windows (what shines and is upright) give no points.
+    """
     omega, azimuth = np.meshgrid(np.radians(np.linspace(-15, 15, 16)), np.arange(AZIMUTHS) * (2 * math.pi / AZIMUTHS))
     rays = _on_rays(omega.ravel(), azimuth.ravel(), np.ones(omega.size))
     mount = np.array([0.0, 0.0, lidar_height_m - camera_height_m])
     origin = map_from_camera[:3, :3] @ mount + map_from_camera[:3, 3]
     directions = np.ascontiguousarray(rays @ map_from_camera[:3, :3].T, np.float32)
     origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape), np.float32)
-    range_m, _ = renderer.cast(origins, directions)
+    range_m, face = renderer.cast(origins, directions)
     hit = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
+    if through_glass:
+        surface = renderer.world.face_surface[np.maximum(face, 0)]
+        hit &= (renderer.world.emission[surface] == 0) | (np.abs(renderer.world.normal[surface, 2]) > 0.5)
     return _measured(rays[hit] * range_m[hit, None].astype(np.float64), errors or Errors(), mount)
 
 

@@ -6,6 +6,7 @@ takes and returns what JSON has. ``report`` writes the sections as one page.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib
 import importlib.metadata
@@ -15,12 +16,14 @@ import platform
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from instant_ic.experiments.processes import run_all
+from instant_ic.experiments.places import KINDS
+from instant_ic.experiments.processes import LostError, run_all
 from instant_ic.experiments.results import finite, save_json
+from instant_ic.paths import share_dir
 
 EXPERIMENTS = {
     "reconstruction": "reconstruction",
@@ -33,7 +36,8 @@ EXPERIMENTS = {
 """Name of each experiment → its module in this package."""
 WORLD = "corridor"
 """Default world."""
-GENERATED = ("corridor", "corridor-free", "random", "long")
+UNIT_TIMEOUT_S = 1800.0
+GENERATED = ("corridor", "corridor-free", "random", "long", *KINDS)
 """Worlds that have seeds."""
 
 
@@ -46,7 +50,8 @@ class Options:
         worlds: names of ``sim.worlds.make_world``. A world of the simulator without a seed gets each seed; a mesh file
             gets its own start, then random free ones. Empty: the experiment's own.
         method: ``ours`` or ``paper``: the virtual space that is compared.
-        bag: recording to use instead of worlds, for experiments that compare views; None: none.
+        bag: recording to use instead of worlds; None: none.
+        meshes: mesh files that are environments beside the simulator's own.
         quick: small images, two seeds and short training, to see whether everything works.
         size: width and height of the views; None: 320 × 180, quick 96 × 54.
     """
@@ -57,6 +62,7 @@ class Options:
     bag: Path | None = None
     quick: bool = False
     size: tuple[int, int] | None = None
+    meshes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -90,10 +96,17 @@ def kind_of(world: str) -> str:
 
 @dataclass(frozen=True)
 class Unit:
-    """One unit of work: an experiment and all that its result depends on, as JSON has it."""
+    """One unit of work.
+
+    Attributes:
+        experiment: its name.
+        arguments: all that the result depends on beside the program, as JSON has it.
+        cost_s: expected CPU seconds, for the progress.
+    """
 
     experiment: str
     arguments: dict[str, Any]
+    cost_s: float = field(default=30.0, compare=False)
 
     @property
     def place(self) -> str:
@@ -102,9 +115,30 @@ class Unit:
 
     @property
     def key(self) -> str:
-        """File name of the result: the same unit of the same version has the same."""
-        text = json.dumps([self.experiment, self.arguments, importlib.metadata.version("instant-ic")], sort_keys=True)
+        """File name of the result: the same unit of the same program, versions and input files has the same."""
+        text = json.dumps([self.experiment, self.arguments, program_hash(), _state_of(self.place)], sort_keys=True)
         return f"{self.experiment}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+@functools.cache
+def program_hash() -> str:
+    """Hash of what a result depends on: sources of package and nodes, parameters, models, versions of libraries."""
+    package = Path(__file__).resolve().parents[1]
+    sources = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in ("cli", "training")]
+    shared = [path for name in ("nodes", "config", "models") for path in share_dir(name).iterdir() if path.is_file()]
+    found = hashlib.sha256(json.dumps(machine(), sort_keys=True).encode())
+    for path in (*sorted(sources), *sorted(shared)):
+        found.update(path.name.encode() + hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()
+
+
+def _state_of(place: str) -> list[Any]:
+    """Names, sizes and times of an input's files; empty for a world of the simulator."""
+    path = Path(place)
+    if not place or not path.exists():
+        return []
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    return [[file.name, (state := file.stat()).st_size, state.st_mtime_ns] for file in files]
 
 
 @dataclass(frozen=True)
@@ -130,30 +164,43 @@ def module(experiment: str) -> Any:
     return importlib.import_module(f"instant_ic.experiments.{EXPERIMENTS[experiment]}")
 
 
+def kept(units: Sequence[Unit], folder: Path) -> list[Result]:
+    """Results of an earlier run."""
+    return [result for unit in units if (result := _load(unit, folder)) is not None]
+
+
 def run(
     units: Sequence[Unit],
     folder: Path,
     jobs: int = 1,
     on_result: Callable[[Result], None] = lambda result: None,
     timeout_s: float = 86400.0,
+    unit_timeout_s: float = UNIT_TIMEOUT_S,
 ) -> list[Result]:
     """Measure all units that have no result in the folder yet; results in the order of the units.
 
-    A unit that fails has a result with its error, which is not kept: the next run tries again.
-
-    Raises:
-        TimeoutError: the units took longer than ``timeout_s``; finished ones are kept.
-        RuntimeError: a process died.
+    The first seeds of all experiments come first. A unit that fails has a result with its error, which is not kept: the
+    next run tries again. So has one whose process died, that took longer than ``unit_timeout_s`` and was ended, or that
+    was not measured within ``timeout_s``.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    found = {unit.key: _load(unit, folder) for unit in units}
-    for result in found.values():
-        if result is not None:
-            on_result(result)
-    tasks = [(unit, folder) for unit in units if found[unit.key] is None]
-    for result in run_all(_measure, tasks, jobs, _prepare, on_result, timeout_s):
+    found = {result.unit.key: result for result in kept(units, folder)}
+    waiting = [unit for unit in units if unit.key not in found]
+    waiting.sort(key=lambda unit: int(unit.arguments.get("seed", 0)))
+
+    def take(result: Result) -> None:
         found[result.unit.key] = result
-    return [result for unit in units if (result := found[unit.key]) is not None]
+        on_result(result)
+
+    def lost(number: int, error: LostError) -> Result:
+        return Result(waiting[number], {}, unit_timeout_s, 0.0, str(error))
+
+    try:
+        run_all(_measure, [(one, folder) for one in waiting], jobs, _prepare, take, timeout_s, unit_timeout_s, lost)
+    except TimeoutError:
+        missing = f"not measured: the time limit of {timeout_s:.0f} s was over"
+        found = {unit.key: Result(unit, {}, 0.0, 0.0, missing) for unit in units} | found
+    return [found[unit.key] for unit in units]
 
 
 def machine() -> dict[str, str]:

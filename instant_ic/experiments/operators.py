@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -21,18 +21,24 @@ from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS
 
 METHODS = ("ic", "mesh", "stop", "shared")
 """``mesh``: illusory control with the mesh of a ``tripod`` scan without the obstacles."""
+COST_S = {"ic": 22.0, "mesh": 20.0, "stop": 9.0, "shared": 9.0}
+"""CPU seconds of a drive."""
 
 
 def units(options: Options) -> list[Unit]:
-    """Each manner by illusory control and by stopping; the plain operator by all methods."""
-    pairs = [("plain", method) for method in METHODS]
-    pairs += [(manner, method) for manner in MANNERS if manner != "plain" for method in ("ic", "stop")]
-    worlds = options.worlds or (RANDOM_CORRIDORS,)
+    """Each manner by each method; quick: the plain operator only.
+
+    Raises:
+        ValueError: a recording was given.
+    """
+    if options.bag is not None:
+        raise ValueError("operators: --bag: a recorded robot does not react to another operator. Leave out --bag")
     return [
-        Unit("operators", {"world": world, "seed": seed, "manner": manner, "method": method})
-        for world in worlds
+        Unit("operators", {"world": world, "seed": seed, "manner": manner, "method": method}, COST_S[method])
+        for world in options.worlds or (RANDOM_CORRIDORS,)
         for seed in range(1 if options.quick else options.seeds)
-        for manner, method in (pairs[:1] if options.quick else pairs)
+        for manner in (("plain",) if options.quick else MANNERS)
+        for method in METHODS
     ]
 
 
@@ -45,12 +51,9 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
         if method == "mesh":
             course, file = settings.course(0), Path(folder) / "scan.glb"
             free = reduce(without, course.obstacles, course.world)
-            scan_world(free, course.world.spawn, QUALITIES["tripod"], seed, file)
-            x, y, yaw = course.world.spawn
-            if (x, y, yaw) != (0.0, 0.0, 0.0):
-                raise ValueError(f"world {arguments['world']!r}: mesh needs a start at the origin")
-            words = ("nerf.space.source:=mesh", f"nerf.space.mesh:={file}")
-            settings = TeleopSettings(1, seed, arguments["world"], (shown,), overrides=words, manner=settings.manner)
+            start = course.world.spawn  # where the map begins
+            scan_world(free, start, QUALITIES["tripod"], seed, file, start)
+            settings = replace(settings, overrides=("nerf.space.source:=mesh", f"nerf.space.mesh:={file}"))
         (drive,) = run_episode(settings, 0)
     return {"drive": {key: value for key, value in asdict(drive).items() if key != "tracks"}}
 
@@ -67,7 +70,10 @@ def section(results: Sequence[Result], options: Options) -> Section:
                 if (one.unit.arguments["manner"], one.unit.arguments["method"]) == (manner, method)
             ]
             if own:
-                psnr = [s["psnr_db"] for drive in own for s in drive["switches"] if s["psnr_db"] is not None]
+                into, back = (
+                    [s["psnr_db"] for drive in own for s in drive["switches"] if s["to_virtual"] is way]
+                    for way in (True, False)
+                )
                 lines.append(
                     [
                         f"{manner}, {method}",
@@ -76,13 +82,22 @@ def section(results: Sequence[Result], options: Options) -> Section:
                         [drive["obedience"] for drive in own],
                         [drive["seconds"] for drive in own if drive["completed"]],
                         [drive["driven_m"] / drive["way_m"] for drive in own if drive["completed"] and drive["way_m"]],
-                        psnr,
+                        into,
+                        back,
                     ]
                 )
-    columns = ("manner, method", "completed", "contacts", "obedience", "time, s", "path ratio", "PSNR at switches, dB")
-    manners = ", ".join(f"{name}: {manner}" for name, manner in MANNERS.items())
+    columns = (
+        "manner, method", "completed", "contacts", "obedience", "time, s", "path ratio",
+        "PSNR into, dB", "PSNR back, dB",
+    )  # fmt: skip
+    manners = [[name, *vars(manner).values()] for name, manner in MANNERS.items()]
     parts: list[Part] = [
-        Text(f"Simulated operators; nothing is claimed about people. {manners}."),
+        Text("Simulated operators; nothing is claimed about people."),
+        Table("Operators", ("manner", "speed, share", "delay, s", "noise, share", "looks around after, s"), manners),
+        Text(
+            "mesh is conventional IC with a tripod scan made without the obstacles. PSNR: the two images on either "
+            "side of a switch into the virtual space and back. Poses are those of the stack's own SLAM."
+        ),
         Table("Drives", columns, lines, command_of(options, "operators")),
     ]
     return Section("Operators (V.E, simulated)", parts)

@@ -1,19 +1,19 @@
-"""A process pool that leaves no process behind when its block ends, at any stage of start-up."""
+"""Calls in several processes, none of which is left when they end, at whatever stage of its start-up."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing.connection import wait
-from multiprocessing.context import SpawnContext, SpawnProcess
-from typing import Any, TypeVar
+import traceback
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from typing import Any, Self, TypeVar
 
 T = TypeVar("T")
 
@@ -21,42 +21,63 @@ _GONE_S = 30.0
 """A killed process is normally gone at once; a longer wait means that the kernel holds it (a hung file system)."""
 
 
-class _Spawned(SpawnContext):
-    """Spawns processes and keeps track of each, including one whose start was interrupted."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.processes: list[SpawnProcess] = []
-
-    def Process(self, *args: Any, **options: Any) -> SpawnProcess:  # type: ignore[override]
-        self.processes.append(SpawnProcess(*args, **options))
-        return self.processes[-1]
+class LostError(RuntimeError):
+    """A call without a result: its process died, or was ended because the call took too long."""
 
 
-@contextlib.contextmanager
-def process_pool(count: int, prepare: Callable[[], None]) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool of ``count`` processes that call ``prepare`` first; all are gone when the block is left.
+class ProcessPool:
+    """Processes that each run one call at a time; all are gone when the block is left.
 
-    The processes are killed: SIGTERM has no effect on a stopped process, or if this program was started with SIGTERM
-    ignored. The sentinel shows that a process is gone: the pool's own thread may have collected the exit status first,
-    and ``exitcode`` is then None for a moment.
+    They are killed: SIGTERM has no effect on a stopped process, or if this program was started with SIGTERM ignored.
+
+    Args:
+        prepare: called first in each process.
 
     Raises:
         RuntimeError: at the end of the block, a process is still there ``30 s`` after it was killed.
     """
-    context = _Spawned()
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(prepare,))
-    # If this end stayed open, the pool's thread would wait for ever for the rest of a killed process's partial result.
-    results = pool._result_queue._writer  # type: ignore[attr-defined]
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        started = [process for process in context.processes if process.pid is not None]
+
+    def __init__(self, prepare: Callable[[], None]) -> None:
+        self._prepare = prepare
+        self._processes: list[SpawnProcess] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Kill the processes."""
+        self._end(self._processes)
+
+    def start(self) -> Connection:
+        """Start a process; send it (function, arguments), and it sends (result, None) or (None, exception)."""
+        ours, theirs = multiprocessing.get_context("spawn").Pipe()
+        process = SpawnProcess(target=_serve, args=(theirs, self._prepare), name=f"pipe{ours.fileno()}")
+        self._processes.append(process)  # first: an interrupt may come as soon as it has started
+        process.start()
+        theirs.close()  # so that ours ends when the process does
+        return ours
+
+    def end(self, pipe: Connection) -> None:
+        """Kill the process of a pipe."""
+        name = f"pipe{pipe.fileno()}"
+        own = [process for process in self._processes if process.name == name]
+        self._processes = [process for process in self._processes if process.name != name]
+        pipe.close()
+        self._end(own)
+
+    @staticmethod
+    def _end(processes: Sequence[SpawnProcess]) -> None:
+        started = [process for process in processes if process.pid is not None]
         for process in started:
             process.kill()
-        results.close()
-        _wait_until_gone(started)
+        left = {process.sentinel: process for process in started}
+        deadline = time.monotonic() + _GONE_S
+        while left:
+            for sentinel in wait(list(left), max(0.0, deadline - time.monotonic())):
+                del left[sentinel]  # type: ignore[arg-type]
+            if left and time.monotonic() > deadline:
+                pids = ", ".join(str(process.pid) for process in left.values())
+                raise RuntimeError(f"process {pids} was killed but is still there after {_GONE_S:g} s; end it by hand")
 
 
 def run_all(
@@ -66,8 +87,12 @@ def run_all(
     prepare: Callable[[], None],
     on_result: Callable[[T], None] | None = None,
     timeout_s: float = 7200.0,
+    call_timeout_s: float = math.inf,
+    on_lost: Callable[[int, LostError], T] | None = None,
 ) -> list[T]:
-    """Call a function for each task's arguments, ``jobs`` at once; with more than one job, each in its own process.
+    """Call a function for each task's arguments, ``jobs`` at once.
+
+    With more than one job, or a time limit for each call, the calls run in processes of their own.
 
     Args:
         function: of a module, so that other processes find it.
@@ -76,6 +101,8 @@ def run_all(
         prepare: called first in each process.
         on_result: called with each result as it arrives.
         timeout_s: for all calls.
+        call_timeout_s: for one call; its process is then killed.
+        on_lost: gives the result of a call whose process died or was killed, from the task's number; None: raise.
 
     Returns:
         Results in the order of completion.
@@ -83,56 +110,81 @@ def run_all(
     Raises:
         ValueError: ``jobs`` is less than 1.
         TimeoutError: the calls took longer than ``timeout_s``.
-        RuntimeError: a process died.
+        LostError: a process died or was killed, and there is no ``on_lost``.
     """
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1 (got {jobs})")
     results: list[T] = []
+    began = time.monotonic()
 
     def take(result: T) -> None:
         results.append(result)
         if on_result is not None:
             on_result(result)
 
-    def late() -> TimeoutError:
-        return TimeoutError(f"it took longer than {timeout_s:.0f} s; {len(results)} of {len(tasks)} are done")
+    def left_s() -> float:
+        left = timeout_s - (time.monotonic() - began)
+        if left < 0:
+            raise TimeoutError(f"it took longer than {timeout_s:.0f} s; {len(results)} of {len(tasks)} are done")
+        return left
 
-    if jobs == 1 or len(tasks) <= 1:
-        began = time.monotonic()
+    if math.isinf(call_timeout_s) and (jobs == 1 or len(tasks) <= 1):
         if tasks:
             prepare()
         for task in tasks:
-            if time.monotonic() - began > timeout_s:
-                raise late()
+            left_s()
             take(function(*task))
         return results
-    with process_pool(min(jobs, len(tasks)), prepare) as pool:
-        try:
-            futures = [pool.submit(function, *task) for task in tasks]
-            for future in as_completed(futures, timeout=timeout_s):
-                take(future.result())
-        except BrokenProcessPool as error:
-            raise RuntimeError("a process died (out of memory?); try --jobs 1") from error
-        except TimeoutError as error:
-            raise late() from error
+    waiting = list(reversed(range(len(tasks))))
+    idle: list[Connection] = []
+    busy: dict[Connection, tuple[int, float]] = {}  # task and the time at which it must be done
+    with ProcessPool(prepare) as pool:
+        while waiting or busy:
+            while waiting and len(busy) < jobs:
+                pipe, number = idle.pop() if idle else pool.start(), waiting.pop()
+                busy[pipe] = number, time.monotonic() + call_timeout_s
+                with contextlib.suppress(OSError):  # it has died: reading from it says so
+                    pipe.send((function, tasks[number]))
+            next_s = min(due for _, due in busy.values()) - time.monotonic()
+            ready = wait(list(busy), max(0.0, min(left_s(), next_s)))
+            for pipe, (number, due) in list(busy.items()):
+                answer: tuple[Any, Exception | None]
+                try:
+                    if pipe in ready:
+                        answer = pipe.recv()
+                        idle.append(pipe)
+                    elif time.monotonic() > due:
+                        raise LostError(f"it took longer than {call_timeout_s:.0f} s and was ended")
+                    else:
+                        continue
+                except (OSError, EOFError, LostError) as lost:
+                    pool.end(pipe)
+                    found = LostError("its process died (out of memory?)") if not isinstance(lost, LostError) else lost
+                    if on_lost is None:
+                        raise LostError(f"task {number}: {found}; try --jobs 1") from None
+                    answer = on_lost(number, found), None
+                del busy[pipe]
+                result, error = answer
+                if error is not None:
+                    raise error
+                take(result)
     return results
 
 
-def _wait_until_gone(processes: list[SpawnProcess]) -> None:
-    left = {process.sentinel: process for process in processes}
-    deadline = time.monotonic() + _GONE_S
-    while left:
-        for sentinel in wait(list(left), max(0.0, deadline - time.monotonic())):
-            del left[sentinel]  # type: ignore[arg-type]
-        if left and time.monotonic() > deadline:
-            pids = ", ".join(str(process.pid) for process in left.values())
-            raise RuntimeError(f"process {pids} was killed but is still there after {_GONE_S:g} s; end it by hand")
-
-
-def _begin(prepare: Callable[[], None]) -> None:
+def _serve(pipe: Connection, prepare: Callable[[], None]) -> None:
+    """Run the calls that come over a pipe, until the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes: the collecting one stops the others
     threading.Thread(target=_end_with_parent, daemon=True).start()
     prepare()
+    while True:
+        function, arguments = pipe.recv()
+        answer: tuple[Any, Exception | None]
+        try:
+            answer = function(*arguments), None
+        except Exception as error:  # noqa: BLE001 - the parent raises it again
+            error.add_note(traceback.format_exc())
+            answer = None, error
+        pipe.send(answer)
 
 
 def _end_with_parent() -> None:

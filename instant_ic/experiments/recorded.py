@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.pictures import perspective_crop
-from instant_ic.experiments.vspace import STRIP_AT_M, Comparison, Row, scores
-from instant_ic.experiments.vspace_sources import KEYFRAMES, Place, Shot, VspaceSettings, make_source
+from instant_ic.experiments.vspace import FILLED, STRIP_AT_M, Comparison, Row, converge_on, filled, scores
+from instant_ic.experiments.vspace_sources import KEYFRAMES, Place, Shot, VspaceSettings, base_of, make_source
 
-SOURCES = ("ours", "older", "no-depth", "depth-warp", "point-warp", "panorama")
+if TYPE_CHECKING:
+    from instant_ic.vspace import VirtualSpaceConfig
+
+SOURCES = ("ours", "older", "no-depth", "depth-warp", "point-warp", "panorama", "fill")
 """Those that need no simulated world."""
 TOPIC = "/keyframe"
 
@@ -66,36 +70,70 @@ def compare_recorded(bag: Path, settings: VspaceSettings, number: int) -> Compar
     Raises:
         ValueError: as ``read_keyframes``, or no later keyframe is near enough.
     """
-    from instant_ic.depth.sources import DepthResult
-    from instant_ic.vspace import VirtualSpaceConfig
-
     keyframes = read_keyframes(bag)
-    shots = []
-    for one in keyframes[max(0, number + 1 - max(KEYFRAMES.values())) : number + 1]:
-        known = one.sigma[np.isfinite(one.sigma)]
-        middle = float(np.median(known)) if known.size else 1.0
-        depth = DepthResult(one.depth_m, one.sigma, True, 1.0, 0.0, 1.0, middle, 0, "", "recorded")
-        shots.append(Shot(one.pose, one.rgb, one.depth_m, one.depth_m, depth, one.depth_m))
-    config = VirtualSpaceConfig(source="auto", panorama_width=settings.panorama_width)
+    shots = [_shot(one) for one in keyframes[max(0, number + 1 - max(KEYFRAMES.values())) : number + 1]]
     nowhere: Any = None
-    place = Place(nowhere, nowhere, nowhere, (0.0, 0.0, 0.0), config, None)
+    place = Place(nowhere, nowhere, nowhere, (0.0, 0.0, 0.0), _config(settings), None)
     here, (width, height), fov = keyframes[number].pose, settings.size, math.radians(settings.fov_deg)
-    away = [(float(np.linalg.norm(one.pose[:3, 3] - here[:3, 3])), one) for one in keyframes[number + 1 :]]
-    near = [(distance, one) for distance, one in away if distance <= settings.reach_m]
+    near = _later(keyframes, number, settings)
     if not near:
         raise ValueError(f"{bag}: no keyframe after number {number} lies within {settings.reach_m:g} m of it")
     comparison = Comparison((float(here[0, 3]), float(here[1, 3]), 0.0))
+    ready: dict[str, Any] = {}
     for source in settings.sources:
-        draw, seconds = make_source(source, shots, settings, place)
+        base = base_of(source, settings.method)
+        if base not in ready:
+            ready[base] = make_source(base, shots, settings, place)
+        draw, seconds = ready[base]
         for distance, one in near:
             at = settings.step_m * round(distance / settings.step_m)
             truth = perspective_crop(one.rgb, np.eye(3), width, height, fov)
-            image, seen = draw(one.pose, width, height, fov)
+            image, confidence = draw(one.pose, width, height, fov)
+            if source in FILLED:
+                image = filled(image, confidence, truth)
             psnr, similarity = scores(image, truth)
-            comparison.rows.append(Row("recorded", source, at, psnr, similarity, seconds, seen))
+            comparison.rows.append(Row("recorded", source, at, psnr, similarity, seconds, float(np.mean(confidence))))
             if at in STRIP_AT_M:
                 comparison.strips.setdefault("recorded", {}).setdefault(at, {"truth": truth}).setdefault(source, image)
     return comparison
+
+
+def converge_recorded(bag: Path, settings: VspaceSettings, number: int, times_s: Sequence[float]) -> list[Row]:
+    """As ``vspace.converge``: views at a keyframe, and at the later one that is nearest to 1 m away (0.5 to 1.5 m).
+
+    Raises:
+        ValueError: as ``read_keyframes``.
+    """
+    keyframes = read_keyframes(bag)
+    here, (width, height), fov = keyframes[number], settings.size, math.radians(settings.fov_deg)
+    beside = [each for each in _later(keyframes, number, settings) if 0.5 <= each[0] <= 1.5]
+    chosen = [(0.0, here), *((1.0, one) for _, one in sorted(beside, key=lambda each: abs(each[0] - 1.0))[:1])]
+    views = [(at, one.pose, perspective_crop(one.rgb, np.eye(3), width, height, fov)) for at, one in chosen]
+    return converge_on(_shot(here), views, settings, _config(settings), times_s)
+
+
+def _config(settings: VspaceSettings) -> VirtualSpaceConfig:
+    from instant_ic.vspace import VirtualSpaceConfig
+
+    return VirtualSpaceConfig(source="auto", panorama_width=settings.panorama_width)
+
+
+def _shot(one: RecordedKeyframe) -> Shot:
+    from instant_ic.depth.sources import DepthResult
+
+    known = one.sigma[np.isfinite(one.sigma)]
+    middle = float(np.median(known)) if known.size else 1.0
+    depth = DepthResult(one.depth_m, one.sigma, True, 1.0, 0.0, 1.0, middle, 0, "", "recorded")
+    return Shot(one.pose, one.rgb, one.depth_m, one.depth_m, depth, one.depth_m)
+
+
+def _later(
+    keyframes: Sequence[RecordedKeyframe], number: int, settings: VspaceSettings
+) -> list[tuple[float, RecordedKeyframe]]:
+    """Later keyframes up to ``reach_m`` away, each with its distance in metres."""
+    here = keyframes[number].pose[:3, 3]
+    away = [(float(np.linalg.norm(one.pose[:3, 3] - here)), one) for one in keyframes[number + 1 :]]
+    return [(distance, one) for distance, one in away if distance <= settings.reach_m]
 
 
 def _messages(bag: Path) -> list[Any]:

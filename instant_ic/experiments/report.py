@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -38,9 +39,33 @@ class Figure:
     caption: str
     source: str
     command: str = ""
+    wide: bool = False
+    """Whether it needs scrolling on a phone."""
 
 
 Part: TypeAlias = Text | Table | Figure
+
+PAPER = {
+    "straight": "V.A: straight ahead, instant IC is above conventional IC in SSIM for about the first 2 m",
+    "curve": "V.A: on a curve, it is above for 1 to 2 m",
+    "training": "V.B: the view converges in 3 to 4 s of training on a GPU",
+    "depth": "V.C: the depth prior improves the view",
+    "scaling": "V.C: scaling the depth by the LiDAR improves the view",
+    "flow": "V.D: the flow r to v to r works without a model made beforehand",
+    "people": "V.E: people prefer neither instant nor conventional IC (three to two, two to two)",
+    "places": "V.F: corridors are shown well; open places, windows and crossing corridors are not always",
+}
+"""Claims of the paper."""
+_MARKS = {True: ("yes", "holds"), False: ("no", "does not hold"), None: ("", "not measured")}
+_SHIPPED_BYTES = 2_000_000
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Whether a claim of the paper holds here, None where it was not measured, and the figures that decide it."""
+
+    held: bool | None
+    figures: str
 
 
 @dataclass(frozen=True)
@@ -50,12 +75,14 @@ class Section:
     Attributes:
         title: with the paper's section.
         parts: in order.
-        verdict: sentence → whether the paper's or our claim holds; None: not measured.
+        verdict: sentence → whether it holds; None: not measured.
+        answers: claim of ``PAPER`` → whether it holds, from the results.
     """
 
     title: str
     parts: Sequence[Part]
     verdict: dict[str, bool | None] = field(default_factory=dict)
+    answers: dict[str, Answer] = field(default_factory=dict)
 
 
 def spread(values: Sequence[float | None], digits: int = 2) -> str:
@@ -72,12 +99,23 @@ def image_address(jpeg_or_other: bytes, kind: str = "image/jpeg") -> str:
     return f"data:{kind};base64,{base64.b64encode(jpeg_or_other).decode()}"
 
 
+def answers(sections: dict[str, Section]) -> dict[str, Answer]:
+    """Answer to each claim of ``PAPER``."""
+    found = {key: answer for section in sections.values() for key, answer in section.answers.items()}
+    none = Answer(None, "")
+    return {key: found.get(key, none) for key in PAPER} | {"people": Answer(None, "it takes people: ic study")}
+
+
+def _claims(sections: dict[str, Section]) -> dict[str, dict[str, Any]]:
+    return {key: {"claim": PAPER[key], **vars(one)} for key, one in answers(sections).items()}
+
+
 def write(
     folder: Path,
     sections: dict[str, Section],
     results: Sequence[Result],
     conditions: dict[str, Any],
-    title: str = "Instant IC: the paper's experiments",
+    title: str = "",
     more: dict[str, Any] | None = None,
 ) -> None:
     """Write ``report.html`` and ``report.json``.
@@ -87,7 +125,7 @@ def write(
         sections: by name.
         results: of the experiments' units; empty for a report without units.
         conditions: machine, versions, command and times.
-        title: of the page.
+        title: of the page; empty for the paper's experiments, whose claims are answered.
         more: further entries of the JSON.
     """
     save_text(folder / "report.html", _page(title, sections, results, conditions))
@@ -97,6 +135,7 @@ def write(
             {
                 **(more or {}),
                 "conditions": conditions,
+                **({} if title else {"paper": _claims(sections)}),
                 "verdict": {name: section.verdict for name, section in sections.items()},
                 "tables": {
                     name: [vars(part) for part in section.parts if isinstance(part, Table)]
@@ -117,6 +156,48 @@ def write(
             5,
         ),
     )
+
+
+def ship(path: Path, sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> int:
+    """Write the page with reduced images, at most about 2 MB, and return its size in bytes.
+
+    Raises:
+        ValueError: it is larger even with the smallest images.
+    """
+    for width in (1100, 800, 600, 440, 320):
+        reduced = {
+            name: replace(
+                section,
+                parts=[
+                    replace(part, source=_reduced(part.source, width))
+                    if isinstance(part, Figure) and part.source.startswith("data:image")
+                    else part
+                    for part in section.parts
+                ],
+            )
+            for name, section in sections.items()
+        }
+        page = _page(reduced, results, conditions)
+        if len(page.encode()) <= _SHIPPED_BYTES:
+            save_text(path, page)
+            return len(page.encode())
+    raise ValueError(f"{path}: the report has {len(page.encode()) / 1e6:.1f} MB with the smallest images, not 2 MB")
+
+
+def _reduced(address: str, width: int) -> str:
+    """An image or film no wider than ``width``, as WebP; of a film every second frame."""
+    from PIL import Image, ImageSequence
+
+    image = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
+    size = (min(width, image.width), max(round(image.height * min(1.0, width / image.width)), 1))
+    frames = [frame.convert("RGB").resize(size, Image.Resampling.LANCZOS) for frame in ImageSequence.Iterator(image)]
+    out = io.BytesIO()
+    if len(frames) == 1:
+        frames[0].save(out, "WEBP", quality=60)
+    else:
+        each_ms = 2 * int(image.info.get("duration", 250))
+        frames[0].save(out, "WEBP", save_all=True, append_images=frames[2::2], duration=each_ms, loop=0, quality=40)
+    return image_address(out.getvalue(), "image/webp")
 
 
 _STYLE = """
@@ -140,8 +221,9 @@ figure { margin: 0; }
 img { width: 100%; } .strip { min-width: 44rem; }
 code { display: block; overflow-x: auto; background: var(--soft); padding: .3rem .5rem; font-size: .78rem;
   margin: .3rem 0 1.2rem; white-space: pre; }
-.yes { color: var(--good); } .no { color: var(--bad); } nav a { margin-right: 1rem; }
-dl { display: grid; grid-template-columns: auto 1fr; gap: 0 1rem; font-size: .85rem; } dd { margin: 0; }
+.yes { color: var(--good); } .no { color: var(--bad); } nav { display: flex; flex-wrap: wrap; gap: 0 1rem; }
+dl { display: grid; grid-template-columns: auto 1fr; gap: 0 1rem; font-size: .85rem; }
+dd { margin: 0; overflow-wrap: anywhere; }
 a { color: inherit; }
 """
 
@@ -149,7 +231,8 @@ a { color: inherit; }
 def _page(title: str, sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> str:
     links = "".join(f'<a href="#{name}">{html.escape(name)}</a>' for name in sections)
     bodies = "".join(_section(name, section, results) for name, section in sections.items())
-    seeds = "<p>Numbers are mean ± standard deviation over the seeds.</p>" if results else ""
+    seeds = "" if title else f"<p>Numbers are mean ± standard deviation over the seeds.</p>{_answers(sections)}"
+    title = title or "Instant IC: the paper's experiments"
     facts = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(str(v))}</dd>" for k, v in conditions.items())
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -160,25 +243,37 @@ def _page(title: str, sections: dict[str, Section], results: Sequence[Result], c
     )
 
 
+def _answers(sections: dict[str, Section]) -> str:
+    rows = "".join(
+        f"<li>{html.escape(PAPER[key])}: {_mark(one.held)}{'; ' if one.figures else ''}{html.escape(one.figures)}.</li>"
+        for key, one in answers(sections).items()
+    )
+    return f"<h2>Claims of the paper</h2><ul>{rows}</ul>"
+
+
+def _mark(held: bool | None) -> str:
+    look, text = _MARKS[held]
+    return f'<b class="{look}">{text}</b>'
+
+
 def _section(name: str, section: Section, results: Sequence[Result]) -> str:
     own = [one for one in results if one.unit.experiment == name]
     parts = [f'<h2 id="{name}">{html.escape(section.title)}</h2>']
     if section.verdict:
-        marks = {True: ("yes", "holds"), False: ("no", "does not hold"), None: ("", "not measured")}
-        rows = "".join(
-            f'<li>{html.escape(text)}: <b class="{marks[held][0]}">{marks[held][1]}</b></li>'
-            for text, held in section.verdict.items()
-        )
+        rows = "".join(f"<li>{html.escape(text)}: {_mark(held)}</li>" for text, held in section.verdict.items())
         parts.append(f"<ul>{rows}</ul>")
     parts += [_part(part) for part in section.parts]
     failed = [one for one in own if one.error]
     if failed:
-        rows = "".join(f"<li>{html.escape(str(one.unit.arguments))}: {html.escape(one.error)}</li>" for one in failed)
-        parts.append(f"<p>Failed:</p><ul>{rows}</ul>")
+        rows = "".join(
+            f"<li>{html.escape(one.unit.place)}, {html.escape(str(one.unit.arguments))}: {html.escape(one.error)}</li>"
+            for one in failed
+        )
+        parts.append(f"<details><summary>{len(failed)} of {len(own)} units failed</summary><ul>{rows}</ul></details>")
     if not results:
         return "".join(parts)
     wall, cpu = (sum(getattr(one, key) for one in own) for key in ("wall_s", "cpu_s"))
-    parts.append(f"<p>{len(own)} units, {wall:.0f} s of wall time, {cpu:.0f} s of CPU time.</p>")
+    parts.append(f"<p>{len(own)} units, {wall:.0f} s of wall time of all together, {cpu:.0f} s of CPU time.</p>")
     return "".join(parts)
 
 
@@ -189,7 +284,7 @@ def _part(part: Part) -> str:
     caption = html.escape(part.caption)
     if isinstance(part, Figure):
         if part.source.startswith("data:"):
-            kind = "strip" if part.source.startswith("data:image/jpeg") else "whole"
+            kind = "strip" if part.wide else "whole"
             body = f'<div class="wide"><img class="{kind}" src="{part.source}" alt="{caption}"></div>'
         else:
             body = f'<div class="plots">{part.source}</div>'

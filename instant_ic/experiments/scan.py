@@ -220,7 +220,14 @@ def best_stations(triangles: Floats, stations: Sequence[Station], tolerance_m: f
     return chosen
 
 
-def scan_world(world: World, start: Sequence[float], quality: ScanQuality, seed: int, path: Path) -> dict[str, Any]:
+def scan_world(
+    world: World,
+    start: Sequence[float],
+    quality: ScanQuality,
+    seed: int,
+    path: Path,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+) -> dict[str, Any]:
     """Scan a world around a start and write the mesh as a GLB file.
 
     Args:
@@ -229,6 +236,7 @@ def scan_world(world: World, start: Sequence[float], quality: ScanQuality, seed:
         quality: of the scan.
         seed: of all errors.
         path: the file.
+        origin: (x, y, yaw) of the file's frame in the world.
 
     Returns:
         Number of ``stations`` and of ``triangles``.
@@ -247,6 +255,7 @@ def scan_world(world: World, start: Sequence[float], quality: ScanQuality, seed:
     triangles = vertices[faces]
     chosen = best_stations(triangles, stations, 2 * quality.cell_m)
     scene, count = trimesh.Scene(), 0
+    map_from_file = pose_matrix(origin[0], origin[1], yaw=origin[2])
     for number, one in enumerate(stations):
         corners = triangles[chosen == number].reshape(-1, 3)
         if not len(corners):
@@ -260,8 +269,9 @@ def scan_world(world: World, start: Sequence[float], quality: ScanQuality, seed:
             np.column_stack([u.reshape(-1), 1 - v]),
             trimesh.visual.material.PBRMaterial(baseColorTexture=Image.open(jpeg)),
         )
+        local = (corners - map_from_file[:3, 3]) @ map_from_file[:3, :3]
         # glTF has y up: (x, y, z) becomes (x, z, -y).
-        turned = np.column_stack([corners[:, 0], corners[:, 2], -corners[:, 1]])
+        turned = np.column_stack([local[:, 0], local[:, 2], -local[:, 1]])
         own = np.arange(len(corners)).reshape(-1, 3)
         scene.add_geometry(trimesh.Trimesh(turned, own, visual=look, process=False), f"station{number}")
         count += len(own)

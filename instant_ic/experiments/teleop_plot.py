@@ -74,7 +74,7 @@ def save_plot(
         maps, modes = (grid[2 + 2 * number + k].subgridspec(1, columns) for k in range(2))
         for k, (course, of) in enumerate(row):
             _draw_course(figure.add_subplot(maps[k]), course, of)
-            _draw_modes(figure.add_subplot(modes[k]), of)
+            draw_modes(figure.add_subplot(modes[k]), of)
     figure.legend(handles=_legend(names), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
     figure.suptitle(
         f"{settings.world}, seed {settings.seed}: {len(indices)} courses; the maps are of those that went worst"
@@ -170,7 +170,7 @@ def _where(drive: Drive, time_s: float) -> FloatArray:
     return np.array(track[min(max(0, round((time_s - modes[0][0]) / TRACK_S)), len(track) - 1)])[:2]
 
 
-def _draw_modes(axis: Any, drives: Sequence[Drive]) -> None:
+def draw_modes(axis: Any, drives: Sequence[Drive]) -> None:
     """Plot the arbiter's mode over time, one bar per method."""
     for k, drive in enumerate(drives):
         modes = drive.tracks["modes"]
@@ -298,4 +298,4 @@ class PlanImage:
         return frame
 
 
-__all__ = ["FPS", "PlanImage", "Video", "operator_image", "save_plot"]
+__all__ = ["FPS", "PlanImage", "Video", "draw_modes", "operator_image", "save_plot"]

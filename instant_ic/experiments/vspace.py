@@ -16,7 +16,9 @@ from instant_ic.experiments.vspace_sources import (
     Drawer,
     Picture,
     Place,
+    Shot,
     VspaceSettings,
+    base_of,
     depth_figures,
     field_alone,
     make_source,
@@ -26,15 +28,19 @@ from instant_ic.experiments.vspace_sources import (
     train,
 )
 from instant_ic.geometry.image_quality import psnr_db, ssim
-from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.poses import pose_matrix, relative2
 
 if TYPE_CHECKING:
+    from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import World
     from instant_ic.vspace import VirtualSpaceConfig
 
 CLEARANCE_M = 0.3
 _RADII_M = (2.5, 4.0, 6.0, 10.0, 16.0)
 STRIP_AT_M = (0.5, 1.0, 2.0, 3.0)
+FILLED = ("fill", "exact-fill")
+CRUISE_M_S = 0.4
+"""Speed of the robot, from which the time at each pose follows."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,8 @@ class Comparison:
 
     start: tuple[float, float, float]
     depth: dict[str, Any] = field(default_factory=dict)
+    slam_error_m: dict[str, float] = field(default_factory=dict)
+    """Largest position error of the SLAM along each path."""
     rows: list[Row] = field(default_factory=list)
     strips: dict[str, dict[float, dict[str, Picture]]] = field(default_factory=dict)
 
@@ -134,12 +142,13 @@ def make_place(
     """
     from instant_ic import paths
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+    from instant_ic.experiments.places import make_place_world
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import make_world
     from instant_ic.vspace import VirtualSpaceConfig
     from instant_ic.vspace.warm_up import warm_up
 
-    made = make_world(world)
+    made, walkers = make_place_world(world)
     config = config or VirtualSpaceConfig(source="auto", panorama_width=settings.panorama_width)
     warm_up(config)
     model = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1)
@@ -147,7 +156,8 @@ def make_place(
     before = (
         made if world.partition(":")[0] != "corridor" else make_world(world.replace("corridor", "corridor-free", 1))
     )
-    return Place(made, before, EquirectRenderer(made), start_pose(made, start, settings.start_seed), config, model)
+    begin = start_pose(made, start, settings.start_seed)
+    return Place(made, before, EquirectRenderer(made), begin, config, model, walkers)
 
 
 def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
@@ -182,20 +192,85 @@ def compare(
         keyframes = max(KEYFRAMES.get(source, 1) for source in settings.sources)
         back = path_poses(place.world, place.start, path, [-float(k) for k in range(keyframes)])
         shots = [take_shot(place.renderer, pose, settings, place.model) for pose in reversed(back)]
+        if keyframes > 1:  # the last panorama alone is the same on all paths
+            ready = {}
         comparison.depth[path] = depth_figures(shots)
         poses = path_poses(place.world, place.start, path, settings.distances_m)
-        truths = [place.renderer.render_perspective(pose, width, height, fov, supersample=3).rgb for pose in poses]
+        seconds = [distance / CRUISE_M_S for distance in settings.distances_m[: len(poses)]]
+        errors = slam_errors(place.world, poses, settings) if "slam-pose" in settings.sources else None
+        if errors is not None:
+            comparison.slam_error_m[path] = float(np.linalg.norm(errors[:, :2], axis=1).max())
+        renderers = [renderer_after(place, passed) for passed in seconds]
+        truths = [
+            renderer.render_perspective(pose, width, height, fov, supersample=3).rgb
+            for renderer, pose in zip(renderers, poses, strict=True)
+        ]
         for source in settings.sources:
-            if source not in ready or keyframes > 1:  # the last panorama alone is the same on all paths
-                ready[source] = make_source(source, shots, settings, place)
-            draw, seconds = ready[source]
-            for distance, pose, truth in zip(settings.distances_m, poses, truths, strict=False):
-                picture, confidence = draw(pose, width, height, fov)
-                comparison.rows.append(_row(path, source, distance, picture, truth, seconds, confidence))
+            if (source == "slam-pose" and errors is None) or (source == "still" and not place.walkers):
+                continue
+            base = base_of(source, settings.method)
+            if base not in ready:
+                ready[base] = make_source(base, shots, settings, place)
+            draw, spent = ready[base]
+            for number, (distance, pose, truth) in enumerate(zip(settings.distances_m, poses, truths, strict=False)):
+                seen_from = pose
+                if source == "slam-pose" and errors is not None:
+                    x, y, yaw = errors[number]
+                    seen_from = pose @ pose_matrix(x, y, yaw=yaw)
+                picture, confidence = draw(seen_from, width, height, fov)
+                if source in FILLED:
+                    picture = filled(picture, confidence, truth)
+                against = truth
+                if source == "still":
+                    against = place.renderer.render_perspective(pose, width, height, fov, supersample=3).rgb
+                comparison.rows.append(
+                    _row(path, source, distance, picture, against, spent, float(np.mean(confidence)))
+                )
                 if distance in STRIP_AT_M:
                     strip = comparison.strips.setdefault(path, {}).setdefault(distance, {"truth": truth})
                     strip[source] = picture
     return comparison
+
+
+def filled(picture: Picture, confidence: Any, truth: Picture) -> Picture:
+    """The image (H, W, 3) with the truth where no keyframe has seen the place."""
+    return np.where(np.broadcast_to(confidence, truth.shape[:2])[..., None] > 0, picture, truth)
+
+
+def renderer_after(place: Place, seconds: float) -> EquirectRenderer:
+    """Renderer of the place some time after the panorama, when people have walked on."""
+    from instant_ic.experiments.places import world_after
+    from instant_ic.sim.render import EquirectRenderer
+
+    return EquirectRenderer(world_after(place.world, place.walkers, seconds)) if place.walkers else place.renderer
+
+
+def slam_errors(world: World, poses: Sequence[Any], settings: VspaceSettings) -> NDArray[np.float64] | None:
+    """Error (x, y, yaw) of the SLAM's pose at each camera pose (4, 4) of a path, (N, 3), in the robot's true frame.
+
+    The robot drives along the path on slipping tracks: the stack's SLAM, or GMapping's filter with the paper's method.
+    None where the robot cannot drive there.
+    """
+    from instant_ic.experiments.particle_slam import ParticleConfig
+    from instant_ic.experiments.slam import run_log
+    from instant_ic.experiments.slam_sim import round_trip
+
+    places = [(float(pose[0, 3]), float(pose[1, 3])) for pose in poses]
+    if len(places) < 2:
+        return None
+    try:
+        trip = round_trip(world, seed=settings.seed, rounds=1, route=places)
+    except ValueError:  # it touches something
+        return None
+    particles = ParticleConfig(seed=settings.seed) if settings.method == "paper" else None
+    estimates = run_log(trip.entries, particles=particles).online[:, 1:]
+    begin = np.array([*places[0], math.atan2(places[1][1] - places[0][1], places[1][0] - places[0][0])])
+    found = []
+    for place in places:
+        local = relative2(begin, np.array([*place, 0.0]))[:2]
+        nearest = int(np.argmin(np.linalg.norm(trip.truth[:, :2] - local, axis=1)))
+        found.append(relative2(trip.truth[nearest], estimates[nearest]))
+    return np.array(found)
 
 
 def converge(
@@ -211,22 +286,36 @@ def converge(
     """
     place = make_place(world, settings, start, config)
     width, height = settings.size
-    fov = math.radians(settings.fov_deg)
     poses = path_poses(place.world, place.start, "straight", (0.0, 1.0))
-    truths = [place.renderer.render_perspective(pose, width, height, fov, supersample=3).rgb for pose in poses]
-    shots = [take_shot(place.renderer, poses[0], settings, place.model)]
+    views = [
+        (distance, pose, place.renderer.render_perspective(pose, width, height, math.radians(settings.fov_deg), 3).rgb)
+        for distance, pose in zip((0.0, 1.0), poses, strict=False)
+    ]
+    shot = take_shot(place.renderer, poses[0], settings, place.model)
+    return converge_on(shot, views, settings, place.config, times_s)
+
+
+def converge_on(
+    shot: Shot,
+    views: Sequence[tuple[float, NDArray[np.float64], Picture]],
+    settings: VspaceSettings,
+    config: VirtualSpaceConfig,
+    times_s: Sequence[float],
+) -> list[Row]:
+    """As ``converge``, from a keyframe and views: distance in metres, camera pose (4, 4), and true image."""
+    width, height = settings.size
     rows = []
-    trained = replace(place.config, source="field")
+    trained = replace(config, source="field")
     for name, shown_as in (("ours", ("ours", "field")), ("paper", ("paper",))):
         own = paper_config(trained) if name == "paper" else trained
-        space, spent = make_space(shots, name, settings, own), 0.0
+        space, spent = make_space([shot], name, settings, own), 0.0
         for seconds in sorted(times_s):
             train(space, seconds - spent)
             spent = seconds
             for source in shown_as:
                 space.config = field_alone(own) if source == "field" else own
-                for distance, pose, truth in zip((0.0, 1.0), poses, truths, strict=False):
-                    view = space.render(pose, width, height, fov)
+                for distance, pose, truth in views:
+                    view = space.render(pose, width, height, math.radians(settings.fov_deg))
                     confidence = float(view.confidence.mean())
                     rows.append(_row("straight", source, distance, view.rgb, truth, seconds, confidence))
             space.config = own

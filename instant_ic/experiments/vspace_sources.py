@@ -15,6 +15,7 @@ from instant_ic.experiments.scan import QUALITIES, ScanQuality, aged, scan_world
 
 if TYPE_CHECKING:
     from instant_ic.depth.sources import DepthResult
+    from instant_ic.experiments.places import Walker
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import World
     from instant_ic.vspace import VirtualSpaceConfig
@@ -27,7 +28,10 @@ SOURCES = {
     "no-depth": "field trained from colours alone (paper: -depth)",
     "no-scale": "the model's depth as it comes, not scaled (paper: -scale)",
     "older": "ours with two older keyframes behind it, a metre apart, for what is hidden from the newest",
+    "fill": "ours (or paper), and the truth where no keyframe has seen the place",
     "exact-fill": "true depth, and the truth where no keyframe has seen the place",
+    "slam-pose": "ours (or paper), seen from the poses that SLAM estimates on the way",
+    "still": "ours (or paper) against the world in which nobody has moved since the panorama",
     "paper": "the paper's choices: density field alone, six cube faces, depth scaled by the 99.5 % maxima",
     "paper-no-scale": "the same, depth not scaled",
     "panorama": "the panorama turned, without depth",
@@ -37,12 +41,15 @@ SOURCES = {
     "mesh": "conventional IC with a perfect scan: exact geometry, obstacle not there yet, colours fitted",
     **{name: f"conventional IC with a real scan: {name}" for name in QUALITIES},
 }
+DERIVED = ("fill", "slam-pose", "still")
+"""Other uses of the views of ``VspaceSettings.method``."""
 KEYFRAMES = {"older": 3}
 """Number of panoramas of the sources that have several."""
 Picture = NDArray[np.uint8]
 CAMERA_HEIGHT_M, LIDAR_HEIGHT_M = 1.2, 0.6
-Drawer: TypeAlias = Callable[[NDArray[np.float64], int, int, float], tuple[Picture, float]]
-"""Renders the place from a pose (4, 4) at width, height, field of view; returns image and share seen by a panorama."""
+Drawer: TypeAlias = Callable[[NDArray[np.float64], int, int, float], tuple[Picture, Any]]
+"""Renders the place from a pose (4, 4) at width, height, field of view; returns image and confidence, (H, W) or one for
+all pixels: 0 where no panorama has seen the place."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +64,7 @@ class VspaceSettings:
         step_m, reach_m: distances from the last panorama are multiples of ``step_m`` up to ``reach_m``.
         seed: of LiDAR noise, training, scans and changed colours.
         start_seed: above 0: of a random start instead of the world's own.
+        method: ``ours`` or ``paper``: of the sources in ``DERIVED``.
     """
 
     paths: tuple[str, ...] = PATHS
@@ -69,6 +77,7 @@ class VspaceSettings:
     reach_m: float = 4.0
     seed: int = 0
     start_seed: int = 0
+    method: str = "ours"
 
     def __post_init__(self) -> None:
         for key, allowed in (("paths", PATHS), ("sources", tuple(SOURCES))):
@@ -112,6 +121,7 @@ class Place:
     start: tuple[float, float, float]
     config: VirtualSpaceConfig
     model: Any
+    walkers: tuple[Walker, ...] = ()
 
 
 def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: VspaceSettings, model: Any) -> Shot:
@@ -124,7 +134,7 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
     rgb = renderer.render(pose, width, width // 2, supersample=2).rgb
     true = renderer.render(pose, min(width, 1024), min(width, 1024) // 2).depth_m
     raw = model.estimate(rgb)
-    points = measure_world(renderer, pose, LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, Errors(seed=settings.seed))
+    points = measure_world(renderer, pose, LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, Errors(seed=settings.seed), True)
     scaler = ScalerConfig(output_kind=model.manifest.output_kind)
     source = DepthSource(SourceConfig(scaler=scaler))
     result = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M)
@@ -213,7 +223,7 @@ def make_space(shots: list[Shot], source: str, settings: VspaceSettings, config:
             space.set_keyframe(rgb, shot.raw, shot.pose, shot.result.relative_sigma)
         elif source == "paper":
             space.set_keyframe(rgb, shot.paper_depth_m, shot.pose, shot.result.relative_sigma)
-        elif source in ("true-depth", "exact-fill"):
+        elif source == "true-depth":
             space.set_keyframe(rgb, shot.true_depth_m, shot.pose, 0.02)
         else:
             space.set_keyframe(rgb, shot.result.depth_m, shot.pose, shot.result.sigma)
@@ -229,6 +239,11 @@ def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
     return replace(config, source="field", picture=replace(config.picture, field_alone=True))
 
 
+def base_of(source: str, method: str) -> str:
+    """Source that renders the views of a source."""
+    return "true-depth" if source == "exact-fill" else method if source in DERIVED else source
+
+
 def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: Place) -> tuple[Drawer, float]:
     """Prepare a source from keyframes, oldest first; return its renderer and the CPU seconds spent."""
     from instant_ic.vspace.warp import PanoramaWarp
@@ -239,17 +254,16 @@ def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: P
     def of_view(drawer: Any) -> Drawer:
         def draw(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
             view = drawer.render(pose, width, height, fov)
-            return view.rgb, float(view.confidence.mean())
+            return view.rgb, view.confidence
 
         return draw
 
-    if name in ("ours", "field", "no-scale", "true-depth", "exact-fill", "older", "paper", "paper-no-scale"):
+    if name in ("ours", "field", "no-scale", "true-depth", "older", "paper", "paper-no-scale"):
         count = KEYFRAMES.get(name, 1)
         own = paper_config(config) if name.startswith("paper") else field_alone(config) if name == "field" else config
         space = make_space(shots[-count:], name, settings, own)
         train(space, settings.seconds)
-        draw = of_view(space) if name != "exact-fill" else _exactly_filled(space, place.renderer)
-        return draw, time.process_time() - start
+        return of_view(space), time.process_time() - start
     if name == "no-depth":
         from instant_ic.experiments.colour_only import ColourOnlyField
 
@@ -288,15 +302,6 @@ def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: P
         return warp.render(turned, width, height, fov).rgb, 1.0
 
     return draw_turned, 0.0
-
-
-def _exactly_filled(space: Any, renderer: EquirectRenderer) -> Drawer:
-    def draw(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
-        view, true = space.render(pose, width, height, fov), renderer.render_perspective(pose, width, height, fov)
-        seen = view.confidence > 0
-        return np.where(seen[..., None], view.rgb, true.rgb), float(view.confidence.mean())
-
-    return draw
 
 
 def _scanned_space(quality: ScanQuality, last: Shot, settings: VspaceSettings, place: Place) -> Any:

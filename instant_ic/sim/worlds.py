@@ -1,6 +1,7 @@
 """Worlds: the corridor of the experiments, random interiors for training, and meshes from files."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -348,17 +349,28 @@ def random_world(seed: int, light_cell_m: float = 0.25, rays: int = 20) -> World
         light_cell_m: resolution of the baked light.
         rays: rays per light texel.
     """
-    rng = np.random.default_rng([23, seed])
+    return interior(np.random.default_rng([23, seed]), f"random:{seed}", light_cell_m=light_cell_m, rays=rays)
+
+
+def interior(
+    rng: np.random.Generator,
+    name: str,
+    kind: str = "",
+    fit_out: Callable[[np.random.Generator, Building, Zone], None] = decorate,
+    light_cell_m: float = 0.25,
+    rays: int = 20,
+) -> World:
+    """Generate an interior with one of the floor plans of ``plan``; ``fit_out`` decorates each zone's walls."""
     building = Building()
-    zones = plan(rng, building)
+    zones = plan(rng, building, kind)
     first = zones[0]
     along = first.x1 - first.x0 > 6.5 and first.y1 - first.y0 < 3.5
     spawn = (0.0, 0.0, 0.0) if along else (*first.centre, 0.0)
     for zone in zones:
         building.lamps(zone, float(rng.uniform(1.8, 3.6)), float(rng.uniform(2.5, 6.0)), bool(rng.random() < 0.5))
-        decorate(rng, building, zone)
+        fit_out(rng, building, zone)
         _furnish(rng, building, zone, (spawn[0], spawn[1]) if zone is first else None)
-    world = building.world(f"random:{seed}", spawn, light_cell_m, rays)
+    world = building.world(name, spawn, light_cell_m, rays)
     # Exposure varies between worlds, as with a real camera.
     world.light *= np.float32(rng.uniform(0.75, 1.25))
     return world

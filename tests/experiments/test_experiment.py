@@ -13,10 +13,24 @@ import pytest
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus import LATCHED
 from instant_ic.cli.main import main
-from instant_ic.experiments import box_room, compared, lab, reconstruction, report
+from instant_ic.experiments import (
+    ablation,
+    box_room,
+    compared,
+    environments,
+    lab,
+    operators,
+    reconstruction,
+    report,
+    teleoperation,
+    training_time,
+    vspace,
+)
+from instant_ic.experiments.depth_lidar import measure_world
 from instant_ic.experiments.illusion_truth import moved_by, things
 from instant_ic.experiments.lab import Options, Result, Unit
-from instant_ic.experiments.pictures import curves_svg, image_strip
+from instant_ic.experiments.pictures import curves_svg, image_strip, jpeg
+from instant_ic.experiments.places import Walker, make_place_world, world_after
 from instant_ic.experiments.scan import (
     QUALITIES,
     ScanQuality,
@@ -28,10 +42,20 @@ from instant_ic.experiments.scan import (
     station_places,
 )
 from instant_ic.experiments.teleop_operator import MANNERS, ManneredOperator, Sight
-from instant_ic.experiments.teleoperation import _Frame, stills
+from instant_ic.experiments.teleoperation import _Frame, _webp, stills
+from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.msg import Keyframe, compressed_image_message, header, image_message, pose_message, serialize
+from instant_ic.msg import (
+    ControlState,
+    Keyframe,
+    compressed_image_message,
+    header,
+    image_message,
+    pose_message,
+    serialize,
+    twist_message,
+)
 from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.world import Material
@@ -116,6 +140,19 @@ def test_a_good_scan_shows_the_room_and_a_bad_one_less(tmp_path) -> None:
     assert seen["fine"] > 22 and seen["fine"] > seen["phone"] + 3
 
 
+def test_a_scan_in_the_frame_of_a_start_shows_the_same(tmp_path) -> None:
+    coarse = dataclasses.replace(FINE, cell_m=0.2, width=256)
+    origin, pose = (0.5, 0.3, 1.0), pose_matrix(-0.5, 0.2, 1.2)
+    views = []
+    for name, start in (("map", (0.0, 0.0, 0.0)), ("start", origin)):
+        scan_world(box_world(1.5), (0.0, 0.0, 0.0), coarse, 0, tmp_path / f"{name}.glb", start)
+        mesh = str(tmp_path / f"{name}.glb")
+        space = MeshSpace(VirtualSpaceConfig(source="mesh", mesh=mesh, mesh_fit_colours=False))
+        map_from_start = pose_matrix(start[0], start[1], yaw=start[2])
+        views.append(space.render(np.linalg.inv(map_from_start) @ pose, 64, 36, math.pi / 2).rgb)
+    assert psnr_db(*views) > 35
+
+
 def test_cases_of_worlds_and_seeds() -> None:
     assert Options(2, ("corridor", "random:7", "house.glb")).cases() == [
         ("corridor:0", 0), ("corridor:1", 0), ("random:7", 0), ("house.glb", 0), ("house.glb", 1),
@@ -137,13 +174,29 @@ def test_finished_units_are_kept_and_failed_ones_tried_again(tmp_path, monkeypat
 
     monkeypatch.setattr(reconstruction, "measure", measure)
     units = [Unit("reconstruction", {"n": n}) for n in (1, 2)]
-    first = lab.run(units, tmp_path, 1)
+    first = lab.run(units, tmp_path, 1, unit_timeout_s=math.inf)
     assert [one.error for one in first] == ["", "no floor here"] and first[0].data["rows"] == [{"value": None}]
-    second = lab.run(units, tmp_path, 1)
+    second = lab.run(units, tmp_path, 1, unit_timeout_s=math.inf)
     assert calls == [1, 2, 2] and [one.data["n"] for one in second] == [1, 2]
     (tmp_path / f"{units[0].key}.json").write_text("{")
-    lab.run(units, tmp_path, 1)
+    lab.run(units, tmp_path, 1, unit_timeout_s=math.inf)
     assert calls == [1, 2, 2, 1]
+    late = lab.run([Unit("reconstruction", {"n": n}) for n in (2, 3)], tmp_path, 1, timeout_s=-1.0)
+    assert calls == [1, 2, 2, 1]
+    assert [one.error for one in late] == ["", "not measured: the time limit of -1 s was over"]
+
+
+def test_results_of_another_program_or_another_file_are_not_used(tmp_path, monkeypatch) -> None:
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    (bag / "a.mcap").write_bytes(b"1")
+    unit, world = Unit("reconstruction", {"bag": str(bag)}), Unit("reconstruction", {"world": "corridor:0"})
+    first = unit.key, world.key
+    assert (unit.key, world.key) == first and Unit("reconstruction", {"world": "corridor:0"}, 99.0).key == first[1]
+    (bag / "a.mcap").write_bytes(b"12")
+    assert unit.key != first[0] and world.key == first[1]
+    monkeypatch.setattr(lab, "program_hash", lambda: "other")
+    assert world.key != first[1]
 
 
 def test_an_unexpected_error_ends_its_unit_only(tmp_path, monkeypatch) -> None:
@@ -151,7 +204,7 @@ def test_an_unexpected_error_ends_its_unit_only(tmp_path, monkeypatch) -> None:
         return {"share": 1 / arguments["n"]}
 
     monkeypatch.setattr(reconstruction, "measure", measure)
-    found = lab.run([Unit("reconstruction", {"n": n}) for n in (0, 1)], tmp_path, 1)
+    found = lab.run([Unit("reconstruction", {"n": n}) for n in (0, 1)], tmp_path, 1, unit_timeout_s=math.inf)
     assert [one.error for one in found] == ["ZeroDivisionError: division by zero", ""]
 
 
@@ -181,7 +234,193 @@ def test_the_report_needs_no_other_file(tmp_path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert "PSNR &lt;dB&gt;" in page and "0.600 ± 0.141" in page and "does not hold" in page and "it broke" in page
     assert not re.search(r"(?:src|href)=\"(?!data:|#)", page.replace("http://www.w3.org", ""))
-    assert json.loads((tmp_path / "report.json").read_text())["verdict"] == {"ablation": {"claim": False}}
+    kept = json.loads((tmp_path / "report.json").read_text())
+    assert kept["verdict"] == {"ablation": {"claim": False}}
+    assert list(kept["paper"]) == list(report.PAPER) and kept["paper"]["flow"]["held"] is None
+
+
+def test_the_shipped_report_has_smaller_images(tmp_path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (900, 1600, 3), np.uint8)
+    images = [report.Figure(f"{n}", report.image_address(jpeg(noise)), wide=True) for n in range(5)]
+    film = _webp([noise[:90, :160], noise[90:180, :160], noise[180:270, :160]], 0.25)
+    section = report.Section("Title", [*images, report.Figure("Film", report.image_address(film, "image/webp"))])
+    size = report.ship(tmp_path / "small.html", {"ablation": section}, [], {})
+    page = (tmp_path / "small.html").read_text()
+    assert size == len(page.encode()) <= 2_000_000 and page.count("data:image/webp") == 6
+    with pytest.raises(ValueError, match="with the smallest images"):
+        text = report.Text("x" * 2_000_000)
+        report.ship(tmp_path / "large.html", {"ablation": report.Section("Title", [text])}, [], {})
+
+
+def view_result(world: str, values: dict[str, float], path: str = "straight") -> Result:
+    """A result with PSNR and SSIM (a hundredth) of each source, at 1 m."""
+    rows = [
+        {"path": path, "source": name, "distance_m": 1.0, "psnr_db": value, "ssim": value / 100}
+        for name, value in values.items()
+    ]
+    data = {"rows": rows, "depth": {path: {"mean_relative_error": 0.1}}, "slam_error_m": {path: 0.02}, "images": {}}
+    return Result(Unit("environments", {"world": world, "seed": 0, "start_seed": 0}), data, 1.0, 1.0)
+
+
+def test_a_place_fails_for_its_largest_measured_loss() -> None:
+    corridor = view_result("corridor:0", {"ours": 26, "fill": 29, "exact-fill": 30, "slam-pose": 25.5, "panorama": 15})
+    windows = view_result("windows:0", {"ours": 20, "fill": 21, "exact-fill": 25, "slam-pose": 19, "panorama": 18})
+    people = view_result("people:0", {"ours": 22, "fill": 23, "exact-fill": 23, "slam-pose": 22, "still": 27})
+    assert environments.losses(windows, "ours") == {"depth": 4.0, "unseen": 1.0, "pose": 1.0, "motion": None}
+    assert [environments.reason(environments.losses(one, "ours")) for one in (corridor, windows, people)] == [
+        "unseen", "depth", "motion",
+    ]  # fmt: skip
+    assert environments.reason({"depth": 0.1, "unseen": None}) == "resolution"
+    section = environments.section([corridor, windows, people], Options())
+    kinds = section.parts[1]
+    assert isinstance(kinds, report.Table)
+    assert [(line[0], line[3], line[4]) for line in kinds.rows] == [
+        ("corridor with windows side by side", "1 of 1", "depth (1)"),
+        ("corridor in which people walk", "1 of 1", "motion (1)"),
+        ("corridor with side rooms", "0 of 1", "unseen (1)"),
+    ]
+    assert section.answers["places"].held is True
+    assert environments.section([corridor], Options()).answers == {}
+
+
+def test_the_papers_claims_follow_from_the_rows() -> None:
+    def along(ours: list[float], scan: list[float]) -> Result:
+        rows = [
+            {"path": path, "source": name, "distance_m": 0.5 * k, "psnr_db": 100 * value, "ssim": value}
+            for path in ("straight", "curve")
+            for name, values in (("ours", ours), ("tripod", scan))
+            for k, value in enumerate(values)
+        ]
+        arguments = {"world": "corridor:0", "seed": 0}
+        return Result(Unit("reconstruction", arguments), {"rows": rows, "images": {}}, 1.0, 1.0)
+
+    # Above at 0.5, 1 and 1.5 m, below at 2 m: enough for the curve, not for the straight way.
+    answers = reconstruction.section([along([0.9] * 5, [0.8, 0.8, 0.8, 0.8, 0.95])], Options()).answers
+    assert (answers["straight"].held, answers["curve"].held) == (False, True)
+    assert "up to 1.5 (1) m" in answers["straight"].figures
+    assert reconstruction.section([], Options()).answers["straight"].held is None
+    one = view_result("corridor:0", {"ours": 26, "no-depth": 17, "no-scale": 27, "paper": 18, "paper-no-scale": 17})
+    answers = ablation.section([one], Options()).answers
+    assert (answers["depth"].held, answers["scaling"].held) == (True, False)
+    assert answers["scaling"].figures == (
+        "ours against no-scale: -1.0 dB, -0.010 SSIM; paper against paper-no-scale: +1.0 dB, +0.010 SSIM"
+    )
+    assert ablation.section([one], Options(method="paper")).answers["scaling"].held is True
+
+
+def test_every_section_is_written_without_results(tmp_path) -> None:
+    options = Options()
+    sections = {name: lab.module(name).section([], options) for name in lab.EXPERIMENTS}
+    report.write(tmp_path, sections, [], {})
+    assert (tmp_path / "report.html").read_text().count("not measured") >= len(report.PAPER)
+    assert {unit.experiment for name in lab.EXPERIMENTS for unit in lab.module(name).units(options)} == {*sections}
+
+
+def test_full_size_fits_into_an_hour_on_two_cores() -> None:
+    units = [unit for name in lab.EXPERIMENTS for unit in lab.module(name).units(Options())]
+    assert sum(unit.cost_s for unit in units) < 0.8 * 2 * 3600
+    quick = [unit for name in lab.EXPERIMENTS for unit in lab.module(name).units(Options(quick=True))]
+    assert sum(unit.cost_s for unit in quick) < 0.8 * 2 * 300
+
+
+def test_people_walk_to_the_end_and_back() -> None:
+    walker = Walker((0, 17), 4.0, 1.0, (0.0, 10.0))
+    # 6 m to the end, then 9 m back: 1 m; to the start and 2 m on.
+    assert [walker.moved_m(t) for t in (0.0, 6.0, 15.0, 18.0)] == pytest.approx([0.0, 6.0, -3.0, -2.0])
+    assert Walker((0, 17), 4.0, -1.0, (0.0, 10.0)).moved_m(5.0) == pytest.approx(-3.0)
+
+
+def test_places_have_what_they_are_named_for() -> None:
+    world, walkers = make_place_world("people:0")
+    assert 2 <= len(walkers) <= 4
+    begin, end = walkers[0].surfaces
+    corners = world.vertices.reshape(len(world.normal), -1, 3)[begin:end]
+    assert corners[..., 2].max() == pytest.approx(1.72) and corners[..., 2].min() == 0
+    assert corners[..., 0].mean() == pytest.approx(walkers[0].x, abs=0.05)
+    later = world_after(world, walkers, 2.0)
+    moved = (later.vertices - world.vertices).reshape(len(world.normal), -1, 3)
+    assert moved[begin:end, :, 0] == pytest.approx(walkers[0].moved_m(2.0), abs=1e-4)
+    assert np.count_nonzero(np.abs(moved).max(axis=(1, 2))) <= 17 * len(walkers)
+    glass, none = make_place_world("windows:0")
+    upright = (glass.emission > 0) & (np.abs(glass.normal[:, 2]) < 0.5)
+    assert none == () and upright.sum() >= 6
+    points, through = (
+        measure_world(EquirectRenderer(glass), pose_matrix(0.0, 0.0, 1.2), 1.3, 1.2, None, through)
+        for through in (False, True)
+    )
+    assert len(through) < 0.95 * len(points)
+    with pytest.raises(ValueError, match="must be an integer"):
+        make_place_world("hall:big")
+
+
+def test_the_paper_method_estimates_poses_with_particles(monkeypatch) -> None:
+    world, used = box_world(1.5), []
+
+    class Found:
+        online = np.zeros((50, 4))
+
+    def run_log(entries, particles=None):
+        used.append(type(particles).__name__)
+        found = Found()
+        found.online = np.column_stack([np.zeros(len(entries)), np.zeros((len(entries), 3))])
+        return found
+
+    monkeypatch.setattr("instant_ic.experiments.slam.run_log", run_log)
+    poses = [pose_matrix(x, 1.0, 1.2) for x in (-1.0, -0.5, 0.0)]
+    for method in ("ours", "paper"):
+        errors = vspace.slam_errors(world, poses, VspaceSettings(method=method))
+        # An estimate that never moves is wrong by the way, backwards.
+        assert errors is not None and errors[:, 0] == pytest.approx([0.0, -0.5, -0.9], abs=0.12)
+    assert used == ["NoneType", "ParticleConfig"]
+    assert vspace.slam_errors(world, poses[:1], VspaceSettings()) is None
+
+
+def test_a_recorded_drive_is_shown(tmp_path) -> None:
+    kinds = {"state": "instant_ic_msgs/msg/ControlState", "key": "instant_ic_msgs/msg/Keyframe"}
+    with BagWriter(tmp_path / "bag") as writer:
+        start, room = 10**9, box_room.panorama(np.eye(4), 128)
+        photo = cv2.imencode(".png", room.rgb[..., ::-1])[1].tobytes()
+        picture = compressed_image_message(photo, "camera", start)
+        for number in range(120):  # 6 s at 20 Hz, in the virtual space from 2 to 4 s
+            stamp, virtual = start + number * 50_000_000, 40 <= number < 80
+            x = 0.01 * number
+            state = ControlState(
+                header=header("map", stamp), mode=int(virtual), reason="", estop=False, blocked=False, transitions=0,
+                robot_pose=pose_message(pose_matrix(x)), vbot_start=pose_message(np.eye(4)),
+                vbot_pose=pose_message(pose_matrix(x, 0.3)), operator_command=twist_message(0.2, 0.0),
+                applied_command=twist_message(0.2, 0.0), pose_gap_m=0.3, yaw_gap_rad=0.0, time_to_obstacle_s=1.0,
+                shown=int(virtual), vbot_action=0, vbot_target=pose_message(np.eye(4)),
+                robot_twist=twist_message(0.2, 0.0), vbot_limit_m_s=0.4, reason_code=0,
+            )  # fmt: skip
+            writer.write("/ic/state", kinds["state"], bytes(serialize(state)), stamp)
+            if number % 4 == 0:
+                kind = "sensor_msgs/msg/CompressedImage"
+                writer.write("/camera/image/compressed", kind, bytes(serialize(picture)), stamp)
+        key = keyframe(0, 0.0, room, start)
+        writer.write("/keyframe", kinds["key"], bytes(serialize(key)), start + 10_000_000, LATCHED)
+    options = Options(bag=tmp_path / "bag")
+    (unit,) = teleoperation.units(options)
+    found = teleoperation.measure(unit.arguments)
+    drive = found["drive"]
+    assert [one["to_virtual"] for one in drive["switches"]] == [True, False]
+    assert drive["gap_max_m"] == pytest.approx(0.3) and drive["obedience"] > 0.95
+    assert drive["mode_seconds"]["virtual"] == pytest.approx(2.0, abs=0.06)
+    stills = [name for name in found["images"] if name[0].isdigit()]
+    assert [name.split()[-1] for name in stills] == ["real", "virtual", "virtual", "virtual", "real"]
+    assert {"Film", "Trajectories of r-bot and v-bot", "State over time"} < {*found["images"]}
+    section = teleoperation.section([Result(unit, found, 1.0, 1.0)], options)
+    assert section.answers["flow"].held is True
+    with pytest.raises(ValueError, match="does not react"):
+        operators.units(options)
+    with pytest.raises(ValueError, match="/ic/state, /camera/image/compressed missing"):
+        with BagWriter(tmp_path / "other") as writer:
+            writer.write("/keyframe", kinds["key"], bytes(serialize(key)), start, LATCHED)
+        teleoperation.measure({"bag": str(tmp_path / "other")})
+    with pytest.raises(ValueError, match="/ic/state has the type Keyframe, not ControlState"):
+        with BagWriter(tmp_path / "wrong") as writer:
+            for topic in ("/ic/state", "/camera/image/compressed", "/keyframe"):
+                writer.write(topic, kinds["key"], bytes(serialize(key)), start, LATCHED)
+        teleoperation.measure({"bag": str(tmp_path / "wrong")})
 
 
 @pytest.mark.parametrize(
@@ -194,7 +433,11 @@ def test_the_report_needs_no_other_file(tmp_path) -> None:
         (["--timeout", "nan"], "--timeout: must be > 0"),
         (["--timeout", "inf"], "--timeout: must be finite"),
         (["--bag", "drive", "--world", "random"], "leave out --world"),
-        (["--bag", "drive", "--method", "paper"], "in ablation only"),
+        (["--bag", "drive", "--method", "paper"], "Leave out --method"),
+        (["--bag", "drive", "--meshes", "."], "leave out --world and --meshes"),
+        (["--meshes", "/nowhere"], "has no mesh"),
+        (["--unit-timeout", "0"], "--unit-timeout: must be > 0"),
+        (["--ship", "report.txt"], "must end in .html"),
     ],
 )
 def test_wrong_options_are_reported_before_anything_is_measured(arguments, words, tmp_path, capsys) -> None:
@@ -211,25 +454,27 @@ def test_a_world_that_is_not_there_is_reported_with_the_rest(tmp_path, capsys) -
     assert len(errors) == 1 and "no.glb" in errors[0] and "no.glb" in (tmp_path / "report.html").read_text()
 
 
+def keyframe(number: int, x: float, room: box_room.RoomPicture, stamp: int) -> Keyframe:
+    return Keyframe(
+        header=header("map", stamp),
+        id=number,
+        pose=pose_message(pose_matrix(x)),
+        panorama=compressed_image_message(cv2.imencode(".png", room.rgb[..., ::-1])[1].tobytes(), "camera", stamp),
+        depth=image_message(room.depth_m, "32FC1", "camera", stamp),
+        sigma=image_message(np.empty((0, 0), np.uint8), "mono8", "camera", stamp),
+        source="network",
+        scale=1.0,
+        quality=0.9,
+        relative_sigma=0.03,
+        fit=True,
+        message="",
+    )
+
+
 def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
     with BagWriter(tmp_path / "bag") as writer:
         for number, x in enumerate((0.0, 0.5, 1.0)):
-            pose = pose_matrix(x)
-            room = box_room.panorama(pose, 128)
-            message = Keyframe(
-                header=header("map", 7),
-                id=number,
-                pose=pose_message(pose),
-                panorama=compressed_image_message(cv2.imencode(".png", room.rgb[..., ::-1])[1].tobytes(), "camera", 7),
-                depth=image_message(room.depth_m, "32FC1", "camera", 7),
-                sigma=image_message(np.empty((0, 0), np.uint8), "mono8", "camera", 7),
-                source="network",
-                scale=1.0,
-                quality=0.9,
-                relative_sigma=0.03,
-                fit=True,
-                message="",
-            )
+            message = keyframe(number, x, box_room.panorama(pose_matrix(x), 128), 7)
             kind = "instant_ic_msgs/msg/Keyframe"
             writer.write("/keyframe", kind, bytes(serialize(message)), 10**9 * (number + 1), LATCHED)
     options = Options(5, bag=tmp_path / "bag", size=(48, 32))
@@ -243,6 +488,17 @@ def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
     assert found["images"]["recorded"].startswith("data:image/jpeg")
     results = [Result(units[0], found, 1.0, 1.0)]
     assert "recorded" in str(reconstruction.section(results, options).parts)
+    (first, _) = environments.units(options)
+    assert first.arguments["sources"] == ["ours", "fill", "panorama"]
+    given = {"panorama_width": 256, "images": False, "size": [48, 32]}
+    place = Result(first, environments.measure({**first.arguments, **given}), 1.0, 1.0)
+    lost = environments.losses(place, "ours")
+    assert lost["unseen"] is not None and lost["unseen"] >= 0 and lost["depth"] is lost["pose"] is None
+    (trained, _) = training_time.units(Options(5, bag=tmp_path / "bag", quick=True, size=(48, 32)))
+    rows = training_time.measure({**trained.arguments, "panorama_width": 256, "times_s": [0.05]})["rows"]
+    assert {(row["source"], row["distance_m"]) for row in rows} == {
+        (source, at) for source in ("ours", "field", "paper") for at in (0.0, 1.0)
+    }
     with pytest.raises(ValueError, match="/keyframe is missing"):
         with BagWriter(tmp_path / "empty"):
             pass

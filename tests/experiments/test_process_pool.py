@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic.experiments.processes import process_pool
+from instant_ic.experiments.processes import LostError, ProcessPool, run_all
 
 
 @pytest.fixture
@@ -75,8 +75,8 @@ def test_an_interrupt_at_any_stage_leaves_no_process(
     halted = work(stage, tmp_path, monkeypatch)
     from slow_start import drive, prepare
 
-    with pytest.raises(KeyboardInterrupt), process_pool(1, prepare) as pool:
-        pool.submit(drive)
+    with pytest.raises(KeyboardInterrupt), ProcessPool(prepare) as pool:
+        pool.start().send((drive, ()))
         if stage != "start":
             wait_for(halted)
         if stopped:
@@ -99,30 +99,43 @@ def test_an_interrupt_between_start_and_the_pools_own_list_leaves_no_process(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(SpawnProcess, "start", interrupted)
-    with pytest.raises(KeyboardInterrupt), process_pool(1, prepare) as pool:
-        pool.submit(drive)
+    with pytest.raises(KeyboardInterrupt), ProcessPool(prepare) as pool:
+        pool.start().send((drive, ()))
     assert len(started) == 1 and gone(started)
 
 
-def test_a_result_cut_short_does_not_hold_up_the_end(
-    started: list[SpawnProcess], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    halted = work("result", tmp_path, monkeypatch)
-    from slow_start import begin_a_result, prepare
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_call_that_hangs_or_dies_is_lost_and_the_others_are_done(jobs: int) -> None:
+    from slow_start import behave, nothing
 
-    with pytest.raises(KeyboardInterrupt), process_pool(1, prepare) as pool:
-        future = pool.submit(begin_a_result)
-        thread = pool._executor_manager_thread  # type: ignore[attr-defined]
-        wait_for(halted)
-        raise KeyboardInterrupt
-    thread.join(120.0)  # an interpreter that ends joins it without a time-out
-    assert not thread.is_alive()
-    assert future.done() and gone(started)
+    lost = []
+
+    def on_lost(number: int, error: LostError) -> str:
+        lost.append((number, str(error)))
+        return "lost"
+
+    tasks = [("hang",), ("one",), ("die",), ("two",)]
+    results = run_all(behave, tasks, jobs, nothing, None, 600.0, 20.0, on_lost)
+    assert sorted(results) == ["lost", "lost", "one", "two"]
+    assert sorted(lost) == [
+        (0, "it took longer than 20 s and was ended"),
+        (2, "its process died (out of memory?)"),
+    ]
 
 
-def test_results_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    work("nowhere", tmp_path, monkeypatch)
-    from slow_start import prepare
+def test_without_a_result_for_lost_calls_the_run_ends(started: list[SpawnProcess]) -> None:
+    from slow_start import behave, nothing
 
-    with process_pool(2, prepare) as pool:
-        assert [future.result(120.0) for future in [pool.submit(abs, -n) for n in range(4)]] == [0, 1, 2, 3]
+    with pytest.raises(LostError, match="task 0: its process died"):
+        run_all(behave, [("die",), ("hang",)], 2, nothing)
+    with pytest.raises(TimeoutError, match="0 of 1 are done"):
+        run_all(behave, [("hang",)], 1, nothing, timeout_s=2.0, call_timeout_s=600.0)
+    with pytest.raises(ValueError, match="no such thing"):
+        run_all(behave, [("raise",), ("one",)], 2, nothing)
+    assert gone(started)
+
+
+def test_results_come_back() -> None:
+    from slow_start import nothing
+
+    assert sorted(run_all(abs, [(-n,) for n in range(4)], 2, nothing)) == [0, 1, 2, 3]

@@ -8,14 +8,17 @@ import os
 import shlex
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from instant_ic.cli.arguments import positive, positive_int, size
+from instant_ic.cli.arguments import check_files, positive, positive_int, size
 from instant_ic.cli.errors import UserError
-from instant_ic.cli.evaluations import counted, errors_for_the_user, use_one_thread_for_matrices
+from instant_ic.cli.evaluations import errors_for_the_user, use_one_thread_for_matrices
+from instant_ic.cli.progress import progress
 
 _NAMES = ("reconstruction", "training-time", "ablation", "teleoperation", "operators", "environments", "all")
+_MESHES = (".glb", ".gltf", ".obj", ".ply")
 
 
 def add_parser(subparsers: Any) -> None:
@@ -39,25 +42,31 @@ def add_parser(subparsers: Any) -> None:
         action="append",
         default=[],
         metavar="W",
-        help="corridor, random, long, a world with its seed (random:7), or a mesh file (.glb, ...); repeatable",
+        help=(
+            "corridor, random, long, hall, furnished, crossing, windows, people, one of them with its seed (random:7), "
+            "or a mesh file (.glb, ...); repeatable"
+        ),
     )
     add("--method", choices=("ours", "paper"), default="ours", help="virtual space (default: %(default)s)")
     add(
-        "--bag",
-        type=Path,
-        help="recording with /keyframe, for reconstruction and ablation: later panoramas are the truth",
+        "--bag", type=Path, help="recording to use instead of worlds (not for operators): later panoramas are the truth"
     )
+    add("--meshes", type=Path, metavar="DIR", help="environments: also the meshes of this folder")
     add("--quick", action="store_true", help="two seeds, small images, short training: does everything work?")
     add("--size", type=_size, metavar="WxH", help="size of the views (default: 320x180)")
     text = "units in parallel (default: %(default)s)"
     add("--jobs", type=positive_int, default=os.cpu_count() or 1, metavar="N", help=text)
-    add("--timeout", type=_limit, default=86400.0, metavar="S", help="time limit (default: %(default)g s)")
+    add("--timeout", type=_limit, default=86400.0, metavar="S", help="limit for all units (default: %(default)g s)")
+    text = "limit for one unit, which is then ended (default: %(default)g s)"
+    add("--unit-timeout", type=_limit, default=1800.0, metavar="S", help=text)
+    add("--ship", type=Path, metavar="FILE.html", help="also write the report with reduced images, at most 2 MB")
     parser.set_defaults(func=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run ``ic experiment``; return the exit status."""
     use_one_thread_for_matrices()
+    check_files(args.ship, suffix=".html")
     with errors_for_the_user():
         return _experiment(args)
 
@@ -65,40 +74,76 @@ def run(args: argparse.Namespace) -> int:
 def _experiment(args: argparse.Namespace) -> int:
     from instant_ic.experiments import lab, report
 
-    began = time.monotonic()
+    began, folder = time.monotonic(), args.out / "units"
     names = list(lab.EXPERIMENTS) if args.name == "all" else [args.name]
-    options = lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, args.size)
-    if args.bag is not None and not {*names} <= {"reconstruction", "ablation"}:
-        raise UserError("--bag works with reconstruction and ablation only: the others need a world", 2)
-    if args.bag is not None and args.world:
-        raise UserError("--bag needs no world: leave out --world", 2)
-    if args.bag is not None and args.method == "paper" and "reconstruction" in names:
-        raise UserError("--bag works with --method paper in ablation only", 2)
+    if args.bag is not None:
+        if args.world or args.meshes:
+            raise UserError("--bag needs no world: leave out --world and --meshes", 2)
+        if args.method == "paper":
+            raise UserError(
+                "--bag: --method paper needs unscaled depth, which a recording lacks. Leave out --method", 2
+            )
+        if args.name == "all":
+            names.remove("operators")
+    meshes = _meshes(args.meshes)
+    options = lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, args.size, meshes)
     modules = {name: lab.module(name) for name in names}
     units = [unit for module in modules.values() for unit in module.units(options)]
-    with counted("measuring", len(units)) as advance:
-
-        def show_progress(result: lab.Result) -> None:
-            how = f"failed: {result.error}" if result.error else f"{result.wall_s:.0f} s"
-            advance(result.unit.experiment, f"{result.unit.experiment}, {result.unit.place}: {how}")
-
-        results = lab.run(units, args.out / "units", args.jobs, show_progress, args.timeout)
-    sections = {
-        name: module.section([one for one in results if one.unit.experiment == name], options)
-        for name, module in modules.items()
-    }
+    found = lab.kept(units, folder)
+    known = {result.unit.key for result in found}
+    cost_s = sum(unit.cost_s for unit in units if unit.key not in known)
     conditions = {
         "command": shlex.join(["ic", *sys.argv[1:]]),
         "date": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
-        "wall time of this run": f"{time.monotonic() - began:.0f} s",
+        "estimate": f"{len(units) - len(found)} of {len(units)} units to measure, {cost_s:.0f} s of CPU time: about "
+        f"{cost_s / 60 / min(args.jobs, os.cpu_count() or 1):.0f} min with {args.jobs} in parallel on free cores",
+        **({"left out": "operators: a recorded robot does not react to another operator"} if args.bag else {}),
         **lab.machine(),
     }
-    report.write(args.out, sections, results, conditions)
+    print(conditions["estimate"], file=sys.stderr, flush=True)
+
+    def write(results: list[lab.Result]) -> None:
+        sections = {
+            name: module.section([one for one in results if one.unit.experiment == name], options)
+            for name, module in modules.items()
+        }
+        conditions["wall time of this run"] = f"{time.monotonic() - began:.0f} s"
+        report.write(args.out, sections, results, conditions)
+        if args.ship is not None:
+            report.ship(args.ship, sections, results, conditions)
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write(found)  # what there is, before hours of work
+    with progress("measuring") as show:
+        done_s = 0.0
+
+        def show_progress(result: lab.Result) -> None:
+            nonlocal done_s
+            done_s += result.unit.cost_s
+            how = f"failed: {result.error}" if result.error else f"{result.wall_s:.0f} s"
+            left_min = (time.monotonic() - began) * (cost_s / done_s - 1) / 60
+            if sys.stderr.isatty():
+                show(done_s / cost_s, result.unit.experiment)
+            else:
+                line = f"{result.unit.experiment}, {result.unit.place}: {how}; {done_s / cost_s:.0%}"
+                print(f"{line}, about {max(left_min, 0):.0f} min left", file=sys.stderr, flush=True)
+
+        results = lab.run(units, folder, args.jobs, show_progress, args.timeout, args.unit_timeout)
+    write(results)
     print(args.out / "report.html")
-    failed = dict.fromkeys(f"{one.unit.experiment} {one.unit.place}: {one.error}" for one in results if one.error)
-    for line in failed:
-        print(f"ic: {line}", file=sys.stderr)
+    failed = Counter(f"{one.unit.experiment} {one.unit.place}: {one.error}" for one in results if one.error)
+    for line, count in failed.items():
+        print(f"ic: {line}{f' ({count} units)' if count > 1 else ''}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def _meshes(folder: Path | None) -> tuple[str, ...]:
+    if folder is None:
+        return ()
+    found = sorted(str(path) for path in folder.glob("*") if path.suffix.lower() in _MESHES)
+    if not found:
+        raise UserError(f"--meshes: {folder} has no mesh ({', '.join(_MESHES)})", 2)
+    return tuple(found)
 
 
 def _size(text: str) -> tuple[int, int]:

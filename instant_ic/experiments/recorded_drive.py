@@ -1,0 +1,211 @@
+"""V.D from a recording: states over time, trajectories on the map, and what the operator saw, without any truth."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.experiments.pictures import new_figure, perspective_crop, save_figure, save_map
+from instant_ic.experiments.teleop_figures import STEP_S, Drive, judge
+from instant_ic.experiments.teleop_plot import draw_modes
+from instant_ic.experiments.teleop_stack import Log
+from instant_ic.geometry.poses import pose_matrix
+
+STATE, MAP, CAMERA, KEYFRAME = "/ic/state", "/map", "/camera/image/compressed", "/keyframe"
+TYPES = {STATE: "ControlState", MAP: "OccupancyGrid", CAMERA: "CompressedImage", KEYFRAME: "Keyframe"}
+SIZE = (320, 180)
+AROUND_S, MOST_S = 2.0, 60.0
+"""The film begins and ends this long before and after the virtual space, and is no longer."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What the operator saw: seconds from the first state, whether of the virtual space, and the image."""
+
+    time_s: float
+    virtual: bool
+    image: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class RecordedDrive:
+    """A drive from a bag.
+
+    Attributes:
+        drive: figures, as of a simulated one; the r-bot's pose is the stack's estimate.
+        moments: before, during and after the first passage through the virtual space; else of the first minute.
+        plot: PNG of both trajectories on the map.
+        modes: PNG of the arbiter's mode over time.
+    """
+
+    drive: Drive
+    moments: list[Moment]
+    plot: bytes
+    modes: bytes
+
+
+def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
+    """Read a drive; images every ``frame_s``. Views of the virtual space are rendered again from the keyframes.
+
+    Raises:
+        ValueError: no bag, or a topic is missing; names it.
+    """
+    from instant_ic.bag.errors import BagError
+    from instant_ic.bag.files import BagReader
+    from instant_ic.msg import deserialize
+
+    try:
+        with BagReader(bag) as reader:
+            types = {one.topic: one.type_name.rpartition("/")[2] for one in reader.topics}
+            names = types.keys()
+            missing = [topic for topic in (STATE, CAMERA, KEYFRAME) if topic not in names]
+            if missing:
+                has = ", ".join(sorted(names)) or "no topics"
+                raise ValueError(
+                    f"{bag}: {', '.join(missing)} missing; it has {has}. Record a drive with the whole stack"
+                )
+            wrong = [f"{topic} has the type {types[topic]}, not {kind}" for topic, kind in TYPES.items()
+                     if types.get(topic, kind) != kind]  # fmt: skip
+            if wrong:
+                raise ValueError(f"{bag}: {'; '.join(wrong)}")
+            begin_ns = 0
+            states: list[tuple[float, Any]] = []
+            keyframes: list[tuple[float, Any]] = []
+            grid = None
+            for one in reader.messages([STATE, KEYFRAME, *([MAP] if MAP in names else [])]):
+                message = deserialize(one.payload, one.type_name)
+                if one.topic == MAP:
+                    grid = message
+                    continue
+                begin_ns = begin_ns or one.stamp_ns
+                time_s = (one.stamp_ns - begin_ns) / 1e9
+                if one.topic == STATE:
+                    states.append((time_s, message))
+                elif message.fit:
+                    keyframes.append((time_s, message))
+            if len(states) < 2:
+                raise ValueError(f"{bag}: {len(states)} messages on {STATE}, 2 are needed")
+            log = as_log(states, len(keyframes))
+            times = film_times(log, frame_s)
+            photos: list[tuple[float, bytes]] = []  # the newest image at each time
+            for one in reader.messages([CAMERA]):
+                time_s = (one.stamp_ns - begin_ns) / 1e9
+                if times[0] - 1.0 <= time_s <= times[-1] and (not photos or time_s >= photos[-1][0] + 0.5 * frame_s):
+                    photos.append((time_s, bytes(deserialize(one.payload, one.type_name).data)))
+    except BagError as error:
+        raise ValueError(str(error)) from error
+    drive = Drive(0, "ic", True, seconds=log.time_s[-1] - log.time_s[0])
+    judge(drive, log, np.empty((0, 2)))
+    return RecordedDrive(drive, _moments(log, times, photos, keyframes), _plot(drive, grid), _modes(drive))
+
+
+def as_log(states: Sequence[tuple[float, Any]], keyframes: int) -> Log:
+    """States (seconds, ControlState), each held until the next, in the steps of a log."""
+    from instant_ic.msg import pose2_from_message
+
+    log = Log(keyframes=keyframes)
+    at = np.array([time_s for time_s, _ in states])
+    for time_s in np.arange(at[0], at[-1] + 1e-9, STEP_S):
+        state = states[int(np.searchsorted(at, time_s + 1e-9)) - 1][1]
+        robot = np.asarray(pose2_from_message(state.robot_pose), np.float64)
+        log.time_s.append(float(time_s))
+        log.mode.append(int(state.mode))
+        log.virtual.append(int(state.shown) == state.SHOWN_VIRTUAL)
+        log.robot.append(robot)
+        log.estimate.append(robot)
+        log.vbot.append(np.asarray(pose2_from_message(state.vbot_pose), np.float64))
+        log.yaw_gap_rad.append(math.nan)  # the true heading is unknown
+        log.known_yaw_gap_rad.append(float(state.yaw_gap_rad))
+        command = state.operator_command
+        log.command.append((float(command.linear.x), float(command.angular.z)))
+        log.blocked.append(bool(state.blocked))
+        log.reason.append(str(state.reason))
+    return log
+
+
+def film_times(log: Log, frame_s: float) -> NDArray[np.float64]:
+    """Times around the first passage through the virtual space; of the first minute without one."""
+    times, virtual = np.array(log.time_s), np.array(log.virtual)
+    begin, end = times[0], times[-1]
+    if virtual.any():
+        first = int(np.argmax(virtual))
+        length = int(np.argmin(virtual[first:])) or len(virtual) - first
+        begin, end = times[first] - AROUND_S, times[first + length - 1] + AROUND_S
+    begin, end = max(begin, times[0]), min(end, times[-1], begin + MOST_S)
+    return np.arange(begin, end + 1e-9, frame_s)
+
+
+def _moments(
+    log: Log,
+    times: NDArray[np.float64],
+    photos: Sequence[tuple[float, bytes]],
+    keyframes: Sequence[tuple[float, Any]],
+) -> list[Moment]:
+    from instant_ic.msg import image_array, matrix_from_pose
+    from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
+    from instant_ic.vspace.jobs import decode_panorama
+
+    space, shown = VirtualSpace(VirtualSpaceConfig(source="warp", panorama_width=1024)), -1
+    base_from_camera = np.eye(4)
+    found = []
+    for time_s in times:
+        row = int(np.searchsorted(log.time_s, time_s + 1e-9)) - 1
+        newest = sum(at <= time_s for at, _ in keyframes) - 1
+        if log.virtual[row] and newest >= 0:
+            if newest != shown:
+                at, message = keyframes[newest]
+                pose = matrix_from_pose(message.pose)
+                robot = log.robot[max(int(np.searchsorted(log.time_s, at + 1e-9)) - 1, 0)]
+                base_from_camera = np.eye(4)
+                base_from_camera[2, 3] = pose[2, 3]
+                ahead = np.linalg.inv(pose_matrix(robot[0], robot[1], yaw=robot[2])) @ pose
+                if math.hypot(ahead[0, 3], ahead[1, 3]) < 0.5:  # else the keyframe is older than this drive's motion
+                    base_from_camera[:2, 3] = ahead[:2, 3]
+                depth = np.asarray(image_array(message.depth), np.float32)
+                rgb = decode_panorama(np.asarray(message.panorama.data, np.uint8))
+                space.set_keyframe(rgb, depth, pose, float(message.relative_sigma))
+                shown = newest
+            x, y, yaw = log.vbot[row]
+            view = space.render(pose_matrix(x, y, yaw=yaw) @ base_from_camera, *SIZE, math.pi / 2)
+            found.append(Moment(float(time_s), True, view.softened()))
+            continue
+        taken = [jpeg for at, jpeg in photos if at <= time_s]
+        if taken:
+            rgb = decode_panorama(np.frombuffer(taken[-1], np.uint8))
+            found.append(Moment(float(time_s), False, perspective_crop(rgb, np.eye(3), *SIZE, math.pi / 2)))
+    return found
+
+
+def _plot(drive: Drive, grid: Any) -> bytes:
+    """PNG of both tracks on the recorded map, on white without one."""
+    from instant_ic.msg import grid_array
+
+    tracks = {
+        name: np.array(drive.tracks[key]) for name, key in (("r-bot", "robot"), ("v-bot", "vbot")) if drive.tracks[key]
+    }
+    places = np.concatenate([track[:, :2] for track in tracks.values()])
+    corner = places.min(axis=0) - 1.5
+    cells, resolution, origin = np.zeros((1, 1), np.int8), 1.0, (float(corner[0]), float(corner[1]))
+    if grid is not None:
+        cells, resolution, origin = grid_array(grid)
+    else:
+        columns, rows = np.ceil(places.max(axis=0) + 1.5 - corner).astype(int)
+        cells = np.zeros((rows, columns), np.int8)
+    with tempfile.TemporaryDirectory() as folder:
+        save_map(Path(folder) / "plot.png", cells, resolution, origin, None, tracks)
+        return (Path(folder) / "plot.png").read_bytes()
+
+
+def _modes(drive: Drive) -> bytes:
+    figure, axes = new_figure(1, 1, (9.0, 1.4))
+    draw_modes(axes[0, 0], [drive])
+    with tempfile.TemporaryDirectory() as folder:
+        save_figure(figure, Path(folder) / "modes.png")
+        return (Path(folder) / "modes.png").read_bytes()
