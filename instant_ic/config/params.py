@@ -392,6 +392,8 @@ def _coerce(value: Any, hint: Any, key: str) -> Any:
     if hint is bool and isinstance(value, bool):
         return value
     if hint is int and isinstance(value, int) and not isinstance(value, bool):
+        if not -(1 << 63) <= value < 1 << 63:
+            raise _RefusedError(f"{key} must have at most 64 bits, as in ROS 2 (got {value})")
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
         with suppress(OverflowError):  # of a huge int

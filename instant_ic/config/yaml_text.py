@@ -17,7 +17,22 @@ _LINE_END = re.compile("[\n\r\x85\u2028\u2029]")
 _MOST_LEVELS = 100
 _MOST_VALUES = 100_000
 """Values of a document with each alias counted where it is used: 300 bytes of aliases can stand for billions."""
+_MOST_BITS = 10_000
+"""Of a whole number. Python prints no number of 4300 digits, not even in the error that refuses it."""
 _TOO_DEEP = "lists or mappings are nested too deeply, or an anchor contains itself"
+
+
+class _Loader(yaml.SafeLoader):
+    """Refuses numbers that cannot be printed, such as a hexadecimal one of thousands of digits."""
+
+    def construct_yaml_int(self, node: Any) -> int:
+        value = int(super().construct_yaml_int(node))
+        if value.bit_length() > _MOST_BITS:
+            raise yaml.constructor.ConstructorError(None, None, "the number is too long", node.start_mark)
+        return value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 def read_yaml(text: str) -> Any:
@@ -51,7 +66,7 @@ def construct(node: yaml.Node) -> Any:
     Raises:
         yaml.YAMLError: a value does not fit its type.
     """
-    loader = yaml.SafeLoader("")
+    loader = _Loader("")
     try:
         return _checked(lambda: loader.construct_object(node, deep=True))
     finally:

@@ -92,6 +92,29 @@ def test_parameter_file_that_is_no_utf8_is_an_error_with_its_name(tmp_path: Path
         load_file(path, "node")
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "why"),
+    [
+        ("port", "9" * 400, "port must have at most 64 bits"),
+        ("port", "-" + "9" * 400, "port must have at most 64 bits"),
+        ("silence_s", "9" * 400, "silence_s must be a finite number"),
+        ("port", "0x" + "f" * 5000, "the number is too long"),
+        ("silence_s", "[0x" + "f" * 5000 + "]", "the number is too long"),
+        ("port", "1:" + "59:" * 3000 + "59", "the number is too long"),  # in base 60
+    ],
+)
+def test_parameter_with_a_huge_number_is_an_error_with_its_place(
+    tmp_path: Path, key: str, value: str, why: str
+) -> None:
+    from instant_ic.config.params import build
+    from nodes.vlp16_driver import Vlp16DriverConfig
+
+    path = tmp_path / "params.yaml"
+    path.write_text(f"node:\n  ros__parameters:\n    {key}: {value}\n")
+    with pytest.raises(ParameterError, match=rf"params\.yaml:3: .*{why}"):
+        build(Vlp16DriverConfig, load_file(path, "node"))
+
+
 @pytest.mark.parametrize("value", ["1" * 5000, "2001-13-45", "!!timestamp x", "{[]: 1}", "[" * 3000, '!!int "_"'])
 def test_manifest_with_a_value_that_is_none_is_an_error(tmp_path: Path, value: str) -> None:
     path = tmp_path / "model.yaml"
