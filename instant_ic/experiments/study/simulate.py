@@ -16,7 +16,7 @@ from instant_ic.experiments.study.server import StudyServer
 
 FLAGS = ("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-background-networking")
 STUCK_S = 4.0
-"""Seconds of the stack. After standing so long under a command, they drive around; the third time they end the drive."""
+"""Seconds of the stack. Standing so long under a command, they drive around; the third time they end the drive."""
 AROUND = (("s", 2.5), ("a", 1.2), ("w", 3.0), ("d", 2.4), ("w", 3.0), ("a", 1.2))
 _WATCH = "addEventListener('rendered', (event) => { window.studyPose = event.detail.pose; })"
 
