@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from console_pages import BROWSER_TEST, SIZE, WAIT_MS, expect_body, watched_page
+from console_pages import BROWSER_TEST, SIZE, WAIT_MS, expect_body, moving, wait_until, watched_page
 
 from instant_ic.experiments.study.plan import CONDITIONS, create
 from instant_ic.experiments.study.record import DONE, Record
@@ -43,7 +43,7 @@ def test_a_participant_fills_every_page_and_sees_no_condition(page, tmp_path, de
         page.locator("button.main").click()
         expect_body(page, "driver", "you")
         page.keyboard.down("w")
-        page.locator("kbd[data-code=KeyW].held").wait_for()
+        wait_until(lambda: moving(demo), page, "the key drives")
         page.keyboard.up("w")
         page.keyboard.press("r")  # no recording of the console's
         page.keyboard.press("h")

@@ -15,6 +15,7 @@ class FakeTrial:
     """A drive that is ready at once."""
 
     console = "http://127.0.0.1:9"
+    pace = 1.0
 
     def __init__(self, drive, bag):
         self.drive, self.status, self.result = drive, "ready", {}

@@ -411,6 +411,8 @@ def test_the_report_of_few_says_so_and_of_none_is_written(study, tmp_path):
     data = json.loads((out / "report.json").read_text())
     assert data["participants"]["finished"] == 3 and len(data["drives"]) == 12
     assert page.count("<svg") >= 5
+    assert stat.S_IMODE(out.stat().st_mode) == 0o700
+    assert stat.S_IMODE((out / "report.json").stat().st_mode) == 0o600
 
 
 def test_participants_are_known_by_code_only(study):

@@ -17,6 +17,7 @@ from instant_ic.experiments.report import Figure, Part, Section, Table, Text
 from instant_ic.experiments.study import stats
 from instant_ic.experiments.study.plan import CONDITIONS, Study
 from instant_ic.experiments.study.record import DONE, WITHDRAWN, Record
+from instant_ic.private import make_folder
 
 MEASURES = {
     "time_s": "time, s",
@@ -92,10 +93,12 @@ def build(study: Study, out: Path, command: str) -> dict[str, Any]:
         "pairs": Section("Pairs of conditions", _pairs(study, drives, order)),
         "choices": Section("Questions after all drives (V.E)", _choices(study, done, order)),
     }
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out, exist_ok=True)
     conditions = {"study": study.folder.name, "command": command, **machine()}
     extra = {"participants": counts, "drives": drives}
     report.write(out, sections, [], conditions, "Instant IC: user study", extra)
+    for name in ("report.html", "report.json"):  # they hold the answers of each participant
+        (out / name).chmod(0o600)
     return counts
 
 

@@ -94,7 +94,7 @@ class StudyServer:
         self._make_trial = make_trial
         self._trial: Trial | None = None
         self._last = ""  # text of the last page, where the participant left
-        self._loop = asyncio.new_event_loop()
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._finish = asyncio.Event()
         self._started = threading.Event()
         self._error: Exception | None = None
@@ -103,6 +103,11 @@ class StudyServer:
     @property
     def url(self) -> str:
         return f"http://127.0.0.1:{self.port}/"
+
+    @property
+    def pace(self) -> float:
+        """Seconds of the running drive per second of the machine."""
+        return 1.0 if self._trial is None else self._trial.pace
 
     def start(self) -> None:
         """Serve; raise StudyError if the port is taken."""
@@ -114,20 +119,21 @@ class StudyServer:
         """End a running drive, and the server."""
         if self._trial is not None:
             self._trial.end("interrupted", END_S)
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            self._loop.call_soon_threadsafe(self._finish.set)
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._finish.set)
         self._thread.join(START_S)
 
     def _run(self) -> None:
         try:
-            self._loop.run_until_complete(self._serve())
+            asyncio.run(self._serve())
         except OSError as error:
             self._error = error
         finally:
-            self._loop.close()
             self._started.set()
 
     async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
         app = web.Application(middlewares=[self._guard], client_max_size=MOST_BODY)
         app.router.add_get("/", self._show)
         app.router.add_post("/", self._take)
@@ -180,7 +186,7 @@ class StudyServer:
         """The participant's present page; with what was sent and what is wrong with it, once more."""
         record, texts = self.record, self.record.study.texts
         if self._last or record.state != OPEN or (step := record.step) is None:
-            self._loop.call_later(1.0, self.over.set)
+            asyncio.get_running_loop().call_later(1.0, self.over.set)
             key = self._last or ("withdrawn" if record.state == WITHDRAWN else "done")
             return self._page(f"<h1>{forms.escape(texts['title'])}</h1>{forms.paragraphs(texts[key])}")
         if step == "consent":

@@ -16,7 +16,7 @@ from instant_ic.experiments.study.server import StudyServer
 
 FLAGS = ("--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-background-networking")
 STUCK_S = 4.0
-"""Standing so long under a command, the participant drives around; the third time the drive is ended."""
+"""Seconds of the stack. Standing so long under a command, they drive around; the third time they end the drive."""
 AROUND = (("s", 2.5), ("a", 1.2), ("w", 3.0), ("d", 2.4), ("w", 3.0), ("a", 1.2))
 _WATCH = "addEventListener('rendered', (event) => { window.studyPose = event.detail.pose; })"
 
@@ -70,7 +70,7 @@ class Participant:
             self._check_time()
             step = server.record.step or "end"
             if self.page.locator("#study-bar").count():
-                self._drive(step)
+                self._drive(step, server)
             elif (form := self.page.locator("form")).count():
                 self.on_page(self.page, step)
                 if self.page.locator("button[value=again]").count():
@@ -96,7 +96,7 @@ class Participant:
             else:
                 field.locator("textarea").fill("written by a program")
 
-    def _drive(self, step: str) -> None:
+    def _drive(self, step: str, server: StudyServer) -> None:
         """Hold W to the end; stuck, drive around with the keys; stuck again and again, end the drive."""
         page, keys = self.page, self.page.keyboard
         page.evaluate(_WATCH)
@@ -119,9 +119,9 @@ class Participant:
                 self.on_page(page, step)
             if page.locator("#banner:visible").count():  # it asks to release the controls
                 keys.up("w")
-                page.wait_for_timeout(1200)
+                page.wait_for_timeout(1200 / server.pace)
                 keys.down("w")
-            elif time.monotonic() - moved_at > STUCK_S:
+            elif (time.monotonic() - moved_at) * server.pace > STUCK_S:
                 tries += 1
                 keys.up("w")
                 if tries > 2:
@@ -129,7 +129,7 @@ class Participant:
                 for key, seconds in AROUND:
                     if page.locator("#study-bar").count():
                         keys.down(key)
-                        page.wait_for_timeout(1000 * seconds)
+                        page.wait_for_timeout(1000 * seconds / server.pace)
                         keys.up(key)
                 keys.down("w")
                 moved_at = time.monotonic()

@@ -108,12 +108,14 @@ class Trial:
         status: ``starting``, ``ready``, ``saving``, ``done`` or ``failed``.
         console: address of the stack's page while ``ready``; empty before.
         result: measures, once ``done``.
+        pace: seconds of the stack per second of the machine.
     """
 
     def __init__(self, drive: Drive, bag: Path) -> None:
         self.drive, self.bag = drive, bag
         self.status, self.console = "starting", ""
         self.result: dict[str, Any] = {}
+        self.pace = 1.0
         self._end = threading.Event()
         self._why = "participant"
         self._thread = threading.Thread(target=self._guarded, name="drive", daemon=True)
@@ -161,7 +163,8 @@ class Trial:
             while not self._end.wait(0.01):
                 stack.observer.spin_once()
                 stack.check_alive("the end of the drive")
-                slowest = min(slowest, stack.pace)
+                self.pace = stack.pace
+                slowest = min(slowest, self.pace)
                 passed_s = (stamp_ns(state[0]) - began_ns) / 1e9
                 if passed_s > self.drive.limit_s:
                     self.end("limit")
