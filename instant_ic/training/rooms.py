@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ class RoomsConfig:
         worlds: number of worlds.
         poses: panoramas in each.
         priors: fused depth images of each panorama, with other faults and another number of revolutions each.
-        first_world: seed of the first world; the others follow. Held-out worlds are the last ones.
+        first_world: seed of the first world; the others follow.
         height: rows of a panorama.
         interiors: ``wide``: ``interiors.interior_world``; ``random``: only ``sim.worlds.random_world``.
         camera_height_m: lowest and highest camera above the floor.
@@ -54,16 +53,6 @@ class RoomsConfig:
         if self.first_world < 0 or self.first_world + self.worlds > FIRST_HELD_OUT:
             raise ValueError(f"world seeds must be in 0..{FIRST_HELD_OUT - 1}: higher ones are for evaluation "
                              f"(got {self.first_world}..{self.first_world + self.worlds - 1})")  # fmt: skip
-
-    @property
-    def count(self) -> int:
-        """Total number of panoramas."""
-        return self.worlds * self.poses
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, for the training record."""
-        module = "depth.interiors.interior_world" if self.interiors == "wide" else "sim.worlds.random_world"
-        return {"kind": f"instant_ic.{module}", **asdict(self)}
 
 
 def render_rooms(config: RoomsConfig, folder: Path, worlds: Iterable[int]) -> Iterator[Path]:

@@ -35,6 +35,10 @@ POLE_WEIGHT = 0.1
 """Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
 hardly trained, and appear as spikes above and below the camera in the point cloud.
 """
+HEAD_RATE = 0.1
+"""Learning rate of the last layer over that of the decoder. Adam moves each of the some 400 weights behind an output by
+the rate in a step: together they would leave the prior in a few steps, before they have learnt anything.
+"""
 TEAM_TIMEOUT = timedelta(minutes=20)
 """A process that waits longer for the others exits with an error."""
 
@@ -244,11 +248,12 @@ class Trainer:
             ids = [self.team.device.index] if self.team.device.type == "cuda" else None
             self._parallel = DistributedDataParallel(self.model, device_ids=ids)
         groups = []
-        for rate, pretrained in ((self.config.encoder_rate, True), (1.0, False)):
-            part = [p for name, p in self.model.named_parameters() if name.startswith("encoder.") == pretrained]
-            for decay, chosen in ((self.config.weight_decay, True), (0.0, False)):
-                parameters = [p for p in part if (p.ndim > 1) == chosen]
-                groups.append({"params": parameters, "weight_decay": decay, "rate": rate})
+        rates = {"encoder.": self.config.encoder_rate, "head.": HEAD_RATE}
+        for decay, matrices in ((self.config.weight_decay, True), (0.0, False)):
+            for name, parameter in self.model.named_parameters():
+                if (parameter.ndim > 1) == matrices:
+                    rate = next((rate for start, rate in rates.items() if name.startswith(start)), 1.0)
+                    groups.append({"params": [parameter], "weight_decay": decay, "rate": rate})
         self.optimizer = torch.optim.AdamW(groups, lr=self.config.learning_rate)
         cuda = self.team.device.type == "cuda"
         self._half = torch.float16 if cuda and not torch.cuda.is_bf16_supported() else torch.bfloat16
@@ -353,7 +358,8 @@ class Trainer:
             row = {
                 "step": self.step, "minutes": round(self.elapsed_s / 60, 2),
                 "loss": round(float(np.mean(losses[-count:])), 5),
-                "learning_rate": self.optimizer.param_groups[-1]["lr"], "panoramas_per_s": round(rate, 2),
+                "learning_rate": self.config.learning_rate * schedule(self.progress, self.config.warmup),
+                "panoramas_per_s": round(rate, 2),
             }  # fmt: skip
             log.row(row, f"step {self.step} epoch {self.step / self.feed.steps_an_epoch:.2f} "
                          f"loss {row['loss']:.4f} {rate:.1f} panoramas/s {100 * self.progress:.0f} %")  # fmt: skip
