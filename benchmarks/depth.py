@@ -66,7 +66,7 @@ def evaluators(
         for source in SOURCES[1:4]
     }
     if completion is not None:
-        made[SOURCES[4]] = Evaluator(DepthSettings(SOURCES[4], lidar), completion)
+        made[SOURCES[4]] = Evaluator(DepthSettings(SOURCES[4], lidar, method=method), model, completion)
     return made if share else {SOURCES[0]: Evaluator(DepthSettings("network"), model), **made}
 
 

@@ -16,7 +16,7 @@ from instant_ic.depth.inference import Inference
 from instant_ic.depth.inputs import HeldImage, Revolution
 from instant_ic.depth.manifest import ManifestError
 from instant_ic.depth.node_config import DepthScalerConfig
-from instant_ic.depth.sources import DepthResult
+from instant_ic.depth.sources import DepthResult, complete
 from instant_ic.keyframe_messages import keyframe_message
 from instant_ic.mapping.local_model import warm_up
 from instant_ic.msg import (
@@ -54,12 +54,13 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     )
 
     def setup(self) -> None:
-        config, completion = self.config, None
+        config = self.config
+        self.completion: Inference | None = None
         if config.source != "network":
             warm_up()
         if config.source == "completed":
             try:
-                completion = Inference(config.completion, config.provider, config.threads, self.stop)
+                self.completion = Inference(config.completion, config.provider, config.threads, self.stop)
             except (ManifestError, FileNotFoundError) as error:
                 raise NodeError(str(error)) from error
         self.request = self.publisher("/depth/request", Header, qos=LATCHED)
@@ -67,7 +68,8 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
         self.warn_of_method()
-        self.chain = DepthChain(config, self.tf, self.diagnose, completion)
+        self.chain = DepthChain(config, self.tf, self.diagnose)
+        self.worker = self.background(self.corrected, self.publish_depth)
         self.local_map = self.publisher("/map/local", PointCloud2, qos=SENSOR)
         self.timer(_LOCAL_MAP_S, self.on_local_map)
         self.state = self.latest("/ic/state", ControlState, _STATE_S, qos=LATCHED)
@@ -77,12 +79,14 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.subscribe("/depth/raw", Image, self.on_depth, qos=SENSOR)
 
     def reconfigure(self, config: DepthScalerConfig) -> None:
+        if config.source == "completed" and self.completion is None:
+            raise ValueError("source completed needs its model from the start: start the node with it")
         self.chain.reconfigure(config)
         super().reconfigure(config)
         self.warn_of_method()
 
     def warn_of_method(self) -> None:
-        if self.config.scaler.method == "as_estimated" and not self.config.of_lidar:
+        if self.config.scaler.method == "as_estimated" and self.config.source != "lidar":
             self.log.warning("depth is used as estimated, without the LiDAR: for recordings, not for driving")
 
     def on_image(self, message: Any) -> None:
@@ -94,7 +98,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.chain.selector.virtual = state is not None and state.mode in _VIRTUAL
         if not self.chain.due(image):
             return
-        if self.config.of_lidar:
+        if self.config.source == "lidar":
             self.handle(self.chain.hold(image))
         elif self.chain.request_due(image.stamp_ns):
             self.request.publish(header(image.frame, image.stamp_ns))
@@ -113,16 +117,30 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             self.local_map.publish(cloud_of_points(mapper.cloud(), self.config.map_frame, self.chain.image_ns))
 
     def on_depth(self, message: Any) -> None:
-        if not self.config.of_lidar:
+        if self.config.source != "lidar":
             self.chain.answered()
             self.handle(HeldImage(message.header.frame_id, stamp_ns(message)), image_array(message))
 
     def handle(self, image: HeldImage | None, raw: NDArray[np.float32] | None = None) -> None:
-        """Compute and publish the depth of an image."""
+        """Compute the depth of an image and publish it; before that a completion corrects it in the background."""
         if image is None:
             return
+        result = self.chain.estimate(raw, image.frame, image.stamp_ns)
+        panorama = self.chain.inputs.images.get(image.stamp_ns)
+        if result.prior is None or panorama is None:
+            self.publish_depth((image, result))
+        else:
+            self.worker.submit((image, result, panorama.data))
+
+    def corrected(self, job: tuple[HeldImage, DepthResult, bytes]) -> tuple[HeldImage, DepthResult]:
+        image, result, data = job
+        assert self.completion is not None  # without one no result has a prior
+        return image, complete(result, functools.partial(self.completion.complete, data))
+
+    def publish_depth(self, done: tuple[HeldImage, DepthResult]) -> None:
+        image, result = done
         camera, stamp = image.frame, image.stamp_ns
-        result = self.chain.estimate(raw, camera, stamp)
+        self.chain.report(result)
         if result.ok:
             self.scaled.publish(image_message(result.depth_m, "32FC1", camera, stamp))
         pose = self.chain.keyframe_pose(result, camera, stamp)

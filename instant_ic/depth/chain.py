@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.inference import Inference
 from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, Revolution, RevolutionTrigger
 from instant_ic.depth.keyframes import KeyframeSelector
-from instant_ic.depth.metric_depth import MetricDepth, MetricDepthConfig
+from instant_ic.depth.metric_depth import MetricDepth
 from instant_ic.depth.node_config import DepthScalerConfig
 from instant_ic.depth.sources import DepthResult, DepthSource
 from instant_ic.diagnosis import Level
@@ -30,43 +29,28 @@ class DepthChain:
         config: parameters.
         transforms: poses over time.
         diagnose: sets a diagnosis: name, level, text, values by keyword.
-        completion: the network of the source ``completed``.
     """
 
-    def __init__(
-        self, config: DepthScalerConfig, transforms: TransformBuffer, diagnose: Callable[..., None],
-        completion: Inference | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, config: DepthScalerConfig, transforms: TransformBuffer, diagnose: Callable[..., None]) -> None:
         self.config, self.inputs, self.selector = config, RecentInputs(), KeyframeSelector(config.keyframes)
-        self._transforms, self._diagnose, self._completion = transforms, diagnose, completion
+        self._transforms, self._diagnose = transforms, diagnose
         self._trigger, self._requests = RevolutionTrigger(), DepthRequests()
         self._model: tuple[str, str] | None = None
         self._last_ns: int | None = None  # stamp of the newest depth
         self.image_ns = 0  # stamp of the newest image
         source = DepthSource(config.depth_source)
-        self.metric = MetricDepth(source, transforms, self.inputs, self._metric_config(config), self._mapper(config))
+        self.metric = MetricDepth(source, transforms, self.inputs, config.metric, self._mapper(config))
 
     def reconfigure(self, config: DepthScalerConfig) -> None:
-        """Apply new parameters.
-
-        Raises:
-            ValueError: the new source needs a network that was not loaded at the start.
-        """
-        if config.source == "completed" and self._completion is None:
-            raise ValueError("source completed needs its model from the start: start the node with it")
+        """Apply new parameters."""
         self.config, self.selector.config = config, config.keyframes
-        self.metric.source.config, self.metric.config = config.depth_source, self._metric_config(config)
+        self.metric.source.config, self.metric.config = config.depth_source, config.metric
         mapper = self.metric.mapper
         if (mapper.config, *mapper.frames) != (config.mapping, config.map_frame, config.odom_frame):
             self.metric.mapper = self._mapper(config)
         self._trigger.clear()
         if self._model is not None:
             self.adopt(*self._model)
-
-    def _metric_config(self, config: DepthScalerConfig) -> MetricDepthConfig:
-        if self._completion is None:
-            return config.metric
-        return replace(config.metric, rows=self._completion.model.manifest.input_height)
 
     def _mapper(self, config: DepthScalerConfig) -> LocalMapper:
         return LocalMapper(self._transforms, config.mapping, config.map_frame, config.odom_frame)
@@ -135,15 +119,10 @@ class DepthChain:
     def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int) -> DepthResult:
         """Depth of the image taken at ``stamp_ns``; ``raw``: (H, W) the network's, if the source needs it."""
         self._last_ns = stamp_ns
-        image, completion, complete = self.inputs.images.get(stamp_ns), self._completion, None
-        if image is not None and completion is not None:
+        return self.metric.estimate(raw, camera, stamp_ns)
 
-            def complete(prior: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-                return completion.complete(image.data, prior)
-
-        result = self.metric.estimate(raw, camera, stamp_ns, complete)
+    def report(self, result: DepthResult) -> None:
         self._diagnose("scale", Level.OK if result.ok else Level.WARN, result.message, **result.figures())
-        return result
 
     def keyframe_pose(self, result: DepthResult, camera: str, stamp_ns: int) -> Matrix | None:
         """map_from_camera of a new keyframe; None if the image of this depth becomes none."""

@@ -1,4 +1,4 @@
-"""Input of depth completion: what is known of a panorama's depth before a network has seen the image."""
+"""Input of depth completion: the fused depth that the network corrects."""
 
 from __future__ import annotations
 
@@ -8,27 +8,28 @@ from numpy.typing import NDArray
 from instant_ic.depth.lidar_depth import rays
 
 Floats = NDArray[np.floating]
-PRIOR_CHANNELS = 5
+PRIOR_CHANNELS = 6
 _AGREE, _AGREE_M = 0.02, 0.02
 """A point is trusted where it differs by less than this share and this length from the depth built of all points."""
 _MOST_M = 40.0
 
 
 def prior_channels(
-    depth_m: Floats, sigma: Floats, ranges_m: Floats, up: Floats, camera_height_m: float | None
+    depth_m: Floats, sigma: Floats, ranges_m: Floats, up: Floats, camera_height_m: float | None, network_m: Floats
 ) -> NDArray[np.float32]:
-    """Channels (5, H, W) that a completion network takes beside the image.
+    """Channels (6, H, W) that a completion network takes beside the image.
 
     Args:
-        depth_m: (H, W) radial metres from the LiDAR and the usual structure of a building, 0 = unknown.
+        depth_m: (H, W) fused radial metres, 0 = unknown.
         sigma: (H, W) its relative standard deviation.
         ranges_m: (H, W) range of the confirmed point in each pixel, 0 without one.
         up: (3,) gravity's up in the camera's frame.
         camera_height_m: of the camera over the floor; None where it is not known.
+        network_m: (H, W) depth of the network that sees the image alone, scaled and corrected by points, 0 = unknown.
 
     Returns:
         ``depth``; ``sigma`` (0 where unknown); ``measured``: 1 at trusted points, where the output is the input;
-        ``rise``: sine of the pixel's elevation; ``floor``: distance of a level floor, 0 above the horizon.
+        ``rise``: sine of the pixel's elevation; ``floor``: distance of a level floor, 0 above the horizon; ``network``.
     """
     depth = np.where((depth_m > 0) & (depth_m < _MOST_M), depth_m, 0).astype(np.float32)
     rise = rays(*depth.shape) @ np.asarray(up, np.float32)
@@ -39,4 +40,5 @@ def prior_channels(
     agree = np.abs(depth - ranges_m) <= _AGREE_M + _AGREE * ranges_m
     measured = (ranges_m > 0) & (depth > 0) & agree
     known_sigma = np.where((depth > 0) & np.isfinite(sigma), sigma, 0)
-    return np.stack((depth, known_sigma, measured, rise, floor)).astype(np.float32)
+    network = np.where((network_m > 0) & (network_m < _MOST_M), network_m, 0)
+    return np.stack((depth, known_sigma, measured, rise, floor, network)).astype(np.float32)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from instant_ic.depth.deskew import points_at
 from instant_ic.depth.inputs import RecentInputs
-from instant_ic.depth.sources import Complete, DepthResult, DepthSource, without_body
+from instant_ic.depth.sources import DepthResult, DepthSource, without_body
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.mapping.mapper import LocalMapper, LocalView, correction
@@ -59,16 +59,13 @@ class MetricDepth:
         self.source, self.transforms, self.inputs, self.config = source, transforms, inputs, config
         self.mapper = mapper
 
-    def estimate(
-        self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int, complete: Complete | None = None
-    ) -> DepthResult:
+    def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int) -> DepthResult:
         """Depth of an image; if something is missing the result is not ok, and its message says what.
 
         Args:
-            raw: (H, W) the network's depth; None for the sources ``lidar`` and ``completed``.
+            raw: (H, W) the network's depth; None for the source ``lidar``.
             camera: the camera's frame.
             stamp_ns: the image's time.
-            complete: completion of the image, for ``completed``.
         """
         config, size = self.config, (self.config.rows, 2 * self.config.rows)
         try:
@@ -84,7 +81,7 @@ class MetricDepth:
             return self.source.refuse(raw, str(error), size)
         if points is None:
             return self.source.refuse(raw, f"no LiDAR revolution within {config.max_age_s} s", size)
-        result = self.source.estimate(raw, points, up, height_m, size=size, local=local, complete=complete)
+        result = self.source.estimate(raw, points, up, height_m, size=size, local=local)
         return without_body(result, up, height_m, config.body_elevation_deg)
 
     def camera_stance(self, camera: str, stamp_ns: int) -> tuple[NDArray[np.float64], float]:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.completion import PRIOR_CHANNELS, prior_channels
+from instant_ic.depth.completion import PRIOR_CHANNELS
 from instant_ic.depth.manifest import InferenceError, ManifestError, ModelManifest, load_manifest, manifest_path
 from instant_ic.depth.providers import OpenSession, open_session
 from instant_ic.geometry.projections import equirect_directions
@@ -115,8 +115,7 @@ class DepthModel:
             InferenceError: the network failed, or :meth:`cancel` ended it.
         """
         if self.manifest.prior_input:
-            nothing = np.zeros((self.manifest.input_height, self.manifest.input_width), np.float32)
-            return self.complete(rgb, prior_channels(nothing, nothing, nothing, np.array([0.0, 0.0, 1.0]), None))[0]
+            raise ValueError(f"{self.manifest.name} corrects fused depth: use it as completion of depth_scaler")
         return self._finish(*self._run({self._input: self.prepare(rgb)}))
 
     def complete(
@@ -126,7 +125,7 @@ class DepthModel:
 
         Args:
             rgb: as for :meth:`estimate`.
-            prior: (5, h, 2h), see ``depth.completion.prior_channels``.
+            prior: (6, h, 2h), see ``depth.completion.prior_channels``.
 
         Raises:
             ValueError: the model takes no prior, or another shape than this one's.

@@ -20,8 +20,8 @@ class DepthScalerConfig:
     """Parameters.
 
     Attributes:
-        source: source of the depth: ``fused``, ``lidar`` (needs no network), ``network``, or ``completed`` (runs
-            ``completion`` in this node; needs no ``depth_estimator``).
+        source: source of the depth: ``fused``, ``lidar`` (needs no network), ``network``, or ``completed``
+            (``fused``, corrected by ``completion`` in this node).
         completion: completion model for ``completed``: ONNX file; a bare name is searched for in ``models/``.
         provider, threads: execution provider and CPU threads of the completion.
         scaler: estimation of the network's scale.
@@ -29,8 +29,8 @@ class DepthScalerConfig:
         fusion: combination of both.
         keyframes: selection of keyframes.
         mapping: the local 3D model, from which the sources ``fused`` and ``lidar`` take depth first.
-        max_rate_hz: highest rate of the sources ``lidar`` and ``completed``, by the images' stamps; that of the others
-            is depth_estimator's.
+        max_rate_hz: highest rate of the source ``lidar``, by the images' stamps; that of the others is
+            depth_estimator's.
         rows: height of the depth image of source ``lidar``; the others have the network's.
         body_elevation_deg: below this elevation the image shows the robot itself, not the room; -90: nowhere.
         max_cloud_age_s: largest difference in seconds between the middle of a revolution and the image.
@@ -60,11 +60,6 @@ class DepthScalerConfig:
         if self.source == "completed" and not self.completion:
             raise ValueError("source completed needs a model: set completion to a file of ic depth train --export")
         self.depth_source  # noqa: B018 - raises ValueError on an unknown source
-
-    @property
-    def of_lidar(self) -> bool:
-        """Whether a revolution, not the network's depth, completes an image."""
-        return self.source in ("lidar", "completed")
 
     @property
     def depth_source(self) -> SourceConfig:

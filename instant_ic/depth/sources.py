@@ -19,7 +19,7 @@ from instant_ic.mapping.mapper import LocalView
 
 Floats = NDArray[np.floating]
 Complete = Callable[[NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
-"""Prior (5, H, W) (``depth.completion``) -> depth (H, W) in metres and relative sigma (H, W), of one image."""
+"""Channels (6, H, W) (``depth.completion``) -> depth (H, W) in metres and relative sigma (H, W), of one image."""
 SOURCES = ("network", "lidar", "fused", "completed")
 # Of the floor under the robot: a camera's height is known to centimetres.
 _FLOOR_SIGMA = 0.02
@@ -35,7 +35,7 @@ class SourceConfig:
 
     Attributes:
         source: ``network``: the network's depth, scaled; ``lidar``: LiDAR and structure, no network; ``fused``: both;
-            ``completed``: a network completes the LiDAR's depth, and per pixel the smaller uncertainty is taken.
+            ``completed``: ``fused``, for :func:`complete` to correct.
         scaler: how the network's depth is scaled.
         lidar: how depth is made from points alone.
         fusion: how both are brought together.
@@ -53,6 +53,21 @@ class SourceConfig:
 
 
 @dataclass(frozen=True)
+class Prior:
+    """Input of a completion, and what it may not change.
+
+    Attributes:
+        channels: (6, H, W), see ``depth.completion.prior_channels``.
+        free_m: (H, W) nothing stands nearer than this.
+        fixed: (H, W) pixels that keep their depth: the robot itself.
+    """
+
+    channels: NDArray[np.float32]
+    free_m: NDArray[np.float32]
+    fixed: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class DepthResult:
     """Depth of one image.
 
@@ -67,6 +82,7 @@ class DepthResult:
         points: number of points compared.
         message: for people.
         source: what ``depth_m`` was made from.
+        prior: for :func:`complete`; None unless the source is ``completed`` and the result ok.
     """
 
     depth_m: NDArray[np.float32]
@@ -79,6 +95,7 @@ class DepthResult:
     points: int
     message: str
     source: str
+    prior: Prior | None = None
 
     def figures(self) -> dict[str, float | str]:
         """Rounded values for a diagnosis."""
@@ -135,7 +152,6 @@ class DepthSource:
         camera_height_m: float | None,
         size: tuple[int, int] = (256, 512),
         local: LocalView | None = None,
-        complete: Complete | None = None,
     ) -> DepthResult:
         """Depth of one image.
 
@@ -143,21 +159,20 @@ class DepthSource:
         network fills what both leave unknown; it overrides nothing.
 
         Args:
-            raw: (H, W) the network's depth in its own unit, 0 = unknown; None is allowed for ``lidar`` alone.
+            raw: (H, W) the network's depth in its own unit, 0 = unknown; None only for ``lidar``.
             points: (N, 3) LiDAR points in the camera's frame at the image's time, metres.
             up: (3,) gravity's up in the camera's frame.
             camera_height_m: of the camera over the floor; None where it is not known.
             size: height and width of the result where there is no ``raw``; else it has ``raw``'s.
             local: the local model, seen from the camera.
-            complete: for ``completed``: the completion of this image; None, or an error of it: the LiDAR alone.
 
         Raises:
             ValueError: arrays of other shapes, or no ``raw`` where the source needs it.
         """
         config = self.config
-        if config.source in ("lidar", "completed"):
+        if config.source == "lidar":
             size = raw.shape if raw is not None else size
-            return self._lidar(points, up, camera_height_m, size, local, complete)
+            return self._lidar(points, up, camera_height_m, size, local)
         if raw is None:
             raise ValueError(f"source {config.source} needs the network's depth")
         fit = self.scaler.fit(raw, points)
@@ -175,16 +190,22 @@ class DepthSource:
                 sigma=np.where(known, built.sigma, result.sigma),
                 ok=False,
                 message=built.message if fit.ok else fit.message,
-                source="fused",
+                source=config.source,
             )
         known = built.depth_m > 0
         guess = np.maximum(network.depth_m, built.free_m)
         depth = np.where(known, built.depth_m, guess)
         sigma = np.where(known, built.sigma, np.where(guess > 0, _NETWORK_SIGMA, np.float32(np.inf)))
         message = f"{fit.message}; {_surfaces(built)}"
+        prior = None
+        if config.source == "completed":
+            ranges = self.structure.ranges(points, depth.shape)
+            channels = prior_channels(depth, sigma, ranges, up, camera_height_m, network.depth_m)
+            prior = Prior(channels, built.free_m, np.zeros(depth.shape, bool))
         return replace(
-            result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source="fused"
-        )
+            result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source=config.source,
+            prior=prior,
+        )  # fmt: skip
 
     def refuse(self, raw: Floats | None, message: str, size: tuple[int, int] = (256, 512)) -> DepthResult:
         """Unfit result for an image without points: ``raw`` if that is in metres, else all unknown."""
@@ -232,49 +253,47 @@ class DepthSource:
         return _Built(depth, sigma, free, structure, seen)
 
     def _lidar(
-        self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int],
-        local: LocalView | None, complete: Complete | None,
-    ) -> DepthResult:  # fmt: skip
+        self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int], local: LocalView | None
+    ) -> DepthResult:
         built = self._built(points, up, camera_height_m, size, local, None)
         quality = agreement(built.depth_m, points, self.config.scaler)
-        depth, sigma, name = built.depth_m, built.sigma, "LiDAR alone"
-        if complete is not None and not built.message:
-            ranges = self.structure.ranges(points, size)
-            try:
-                found = complete(prior_channels(built.depth_m, built.sigma, ranges, up, camera_height_m))
-                depth, sigma = arbitrate(built.depth_m, built.sigma, built.free_m, *found)
-                name = "LiDAR completed"
-            except (InferenceError, ValueError) as error:
-                name = f"LiDAR alone, no completion ({error})"
-        message = f"{name}: {quality:.0%} of {built.points} points on its surfaces; {_surfaces(built)}"
+        message = f"LiDAR alone: {quality:.0%} of {built.points} points on its surfaces; {_surfaces(built)}"
         return DepthResult(
-            depth_m=depth,
-            sigma=sigma,
+            depth_m=built.depth_m,
+            sigma=built.sigma,
             ok=not built.message,
             scale=1.0,
             shift=0.0,
             quality=quality,
-            relative_sigma=_median(sigma),
+            relative_sigma=_median(built.sigma),
             points=built.points,
             message=built.message or message,
-            source=self.config.source,
+            source="lidar",
         )
 
 
-def arbitrate(
-    depth_m: Floats, sigma: Floats, free_m: Floats, completed_m: Floats, completed_sigma: Floats
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth and relative sigma of the more certain of two sources in each pixel; all (H, W).
+def complete(result: DepthResult, completion: Complete) -> DepthResult:
+    """Correct a result of the source ``completed``; needs no other state, so that any thread may do it.
 
-    Args:
-        depth_m, sigma: of the LiDAR, 0 and inf where unknown.
-        free_m: nothing stands nearer than this.
-        completed_m, completed_sigma: of the completion; what is not a number counts as unknown.
+    A pixel is changed where the completion is no less certain than the prior, and never to nearer than free space.
+    Without a prior, and where the completion fails, the result stays as it is, and its message says why.
     """
-    usable = np.isfinite(completed_m) & (completed_m > 0) & np.isfinite(completed_sigma)
-    better = usable & ((depth_m <= 0) | (completed_sigma < sigma))
-    depth = np.where(better, np.maximum(completed_m, free_m), depth_m)
-    return depth.astype(np.float32), np.where(better, completed_sigma, sigma).astype(np.float32)
+    prior = result.prior
+    if prior is None:
+        return result
+    result = replace(result, prior=None)
+    try:
+        found_m, found_sigma = completion(prior.channels)
+        if found_m.shape != result.depth_m.shape:
+            raise ValueError(f"it is {found_m.shape}, the depth {result.depth_m.shape}")
+    except (InferenceError, ValueError) as error:
+        return replace(result, message=f"{result.message}; no completion ({error})")
+    usable = np.isfinite(found_m) & (found_m > 0) & np.isfinite(found_sigma)
+    better = usable & ((result.depth_m <= 0) | (found_sigma <= result.sigma)) & ~prior.fixed
+    depth = np.where(better, np.maximum(found_m, prior.free_m), result.depth_m).astype(np.float32)
+    sigma = np.where(better, found_sigma, result.sigma).astype(np.float32)
+    message = f"{result.message}; completed"
+    return replace(result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message)
 
 
 def without_body(result: DepthResult, up: Floats, camera_height_m: float | None, elevation_deg: float) -> DepthResult:
@@ -293,7 +312,8 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
     depth, sigma = result.depth_m.copy(), result.sigma.copy()
     depth[body] = 0 if camera_height_m is None else -camera_height_m / rise[body]
     sigma[body] = np.inf if camera_height_m is None else _FLOOR_SIGMA
-    return replace(result, depth_m=depth, sigma=sigma)
+    prior = None if result.prior is None else replace(result.prior, fixed=body)
+    return replace(result, depth_m=depth, sigma=sigma, prior=prior)
 
 
 def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:

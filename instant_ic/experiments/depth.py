@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
 from instant_ic.depth.scaler import ScalerConfig
-from instant_ic.depth.sources import DepthSource, SourceConfig
+from instant_ic.depth.sources import DepthSource, SourceConfig, complete
 from instant_ic.experiments.depth_lidar import Errors, measure
 from instant_ic.geometry.projections import equirect_directions, sample_equirect
 
@@ -80,8 +81,8 @@ class DepthSettings:
             raise DepthEvaluationError(f"source {self.source} needs LiDAR points: add --lidar (and --depth)")
         if self.method and self.lidar is None:
             raise DepthEvaluationError("a scaling method needs LiDAR points: add --lidar (and --depth)")
-        if self.method and self.source in ("lidar", "completed"):
-            raise DepthEvaluationError(f"source {self.source} does not scale a network: omit the method")
+        if self.method and self.source == "lidar":
+            raise DepthEvaluationError("source lidar does not scale a network: omit the method")
         if not self.camera_height_m > 0:
             raise DepthEvaluationError(f"the camera's height must be above 0 (got {self.camera_height_m})")
 
@@ -153,18 +154,24 @@ _KEYS = {"before": "before", "after": "after", "weighted": "after_by_solid_angle
 class Evaluator:
     """Scores panoramas one by one with the same settings.
 
+    Args:
+        settings: of the evaluation.
+        model: the network that sees the image alone; None for ``lidar``.
+        completion: of ``completed``.
+
     Raises:
         DepthEvaluationError: the settings need a model, or a different one.
     """
 
-    def __init__(self, settings: DepthSettings, model: Model | None) -> None:
-        self.settings = settings
+    def __init__(self, settings: DepthSettings, model: Model | None, completion: Model | None = None) -> None:
+        self.settings, self.completion = settings, completion
         self.model = model if settings.source != "lidar" else None
         if self.model is None and settings.source != "lidar":
             raise DepthEvaluationError(f"source {settings.source} needs a model")
-        if settings.source == "completed" and self.model is not None and not self.model.manifest.prior_input:
-            raise DepthEvaluationError(f"{self.model.manifest.name} takes the image alone: source completed needs a "
-                                       "model of ic depth train")  # fmt: skip
+        if settings.source == "completed" and (completion is None or not completion.manifest.prior_input):
+            raise DepthEvaluationError("source completed needs a completion: give a model of ic depth train")
+        if self.model is not None and self.model.manifest.prior_input:
+            raise DepthEvaluationError(f"{self.model.manifest.name} is a completion: use it with source completed")
         kind = self.model.manifest.output_kind if self.model else "metric"
         if kind != "metric" and settings.lidar is None:
             raise DepthEvaluationError(f"the model's depth is {kind}: metres come only from LiDAR, add --lidar")
@@ -204,8 +211,7 @@ class Evaluator:
             self.model.estimate(rgb)  # warm-up: the first run allocates memory
             self._warm = True
         begin = time.perf_counter()
-        model, completes = self.model, settings.source == "completed"
-        raw = model.estimate(rgb) if model is not None and not completes else None
+        raw = self.model.estimate(rgb) if self.model is not None else None
         between, cpu_s = time.perf_counter(), time.process_time()
         sigma = fit = None
         if settings.lidar is None:
@@ -213,14 +219,9 @@ class Evaluator:
             depth = raw
         else:
             assert points is not None
-            if completes:
-                assert model is not None
-                size = model.manifest.input_height, model.manifest.input_width
-                result = self.source.estimate(
-                    None, points, _UP, settings.camera_height_m, size, complete=lambda prior: model.complete(rgb, prior)
-                )
-            else:
-                result = self.source.estimate(raw, points, _UP, settings.camera_height_m)
+            result = self.source.estimate(raw, points, _UP, settings.camera_height_m)
+            if self.completion is not None:
+                result = complete(result, partial(self.completion.complete, rgb))
             depth, sigma = result.depth_m, result.sigma
             keys = ("ok", "message", "scale", "shift", "quality", "relative_sigma", "points")
             fit = {key: _rounded(getattr(result, key)) for key in keys}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -52,17 +53,22 @@ def photograph(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor
     (vignetting, blur), sensor (exposure, colours, noise), JPEG. The depth (B, H, W) is unchanged: below the robot it is
     the floor's depth, so that the network learns to continue the floor there.
     """
-    changed = _some(rgb, floor_reflection(rgb, depth, generator), 0.2, generator)
-    changed = _some(changed, robot_body(changed, generator), 0.4, generator)
-    changed = _some(changed, vignetting(changed, generator), 0.4, generator)
-    changed = camera_colours(_some(changed, blur(changed, generator), 0.25, generator), generator)
-    changed = _some(changed, jpeg(changed, generator), 0.4, generator)
-    return _some(camera_colours(rgb, generator), changed, 0.6, generator)
+    degraded = torch.rand(len(rgb), generator=generator) < 0.6
 
+    def some(rgb: Tensor, share: float, effect: Callable[..., Tensor], *maps: Tensor) -> Tensor:
+        """Apply an effect to a share of the degraded images; it costs nothing on the others."""
+        chosen = ((torch.rand(len(rgb), generator=generator) < share) & degraded).to(rgb.device)
+        if not chosen.any():
+            return rgb
+        rgb = rgb.clone()
+        rgb[chosen] = effect(rgb[chosen], *(part[chosen] for part in maps), generator)
+        return rgb
 
-def _some(before: Tensor, after: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    chosen = torch.rand(before.shape[0], 1, 1, 1, generator=generator) < share
-    return torch.where(chosen.to(before.device), after, before)
+    rgb = some(rgb, 0.2, floor_reflection, depth)
+    rgb = some(rgb, 0.4, robot_body)
+    rgb = some(rgb, 0.4, vignetting)
+    rgb = camera_colours(some(rgb, 0.25, blur), generator)
+    return some(rgb, 0.4, jpeg)
 
 
 def _uniform(like: Tensor, generator: torch.Generator, low: float, high: float, channels: int = 1) -> Tensor:

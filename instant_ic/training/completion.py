@@ -1,10 +1,12 @@
-"""Depth completion: a panorama and an incomplete depth image of it give dense depth with its uncertainty.
+"""Depth completion: a network that corrects fused depth (the *prior*, ``instant_ic.depth.sources``) by the image.
 
-The network corrects a *prior*, the depth that LiDAR revolutions and the usual structure of a building give
-(``instant_ic.depth.sources``), instead of guessing metres from the image alone. The encoder is EfficientNet-lite0
-(Tan and Le, ICML 2019; the "lite" variant has no squeeze-and-excitation), because ImageNet weights for it may be used
-under Apache-2.0. All convolutions are circular in width. At 1/16 the features of each column are folded into a vector
-and exchanged along the horizon, as in SliceNet (Pintore et al., CVPR 2021), with convolutions instead of an LSTM.
+It gives a factor on the prior's depth and on its sigma, both 1 before the training, so that it starts as its prior. The
+image's features are those of EfficientNet-lite0 (Tan and Le, ICML 2019; the "lite" variant has no
+squeeze-and-excitation) down to 1/16, because ImageNet weights for it may be used under Apache-2.0; its batch norms keep
+their published statistics. The decoder ends at 1/4 and gives 4 × 4 pixels at each place: it sees the prior's pixels
+there, and a step costs a quarter of one with a decoder at 1/2. All convolutions are circular in width. At 1/16 the
+features of each column are folded into a vector and exchanged along the horizon, as in SliceNet (Pintore et al., CVPR
+2021), with convolutions instead of an LSTM.
 """
 
 from __future__ import annotations
@@ -19,24 +21,21 @@ from torch.nn import functional
 
 from instant_ic.training.slicenet import CheckpointError, check_state, read_checkpoint
 
-GEOMETRY_CHANNELS = 9
+GEOMETRY_CHANNELS = 8
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 40.0
-_TYPICAL_LOG_M = 0.9
-"""Logarithm of a room's typical depth, where an image without any prior starts."""
-_START_GATE = 3.0
-_UNKNOWN_LOG_SIGMA = -1.0
-"""Where there is no prior, whose sigma is the start elsewhere."""
+_TYPICAL_M, _UNKNOWN_SIGMA = 2.5, 0.6
+"""Where there is no prior."""
+_LEAST_STEP, _MOST_STEP = 0.02, 0.6
+"""Logarithm of the factor on the depth for an output of 1: the prior's sigma, within these bounds. What is known to a
+percent is hardly changed by a network that has not learnt it yet, and what nobody measured moves at once."""
 
-# Blocks of EfficientNet-lite0: repeats, kernel, stride, expansion, outputs. Stem and last stage are fixed in "lite".
-_STAGES = (
-    (1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112), (4, 5, 2, 6, 192),
-    (1, 3, 1, 6, 320),
-)  # fmt: skip
+# Blocks of EfficientNet-lite0 to 1/16: repeats, kernel, stride, expansion, outputs. The stem is fixed in "lite".
+_STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
 _STEM = 32
-_TAPS = {0: 16, 2: 24, 4: 40, 10: 112, 15: 320}
-"""Blocks whose output the decoder reads, at 1/2, 1/4 ... 1/32, with their channels."""
+_TAPS = {2: 24, 4: 40, 10: 112}
+"""Blocks whose output the decoder reads, at 1/4, 1/8 and 1/16, with their channels."""
 _IMAGE_MEAN, _IMAGE_STD = 127 / 255, 128 / 255
-_PUBLISHED_HEAD = ("_conv_head.", "_bn1.", "_fc.")
+_PUBLISHED_REST = ("_conv_head.", "_bn1.", "_fc.", *(f"_blocks.{number}." for number in range(11, 16)))
 
 
 @dataclass(frozen=True)
@@ -45,20 +44,20 @@ class CompletionConfig:
 
     Attributes:
         height: rows of the image, a multiple of 32; the width is twice that.
-        decoder: channels of the decoder at 1/32 and 1/16, 1/8, 1/4, 1/2.
+        decoder: channels of the decoder at 1/16, 1/8 and 1/4.
         slices: features exchanged along the horizon per row of 1/16; 0 leaves the exchange out.
     """
 
     height: int = 256
-    decoder: tuple[int, int, int, int] = (96, 64, 48, 32)
+    decoder: tuple[int, int, int] = (96, 64, 48)
     slices: int = 24
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "decoder", tuple(self.decoder))
         if self.height < 64 or self.height % 32:
             raise ValueError(f"height must be a multiple of 32, 64 or more (got {self.height})")
-        if len(self.decoder) != 4 or min(self.decoder) < 4:
-            raise ValueError(f"decoder must be four numbers of 4 or more (got {self.decoder})")
+        if len(self.decoder) != 3 or min(self.decoder) < 4:
+            raise ValueError(f"decoder must be three numbers of 4 or more (got {self.decoder})")
         if self.slices < 0:
             raise ValueError(f"slices must be 0 or more (got {self.slices})")
 
@@ -119,12 +118,11 @@ class Block(nn.Module):
 
 
 class Encoder(nn.Module):
-    """EfficientNet-lite0 without its classifier; the geometry enters beside the colours in the first convolution."""
+    """EfficientNet-lite0 down to 1/16; its batch norms use the published statistics, in training too."""
 
     def __init__(self) -> None:
         super().__init__()
         self.stem = Convolution(3, _STEM, 3, 2)
-        self.geometry = nn.Conv2d(GEOMETRY_CHANNELS, _STEM, 3, 2, bias=False)
         self.blocks = nn.ModuleList()
         inputs = _STEM
         for repeats, kernel, stride, expansion, outputs in _STAGES:
@@ -132,16 +130,31 @@ class Encoder(nn.Module):
                 self.blocks.append(Block(inputs, outputs, kernel, stride if index == 0 else 1, expansion))
                 inputs = outputs
 
-    def forward(self, image: Tensor, geometry: Tensor) -> list[Tensor]:
-        stem = self.stem
-        x = stem.conv(padded(image, stem.before, stem.after))
-        x = functional.relu6(stem.norm(x + self.geometry(padded(geometry, stem.before, stem.after))))
-        levels = []
+    def train(self, mode: bool = True) -> Encoder:
+        return super().train(False)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        x, levels = self.stem(image), []
         for index, block in enumerate(self.blocks):
             x = block(x)
             if index in _TAPS:
                 levels.append(x)
         return levels
+
+
+class Mix(nn.Module):
+    """Joins maps of one resolution by a 1 × 1 convolution, and mixes them by a circular 3 × 3 one."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.join, self.mix = nn.Conv2d(inputs, outputs, 1), nn.Conv2d(outputs, outputs, 3)
+        for conv in (self.join, self.mix):
+            nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
+            nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
+
+    def forward(self, *maps: Tensor) -> Tensor:
+        x = functional.relu(self.join(torch.cat(maps, dim=1)))
+        return functional.relu(self.mix(padded(x, 1, 1)))
 
 
 class Slices(nn.Module):
@@ -166,22 +179,8 @@ class Slices(nn.Module):
         return x + self.merge(unfolded)
 
 
-class Up(nn.Module):
-    """Doubles the resolution, joins the encoder's features of that level, and mixes both."""
-
-    def __init__(self, inputs: int, skip: int, outputs: int) -> None:
-        super().__init__()
-        self.reduce = Convolution(inputs, outputs, 1)
-        self.join = Convolution(outputs + skip, outputs, 1)
-        self.mix = Convolution(outputs, outputs, 3)
-
-    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        x = functional.interpolate(self.reduce(x), scale_factor=2.0, mode="nearest")
-        return self.mix(self.join(torch.cat((x, skip), dim=1)))
-
-
 class CompletionNet(nn.Module):
-    """Image (B, 3, H, W) in 0..1 and prior (B, 5, H, W) -> depth in metres and relative sigma, (B, H, W) each.
+    """Image (B, 3, H, W) in 0..1 and prior (B, 6, H, W) -> depth in metres and relative sigma, (B, H, W) each.
 
     The output at measured pixels is the prior's depth and sigma, exactly.
     """
@@ -189,50 +188,49 @@ class CompletionNet(nn.Module):
     def __init__(self, config: CompletionConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or CompletionConfig()
-        deep, eighth, quarter, half = config.decoder
-        taps = list(_TAPS.values())
+        sixteenth, eighth, quarter = config.decoder
+        at4, at8, at16 = _TAPS.values()
         self.encoder = Encoder()
-        self.up16 = Up(taps[4], taps[3], deep)
-        self.slices = Slices(deep, config.height // 16, config.slices) if config.slices else None
-        self.up8 = Up(deep, taps[2], eighth)
-        self.up4 = Up(eighth, taps[1], quarter)
-        self.up2 = Up(quarter, taps[0] + 4 * (3 + GEOMETRY_CHANNELS), half)
-        self.head = nn.Conv2d(half, 4 * 4, 3)
+        self.down4 = Mix(16 * (3 + GEOMETRY_CHANNELS), quarter)
+        self.down8 = Mix(4 * quarter, eighth)
+        self.down16 = Mix(4 * eighth, sixteenth)
+        self.up16 = Mix(sixteenth + at16, sixteenth)
+        self.slices = Slices(sixteenth, config.height // 16, config.slices) if config.slices else None
+        self.up8 = Mix(sixteenth + eighth + at8, eighth)
+        self.up4 = Mix(eighth + quarter + at4, quarter)
+        self.head = nn.Conv2d(quarter, 2 * 16, 3)
         nn.init.zeros_(self.head.weight)
-        nn.init.normal_(self.encoder.geometry.weight, std=0.02)
-        with torch.no_grad():  # the network starts as the prior
-            start = torch.tensor([0.0, _TYPICAL_LOG_M, _START_GATE, 0.0])
-            assert self.head.bias is not None
-            self.head.bias.copy_(start.repeat_interleave(4))
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
     def forward(self, image: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-        depth, sigma, measured, rise, floor = prior.unbind(1)
+        depth, sigma, measured, rise, floor, network = prior.unbind(1)
         known = (depth > 0).to(image.dtype)
-        log_prior = torch.where(depth > 0, depth.clamp(MIN_DEPTH_M, MAX_DEPTH_M), torch.ones_like(depth)).log()
-        shown = (floor > 0).to(image.dtype)
-        log_floor = torch.where(floor > 0, floor.clamp(MIN_DEPTH_M, MAX_DEPTH_M), torch.ones_like(floor)).log()
-        log_sigma = sigma.clamp(0.003, 1.0).log()
+        log_prior = _log(torch.where(depth > 0, depth, _TYPICAL_M))
+        sigma = torch.where(depth > 0, sigma, _UNKNOWN_SIGMA).clamp(0.003, 1.0)
         geometry = torch.stack(
-            (known, (log_prior - 1.0) * known, 0.5 * (log_sigma + 3.0) * known, measured, rise,
-             shown, (log_floor - 1.0) * shown, (log_prior - log_floor) * known * shown,
-             0.4 * log_prior.exp() * rise * known),
+            (known, log_prior - 1.0, 0.5 * (sigma.log() + 3.0), measured, rise, 0.4 * log_prior.exp() * rise,
+             torch.where(floor > 0, log_prior - _log(floor), 0.0).clamp(-2.0, 2.0),
+             torch.where(network > 0, log_prior - _log(network), 0.0).clamp(-2.0, 2.0)),
             dim=1,
         )  # fmt: skip
         colours = (image - _IMAGE_MEAN) / _IMAGE_STD
-        half, quarter, eighth, sixteenth, deep = self.encoder(colours, geometry)
-        x = self.up16(deep, sixteenth)
+        quarter, eighth, sixteenth = self.encoder(colours)
+        down4 = self.down4(functional.pixel_unshuffle(torch.cat((colours, geometry), 1), 4))
+        down8 = self.down8(functional.pixel_unshuffle(down4, 2))
+        x = self.up16(self.down16(functional.pixel_unshuffle(down8, 2)), sixteenth)
         if self.slices is not None:
             x = self.slices(x)
-        x = self.up4(self.up8(x, eighth), quarter)
-        x = self.up2(x, torch.cat((half, functional.pixel_unshuffle(torch.cat((colours, geometry), 1), 2)), dim=1))
+        x = self.up8(functional.interpolate(x, scale_factor=2.0, mode="nearest"), down8, eighth)
+        x = self.up4(functional.interpolate(x, scale_factor=2.0, mode="nearest"), down4, quarter)
         # The prior is float32 also where the convolutions run in half precision.
-        out = functional.pixel_shuffle(self.head(padded(x, 1, 1)), 2).to(prior.dtype)
-        change, alone, gate, spread = out.unbind(1)
-        share = torch.sigmoid(gate) * known
-        log_depth = share * (log_prior + change) + (1 - share) * alone
-        complete = log_depth.clamp(-2.4, 3.7).exp()
-        doubt = (torch.where(depth > 0, log_sigma, _UNKNOWN_LOG_SIGMA) + spread).clamp(-6.0, 1.0).exp()
+        change, spread = functional.pixel_shuffle(self.head(padded(x, 1, 1)), 4).to(prior.dtype).unbind(1)
+        complete = (log_prior + sigma.clamp(_LEAST_STEP, _MOST_STEP) * change).clamp(-2.4, 3.7).exp()
+        doubt = sigma * spread.clamp(-4.0, 3.0).exp()
         return torch.where(measured > 0, depth, complete), torch.where(measured > 0, sigma, doubt)
+
+
+def _log(depth_m: Tensor) -> Tensor:
+    return depth_m.clamp(MIN_DEPTH_M, MAX_DEPTH_M).log()
 
 
 def load_encoder(model: CompletionNet, path: str | Path) -> None:
@@ -246,11 +244,11 @@ def load_encoder(model: CompletionNet, path: str | Path) -> None:
     state = read_checkpoint(Path(path))
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise CheckpointError(f"{path}: does not hold tensors by name; give the package's .pth file")
-    renamed = {_own_name(key): value for key, value in state.items() if not key.startswith(_PUBLISHED_HEAD)}
+    renamed = {_own_name(key): value for key, value in state.items() if not key.startswith(_PUBLISHED_REST)}
     own = model.encoder.state_dict()
-    expected = {key: tuple(value.shape) for key, value in own.items() if key != "geometry.weight"}
+    expected = {key: tuple(value.shape) for key, value in own.items()}
     check_state(f"{path}: not the weights of EfficientNet-lite0", renamed, expected)
-    model.encoder.load_state_dict({**renamed, "geometry.weight": own["geometry.weight"]}, strict=True)
+    model.encoder.load_state_dict(renamed, strict=True)
 
 
 def _own_name(key: str) -> str:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+_HELD_OUT_WORLDS = 12
 
 
 class DatasetError(ValueError):
@@ -22,13 +27,21 @@ class Sample:
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) radial metres, 0 = unknown.
         world: its seed.
-        prior: (5, H, W) incomplete depth (``depth.completion.prior_channels``); None: the feed simulates it.
+        prior: (6, H, W) fused depth (``depth.completion.prior_channels``); None: the feed simulates it.
     """
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.floating]
     world: int
     prior: NDArray[np.floating] | None = None
+
+
+def save_sample(path: Path, rgb: NDArray[np.uint8], depth_m: Floats, priors: Sequence[Floats]) -> None:
+    """Write a panorama with its priors (``Sample``) to ``NAME.npz``; the file is there only when it is complete."""
+    part = path.with_suffix(".part")
+    with part.open("wb") as file:
+        np.savez_compressed(file, rgb=rgb, depth_m=depth_m.astype(np.float16), priors=np.array(priors, np.float16))
+    part.replace(path)
 
 
 class Selection:
@@ -44,3 +57,63 @@ class Selection:
         samples, place = self._places[index]
         sample: Sample = samples[place]
         return sample
+
+
+class RenderedDataset:
+    """Panoramas of ``ic depth render``; each of their priors is a sample. One world in twelve is held out.
+
+    Raises:
+        DatasetError: there is no panorama in the folder, or none of the needed size.
+    """
+
+    def __init__(self, folder: Path, size: tuple[int, int]) -> None:
+        self.folder, self.size = folder, size
+        self.samples: list[tuple[Path, int]] = []
+        for path in sorted(folder.glob("*-*.npz")):
+            shape = _shape(path)
+            if shape[2:] != size:
+                raise DatasetError(f"{path}: {shape[2]} x {shape[3]}, the network takes {size[0]} x {size[1]}: render "
+                                   "the worlds again into another folder with its --height")  # fmt: skip
+            self.samples += [(path, number) for number in range(shape[0])]
+        if not self.samples:
+            raise DatasetError(f"{folder}: no rendered panoramas: run ic depth render -o {folder}")
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Recipe for the training record, without the local path."""
+        worlds = {_world(path) for path, _ in self.samples}
+        return {"kind": "rendered", "folder": self.folder.name, "count": len(self.samples), "scenes": len(worlds)}
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> Sample:
+        path, number = self.samples[index]
+        try:
+            with np.load(path) as file:
+                return Sample(file["rgb"], file["depth_m"], _world(path), file["priors"][number])
+        except Exception as error:  # a damaged archive raises anything
+            raise DatasetError(f"{path}: damaged ({error}): delete it and run ic depth render again") from error
+
+    def split(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Indices for training and for evaluation; a world stays where it is when more are rendered."""
+        held = np.array([_world(path) % _HELD_OUT_WORLDS == 0 for path, _ in self.samples])
+        if held.all() or not held.any():
+            raise DatasetError(f"{self.folder}: worlds for training or for evaluation are missing: render "
+                               f"{_HELD_OUT_WORLDS} or more")  # fmt: skip
+        return np.flatnonzero(~held), np.flatnonzero(held)
+
+
+def _world(path: Path) -> int:
+    return int(path.stem.split("-")[0])
+
+
+def _shape(path: Path) -> tuple[int, ...]:
+    """Shape of a panorama's priors, from the header alone."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("priors.npy") as file:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            return read(file)[0]
+    except Exception as error:  # a damaged archive raises anything
+        raise DatasetError(f"{path}: damaged ({error}): delete it and run ic depth render again") from error

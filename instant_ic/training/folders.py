@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES, DepthFileError, load_depth, load_picture
-from instant_ic.training.dataset import DatasetError, Sample
+from instant_ic.training.dataset import DatasetError, RenderedDataset, Sample
 
 _HELD_OUT_SHARE = 0.08
 _MOST_UNREADABLE = 0.01
@@ -186,22 +186,24 @@ class FolderDataset:
         return np.flatnonzero(~held), np.flatnonzero(held)
 
 
-def open_folder(name: str, size: tuple[int, int]) -> FolderDataset:
+def open_folder(name: str, size: tuple[int, int]) -> FolderDataset | RenderedDataset:
     """Open ``LAYOUT:FOLDER``.
 
     Args:
-        name: layout (one of :data:`LAYOUTS`) and folder.
+        name: layout (``rendered`` or one of :data:`LAYOUTS`) and folder.
         size: height and width to which the panoramas are resized.
 
     Raises:
         DatasetError: unknown layout, missing folder, or no files in this layout.
     """
     kind, colon, place = name.partition(":")
-    if kind not in LAYOUTS or not colon:
-        raise DatasetError(f"{name!r}: expected LAYOUT:FOLDER with LAYOUT one of {', '.join(LAYOUTS)}")
+    if kind not in ("rendered", *LAYOUTS) or not colon:
+        raise DatasetError(f"{name!r}: expected LAYOUT:FOLDER with LAYOUT one of rendered, {', '.join(LAYOUTS)}")
     folder = Path(place).expanduser()
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such folder")
+    if kind == "rendered":
+        return RenderedDataset(folder, size)
     found = list(LAYOUTS[kind].pictures(folder))
     pairs = [pair for pair in found if pair.depth.is_file()]
     if not pairs:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.training.dataset import Sample
+from instant_ic.training.dataset import save_sample
 
 FIRST_HELD_OUT = 900_000
 """Worlds from this seed on are reserved for the evaluations (``instant_ic.experiments.depth_worlds``)."""
@@ -24,7 +24,8 @@ class RoomsConfig:
     Attributes:
         worlds: number of worlds.
         poses: panoramas in each.
-        first_world: seed of the first world; the others follow. Held-out worlds are the last ones.
+        priors: fused depth images of each panorama, with other faults and another number of revolutions each.
+        first_world: seed of the first world; the others follow.
         height: rows of a panorama.
         interiors: ``wide``: ``interiors.interior_world``; ``random``: only ``sim.worlds.random_world``.
         camera_height_m: lowest and highest camera above the floor.
@@ -35,6 +36,7 @@ class RoomsConfig:
 
     worlds: int = 400
     poses: int = 6
+    priors: int = 2
     first_world: int = 1000
     height: int = 256
     interiors: str = "wide"
@@ -52,21 +54,12 @@ class RoomsConfig:
             raise ValueError(f"world seeds must be in 0..{FIRST_HELD_OUT - 1}: higher ones are for evaluation "
                              f"(got {self.first_world}..{self.first_world + self.worlds - 1})")  # fmt: skip
 
-    @property
-    def count(self) -> int:
-        """Total number of panoramas."""
-        return self.worlds * self.poses
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, for the training record."""
-        module = "depth.interiors.interior_world" if self.interiors == "wide" else "sim.worlds.random_world"
-        return {"kind": f"instant_ic.{module}", **asdict(self)}
+def render_rooms(config: RoomsConfig, folder: Path, worlds: Iterable[int]) -> Iterator[Path]:
+    """Render worlds of the recipe into a folder, one file a panorama (``dataset.load_sample``); the same recipe gives
+    the same files.
 
-
-def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> Iterator[Sample]:
-    """Render the recipe, or only some of its world seeds; the same recipe gives the same panoramas.
-
-    Worlds without a free camera position are skipped, so there may be fewer samples than ``config.count``.
+    Worlds of which the folder has panoramas are left out, so that an interrupted run continues.
     """
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import World, random_world
@@ -75,8 +68,9 @@ def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> It
     from instant_ic.training.sparse import sample_prior
 
     make: Callable[[int], World] = interior_world if config.interiors == "wide" else random_world
-    seeds = range(config.first_world, config.first_world + config.worlds) if worlds is None else worlds
-    for seed in seeds:
+    for seed in worlds:
+        if (folder / f"{seed}-{config.poses - 1}.npz").exists():
+            continue
         rng, prior_rng = np.random.default_rng((7, seed)), np.random.default_rng((8, seed))
         world = make(seed)
         if config.textures:
@@ -84,12 +78,14 @@ def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> It
         renderer = EquirectRenderer(world)
         try:
             poses = world.sample_free_poses(rng, config.poses, clearance_m=rng.uniform(*config.clearance_m))
-        except ValueError:
+        except ValueError:  # no free place
             continue
-        for x, y, yaw in poses:
+        for number, (x, y, yaw) in enumerate(poses):
             roll, pitch = np.radians(config.tilt_deg) * rng.standard_normal(2)
             height = rng.uniform(*config.camera_height_m)
             pose = pose_matrix(x, y, height, roll, pitch, math.remainder(yaw, math.tau))
             frame = renderer.render(pose, 2 * config.height, config.height)
-            prior = sample_prior(renderer, pose, prior_rng, (config.height, 2 * config.height))
-            yield Sample(frame.rgb, frame.depth_m, seed, prior.astype(np.float16))
+            priors = [sample_prior(renderer, pose, frame.rgb, frame.depth_m, prior_rng) for _ in range(config.priors)]
+            path = folder / f"{seed}-{number}.npz"
+            save_sample(path, frame.rgb, frame.depth_m, [prior for prior in priors if prior is not None])
+            yield path

@@ -1,110 +1,107 @@
-"""Incomplete depth for training a completion: from nothing over one faulty LiDAR revolution to a local 3D model."""
+"""Fused depth for training a completion: from one faulty LiDAR revolution to a local 3D model."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from instant_ic.depth.completion import prior_channels
+from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.sources import DepthSource, SourceConfig
 from instant_ic.experiments.depth_lidar import Errors, measure, measure_world
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.mapping.local_model import LocalModel
 from instant_ic.mapping.mapper import LocalView
+from instant_ic.training.augment import photograph
 
 if TYPE_CHECKING:
     from instant_ic.sim.render import EquirectRenderer
 
 Floats = NDArray[np.floating]
-MOST_REVOLUTIONS = 60
+MOST_REVOLUTIONS = 24
+MODEL_SHARE, FAULTY_SHARE, BENT_SHARE = 0.3, 0.6, 0.6
+"""Shares of priors with a local model of 2 to ``MOST_REVOLUTIONS`` revolutions (the others have one revolution), with
+faults of the revolution beyond noise, and with the network as wrong as in rooms unlike those it was trained on."""
+_MOST_BEND = 0.35
 _MOST_TILT_DEG, _MOST_SHIFT_M = 1.0, 0.02
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True)
-class Sparsity:
-    """How much depth a training panorama comes with.
-
-    Attributes:
-        none: share of panoramas without any.
-        model: share with a local 3D model of 2 to ``MOST_REVOLUTIONS`` revolutions; the others have one revolution.
-        faulty: share of the revolutions with faults beyond noise.
-    """
-
-    none: float = 0.1
-    model: float = 0.35
-    faulty: float = 0.6
-
-    def __post_init__(self) -> None:
-        if min(self.none, self.model) < 0 or self.none + self.model > 1 or not 0 <= self.faulty <= 1:
-            raise ValueError(f"shares must lie in 0..1, none and model together too (got {self})")
-
-
 def sample_prior(
-    renderer: EquirectRenderer,
-    map_from_camera: Floats,
+    renderer: EquirectRenderer, map_from_camera: Floats, rgb: NDArray[np.uint8], depth_m: Floats,
     rng: np.random.Generator,
-    size: tuple[int, int],
-    sparsity: Sparsity | None = None,
-) -> NDArray[np.float32]:
-    """Prior (5, H, W) of a camera (4, 4) in a world with its floor at 0; see ``prior_channels``."""
-    sparsity = sparsity or Sparsity()
-    kind = rng.random()
+) -> NDArray[np.float32] | None:  # fmt: skip
+    """Prior (6, H, W) (``depth.completion``) of a camera (4, 4) in a world with its floor at 0; None without a fit.
+
+    Args:
+        renderer: of the world.
+        map_from_camera: the camera's pose.
+        rgb, depth_m: (H, W, 3) and (H, W) seen from it.
+        rng: source of randomness.
+    """
     camera_m = float(map_from_camera[2, 3])
-    up = map_from_camera[:3, :3].T @ _UP
-    if kind < sparsity.none:
-        return nothing(size, up, camera_m if rng.random() < 0.5 else None)
     lidar_m = min(rng.uniform(0.35, 0.9), camera_m - 0.1)
-    faulty = rng.random() < sparsity.faulty
-    errors = Errors(rng.uniform(0.01, 0.03), rng.uniform(0, 0.05) if faulty else 0.0, int(rng.integers(1 << 31)))
-    points = measure_world(renderer, map_from_camera, lidar_m, camera_m, errors)
-    mount = np.array([0.0, 0.0, lidar_m - camera_m])
-    if faulty:
-        points = misplaced(spoiled(points - mount, rng) + mount, rng)
+    faulty, modelled = rng.random() < FAULTY_SHARE, rng.random() < MODEL_SHARE
+    points = measure_world(renderer, map_from_camera, lidar_m, camera_m, _errors(rng, 0.05 if faulty else 0.0))
     local = None
-    if kind < sparsity.none + sparsity.model:
+    if modelled:
         local = LocalView(drive(renderer, map_from_camera, lidar_m, rng), np.asarray(map_from_camera, np.float64))
-    return _prior(points, up, camera_m + rng.normal(0, 0.01), size, local)
+    up, mount = map_from_camera[:3, :3].T @ _UP, np.array([0.0, 0.0, lidar_m - camera_m])
+    return _prior(rgb, depth_m, points, mount, faulty, up, camera_m + rng.normal(0, 0.01), local, rng)
 
 
-def prior_of_image(depth_m: Floats, rng: np.random.Generator) -> NDArray[np.float32]:
-    """The same for a level panorama with true depth (H, W) instead of a world: none, or one revolution."""
-    if rng.random() < Sparsity().none:
-        return nothing(depth_m.shape, _UP, None)
-    below_m = rng.uniform(0.1, 0.7)
-    errors = Errors(rng.uniform(0.01, 0.03), 0.0, int(rng.integers(1 << 31)))
-    points = measure(depth_m, 0.0, below_m, errors)
-    mount = np.array([0.0, 0.0, -below_m])
-    if rng.random() < Sparsity().faulty:
-        points = misplaced(spoiled(points - mount, rng) + mount, rng)
-    return _prior(points, _UP, None, depth_m.shape, None)
+def prior_of_image(rgb: NDArray[np.uint8], depth_m: Floats, rng: np.random.Generator) -> NDArray[np.float32] | None:
+    """The same for a level panorama with true depth (H, W) instead of a world: one revolution."""
+    mount, faulty = np.array([0.0, 0.0, -rng.uniform(0.1, 0.7)]), rng.random() < FAULTY_SHARE
+    points = measure(depth_m, 0.0, -mount[2], _errors(rng, 0.0))
+    return _prior(rgb, depth_m, points, mount, faulty, _UP, None, None, rng)
 
 
-def nothing(size: tuple[int, ...], up: Floats, camera_m: float | None) -> NDArray[np.float32]:
-    """Prior without any depth."""
-    zero = np.zeros(size, np.float32)
-    return prior_channels(zero, zero, zero, up, camera_m)
+def _errors(rng: np.random.Generator, outliers: float) -> Errors:
+    return Errors(rng.uniform(0.01, 0.03), rng.uniform(0, outliers), int(rng.integers(1 << 31)))
 
 
 def _prior(
-    points: Floats, up: Floats, camera_m: float | None, size: tuple[int, ...], local: LocalView | None
-) -> NDArray[np.float32]:
-    source, (height, width) = _source(), size
-    built = source.estimate(None, points, up, camera_m, (height, width), local)
-    if not built.ok:
-        return nothing(size, up, camera_m)
-    return prior_channels(built.depth_m, built.sigma, source.structure.ranges(points, (height, width)), up, camera_m)
+    rgb: NDArray[np.uint8], depth_m: Floats, points: Floats, mount: Floats, faulty: bool, up: Floats,
+    camera_m: float | None, local: LocalView | None, rng: np.random.Generator,
+) -> NDArray[np.float32] | None:  # fmt: skip
+    """Prior as ``DepthSource`` gives it to a completion, from the network's view of a degraded image."""
+    if faulty:
+        points = misplaced(spoiled(points - mount, rng) + mount, rng)
+    image = torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 255
+    generator = torch.Generator().manual_seed(int(rng.integers(1 << 31)))
+    seen = photograph(image, torch.from_numpy(np.asarray(depth_m, np.float32))[None], generator)
+    raw = _network().estimate((255 * seen[0]).byte().permute(1, 2, 0).numpy().copy())
+    if raw.shape != depth_m.shape:
+        raw = np.asarray(cv2.resize(raw, depth_m.shape[::-1], interpolation=cv2.INTER_NEAREST))
+    if rng.random() < BENT_SHARE:
+        raw = raw * bend(raw.shape, rng)
+    prior = _source().estimate(raw, points, up, camera_m, local=local).prior
+    return None if prior is None else prior.channels
+
+
+def bend(size: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Smooth factors (H, W) around 1, of neighbours some 45 degrees apart."""
+    coarse = rng.uniform(0, _MOST_BEND) * rng.standard_normal((5, 8))
+    wide = np.concatenate((coarse[:, -1:], coarse, coarse[:, :1]), axis=1).astype(np.float32)
+    step = size[1] // 8
+    grown = cv2.resize(wide, (size[1] + 2 * step, size[0]), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(np.exp(grown[:, step:-step]), np.float32)
 
 
 @lru_cache(maxsize=1)
 def _source() -> DepthSource:
-    return DepthSource(SourceConfig(source="lidar"))
+    return DepthSource(SourceConfig(source="completed"))
+
+
+@lru_cache(maxsize=1)
+def _network() -> DepthModel:
+    return DepthModel.find(DEFAULT_MODEL, threads=1, provider="cpu")
 
 
 @lru_cache(maxsize=1)
@@ -121,7 +118,7 @@ def drive(renderer: EquirectRenderer, map_from_camera: Floats, lidar_m: float, r
     origins = np.array([[end[0], end[1], 0.15], [end[0], end[1], lidar_m]], np.float32)
     free_m, _ = renderer.cast(origins, np.repeat(back[None], 2, axis=0).astype(np.float32))
     length = min(float(np.min(free_m)) - 0.4, rng.uniform(0.3, 9.0))
-    count = int(np.clip(length / 0.15, 2, MOST_REVOLUTIONS)) if length > 0.3 else 2
+    count = int(np.clip(length / 0.3, 2, MOST_REVOLUTIONS)) if length > 0.3 else 2
     for place in np.linspace(max(length, 0.0), 0.0, count):
         at = end + place * back
         pose = pose_matrix(at[0], at[1], lidar_m, yaw=heading)

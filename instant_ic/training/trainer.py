@@ -25,6 +25,7 @@ from torch.nn.parallel import DistributedDataParallel
 from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
 from instant_ic.training.augment import photograph, to_brightness, turn_and_mirror
 from instant_ic.training.completion import CompletionNet
+from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import Ahead, Batch, Feed, Samples, stack
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.losses import depth_loss, edge_loss, sigma_loss
@@ -34,9 +35,9 @@ POLE_WEIGHT = 0.1
 """Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
 hardly trained, and appear as spikes above and below the camera in the point cloud.
 """
-DECODER_RATE, HEAD_RATE = 3.0, 10.0
-"""Learning rates of what starts from nothing, over that of the pretrained encoder. The head starts at 0, and Adam moves
-a weight by no more than the rate a step.
+HEAD_RATE = 0.1
+"""Learning rate of the last layer over that of the decoder. Adam moves each of the some 400 weights behind an output by
+the rate in a step: together they would leave the prior in a few steps, before they have learnt anything.
 """
 TEAM_TIMEOUT = timedelta(minutes=20)
 """A process that waits longer for the others exits with an error."""
@@ -50,7 +51,9 @@ class TrainingConfig:
         minutes: wall time of the learning rate schedule, after which training ends.
         epochs: passes over the data after which training ends, if that comes first.
         batch_size: panoramas per step and process.
-        learning_rate: maximum, of AdamW, for the encoder.
+        learning_rate: maximum, of AdamW.
+        encoder_rate: learning rate of the pretrained encoder over that of the decoder; 0: the encoder is fixed, and a
+            step costs half.
         weight_decay: of AdamW.
         warmup: share of the schedule in which the learning rate rises.
         average: decay of the weight average per step.
@@ -70,6 +73,7 @@ class TrainingConfig:
     epochs: int = 40
     batch_size: int = 6
     learning_rate: float = 1e-3
+    encoder_rate: float = 0.0
     weight_decay: float = 0.02
     warmup: float = 0.04
     average: float = 0.998
@@ -168,7 +172,7 @@ def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
 
 def to_tensors(batch: Batch, max_range_m: float, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Convert a batch to tensors: (B, 3, H, W) in 0..1, ground truth (B, H, W), 0 where unknown or too far, and prior
-    (B, 5, H, W).
+    (B, 6, H, W).
     """
     rgb, depth, prior = batch
     pictures = torch.tensor(rgb).to(device).permute(0, 3, 1, 2).float() / 255.0
@@ -237,21 +241,19 @@ class Trainer:
             raise ValueError(f"the panoramas are {rgb.shape[1]} x {rgb.shape[2]}, the network takes "
                              f"{self.network.height} x {self.network.width}")  # fmt: skip
         self.model = self.model.to(self.team.device)
+        self.model.encoder.requires_grad_(self.config.encoder_rate > 0)
         self.average = copy.deepcopy(self.model).eval()
-        if self.team.ranks > 1 and self.team.device.type == "cuda":
-            self.model = nn.SyncBatchNorm.convert_sync_batchnorm(self.model)
         self._parallel: nn.Module = self.model
         if self.team.ranks > 1:
             ids = [self.team.device.index] if self.team.device.type == "cuda" else None
             self._parallel = DistributedDataParallel(self.model, device_ids=ids)
         groups = []
-        new = ("encoder.geometry.", "up", "slices.")
-        pretrained = ("encoder.stem.", "encoder.blocks.")
-        for faster, inside in ((1.0, pretrained), (DECODER_RATE, new), (HEAD_RATE, ("head.",))):
-            part = [p for name, p in self.model.named_parameters() if name.startswith(inside)]
-            for decay, chosen in ((self.config.weight_decay, True), (0.0, False)):
-                parameters = [p for p in part if (p.ndim > 1) == chosen]
-                groups.append({"params": parameters, "weight_decay": decay, "faster": faster})
+        rates = {"encoder.": self.config.encoder_rate, "head.": HEAD_RATE}
+        for decay, matrices in ((self.config.weight_decay, True), (0.0, False)):
+            for name, parameter in self.model.named_parameters():
+                if (parameter.ndim > 1) == matrices:
+                    rate = next((rate for start, rate in rates.items() if name.startswith(start)), 1.0)
+                    groups.append({"params": [parameter], "weight_decay": decay, "rate": rate})
         self.optimizer = torch.optim.AdamW(groups, lr=self.config.learning_rate)
         cuda = self.team.device.type == "cuda"
         self._half = torch.float16 if cuda and not torch.cuda.is_bf16_supported() else torch.bfloat16
@@ -280,7 +282,7 @@ class Trainer:
         """
         factor = schedule(self.progress if progress is None else progress, self.config.warmup)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * factor * group["faster"]
+            group["lr"] = self.config.learning_rate * factor * group["rate"]
         batch = to_tensors(self._ahead.batch(self.step), self.config.max_range_m, self.team.device)
         rgb, truth, prior = self._augmented(*batch)
         self.model.train()
@@ -316,6 +318,8 @@ class Trainer:
         begin = time.monotonic() - self.elapsed_s
         last_checkpoint, last_row, losses = time.monotonic(), (time.monotonic(), self.step), []
         try:
+            if log is not None and not self.history:
+                self._checkpoint(log, self._evaluate(self._picked()), [])  # the prior
             while True:
                 progress, stop = self._agreed()
                 if progress >= 1.0 or stop:
@@ -329,9 +333,7 @@ class Trainer:
                 if self.step % 50 == 0 or now - last_row[0] > 60:
                     last_row = self._row(log, losses, *last_row)
                 if now - last_checkpoint > self.config.checkpoint_s:
-                    step = max(1, len(self.held_out) // self.config.evaluation_panoramas)
-                    picked = [self.held_out[i] for i in range(0, len(self.held_out), step)]
-                    self._checkpoint(log, self._evaluate(picked), losses)
+                    self._checkpoint(log, self._evaluate(self._picked()), losses)
                     self.elapsed_s = time.monotonic() - begin
                     last_checkpoint, last_row = time.monotonic(), (time.monotonic(), self.step)
             if log is None:
@@ -356,11 +358,16 @@ class Trainer:
             row = {
                 "step": self.step, "minutes": round(self.elapsed_s / 60, 2),
                 "loss": round(float(np.mean(losses[-count:])), 5),
-                "learning_rate": self.optimizer.param_groups[0]["lr"], "panoramas_per_s": round(rate, 2),
+                "learning_rate": self.config.learning_rate * schedule(self.progress, self.config.warmup),
+                "panoramas_per_s": round(rate, 2),
             }  # fmt: skip
             log.row(row, f"step {self.step} epoch {self.step / self.feed.steps_an_epoch:.2f} "
                          f"loss {row['loss']:.4f} {rate:.1f} panoramas/s {100 * self.progress:.0f} %")  # fmt: skip
         return now, self.step
+
+    def _picked(self) -> list[Sample]:
+        step = max(1, len(self.held_out) // self.config.evaluation_panoramas)
+        return [self.held_out[i] for i in range(0, len(self.held_out), step)]
 
     def _evaluate(self, samples: Samples) -> DepthMetrics:
         return evaluate(self.average, samples, self.config.max_range_m, self.config.brightness)

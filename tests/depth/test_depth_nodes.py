@@ -258,45 +258,57 @@ def test_lidar_alone_needs_no_network() -> None:
     assert keyframes[0].fit and keyframes[0].source == "lidar" and keyframes[0].scale == 1.0
 
 
-def test_completion_runs_in_the_node_and_needs_no_estimator(tmp_path: Path) -> None:
+def completed_config(tmp_path: Path) -> DepthScalerConfig:
+    """With an untrained completion that is sure of itself: it leaves the depth and makes sigma smaller."""
     torch.manual_seed(0)
-    model = CompletionNet(CompletionConfig(64, (8, 8, 8, 8), 2))
-    torch.nn.init.constant_(model.head.bias[-4:], -8.0)  # log sigma: more certain than the structure everywhere
-    torch.nn.init.constant_(model.head.bias[8:12], 20.0)  # gate: the prior where there is one
+    model = CompletionNet(CompletionConfig(64, (8, 8, 8), 2))
+    torch.nn.init.constant_(model.head.bias[16:], -1.0)
     export_model(model.eval(), tmp_path / "c.onnx", "c", "Apache-2.0", 40.0)
-    config = DepthScalerConfig(source="completed", completion=str(tmp_path / "c.onnx"), provider="cpu",
-                               lidar=LidarDepthConfig(ceiling_height_m=2.6), max_rate_hz=1.0)  # fmt: skip
-    with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode, config)
-        drive(bus, 2.5, network=False)
-        scaled, keyframes = bus.messages("/depth/scaled"), bus.messages("/keyframe")
-        severity, text = level(node, "scale")
-    assert severity == 0 and text.startswith("LiDAR completed")
-    assert image_array(scaled[0]).shape == (64, 128)  # the model's
-    assert np.quantile(far_off(image_array(scaled[0]), stamp_ns(scaled[0])), 0.9) < 0.04
-    assert keyframes[0].fit and keyframes[0].source == "completed"
-    sigma = decode_sigma(image_array(keyframes[0].sigma))
-    assert np.isfinite(sigma).all() and np.median(sigma) < 0.01  # exp(-6), the smallest, not the structure's
+    return DepthScalerConfig(source="completed", completion=str(tmp_path / "c.onnx"), provider="cpu")
 
 
-def test_a_completion_that_fails_or_takes_too_long_leaves_the_lidar_alone(tmp_path: Path) -> None:
-    model = CompletionNet(CompletionConfig(64, (8, 8, 8, 8), 2))
-    export_model(model.eval(), tmp_path / "c.onnx", "c", "Apache-2.0", 40.0)
-    config = DepthScalerConfig(source="completed", completion=str(tmp_path / "c.onnx"), provider="cpu",
-                               lidar=LidarDepthConfig(ceiling_height_m=2.6), max_rate_hz=1.0)  # fmt: skip
+def test_completion_corrects_the_fused_depth(tmp_path: Path) -> None:
+    sigmas = {}
+    for config in (DepthScalerConfig(), completed_config(tmp_path)):
+        with LockstepBus(START) as bus:
+            node = bus.add(DepthScalerNode, config)
+            drive(bus, 2.5)
+            scaled, keyframes = bus.messages("/depth/scaled"), bus.messages("/keyframe")
+            severity, text = level(node, "scale")
+        assert severity == 0 and text.endswith("; completed") == (config.source == "completed")
+        assert np.quantile(far_off(image_array(scaled[0]), stamp_ns(scaled[0])), 0.9) < 0.04
+        assert keyframes[0].fit and keyframes[0].source == config.source
+        sigmas[config.source] = decode_sigma(image_array(keyframes[0].sigma))
+    assert 0.3 < np.median(sigmas["completed"] / sigmas["fused"]) < 1.0  # exp(-1) but at trusted points and the body
+
+
+def test_a_completion_that_fails_or_takes_too_long_leaves_the_fused_depth(tmp_path: Path) -> None:
     cancelled = threading.Event()
     with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode, config)
-        inference = node.chain._completion
-        inference.timeout_s = 0.05
-        inference.model.complete = lambda rgb, prior: cancelled.wait(60)
-        inference.model.cancel = cancelled.set
-        drive(bus, 0.5, network=False)
+        node = bus.add(DepthScalerNode, completed_config(tmp_path))
+        node.completion.timeout_s = 0.05
+        node.completion.model.complete = lambda rgb, prior: cancelled.wait(60)
+        node.completion.model.cancel = cancelled.set
+        drive(bus, 0.5)
         severity, text = level(node, "scale")
-        assert severity == 0 and text.startswith(
-            "LiDAR alone, no completion (the inference took longer than 0.05 s on cpu and was cancelled)"
+        assert severity == 0 and text.endswith(
+            "no completion (the inference took longer than 0.05 s on cpu and was cancelled)"
         )
         assert len(bus.messages("/depth/scaled")) == 1 and not node.stopping
+
+
+def test_the_node_hears_messages_while_a_completion_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What runs in the worker is given back to the node's thread later: nothing is published before."""
+    given = []
+    monkeypatch.setattr("instant_ic.bus.node.Worker.submit", lambda self, item: given.append((self, item)))
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthScalerNode, completed_config(tmp_path))
+        drive(bus, 0.5)
+        assert len(given) == 1 and not bus.messages("/depth/scaled")
+        worker, job = given[0]
+        worker._do(job)
+        drive(bus, 0.02, START + S)
+        assert len(bus.messages("/depth/scaled")) == 1 and level(node, "scale")[1].endswith("; completed")
 
 
 def test_completion_without_a_model_is_refused(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from instant_ic.depth.lidar_depth import (
 )
 from instant_ic.depth.manifest import InferenceError
 from instant_ic.depth.scaler import ScalerConfig
-from instant_ic.depth.sources import SOURCES, DepthSource, SourceConfig, arbitrate, without_body
+from instant_ic.depth.sources import SOURCES, DepthResult, DepthSource, SourceConfig, complete, without_body
 from instant_ic.depth.visibility import nearest_points
 from instant_ic.geometry.poses import rotation_matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -279,7 +279,7 @@ def raw_of(true: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("source", SOURCES)
 def test_each_source_in_the_room(source: str) -> None:
     config = SourceConfig(source=source, lidar=LidarDepthConfig(ceiling_height_m=2.6))
-    raw = None if source in ("lidar", "completed") else raw_of(truth())
+    raw = None if source == "lidar" else raw_of(truth())
     found = DepthSource(config).estimate(raw, POINTS, UP, CAMERA_M, size=SIZE)
     assert found.ok and found.source == source and found.depth_m.shape == SIZE
     assert found.depth_m.dtype == found.sigma.dtype == np.float32
@@ -367,13 +367,8 @@ def test_a_wrong_network_makes_nothing_worse_than_the_lidar_alone(seed: int) -> 
     np.testing.assert_array_equal(fused.depth_m[known], alone.depth_m[known])
 
 
-def completed(complete, points=POINTS):
-    source = DepthSource(SourceConfig(source="completed"))
-    return source.estimate(None, points, UP, CAMERA_M, SIZE, complete=complete)
-
-
-def alone(points=POINTS):
-    return DepthSource(SourceConfig(source="lidar")).estimate(None, points, UP, CAMERA_M, SIZE)
+def with_prior(points=POINTS, room=ROOM) -> DepthResult:
+    return DepthSource(SourceConfig(source="completed")).estimate(raw_of(truth(room)), points, UP, CAMERA_M)
 
 
 def test_prior_by_hand() -> None:
@@ -383,57 +378,75 @@ def test_prior_by_hand() -> None:
     ranges_m = np.zeros((4, 8))
     ranges_m[2, :3] = 2.05, 2.07, 2.0  # agrees within 2 cm and 2 %: 6.1 cm; not; agrees
     depth[3, 0] = 50.0  # too far to count
-    prior = prior_channels(depth, sigma, ranges_m, UP, CAMERA_M)
-    assert prior.shape == (5, 4, 8) and prior.dtype == np.float32
+    network = np.full((4, 8), 3.0)
+    network[1] = 41.0  # too far to count
+    prior = prior_channels(depth, sigma, ranges_m, UP, CAMERA_M, network)
+    assert prior.shape == (6, 4, 8) and prior.dtype == np.float32
     np.testing.assert_array_equal(prior[0, :, 0], [0.0, 2.0, 2.0, 0.0])
     np.testing.assert_allclose(prior[1, :, 0], [0.0, 0.1, 0.1, 0.0])
     assert prior[2].sum() == 2 and prior[2, 2, 0] == prior[2, 2, 2] == 1
     np.testing.assert_allclose(prior[3, :, 0], np.sin(np.radians([67.5, 22.5, -22.5, -67.5])), rtol=1e-6)
     np.testing.assert_allclose(prior[4, :, 0], [0.0, 0.0, 1.2 / 0.38268, 1.2 / 0.92388], rtol=1e-4)
-    assert not prior_channels(depth, sigma, ranges_m, UP, None)[4].any()
+    np.testing.assert_array_equal(prior[5, :, 0], [3.0, 0.0, 3.0, 3.0])
+    assert not prior_channels(depth, sigma, ranges_m, UP, None, network)[4].any()
 
 
-def test_the_more_certain_source_is_taken_in_each_pixel() -> None:
-    depth, sigma = np.array([[2.0, 2.0, 0.0, 0.0, 2.0]]), np.array([[0.1, 0.1, np.inf, np.inf, 0.1]])
-    free = np.array([[0.0, 0.0, 4.0, 0.0, 0.0]])
-    got, doubt = arbitrate(
-        depth, sigma, free, np.array([[3.0, 3.0, 3.0, 3.0, np.nan]]), np.array([[0.05, 0.2, 0.3, 0.3, 0.01]])
-    )
-    assert got.tolist() == [[3.0, 2.0, 4.0, 3.0, 2.0]]  # beams have passed the third pixel up to 4 m
-    np.testing.assert_allclose(doubt, [[0.05, 0.1, 0.3, 0.3, 0.1]], rtol=1e-6)
+def test_a_pixel_is_corrected_where_the_completion_is_no_less_certain() -> None:
+    result = with_prior()
+    assert result.prior is not None and not result.prior.fixed.any()
+    pixels = [(60, column) for column in range(6)]
+    result.sigma[60, :6] = 0.1
+    result.prior.free_m[60, 2], result.prior.fixed[60, 3] = 4.0, True
+    found, doubt = np.full(SIZE, 3.0), np.full(SIZE, np.inf)
+    doubt[60, :6] = 0.05, 0.2, 0.1, 0.01, 0.05, 0.01
+    found[60, 4] = np.nan
+    got = complete(result, lambda channels: (found, doubt))
+    old = result.depth_m[60]
+    # Taken; less certain; taken, but beams have passed it up to 4 m; the robot itself; no number; taken.
+    assert [float(got.depth_m[at]) for at in pixels] == [3.0, old[1], 4.0, old[3], old[4], 3.0]
+    np.testing.assert_allclose(got.sigma[60, :6], [0.05, 0.1, 0.1, 0.1, 0.1, 0.01], rtol=1e-6)
+    np.testing.assert_array_equal(got.depth_m[:60], result.depth_m[:60])
+    assert got.prior is None and got.message.endswith("completed") and got.source == "completed"
+
+
+def test_the_robot_itself_is_not_completed() -> None:
+    result = without_body(with_prior(), UP, CAMERA_M, -60.0)
+    assert result.prior is not None and result.prior.fixed[-1].all() and not result.prior.fixed[60].any()
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_completion_with_an_honest_sigma_is_never_worse_than_the_lidar(seed: int) -> None:
-    """A completion that is wrong by as much as it says changes nothing that the LiDAR knows better, and a good one
+def test_completion_with_an_honest_sigma_is_never_worse_than_its_prior(seed: int) -> None:
+    """A completion that is wrong by as much as it says changes nothing that the prior knows better, and a good one
     improves the rest."""
-    rng, true, points = np.random.default_rng(seed), truth(HALL), revolution(HALL, noise_m=0.02)
+    rng, true = np.random.default_rng(seed), truth(HALL)
     wrong = rng.uniform(0.005, 0.6, SIZE)
-    found = completed(lambda prior: (true * np.exp(wrong * rng.choice([-1, 1], SIZE)), wrong), points)
-    before = alone(points)
-    kept = before.sigma <= wrong
+    before = with_prior(revolution(HALL, noise_m=0.02), HALL)
+    found = complete(before, lambda channels: (true * np.exp(wrong * rng.choice([-1, 1], SIZE)), wrong))
+    kept = before.sigma < wrong
     assert 0.1 < kept.mean() < 0.999
     np.testing.assert_array_equal(found.depth_m[kept], before.depth_m[kept])
-    np.testing.assert_array_equal(found.sigma[kept], before.sigma[kept])
-    assert (found.sigma <= before.sigma).all() and found.source == "completed"
+    assert (found.sigma <= before.sigma).all()
 
-    def log_error(result) -> float:
+    def log_error(result: DepthResult) -> float:
         return float(np.abs(np.log(np.maximum(result.depth_m, 0.1) / true)).mean())
 
     assert log_error(found) <= log_error(before) + 0.005
 
 
 @pytest.mark.parametrize("error", [InferenceError("out of memory"), ValueError("no panorama")])
-def test_failed_completion_leaves_the_lidar(error: Exception) -> None:
-    def fails(prior):
+def test_failed_completion_leaves_the_fused_depth(error: Exception) -> None:
+    def fails(channels):
         raise error
 
-    found, before = completed(fails), alone()
+    before = with_prior()
+    found = complete(before, fails)
     np.testing.assert_array_equal(found.depth_m, before.depth_m)
-    assert found.ok and str(error) in found.message
-    np.testing.assert_array_equal(completed(None).depth_m, before.depth_m)
+    assert found.ok and str(error) in found.message and found.prior is None
+    small = complete(before, lambda channels: (np.ones((8, 16)), np.ones((8, 16))))
+    assert "it is (8, 16), the depth (96, 192)" in small.message
 
 
-def test_completion_is_not_asked_without_points() -> None:
-    found = completed(lambda prior: pytest.fail("asked"), POINTS[:100])
-    assert not found.ok and "LiDAR points" in found.message
+def test_without_points_there_is_nothing_to_complete() -> None:
+    found = with_prior(POINTS[:100])
+    assert not found.ok and found.prior is None and "LiDAR points" in found.message
+    assert complete(found, lambda channels: pytest.fail("asked")) is found

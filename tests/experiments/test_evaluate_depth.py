@@ -152,7 +152,7 @@ class KnownModel:
 
     def __init__(self, depth, kind="metric"):
         self.depth, self.provider = depth, "none"
-        self.manifest = SimpleNamespace(output_kind=kind, name="known")
+        self.manifest = SimpleNamespace(output_kind=kind, name="known", prior_input="")
 
     def estimate(self, rgb):
         return self.depth.copy()
@@ -214,8 +214,19 @@ def test_lidar_alone_needs_no_network():
     assert 0 < scored.sigma_shares[0] <= scored.sigma_shares[1] <= scored.sigma_shares[2] <= 1
 
 
+def test_completed_is_the_fused_depth_corrected():
+    truth, model = box_room((128, 256)), KnownModel(box_room((128, 256)))
+    completion = KnownModel(truth)
+    completion.manifest.prior_input = "prior"
+    completion.complete = lambda rgb, prior: (truth, np.full(truth.shape, 1e-4, np.float32))
+    scored = Evaluator(DepthSettings("completed", LidarSettings()), model, completion).score("room", RGB, truth)
+    assert scored.after.mre < 1e-5 and scored.fit["message"].endswith("completed")
+
+
 def test_what_cannot_be_scored_says_why():
     model = KnownModel(box_room())
+    with pytest.raises(DepthEvaluationError, match="give a model of ic depth train"):
+        Evaluator(DepthSettings("completed", LidarSettings()), model)
     with pytest.raises(DepthEvaluationError, match="--lidar"):
         DepthSettings("fused")
     with pytest.raises(DepthEvaluationError, match="method"):

@@ -12,12 +12,12 @@ from instant_ic.training.export import export_model
 from instant_ic.training.losses import sigma_loss
 from instant_ic.training.slicenet import CheckpointError
 
-TINY = CompletionConfig(64, (8, 8, 8, 8), 2)
+TINY = CompletionConfig(64, (8, 8, 8), 2)
 
 
 def inputs(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Random image, and a prior of 2 m (sigma .05) whose left half is unknown, with one measured row of 3 m."""
-    prior = torch.zeros(1, 5, 64, 128)
+    prior = torch.zeros(1, 6, 64, 128)
     prior[:, 0, :, 64:], prior[:, 1, :, 64:] = 2.0, 0.05
     prior[:, 0, 32, 64:], prior[:, 1, 32, 64:], prior[:, 2, 32, 64:] = 3.0, 0.01, 1.0
     return torch.rand((1, 3, 64, 128), generator=torch.Generator().manual_seed(seed)), prior
@@ -33,13 +33,34 @@ def trained() -> CompletionNet:
 
 @torch.inference_mode()
 def test_untrained_network_gives_the_prior_and_a_typical_depth() -> None:
-    depth, sigma = CompletionNet(TINY).eval()(*inputs())
-    # log depth = s log 2 + (1 - s) 0.9 with s = sigmoid(3) = .9526; without a prior 0.9.
-    known, unknown = np.exp(0.9526 * np.log(2) + 0.0474 * 0.9), np.exp(0.9)
-    torch.testing.assert_close(depth[0, 5, 64:], torch.full((64,), float(known)), rtol=1e-4, atol=0)
-    torch.testing.assert_close(depth[0, :, :64], torch.full((64, 64), float(unknown)), rtol=1e-4, atol=0)
-    assert sigma[0, 5, 100].item() == pytest.approx(0.05, rel=1e-4)  # the prior's
-    assert sigma[0, 5, 10].item() == pytest.approx(np.exp(-1), rel=1e-4)
+    image, prior = inputs()
+    depth, sigma = CompletionNet(TINY).eval()(image, prior)
+    torch.testing.assert_close(depth[..., 64:], prior[:, 0, :, 64:], rtol=1e-6, atol=0)
+    torch.testing.assert_close(sigma[..., 64:], prior[:, 1, :, 64:], rtol=1e-6, atol=0)
+    torch.testing.assert_close(depth[..., :64], torch.full((1, 64, 64), 2.5), rtol=1e-6, atol=0)
+    torch.testing.assert_close(sigma[..., :64], torch.full((1, 64, 64), 0.6), rtol=1e-6, atol=0)
+
+
+@torch.inference_mode()
+def test_an_output_of_one_is_the_priors_sigma() -> None:
+    """Change 1 and spread log 2: the factor on the depth is exp(sigma) within .02 to .6, that on sigma 2."""
+    model = CompletionNet(TINY).eval()
+    model.head.bias.copy_(torch.tensor([1.0, np.log(2)]).repeat_interleave(16))
+    image, prior = inputs()
+    prior[:, 1, 5, 64:] = 0.005
+    depth, sigma = model(image, prior)
+    for row, step in ((5, 0.02), (6, 0.05)):
+        assert depth[0, row, 100].item() == pytest.approx(2 * np.exp(step), rel=1e-5)
+    assert depth[0, 5, 10].item() == pytest.approx(2.5 * np.exp(0.6), rel=1e-5)
+    assert sigma[0, 6, 100].item() == pytest.approx(0.1, rel=1e-5)
+
+
+@torch.inference_mode()
+def test_the_encoder_keeps_its_statistics_in_training() -> None:
+    model = CompletionNet(TINY).train()
+    before = model.encoder.stem.norm.running_mean.clone()
+    model(*inputs())
+    assert torch.equal(before, model.encoder.stem.norm.running_mean) and model.head.training
 
 
 @torch.inference_mode()
@@ -67,9 +88,8 @@ def published(model: CompletionNet) -> dict[str, torch.Tensor]:
     for key, value in model.encoder.state_dict().items():
         for own, theirs in {**parts, "stem.conv": "_conv_stem", "stem.norm": "_bn0"}.items():
             key = key.replace(own, theirs)
-        if key != "geometry.weight":
-            state[f"_{key}" if key.startswith("blocks") else key] = value
-    return state | {"_fc.weight": torch.zeros(2, 2)}
+        state[f"_{key}" if key.startswith("blocks") else key] = value
+    return state | {"_fc.weight": torch.zeros(2, 2), "_blocks.11._bn0.weight": torch.zeros(2)}  # not used
 
 
 def test_published_encoder_loads_by_its_names(tmp_path: Path) -> None:
@@ -78,8 +98,7 @@ def test_published_encoder_loads_by_its_names(tmp_path: Path) -> None:
     torch.save(published(source), tmp_path / "lite0.pth")
     load_encoder(target, tmp_path / "lite0.pth")
     for key, value in source.encoder.state_dict().items():
-        if key != "geometry.weight":
-            assert torch.equal(value, target.encoder.state_dict()[key]), key
+        assert torch.equal(value, target.encoder.state_dict()[key]), key
     torch.save({"_conv_stem.weight": torch.zeros(3)}, tmp_path / "other.pth")
     with pytest.raises(CheckpointError, match="not the weights of EfficientNet-lite0"):
         load_encoder(target, tmp_path / "other.pth")
@@ -95,7 +114,8 @@ def test_exported_file_completes_as_the_network_does(tmp_path: Path) -> None:
     got, doubt = loaded.complete(rgb, prior[0].numpy())
     np.testing.assert_allclose(got, depth[0].numpy().clip(0.1, 40), rtol=1e-3)
     np.testing.assert_allclose(doubt, sigma[0].numpy(), rtol=1e-3)
-    assert loaded.estimate(rgb).shape == (64, 128)  # without any LiDAR
+    with pytest.raises(ValueError, match="c corrects fused depth"):
+        loaded.estimate(rgb)
     with pytest.raises(ValueError, match="the prior must be"):
         loaded.complete(rgb, prior[0, :, :32].numpy())
 
@@ -110,7 +130,7 @@ def test_sigma_loss_is_smallest_where_68_percent_lie_within() -> None:
     assert (error.abs() < best).float().mean().item() == pytest.approx(0.68, abs=0.03)
 
 
-@pytest.mark.parametrize("options", [{"height": 100}, {"decoder": (8, 8, 8)}, {"slices": -1}])
+@pytest.mark.parametrize("options", [{"height": 100}, {"decoder": (8, 8)}, {"slices": -1}])
 def test_wrong_shapes_are_named(options: dict) -> None:
     with pytest.raises(ValueError, match=next(iter(options))):
         CompletionConfig(**options)

@@ -1,6 +1,7 @@
 """Generated interiors: every kind can be stood in and repeats; seeds of the evaluations are refused."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 from instant_ic.experiments import depth_worlds
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
+from instant_ic.training.dataset import DatasetError, save_sample
+from instant_ic.training.folders import open_folder
 from instant_ic.training.interiors import KINDS, interior_world
 from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig, render_rooms
 
@@ -28,14 +31,54 @@ def test_kinds_are_drawn_by_their_shares_and_unknown_ones_refused() -> None:
         interior_world(1, "cave")
 
 
-def test_rooms_are_reproducible_and_vary() -> None:
-    recipe = RoomsConfig(worlds=2, poses=2, height=32, first_world=300_006)
-    first, again = list(render_rooms(recipe)), list(render_rooms(recipe, worlds=[300_007]))
-    assert [s.world for s in first] == [300_006, 300_006, 300_007, 300_007]
-    np.testing.assert_array_equal(first[2].rgb, again[0].rgb)
-    np.testing.assert_array_equal(first[3].depth_m, again[1].depth_m)
-    heights = {round(float(s.depth_m[-1].mean()), 2) for s in first}
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[RoomsConfig, Path]:
+    """Two panoramas of a world for training and of a held-out one, whose seed is a multiple of twelve."""
+    folder = tmp_path_factory.mktemp("p")
+    recipe = RoomsConfig(worlds=2, poses=2, height=64, first_world=300_000, interiors="random")
+    paths = list(render_rooms(recipe, folder, [300_000, 300_001]))
+    assert [path.name for path in paths] == ["300000-0.npz", "300000-1.npz", "300001-0.npz", "300001-1.npz"]
+    return recipe, folder
+
+
+def test_rooms_are_reproducible_and_vary(rendered: tuple[RoomsConfig, Path], tmp_path: Path) -> None:
+    recipe, folder = rendered
+    (again,) = [path for path in render_rooms(recipe, tmp_path, [300_001]) if path.stem == "300001-1"]
+    first = open_folder(f"rendered:{folder}", (64, 128))
+    second = open_folder(f"rendered:{tmp_path}", (64, 128))
+    assert [path for path, _ in second.samples].count(again) in (1, 2)
+    for old, new in zip(list(first)[-1:], list(second)[-1:], strict=True):
+        np.testing.assert_array_equal(old.rgb, new.rgb)
+        np.testing.assert_array_equal(old.depth_m, new.depth_m)
+        np.testing.assert_array_equal(old.prior, new.prior)
+    heights = {round(float(sample.depth_m[-1].mean()), 2) for sample in first}
     assert len(heights) == 4 and min(heights) > 0.45 and max(heights) < 1.85
+    assert not list(render_rooms(recipe, folder, [300_000, 300_001]))  # they are there
+
+
+def test_a_rendered_folder_holds_out_worlds(rendered: tuple[RoomsConfig, Path]) -> None:
+    data = open_folder(f"rendered:{rendered[1]}", (64, 128))
+    training, held = data.split()
+    assert {data[int(i)].world for i in training} == {300_001} and {data[int(i)].world for i in held} == {300_000}
+    sample = data[int(held[0])]
+    assert sample.prior is not None and sample.prior.shape == (6, 64, 128) and sample.rgb.dtype == np.uint8
+    error = np.abs(sample.prior[0] - sample.depth_m)[sample.prior[2] > 0] / sample.depth_m[sample.prior[2] > 0]
+    assert np.median(error) < 0.06
+    assert data.info == {"kind": "rendered", "folder": rendered[1].name, "count": len(data), "scenes": 2}
+
+
+def test_a_rendered_folder_says_what_is_wrong(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no rendered panoramas: run ic depth render"):
+        open_folder(f"rendered:{tmp_path}", (64, 128))
+    prior = np.zeros((6, 64, 128))
+    save_sample(tmp_path / "5-0.npz", np.zeros((64, 128, 3), np.uint8), prior[0], [prior])
+    with pytest.raises(DatasetError, match=r"5-0\.npz: 64 x 128, the network takes 256 x 512"):
+        open_folder(f"rendered:{tmp_path}", (256, 512))
+    with pytest.raises(DatasetError, match="render 12 or more"):
+        open_folder(f"rendered:{tmp_path}", (64, 128)).split()
+    (tmp_path / "6-0.npz").write_bytes(b"damaged")
+    with pytest.raises(DatasetError, match=r"6-0\.npz: damaged"):
+        open_folder(f"rendered:{tmp_path}", (64, 128))
 
 
 def test_worlds_of_the_evaluations_are_never_trained_on() -> None:

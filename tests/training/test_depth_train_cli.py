@@ -1,4 +1,4 @@
-"""``ic depth train`` as a person calls it."""
+"""``ic depth train`` and ``ic depth render`` as a person calls them."""
 
 import argparse
 import json
@@ -18,33 +18,31 @@ import torch
 from instant_ic.cli import depth_train
 from instant_ic.cli.errors import UserError
 from instant_ic.training import feeds
-from instant_ic.training.dataset import DatasetError, Sample
-from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig
+from instant_ic.training.dataset import DatasetError, save_sample
+from instant_ic.training.rooms import RoomsConfig
 from instant_ic.training.slicenet import CheckpointError
-
-SEEDS: list[int] = []
 
 
 def ic(*words: str) -> int:
     parser = argparse.ArgumentParser(prog="ic")
-    depth_train.add_parser(parser.add_subparsers(required=True))
-    args = parser.parse_args(["train", "--height", "64", "--encoder", "none", *words])
+    commands = parser.add_subparsers(required=True)
+    depth_train.add_parser(commands)
+    depth_train.add_render_parser(commands)
+    fixed = ["--height", "64", *(["--encoder", "none"] if words[0] == "train" else [])]
+    args = parser.parse_args([words[0], *fixed, *words[1:]])
     return int(args.func(args))
 
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Worlds that are rendered at once."""
+    """Priors of panoramas at once: 2 m everywhere."""
 
-    def render(recipe: RoomsConfig, worlds: list[int]) -> Iterator[Sample]:
-        for seed in worlds:
-            SEEDS.append(seed)
-            depth = np.full((recipe.height, 2 * recipe.height), 1.0 + seed % 4, np.float32)
-            for _ in range(recipe.poses):
-                yield Sample(np.repeat((depth * 50).astype(np.uint8)[..., None], 3, axis=-1), depth, seed)
+    def prior(rgb: np.ndarray, depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        channels = np.zeros((6, *depth_m.shape), np.float32)
+        channels[0], channels[1] = 2.0, 0.3
+        return channels
 
-    SEEDS.clear()
-    monkeypatch.setattr(feeds, "render_rooms", render)
+    monkeypatch.setattr(feeds, "prior_of_image", prior)
 
 
 def plain_folder(root: Path) -> str:
@@ -60,36 +58,64 @@ def record(checkpoint: Path) -> dict:
     return torch.load(checkpoint, weights_only=True)["record"]
 
 
-def test_rendered_on_the_way_and_taken_up_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def rendered_folder(root: Path) -> str:
+    """Panoramas of worlds 12 to 20, of which 12 is held out; their priors are 10 % too far."""
+    root.mkdir()
+    for seed in range(12, 21):
+        depth = np.full((64, 128), 1.0 + seed % 4, np.float32)
+        channels = np.zeros((6, 64, 128), np.float32)
+        channels[0], channels[1] = 1.1 * depth, 0.1
+        rgb = np.repeat((depth * 50).astype(np.uint8)[..., None], 3, axis=-1)
+        save_sample(root / f"{seed}-0.npz", rgb, depth, [channels, channels])
+    return f"rendered:{root}"
+
+
+def test_rendered_panoramas_and_taken_up_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     weights = tmp_path / "runs" / "w.pt"
-    words = ("--worlds", "8", "--poses", "2", "--pool", "4", "--reuse", "2", "--batch-size", "4", "--workers", "0",
-             "--held-out", "4", "--checkpoint", str(weights))  # fmt: skip
+    words = ("train", "--data", rendered_folder(tmp_path / "p"), "--batch-size", "4", "--checkpoint", str(weights))
     assert ic(*words, "--epochs", "1") == 0
-    assert record(weights)["steps"] == 8  # 8 worlds x 2 panoramas x 2 uses / 4
-    assert record(weights)["data"]["first_world"] == 100_000
-    assert set(SEEDS) <= {*range(100_000, 100_008), FIRST_HELD_OUT - 2, FIRST_HELD_OUT - 1}
+    assert record(weights)["steps"] == 4  # 8 worlds x 2 priors / 4
+    assert record(weights)["history"][0]["mre"] == pytest.approx(0.1, abs=0.001)  # of the prior
+    assert record(weights)["data"] == {"kind": "rendered", "folder": "p", "count": 18, "scenes": 9, "panoramas": 16}
     said = capsys.readouterr().out
     assert "training on 1 x CPU" in said and json.loads(said.splitlines()[-1])["mre"] > 0
-    assert weights.with_suffix(".csv").read_text().splitlines()[-1].startswith("8,")
+    assert weights.with_suffix(".csv").read_text().splitlines()[-1].startswith("4,")
     assert ic(*words, "--epochs", "2", "--resume") == 0
-    assert record(weights)["steps"] == 16 and len(record(weights)["history"]) == 2
+    assert record(weights)["steps"] == 8 and len(record(weights)["history"]) == 3
 
 
-def test_own_folder_and_worlds_mixed_and_started_from_weights(tmp_path: Path) -> None:
+def test_folders_mixed_and_started_from_weights(tmp_path: Path) -> None:
     data = plain_folder(tmp_path / "mine")
     first, second = tmp_path / "a.pt", tmp_path / "b.pt"
-    words = ("--data", data, "--batch-size", "3", "--epochs", "1", "--workers", "0")
+    words = ("train", "--data", data, "--batch-size", "3", "--epochs", "1")
     assert ic(*words, "--checkpoint", str(first)) == 0
     made = record(first)
     assert made["data"] == {"kind": "plain", "folder": "mine", "count": 6, "scenes": 6, "panoramas": 5}
-    assert made["held_out"] == 1 and not SEEDS
-    more = ("--generated", "wide", "--generated-share", "0.34", "--worlds", "2", "--poses", "2", "--pool", "2",
-            "--held-out", "4", "--init", str(first), "--checkpoint", str(second))  # fmt: skip
+    assert made["held_out"] == 1
+    more = ("--data", rendered_folder(tmp_path / "p"), "--init", str(first), "--checkpoint", str(second))
     assert ic(*words, *more) == 0
     made = record(second)
-    assert [part["batch_size"] for part in made["data"]["mixed"]] == [2, 1]
-    assert made["held_out"] == 1 + 4
+    assert [part["batch_size"] for part in made["data"]["mixed"]] == [1, 2]
+    assert made["held_out"] == 1 + 2
     assert made["start"]["file"] == "a.pt" and made["start"]["record"]["steps"] == record(first)["steps"]
+
+
+def test_render_writes_what_train_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def render(recipe: RoomsConfig, folder: Path, worlds: range) -> Iterator[Path]:
+        asked.append((recipe, worlds))
+        yield folder / "24-1.npz"
+
+    monkeypatch.setattr("instant_ic.training.rooms.render_rooms", render)
+    words = ("render", "-o", str(tmp_path / "p"), "--worlds", "3", "--poses", "2", "--first", "24")
+    assert ic(*words) == 0 and (tmp_path / "p").is_dir()
+    ((recipe, worlds),) = asked
+    assert worlds == range(24, 27) and (recipe.poses, recipe.height, recipe.textures) == (2, 64, "")
+    with pytest.raises(UserError, match="for evaluation"):
+        ic("render", "-o", str(tmp_path / "p"), "--first", "899999")
+    with pytest.raises(DatasetError, match="no textures"):
+        ic("render", "-o", str(tmp_path / "p"), "--textures", "/absent")
 
 
 def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
@@ -107,18 +133,16 @@ def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
     [
         (("--height", "100"), UserError, "multiple of 32"),
         (("--encoder", "/absent.pth"), CheckpointError, "no such file"),
-        (("--textures", "/absent"), DatasetError, "no textures"),
         (("--device", "tpu9"), UserError, "device 'tpu9'"),
         (("--data", "m3d:/absent"), DatasetError, "no such folder"),
-        (("--generated", "none"), UserError, "nothing to train on"),
-        (("--worlds", "899999"), UserError, "for evaluation"),
         (("--init", "/absent.pt"), CheckpointError, "no such file"),
         (("--checkpoint", "/tmp"), UserError, "is a folder"),
     ],
 )
 def test_mistakes_are_told(words: tuple[str, ...], error: type[Exception], message: str, tmp_path: Path) -> None:
     with pytest.raises(error, match=message):
-        ic("--checkpoint", str(tmp_path / "w.pt"), "--workers", "0", *words)
+        given = () if "--data" in words else ("--data", plain_folder(tmp_path / "mine"))
+        ic("train", "--checkpoint", str(tmp_path / "w.pt"), *given, *words)
 
 
 @pytest.mark.system
@@ -137,7 +161,7 @@ def test_two_processes_train_one_network(tmp_path: Path) -> None:
 
 def test_preset_sets_what_is_not_given(tmp_path: Path) -> None:
     data = plain_folder(tmp_path / "mine")
-    words = ("--data", data, "--workers", "0", "--epochs", "1", "--checkpoint", str(tmp_path / "w.pt"))
-    assert ic("--preset", "gpu", "--batch-size", "2", *words) == 0
+    words = ("--data", data, "--epochs", "1", "--checkpoint", str(tmp_path / "w.pt"))
+    assert ic("train", "--preset", "gpu", "--batch-size", "2", *words) == 0
     made = record(tmp_path / "w.pt")["training"]
     assert (made["batch_size"], made["minutes"], made["learning_rate"]) == (2, 20.0, 2e-3)

@@ -1,4 +1,4 @@
-"""Incomplete depth for training: none, a revolution with faults, a local model; and photographs on surfaces."""
+"""Fused depth for training: a revolution with faults, a local model; and photographs on surfaces."""
 
 import zipfile
 from pathlib import Path
@@ -11,9 +11,10 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.world import World
 from instant_ic.sim.worlds import random_world
+from instant_ic.training import sparse
 from instant_ic.training.dataset import DatasetError
 from instant_ic.training.photographs import unpack, with_photographs
-from instant_ic.training.sparse import Sparsity, misplaced, prior_of_image, sample_prior, spoiled
+from instant_ic.training.sparse import bend, misplaced, prior_of_image, sample_prior, spoiled
 
 SIZE = (64, 128)
 
@@ -24,28 +25,36 @@ def world() -> World:
 
 
 @pytest.fixture(scope="module")
-def room(world: World) -> tuple[EquirectRenderer, np.ndarray, np.ndarray]:
-    """Renderer, a camera's pose, and the true depth there."""
+def room(world: World) -> tuple[EquirectRenderer, np.ndarray, np.ndarray, np.ndarray]:
+    """Renderer, a camera's pose, the image and the true depth there."""
     renderer = EquirectRenderer(world)
     x, y, yaw = world.sample_free_poses(np.random.default_rng(0), 1)[0]
     pose = pose_matrix(x, y, 1.2, yaw=yaw)
-    return renderer, pose, renderer.render(pose, SIZE[1], SIZE[0]).depth_m
+    frame = renderer.render(pose, SIZE[1], SIZE[0])
+    return renderer, pose, frame.rgb, frame.depth_m
 
 
-def test_sparsity_from_nothing_to_a_model(room: tuple) -> None:
-    renderer, pose, true = room
-    kinds = (Sparsity(1.0, 0.0), Sparsity(0.0, 0.0, 0.0), Sparsity(0.0, 1.0, 0.0))
-    none, one, model = (sample_prior(renderer, pose, np.random.default_rng(1), SIZE, kind) for kind in kinds)
-    assert not none[:3].any() and none[3].std() > 0.5
-    for prior in (one, model):
-        known, measured = prior[0] > 0, prior[2] > 0
-        error = np.abs(prior[0] - true) / true
-        assert known.mean() > 0.8 and 0.02 < measured.mean() < 0.3
-        assert np.median(error[measured]) < 0.03 and np.median(error[known]) < 0.06
-        assert (prior[1][known] > 0).all() and not prior[1][~known].any()
-    assert not np.array_equal(one[0], model[0])
-    again = sample_prior(renderer, pose, np.random.default_rng(1), SIZE, kinds[2])
-    np.testing.assert_array_equal(again, model)  # nothing is left of the drive before
+@pytest.mark.parametrize("modelled", [0.0, 1.0])
+def test_prior_of_a_revolution_and_of_a_model(room: tuple, modelled: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    renderer, pose, rgb, true = room
+    monkeypatch.setattr(sparse, "MODEL_SHARE", modelled)
+    monkeypatch.setattr(sparse, "FAULTY_SHARE", 0.0)
+    prior = sample_prior(renderer, pose, rgb, true, np.random.default_rng(1))
+    assert prior is not None and prior.shape == (6, *SIZE)
+    known, measured = prior[0] > 0, prior[2] > 0
+    error = np.abs(prior[0] - true) / true
+    assert known.mean() > 0.95 and 0.02 < measured.mean() < 0.3 and (prior[5] > 0).mean() > 0.95
+    assert np.median(error[measured]) < 0.03 and np.median(error[known]) < 0.06
+    assert (prior[1][known] > 0).all() and not prior[1][~known].any()
+    again = sample_prior(renderer, pose, rgb, true, np.random.default_rng(1))
+    np.testing.assert_array_equal(again, prior)  # nothing is left of the drive before
+
+
+def test_bent_depth_is_smooth_over_the_seam() -> None:
+    fields = [bend((64, 128), np.random.default_rng(seed)) for seed in range(20)]
+    step = max(float(np.abs(np.log(field / np.roll(field, 1, axis=1))).max()) for field in fields)
+    assert step < 0.25  # 2.8 degrees of a field whose values are 45 degrees apart
+    assert 0.05 < np.std([np.log(field) for field in fields]) < 0.3
 
 
 def test_faults_stay_on_their_beams_and_take_points_away() -> None:
@@ -78,19 +87,13 @@ def test_wrong_mount_is_within_its_bounds() -> None:
 
 
 def test_prior_of_a_panorama_without_a_world(room: tuple) -> None:
-    true = room[2]
-    priors = [prior_of_image(true, np.random.default_rng(seed)) for seed in range(8)]
-    measured = [prior for prior in priors if prior[2].any()]
-    assert len(measured) >= 5 and all(prior.shape == (5, *SIZE) for prior in priors)
-    for prior in measured:
+    rgb, true = room[2:]
+    priors = [prior_of_image(rgb, true, np.random.default_rng(seed)) for seed in range(3)]
+    found = [prior for prior in priors if prior is not None]
+    assert found
+    for prior in found:
         error = np.abs(prior[0] - true)[prior[2] > 0] / true[prior[2] > 0]
         assert np.median(error) < 0.06
-
-
-@pytest.mark.parametrize("shares", [(-0.1, 0.5), (0.6, 0.6)])
-def test_shares_are_checked(shares: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match="shares must lie in"):
-        Sparsity(*shares)
 
 
 def test_photographs_change_the_surfaces_and_nothing_else(world: World, tmp_path: Path) -> None:

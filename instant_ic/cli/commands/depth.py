@@ -27,11 +27,12 @@ def add_parser(subparsers: Any) -> None:
         "ic depth estimate panorama.jpg --output depth.png",
     )  # fmt: skip
     depth_train.add_parser(commands)
+    depth_train.add_render_parser(commands)
     add = verb(
-        commands, "textures", "unpack photographic textures for ic depth train", textures,
+        commands, "textures", "unpack photographic textures for ic depth render", textures,
         "ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures",
         "Write the surface textures of a robosuite wheel (MIT licence) as JPEG files into a folder, for\n"
-        "ic depth train --textures. Get the wheel with: pip download --no-deps robosuite==1.5.2",
+        "ic depth render --textures. Get the wheel with: pip download --no-deps robosuite==1.5.2",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     ).add_argument  # fmt: skip
     add("wheel", type=Path, help="the wheel")

@@ -25,6 +25,8 @@ def add_kind(kinds: Any) -> None:
     text += "(key depth) or .exr in metres; 0 = unknown"
     add("--depth", type=Path, nargs="+", default=[], metavar="GT", help=text)
     add("--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)")
+    text = "ONNX file of ic depth train, for source completed"
+    add("--completion", type=Path, metavar="M", help=text)
     text = "depth source (default: fused with --lidar, else network)"
     add("--source", choices=("network", "lidar", "fused", "completed"), help=text)
     text = "scale the depth by a simulated VLP-16 that measures the true depth"
@@ -71,7 +73,8 @@ def evaluate_depth(args: argparse.Namespace) -> int:
         model = None
         if source != "lidar":
             model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads)
-        evaluator = Evaluator(settings, model)
+        completion = DepthModel.load(args.completion, threads=args.threads) if args.completion else None
+        evaluator = Evaluator(settings, model, completion if source == "completed" else None)
         pictures = find_pictures(args.images)
         pairs = pair(pictures, args.depth) if args.depth else [(picture, None) for picture in pictures]
     except (DepthEvaluationError, ManifestError, PairError, FileNotFoundError, ValueError) as error:
