@@ -177,7 +177,7 @@ def ship(path: Path, sections: dict[str, Section], results: Sequence[Result], co
             )
             for name, section in sections.items()
         }
-        page = _page(reduced, results, conditions)
+        page = _page("", reduced, results, conditions)
         if len(page.encode()) <= _SHIPPED_BYTES:
             save_text(path, page)
             return len(page.encode())
