@@ -141,8 +141,9 @@ class Levels:
     def judge(self) -> dict[str, dict[str, Any]]:
         """Growth in each process's longest life: ``rss_mb``, ``fds``, ``seconds``, ``leak``.
 
-        Memory grows by the fitted line. Descriptors come and go with every process that connects: theirs is the
-        difference of the lowest counts in the first and last third.
+        Memory grows by the fitted line, and leaks if it does so in both halves: a step, as at the first loop closure, is
+        no leak. Descriptors come and go with every process that connects: theirs is the difference of the lowest counts
+        in the first and last third.
         """
         result: dict[str, dict[str, Any]] = {}
         for (name, _), rows in self._rows.items():
@@ -150,7 +151,8 @@ class Levels:
             span = float(late[-1, 0] - late[0, 0]) if len(late) > 10 else 0.0
             if span < JUDGED_S or span < result.get(name, {}).get("seconds", 0.0):
                 continue
-            rss = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) * span
+            parts = (late, late[: len(late) // 2], late[len(late) // 2 :])
+            rss, *halves = (float(np.polyfit(part[:, 0], part[:, 1], 1)[0]) * span for part in parts)
             third = len(late) // 3
             fds = float(late[-third:, 2].min() - late[:third, 2].min())
             result[name] = {
@@ -158,7 +160,7 @@ class Levels:
                 "rss_mb": round(rss, 1),
                 "of_mb": round(float(late[0, 1]), 0),
                 "fds": round(fds, 1),
-                "leak": rss > max(LEAK_MB, 0.1 * float(late[0, 1])) or fds > LEAK_FDS,
+                "leak": min(rss, *halves) > max(LEAK_MB, 0.1 * float(late[0, 1])) or fds > LEAK_FDS,
             }
         return result
 

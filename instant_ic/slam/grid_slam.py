@@ -24,7 +24,7 @@ from instant_ic.slam.map_files import load_graph, load_grid, save_graph, save_gr
 from instant_ic.slam.motion import MotionMonitor
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.odometry import CorrectionLimiter
-from instant_ic.slam.pose_graph import Edge
+from instant_ic.slam.pose_graph import Edge, optimise
 from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
 
 MOST_JOIN_CONTRADICTION = 0.1
@@ -511,7 +511,10 @@ def make_slam(config: SlamConfig | None = None, map_file: Path | None = None, lo
 
 
 def warm_up(config: SlamConfig | None = None) -> None:
-    """Compile the kernels, or load them from their cache, so that they do not delay the first scan."""
+    """Compile the kernels, or load them from their cache, and import the solver.
+
+    Otherwise they would delay the first scan, and the solver (60 MB) the scans of the first loop closure.
+    """
     leave_out_blas()
     slam = GridSlam(config)
     angles = np.linspace(-math.pi, math.pi, 181)[:-1]
@@ -519,6 +522,7 @@ def warm_up(config: SlamConfig | None = None) -> None:
     for index in range(2):
         slam.process(Scan(ranges, -math.pi, 2 * math.pi / 180, 0.1, 30.0, index + 1))
     slam.grid()
+    optimise(np.zeros((2, 3)), [Edge(0, 1, np.ones(3), np.eye(3))], {0: 0, 1: 1})
 
 
 def save_answer(slam: GridSlam, stem: Path) -> str:
