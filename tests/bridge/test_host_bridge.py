@@ -460,7 +460,7 @@ def test_shipped_lists_are_whole():
             line = re.search(rf"^{word}: (.*)$", part, re.M)
             found[name] = set(re.findall(r"`(/[\w/]+)`", line[1])) if line else set()
     sides = {
-        side: set(re.findall(r"exec: (\w+)", paths.shipped_file("launch", f"{side}.yaml").read_text()))
+        side: set(re.findall(r"exec: (?:\$\(var )?(\w+)", paths.shipped_file("launch", f"{side}.yaml").read_text()))
         - {"host_bridge", "bag_recorder"}
         for side in ("robot", "station")
     }

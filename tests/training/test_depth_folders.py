@@ -98,7 +98,7 @@ def test_rendered_matterport_as_exr(tmp_path: Path) -> None:
 def test_wrong_names_and_folders_are_told(tmp_path: Path) -> None:
     stanford(tmp_path / "s")
     for name, words in (
-        ("kitti:x", "LAYOUT one of m3d, s2d3d, s3d, plain"),
+        ("kitti:x", "LAYOUT one of rendered, m3d, s2d3d, s3d, plain"),
         ("m3d", "LAYOUT:FOLDER"),
         (f"m3d:{tmp_path / 'absent'}", "no such folder"),
         (f"m3d:{tmp_path / 's'}", "SCAN/pano_skybox_color.*it looks like s2d3d"),
