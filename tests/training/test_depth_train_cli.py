@@ -147,7 +147,7 @@ def test_mistakes_are_told(words: tuple[str, ...], error: type[Exception], messa
 
 @pytest.mark.system
 def test_two_processes_train_one_network(tmp_path: Path) -> None:
-    data, weights = plain_folder(tmp_path / "mine"), tmp_path / "w.pt"
+    data, weights = rendered_folder(tmp_path / "p"), tmp_path / "w.pt"
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
                "instant_ic.cli.main", "depth", "train", "--height", "64", "--encoder", "none", "--data", data,
                "--batch-size", "1", "--epochs", "1", "--checkpoint", str(weights), "--device", "cpu"]  # fmt: skip
@@ -155,8 +155,8 @@ def test_two_processes_train_one_network(tmp_path: Path) -> None:
         command, capture_output=True, text=True, timeout=280, env={**os.environ, "OMP_NUM_THREADS": "1"}
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    assert record(weights)["device"].startswith("2 x CPU") and record(weights)["steps"] == 2  # 5 panoramas, 2 a step
-    assert done.stdout.count("training on 2 x CPU") == 1 and done.stdout.count("held-out panoramas:") == 1
+    assert record(weights)["device"].startswith("2 x CPU") and record(weights)["steps"] == 8  # 16 panoramas, 2 a step
+    assert done.stdout.count("training on 2 x CPU") == 1 and done.stdout.count("held-out panoramas:") == 2  # before and after
 
 
 def test_preset_sets_what_is_not_given(tmp_path: Path) -> None:
