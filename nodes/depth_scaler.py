@@ -100,7 +100,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             return
         if self.config.source == "lidar":
             self.handle(self.chain.hold(image))
-        elif self.chain.request_due(image.stamp_ns):
+        elif not self.worker.busy and self.chain.request_due(image.stamp_ns):  # a keyframe may be on its way
             self.request.publish(header(image.frame, image.stamp_ns))
 
     def on_cloud(self, message: Any) -> None:

@@ -19,7 +19,10 @@ _BASE = "crawler_base"
 _BRIDGES = ("host_bridge", "zenoh_gateway")
 """Pass what they subscribe to on to a robot on another machine."""
 _COMMAND = "/cmd_vel"
-_ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
+_ACTED_ON = (
+    *("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom"),
+    *("/view/shown", "/vspace/status"),  # whether the operator sees recent images
+)
 """Topics that a robot's nodes act on, in the namespace of its base."""
 _HARMLESS = {"/clock", *EVERY_NODES}
 """On any other topic a second publisher would mix the bag with the live robot."""

@@ -142,9 +142,9 @@ class LocalTransport:
     def wait(self, timeout: float) -> None:
         """Read the node's sockets until a message arrives, the event is set, or the time is over."""
         self._driver = threading.get_ident()
+        self._read(self._unread)  # sets the event: its descriptors will not report what this reads
         timeout = 0.0 if self._set else timeout
         self._waiting = timeout > 0.0  # a mere look leaves the reading to the bus thread, if that has taken over
-        self._read(self._unread)
         patient = self.patient
         if patient:
             ready = [*_readable([self._wake], timeout), *self._readers]

@@ -168,7 +168,7 @@ class Worker:
             return
         with self._condition:
             self.skipped += len(self._item)
-            self._item = [item]
+            self._item, self.busy = [item], True
             self._condition.notify()
 
     def stop(self, timeout_s: float = 3.0) -> None:
@@ -658,7 +658,8 @@ class Node(Generic[ConfigT]):
 
     def read_all(self) -> None:
         """Run the callbacks of all messages that have arrived, also of those that are still in the sockets."""
-        for _ in range(2):  # the first wait may read only one message of each socket, the next one the rest
+        # A wait reads one message of each of 64 sockets at most, and all that is left in those of the wait before it.
+        for _ in range(2 + len(self.subscriptions) // 64):
             self._wake.wait(0.0)
         self.spin_once()
 

@@ -71,7 +71,7 @@ class RenderedDataset:
         self.samples: list[tuple[Path, int]] = []
         for path in sorted(folder.glob("*-*.npz")):
             shape = _shape(path)
-            if shape[2:] != size:
+            if shape[0] and shape[2:] != size:  # no prior fitted to a few panoramas
                 raise DatasetError(f"{path}: {shape[2]} x {shape[3]}, the network takes {size[0]} x {size[1]}: render "
                                    "the worlds again into another folder with its --height")  # fmt: skip
             self.samples += [(path, number) for number in range(shape[0])]

@@ -56,7 +56,7 @@ class RoomsConfig:
 
 
 def render_rooms(config: RoomsConfig, folder: Path, worlds: Iterable[int]) -> Iterator[Path]:
-    """Render worlds of the recipe into a folder, one file a panorama (``dataset.load_sample``); the same recipe gives
+    """Render worlds of the recipe into a folder, one file a panorama (``dataset.save_sample``); the same recipe gives
     the same files.
 
     Worlds of which the folder has panoramas are left out, so that an interrupted run continues.

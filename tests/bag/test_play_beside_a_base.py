@@ -131,6 +131,13 @@ def test_a_bridge_passes_no_emergency_stop_release_of_a_bag_to_a_robot_elsewhere
     player(bag("/played", "/operator/estop"), namespace="robot1", force=True)
 
 
+@pytest.mark.parametrize("topic", ["/view/shown", "/vspace/status"])
+def test_a_bridge_passes_no_old_report_of_the_page_to_a_robot_elsewhere(bag, base, player, topic):
+    base("link", executable="host_bridge", command=topic)
+    with pytest.raises(NodeError, match=f"{topic} would reach the robot of link"):
+        player(bag("/played", topic))
+
+
 def test_a_renamed_player_does_not_take_itself_for_a_live_node(bag, base, player):
     base()
     node = player(bag("/played"))

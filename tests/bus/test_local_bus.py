@@ -416,3 +416,29 @@ def test_a_wait_that_read_one_of_two_messages_leaves_the_other_to_the_bus_thread
     finally:
         for transport in (out, reader):
             transport.close()
+
+
+def test_the_second_of_two_messages_ends_the_next_wait(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One wait reads the first; the next finds the second by itself, since no descriptor will report it."""
+    out, reader = (LocalTransport(run_dir, name, time.time_ns) for name in ("talker", "reader"))
+    try:
+        publisher = out.advertise("/x", "std_msgs/msg/String", RELIABLE)
+        subscription = reader.subscribe("/x", "std_msgs/msg/String", RELIABLE, reader.set)
+        wait_for(lambda: publisher.subscriber_count)
+        for name in ("_LOOK_S", "_IDLE_S"):
+            monkeypatch.setattr(f"instant_ic.bus.local_transport.{name}", 1000.0)
+        reader._left_s = time.monotonic() + 1000.0  # the bus thread does not read
+        wait_for(lambda: reader._next_look_s > time.monotonic() + 100)
+        for text in ("first", "second"):
+            publisher.send(serialize(String(text)))
+        time.sleep(0.1)  # both are in the socket
+        reader.wait(10.0)
+        assert len(subscription.take()) == 1
+        reader.clear()
+        started_s = time.monotonic()
+        reader.wait(30.0)
+        assert len(subscription.take()) == 1
+        assert time.monotonic() - started_s < 20.0
+    finally:
+        for transport in (out, reader):
+            transport.close()

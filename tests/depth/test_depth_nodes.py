@@ -311,6 +311,21 @@ def test_the_node_hears_messages_while_a_completion_runs(tmp_path: Path, monkeyp
         assert len(bus.messages("/depth/scaled")) == 1 and level(node, "scale")[1].endswith("; completed")
 
 
+def test_no_depth_is_requested_while_a_completion_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until its keyframe is taken every image would be due, and each request costs an inference."""
+    monkeypatch.setattr("instant_ic.bus.node.Worker.submit", lambda self, item: setattr(self, "busy", True))
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthScalerNode, completed_config(tmp_path))
+        drive(bus, 0.5)  # an image, its revolution and its depth
+        assert node.worker.busy
+        before = len(bus.messages("/depth/request"))
+        images(bus, [0.0, 0.0, 0.0], START + S)
+        assert len(bus.messages("/depth/request")) == before
+        node.worker.busy = False
+        images(bus, [0.0], START + 2 * S)
+        assert len(bus.messages("/depth/request")) == before + 1
+
+
 def test_completion_without_a_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="source completed needs a model"):
         DepthScalerConfig(source="completed")

@@ -88,3 +88,10 @@ def test_worlds_of_the_evaluations_are_never_trained_on() -> None:
         replace(recipe, worlds=401)
     with pytest.raises(ValueError, match="interiors must be one of"):
         replace(recipe, interiors="caves")
+
+
+def test_a_panorama_to_which_no_prior_fitted_gives_no_sample(tmp_path: Path) -> None:
+    rgb, depth = np.zeros((64, 128, 3), np.uint8), np.ones((64, 128))
+    save_sample(tmp_path / "1-0.npz", rgb, depth, [np.zeros((6, 64, 128))])
+    save_sample(tmp_path / "1-1.npz", rgb, depth, [])
+    assert len(open_folder(f"rendered:{tmp_path}", (64, 128))) == 1
