@@ -288,6 +288,8 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
                 problems.append(Problem(str(error), value.where, key))
         except _RefusedError as error:
             problems.append(Problem(str(error), value.where, key))
+    if problems and base is None and _required(config_class) - typed.keys():
+        raise ParameterError(*problems)  # it cannot be built without them
     while True:
         try:
             config = _assemble(config_class, typed, base)
@@ -301,6 +303,11 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
     if problems:
         raise ParameterError(*problems)
     return config
+
+
+def _required(config_class: type[Any]) -> set[str]:
+    missing = dataclasses.MISSING
+    return {f.name for f in dataclasses.fields(config_class) if f.default is missing and f.default_factory is missing}
 
 
 class _RefusedError(ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
     }
     if scaled == "no-scale" and answers["scaling"].held is not None:
         own = _answer(paper, "paper", "paper-no-scale")
-        answers["scaling"] = Answer(answers["scaling"].held, f"{answers['scaling'].figures}; {own.figures}")
+        answers["scaling"] = replace(answers["scaling"], figures=f"{answers['scaling'].figures}; {own.figures}")
     parts += curves_and_tables(results, command)
     return Section("Ablation study (V.C, Figs. 6, 8)", parts, verdict, answers)
 
@@ -78,7 +79,7 @@ def _answer(results: Sequence[Result], better: str, worse: str) -> Answer:
     gains = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]
     if len(gains) < 2:
         return Answer(None, "")
-    return Answer(min(gains) > 0, f"{better} against {worse}: {gains[0]:+.1f} dB, {gains[1]:+.3f} SSIM")
+    return Answer(min(gains) > 0, f"{better} against {worse}: {gains[0]:+.1f} dB, {gains[1]:+.3f} SSIM", len(results))
 
 
 def _means(results: Sequence[Result], name: str, key: str) -> dict[str, list[float]]:

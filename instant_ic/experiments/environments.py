@@ -146,4 +146,4 @@ def _answers(means: dict[str, list[float]]) -> dict[str, Answer]:
     corridor: Any = statistics.fmean(means[WORLD])
     held = min(means[WORLD]) >= FIT_DB and min(hard.values()) < corridor
     others = ", ".join(f"{NAMES[name]} {value:.1f}" for name, value in hard.items())
-    return {"places": Answer(held, f"corridor {corridor:.1f} dB; {others}")}
+    return {"places": Answer(held, f"corridor {corridor:.1f} dB; {others}", len(means[WORLD]))}

@@ -80,7 +80,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
         reach = [each for name in dict.fromkeys(map(family, paper)) for each in _above(
             paper, name, path, "ssim", options.method, _PAPERS_SCAN)]  # fmt: skip
         figures = f"{options.method} is above the {_PAPERS_SCAN} scan up to {spread(reach, 1)} m"
-        answers[path] = Answer(bool(np.mean(reach) >= claim), figures) if reach else Answer(None, "")
+        answers[path] = Answer(bool(np.mean(reach) >= claim), figures, len(reach)) if reach else Answer(None, "")
     parts += curves_and_tables(results, command)
     return Section("Reconstruction accuracy (V.A, Figs. 3, 4, 7)", parts, verdict, answers)
 

@@ -106,28 +106,37 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
     return RecordedDrive(drive, _moments(log, times, photos, keyframes), _plot(drive, grid), _modes(drive))
 
 
-def as_log(states: Sequence[tuple[float, Any]], keyframes: int) -> Log:
-    """States (seconds, ControlState), each held until the next, in the steps of a log."""
-    from instant_ic.msg import pose2_from_message
+def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> Log:
+    """States (seconds, ControlState), which come at uneven times, in the steps of a log.
 
-    log = Log(keyframes=keyframes)
+    Poses are interpolated, as their differences are speeds; all else is held until the next state.
+    """
+    from instant_ic.msg import pose2_from_message, twist_values
+
     at = np.array([time_s for time_s, _ in states])
-    for time_s in np.arange(at[0], at[-1] + 1e-9, STEP_S):
-        state = states[int(np.searchsorted(at, time_s + 1e-9)) - 1][1]
-        robot = np.asarray(pose2_from_message(state.robot_pose), np.float64)
-        log.time_s.append(float(time_s))
-        log.mode.append(int(state.mode))
-        log.virtual.append(int(state.shown) == state.SHOWN_VIRTUAL)
-        log.robot.append(robot)
-        log.estimate.append(robot)
-        log.vbot.append(np.asarray(pose2_from_message(state.vbot_pose), np.float64))
-        log.yaw_gap_rad.append(math.nan)  # the true heading is unknown
-        log.known_yaw_gap_rad.append(float(state.yaw_gap_rad))
-        command = state.operator_command
-        log.command.append((float(command.linear.x), float(command.angular.z)))
-        log.blocked.append(bool(state.blocked))
-        log.reason.append(str(state.reason))
-    return log
+    grid = np.arange(at[0], at[-1] + 1e-9, STEP_S)
+
+    def poses(name: str) -> list[NDArray[np.float64]]:
+        found = np.array([pose2_from_message(getattr(one, name)) for _, one in states])
+        found[:, 2] = np.unwrap(found[:, 2])
+        return list(np.stack([np.interp(grid, at, column) for column in found.T], axis=1))
+
+    held = [states[row][1] for row in np.searchsorted(at, grid + 1e-9) - 1]
+    robot = poses("robot_pose")
+    return Log(
+        time_s=grid.tolist(),
+        mode=[int(one.mode) for one in held],
+        virtual=[int(one.shown) == one.SHOWN_VIRTUAL for one in held],
+        robot=robot,
+        estimate=robot,
+        vbot=poses("vbot_pose"),
+        yaw_gap_rad=[math.nan] * len(held),  # the true heading is unknown
+        known_yaw_gap_rad=[float(one.yaw_gap_rad) for one in held],
+        command=[(float(v), float(w)) for v, w in (twist_values(one.operator_command) for one in held)],
+        blocked=[bool(one.blocked) for one in held],
+        reason=[str(one.reason) for one in held],
+        keyframes=keyframes,
+    )
 
 
 def film_times(log: Log, frame_s: float) -> NDArray[np.float64]:

@@ -58,14 +58,19 @@ PAPER = {
 """Claims of the paper."""
 _MARKS = {True: ("yes", "holds"), False: ("no", "does not hold"), None: ("", "not measured")}
 _SHIPPED_BYTES = 2_000_000
+LEAST_UNITS = 3
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Whether a claim of the paper holds here, None where it was not measured, and the figures that decide it."""
+    """Whether a claim of the paper holds here, None where it was not measured, and the figures that decide it.
+
+    ``units`` is the number of measurements behind it; the report decides nothing from less than ``LEAST_UNITS``.
+    """
 
     held: bool | None
     figures: str
+    units: int = 0
 
 
 @dataclass(frozen=True)
@@ -101,9 +106,15 @@ def image_address(jpeg_or_other: bytes, kind: str = "image/jpeg") -> str:
 
 def answers(sections: dict[str, Section]) -> dict[str, Answer]:
     """Answer to each claim of ``PAPER``."""
-    found = {key: answer for section in sections.values() for key, answer in section.answers.items()}
+    found = {key: _decided(answer) for section in sections.values() for key, answer in section.answers.items()}
     none = Answer(None, "")
     return {key: found.get(key, none) for key in PAPER} | {"people": Answer(None, "it takes people: ic study")}
+
+
+def _decided(answer: Answer) -> Answer:
+    if answer.held is None or answer.units >= LEAST_UNITS:
+        return answer
+    return replace(answer, held=None, figures=f"{answer.figures}; too few to decide: {answer.units} units")
 
 
 def _claims(sections: dict[str, Section]) -> dict[str, dict[str, Any]]:

@@ -50,6 +50,8 @@ class SharedControl(Arbiter):
         command, costmap, pose = decision.operator_command, inputs.costmap, inputs.robot_pose
         if decision.mode != Mode.REAL or costmap is None or pose is None or command[0] < 0.0:
             return self._given_back(decision)
+        if decision.reason_code >= Reason.ESTOP:  # held: nothing may move, not even by the planner
+            return decision
         if command == (0.0, 0.0):
             self._speed_m_s = 0.0
             return decision

@@ -166,7 +166,9 @@ def section(results: Sequence[Result], options: Options) -> Section:
         for one in done
     ]
     where = "recorded" if options.bag is not None else "simulated, without contact"
-    answer = Answer(all(flow) if flow else None, f"{sum(flow)} of {len(flow)} drives, {where}" if flow else "")
+    answer = Answer(
+        all(flow) if flow else None, f"{sum(flow)} of {len(flow)} drives, {where}" if flow else "", len(flow)
+    )
     return Section("Teleoperation (V.D, Fig. 9)", parts, answers={"flow": answer})
 
 

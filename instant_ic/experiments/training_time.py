@@ -91,7 +91,9 @@ def section(results: Sequence[Result], options: Options) -> Section:
                         if source == "paper" and gpu:
                             answer = settled
         parts.insert(1, Figure(f"{name}: by training time", curves_svg(panels), command))
-    answers = {"training": Answer(answer, ", ".join(figures))} if verdict else {}
+    answers = (
+        {"training": Answer(answer, ", ".join(figures), sum(bool(one.data) for one in results))} if verdict else {}
+    )
     return Section("Training time (V.B, Fig. 5)", parts, verdict, answers)
 
 

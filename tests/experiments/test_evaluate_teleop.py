@@ -515,6 +515,11 @@ def test_shared_control_goes_round_by_itself_and_gives_back() -> None:
     assert bent[-1].mode == Mode.REAL and "goes round by itself" in bent[-1].reason
     assert any(abs(one.command[1]) > 0.1 for one in bent), "it turns although straight on was commanded"
     assert shared.goal is not None and shared.goal[0] > 1.4  # behind the box's unseen body
+    for lost in ("pose", "odometry", "camera", "scan"):
+        late = replace(fresh, operator_command=(0.4, 0.0), ages={**fresh.ages, lost: 0.6})
+        decision = shared.step(late, 50_000_000 * 60)
+        assert (decision.command, decision.mode) == ((0.0, 0.0), Mode.REAL), f"{lost} is stale: it must brake"
+        step(60, (0.4, 0.0))
     assert step(60, (0.0, 0.0)).command == (0.0, 0.0)
     step(61, (-0.2, 0.0))
     assert shared.goal is None

@@ -529,3 +529,13 @@ def test_stills_are_before_first_middle_last_and_after() -> None:
     frames = [_Frame(0.25 * k, virtual, np.zeros((2, 2, 3), np.uint8)) for k, virtual in enumerate(shown)]
     assert [frame.time_s / 0.25 for frame in stills(frames)] == [6, 10, 20, 30, 33]
     assert stills(frames[:3]) == frames[:1]
+
+
+def test_a_claim_is_not_decided_by_two_units() -> None:
+    def found(units: int) -> report.Answer:
+        return report.answers({"x": report.Section("", [], {}, {"depth": report.Answer(True, "+1 dB", units)})})[
+            "depth"
+        ]
+
+    assert found(3).held is True
+    assert (found(2).held, found(2).figures) == (None, "+1 dB; too few to decide: 2 units")

@@ -4,6 +4,7 @@ import asyncio
 import json
 import math
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import aiohttp
@@ -63,9 +64,9 @@ def test_a_new_study_is_private_and_reads_back(study):
 
 
 WRONG = [
-    (lambda raw: raw.pop("goal_m"), "goal_m must be a number"),
-    (lambda raw: raw.update(goal_m=math.nan), r"goal_m must be in \[0.5, 1000\]"),
-    (lambda raw: raw.update(starts_m=[1, "x"]), "starts_m must be 2 numbers"),
+    (lambda raw: raw.pop("goal_m"), "study.yaml: goal_m is missing"),
+    (lambda raw: raw.update(goal_m=math.nan), "goal_m must be a finite number"),
+    (lambda raw: raw.update(starts_m=[1, "x"]), r"starts_m\[1\] must be float \(got \'x\'\)"),
     (lambda raw: raw["participants"].update(P01=["ic", "ic"]), "participants.P01 must list 4 conditions"),
     (lambda raw: raw["participants"].update({"../x": ["ic"] * 4}), "a code is a letter and two or three digits"),
     (lambda raw: raw["texts"].pop("withdraw"), "texts.withdraw is missing"),
@@ -74,6 +75,14 @@ WRONG = [
     (lambda raw: raw["questionnaires"][1].update(id="drive"), "needs an id of its own"),
     (lambda raw: raw["arguments"].update(params="mine.yaml"), "arguments.params is set by the study itself"),
     (lambda raw: raw.update(questionnaires="none"), "questionnaires must be a list"),
+    (lambda raw: raw.update(goal_m=0.1), r"goal_m must lie in 0.5..1000"),
+    (lambda raw: raw["participants"].update(P01=5), r"participants.P01 must be a list of conditions \(got 5\)"),
+    (lambda raw: raw["questionnaires"][2]["items"][3].update(revers=True), "'revers'; did you mean 'reverse'"),
+    (lambda raw: raw["questionnaires"][0]["items"][0].update(options=[True, False]), r"options\[0\] must be str"),
+    (lambda raw: raw["questionnaires"][0]["items"][0].update(id="step"), "not step or action"),
+    (lambda raw: raw["questionnaires"][0].update(id="withdraw"), "needs an id of its own"),
+    (lambda raw: raw["questionnaires"][4]["items"][0].update(truth="driven"), "truth is for numbers, one of driven_m"),
+    (lambda raw: raw["questionnaires"][1]["items"][0].update(step=0.5), "a scale has at most 101 points"),
 ]
 
 
@@ -84,6 +93,13 @@ def test_a_wrong_study_is_refused_with_its_place(study, change, text):
     save(study.folder / "study.yaml", yaml.safe_dump(raw))
     with pytest.raises(StudyError, match=text):
         load(study.folder)
+
+
+def test_a_number_may_have_a_large_range(study):
+    raw = yaml.safe_load((study.folder / "study.yaml").read_text())
+    raw["questionnaires"][0]["items"].append({"id": "km", "kind": "number", "text": "?", "low": 0, "high": 1e9})
+    save(study.folder / "study.yaml", yaml.safe_dump(raw))
+    assert load(study.folder).questionnaires[0].items[-1].high == 1e9
 
 
 # ---- scores and statistics
@@ -169,6 +185,13 @@ def test_what_a_browser_sends_is_checked(study):
     assert forms.answers(compare, 4, {"appearance": "5", "usability": "0"})[1] == {"appearance": "wrong"}
 
 
+@pytest.mark.parametrize("text", ["\N{WOMAN}\u200d\N{PERSONAL COMPUTER}", "\u0645\u06cc\u200c\u062e", "two\nlines"])
+def test_text_of_every_language_is_kept(study, text):
+    given = {"driven": "1", "ahead": "1", "noticed": f" {text}\0 "}
+    right, faults = forms.answers(study.questionnaire("distance.1"), 4, given)
+    assert (right["noticed"], faults) == (text, {})
+
+
 def test_text_of_a_participant_is_no_html(study):
     found = study.questionnaire("distance.1")
     page = forms.questions(found, 4, study.texts, {"noticed": "<script>x</script>"}, {})
@@ -218,6 +241,32 @@ def test_measures_of_a_drive_by_hand(tmp_path):
     assert found["ahead_m"] == pytest.approx(2.5)
     assert (found["switches"], found["virtual_s"]) == (0, 0.0)
     assert 0.7 < found["obedience"] < 0.9
+
+
+@pytest.mark.parametrize("virtual", [False, True])
+def test_states_at_uneven_times_do_not_look_like_disobedience(tmp_path, virtual):
+    """A robot at a steady 0.4 m/s obeys all the time but for the start; a virtual one has no range ahead."""
+    late_s = np.random.default_rng(1).uniform(0.0, 0.02, 200)
+    with BagWriter(tmp_path / "bag") as writer:
+        for n, late in enumerate(late_s):
+            at = n / 20 + late
+            stamp_ns = round(at * 1e9) + 10**18
+            state = control_state((0.4 * at, 0.0, 0.0), 0.4, stamp_ns)
+            state.shown = ControlState.SHOWN_VIRTUAL if virtual else ControlState.SHOWN_REAL
+            writer.write("/ic/state", state.__msgtype__, serialize(state), stamp_ns, LATCHED)
+        scan = scan_message(np.full(360, 2.5), -math.pi, math.pi / 180, 0.1, 30.0, "velodyne", 10**18)
+        writer.write("/scan", scan.__msgtype__, serialize(scan), 10**18, LATCHED)
+    found = measures(tmp_path / "bag")
+    assert found["obedience"] > 0.95 and found["driven_m"] == pytest.approx(4.0, abs=0.05)
+    assert found["ahead_m"] is None if virtual else found["ahead_m"] == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize("key", ["worlds", "practice_world"])
+def test_a_world_that_does_not_exist_is_found_before_the_participant_comes(study, key):
+    wrong = replace(study, **{key: "corridr" if key == "practice_world" else (*study.worlds[:3], "corridr")})
+    wrong = replace(wrong, participants={"P01": ("ic", "stop", "shared", "ic")})
+    with pytest.raises(StudyError, match=r"study.yaml: world corridr: "):
+        trial.make_scans(wrong, "P01")
 
 
 def test_nothing_ahead_is_unknown():
@@ -346,6 +395,57 @@ def test_a_participant_can_leave_in_the_middle_of_a_drive(study, action, left):
     assert Record(study, "P02").state == (WITHDRAWN if left else OPEN)
 
 
+def test_nobody_reads_that_data_are_deleted_which_are_not(study, monkeypatch):
+    record = Record(study, "P02")
+    record.finish("consent", {"agreed": True})
+
+    def busy(folder):
+        raise OSError(39, "Directory not empty")
+
+    monkeypatch.setattr("instant_ic.experiments.study.record.shutil.rmtree", busy)
+    with served(record) as server:
+
+        async def go():
+            async with aiohttp.ClientSession() as http:
+                return await _post(http, server.url, step="withdraw", action="delete")
+
+        status, text = asyncio.run(go())
+    assert status == 200 and "Please call the experimenter" in text and "deleted" not in text
+
+
+class Unhurried(FakeTrial):
+    """Keeps its first reason, as ``Trial``."""
+
+    def end(self, why="participant", wait_s=0.0):
+        if self.status != "done":
+            super().end(why, wait_s)
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_drive_that_has_ended_is_stored_at_an_interruption(study, finished):
+    """The participant's page has not asked again; a drive in the middle is made again."""
+    record = Record(study, "P02")
+    for step in study.steps()[: study.steps().index("drive1")]:
+        record.finish(step, filled(study, step))
+    server = StudyServer(record, make_trial=Unhurried)
+    server.start()
+    try:
+
+        async def go():
+            async with aiohttp.ClientSession() as http:
+                await _post(http, server.url, step="drive1", action="start")
+                if finished:
+                    fields = {"step": "drive1", "action": "finish"}
+                    origin = {"Origin": server.url.rstrip("/")}
+                    async with http.post(server.url, data=fields, headers=origin, allow_redirects=False):
+                        pass
+
+        asyncio.run(go())
+    finally:
+        server.stop()
+    assert ("drive1" in Record(study, "P02").steps) is finished
+
+
 def test_a_participant_continues_where_the_computer_went_off(study):
     record = Record(study, "P03")
     for step in study.steps()[:6]:
@@ -413,6 +513,37 @@ def test_the_report_of_few_says_so_and_of_none_is_written(study, tmp_path):
     assert page.count("<svg") >= 5
     assert stat.S_IMODE(out.stat().st_mode) == 0o700
     assert stat.S_IMODE((out / "report.json").stat().st_mode) == 0o600
+
+
+def test_random_answers_of_programs_are_not_mixed_with_those_of_people(study, tmp_path):
+    finished_study(study, ["P01", "P02"], simulated=False)
+    finished_study(study, ["P03"])
+    assert main(["study", "report", str(study.folder), "-o", str(tmp_path / "report")]) == 0
+    data = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert {row["participant"] for row in data["drives"]} == {"P01", "P02"}
+    assert (data["participants"]["finished"], data["participants"]["simulated"]) == (3, 1)
+    assert "They are left out" in (tmp_path / "report" / "report.html").read_text()
+
+
+def test_time_of_drives_that_did_not_arrive_is_qualified(study, tmp_path):
+    texts = []
+    for end in ("arrived", "limit"):
+        finished_study(study, ["P01"], simulated=False)
+        record = Record(study, "P01")
+        record.steps["drive1"]["end"] = end
+        record.save()
+        assert main(["study", "report", str(study.folder), "-o", str(tmp_path / end)]) == 0
+        texts.append((tmp_path / end / "report.html").read_text())
+    assert ["before the goal" in text for text in texts] == [False, True]
+
+
+def test_a_study_of_one_condition_has_a_report(study, tmp_path):
+    raw = yaml.safe_load((study.folder / "study.yaml").read_text())
+    raw |= {"worlds": ["corridor-free"], "participants": {"P01": ["stop"]}}
+    save(study.folder / "study.yaml", yaml.safe_dump(raw))
+    finished_study(load(study.folder), ["P01"])
+    assert main(["study", "report", str(study.folder), "-o", str(tmp_path / "report")]) == 0
+    assert "Too few participants: with 1" in (tmp_path / "report" / "report.html").read_text()
 
 
 def test_participants_are_known_by_code_only(study):

@@ -156,7 +156,9 @@ def test_two_processes_train_one_network(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert record(weights)["device"].startswith("2 x CPU") and record(weights)["steps"] == 8  # 16 panoramas, 2 a step
-    assert done.stdout.count("training on 2 x CPU") == 1 and done.stdout.count("held-out panoramas:") == 2  # before and after
+    assert (
+        done.stdout.count("training on 2 x CPU") == 1 and done.stdout.count("held-out panoramas:") == 2
+    )  # before and after
 
 
 def test_preset_sets_what_is_not_given(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import unicodedata
 from collections.abc import Mapping
 from typing import Any
 
@@ -111,8 +112,9 @@ def answers(
 
 def _answer(item: Item, drives: int, text: str) -> float | str | None:
     if item.kind == "text":
-        text = " ".join(text.split())
-        return text if len(text) <= MOST_CHARACTERS and text.isprintable() else None
+        # Format characters are part of Persian and Hindi words, and of emojis; line breaks are kept.
+        text = "".join(c for c in text if c == "\n" or unicodedata.category(c) not in ("Cc", "Cs"))
+        return text if len(text) <= MOST_CHARACTERS else None
     if item.kind == "choice":
         return text if text in item.options else None
     try:

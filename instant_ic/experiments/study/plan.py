@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import re
 import string
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
 
+from instant_ic.config.params import ParameterError, Value, build
+from instant_ic.config.ranges import Range
 from instant_ic.private import make_folder, open_file
 
 CONDITIONS = ("ic", "stop", "shared", "mesh")
 """Illusory control as shipped; the robot stops at obstacles; it drives around them; illusory control with a scan."""
-KINDS = ("scale", "number", "choice", "drive", "text")
-SCORES = ("mean", "sus", "none")
 WHEN = ("before", "drive", "after")
+TRUTHS = ("", "driven_m", "ahead_m", "time_s", "longest_stall_s", "contacts")
 MOST_PARTICIPANTS = 999
 RESERVED = frozenset({"arbiter", "console_port", "params", "record", "recorder", "seed", "vspace_mesh_pose", "world"})
 """Launch arguments that differ between drives."""
+T = TypeVar("T")
+NAME = r"[a-z][a-z0-9_]{0,30}"
 TEMPLATE = Path(__file__).with_name("template.yaml")
 
 
@@ -35,7 +39,7 @@ class Item:
 
     Attributes:
         id: name of the answer.
-        kind: of ``KINDS``; ``drive`` asks for one of the drives, or for none of them.
+        kind: ``drive`` asks for one of the drives, or for none of them.
         text: the question.
         low, high, step: range of ``scale`` and ``number``.
         ends: labels of both ends of a scale.
@@ -46,11 +50,11 @@ class Item:
     """
 
     id: str
-    kind: str
+    kind: Literal["scale", "number", "choice", "drive", "text"]
     text: str
     low: float = 1.0
     high: float = 7.0
-    step: float = 1.0
+    step: Annotated[float, Range(above=0.0)] = 1.0
     ends: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
     reverse: bool = False
@@ -64,14 +68,14 @@ class Item:
 
 @dataclass(frozen=True)
 class Questionnaire:
-    """Questions of one page; ``when`` is of ``WHEN``, ``score`` of ``SCORES``."""
+    """Questions of one page."""
 
     id: str
     title: str
-    intro: str
-    when: str
-    score: str
-    items: tuple[Item, ...]
+    when: Literal["before", "drive", "after"]
+    intro: str = ""
+    score: Literal["mean", "sus", "none"] = "none"
+    items: tuple[Item, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -92,18 +96,18 @@ class Study:
         questionnaires: in order.
     """
 
-    folder: Path
-    seed: int
-    participants: dict[str, tuple[str, ...]]
+    seed: Annotated[int, Range(0, 2**31)]
     worlds: tuple[str, ...]
     starts_m: tuple[float, float]
-    goal_m: float
-    limit_s: float
-    practice_s: float
+    goal_m: Annotated[float, Range(0.5, 1000)]
+    limit_s: Annotated[float, Range(1, 36000)]
+    practice_s: Annotated[float, Range(1, 36000)]
     practice_world: str
-    arguments: dict[str, Any]
-    texts: dict[str, str]
-    questionnaires: tuple[Questionnaire, ...]
+    folder: Path = Path()
+    participants: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    arguments: dict[str, Any] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
+    questionnaires: tuple[Questionnaire, ...] = ()
 
     def steps(self) -> list[str]:
         """Names of the participant's pages in order; none names a condition."""
@@ -166,12 +170,12 @@ def create(folder: Path, participants: int, seed: int) -> Study:
 
 
 def save(path: Path, text: str) -> None:
-    """Write a file that only its owner can read, atomically."""
-    import os
-
+    """Write a file that only its owner can read, atomically, also if the computer goes off."""
     beside = path.with_name(f".{path.name}.new")
     with os.fdopen(open_file(beside, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8") as file:
         file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
     beside.replace(path)
 
 
@@ -188,28 +192,41 @@ def load(folder: Path) -> Study:
         raise StudyError(f"{path} does not exist: create a study with `ic study new {folder}`") from None
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise StudyError(f"{path} cannot be read: {' '.join(str(error).split())}") from None
-    root = _Fields(raw, str(path))
-    low, high = root.floats("starts_m", 2)
-    participants = root.mapping("participants")
-    questionnaires = tuple(
-        _questionnaire(one, f"{path}: questionnaires[{n}]") for n, one in root.rows("questionnaires")
-    )
-    study = Study(
-        folder,
-        int(root.number("seed", 0, 2**31)),
-        {str(code): tuple(str(one) for one in order or ()) for code, order in participants.items()},
-        root.strings("worlds"),
-        (low, high),
-        root.number("goal_m", 0.5, 1000),
-        root.number("limit_s", 1, 36000),
-        root.number("practice_s", 1, 36000),
-        root.string("practice_world"),
-        root.mapping("arguments"),
-        {str(key): str(value) for key, value in root.mapping("texts").items()},
-        questionnaires,
+    if not isinstance(raw, dict):
+        raise StudyError(f"{path} must be a mapping (got {type(raw).__name__})")
+    parts = {key: raw.pop(key, None) for key in ("participants", "arguments", "texts", "questionnaires")}
+    for key, value in parts.items():
+        if not isinstance(value, wanted := list if key == "questionnaires" else dict):
+            what = "list" if wanted is list else "mapping"
+            raise StudyError(f"{path}: {key} must be a {what} (got {value!r:.60})")
+    for code, order in parts["participants"].items():
+        if not isinstance(order, list):
+            raise StudyError(f"{path}: participants.{code} must be a list of conditions (got {order!r:.60})")
+    study = replace(
+        _build(Study, raw, str(path)),
+        folder=folder,
+        participants={str(code): tuple(map(str, order)) for code, order in parts["participants"].items()},
+        arguments=parts["arguments"],
+        texts={str(key): str(value) for key, value in parts["texts"].items()},
+        questionnaires=tuple(
+            _questionnaire(one, f"{path}: questionnaires[{n}]") for n, one in enumerate(parts["questionnaires"])
+        ),
     )
     _check(study, path)
     return study
+
+
+def _build(kind: type[T], raw: Any, where: str) -> T:
+    """A dataclass from a mapping of the YAML file."""
+    if not isinstance(raw, dict):
+        raise StudyError(f"{where} must be a mapping (got {type(raw).__name__})")
+    needed = (one.name for one in fields(kind) if one.default is MISSING and one.default_factory is MISSING)  # type: ignore[arg-type]
+    if missing := [name for name in needed if name not in raw]:
+        raise StudyError(f"{where}: {missing[0]} is missing")
+    try:
+        return build(kind, {str(key): Value(value, where) for key, value in raw.items()})
+    except ParameterError as error:
+        raise StudyError(str(error)) from None
 
 
 def _check(study: Study, path: Path) -> None:
@@ -222,8 +239,14 @@ def _check(study: Study, path: Path) -> None:
                 f"{', '.join(CONDITIONS)} (got {', '.join(order)})"
             )
     names = [one.id for one in study.questionnaires]
-    if len({*names}) < len(names) or {*names} & {"consent", "practice"} or any(n.startswith("drive") for n in names):
-        raise StudyError(f"{path}: questionnaires: each needs an id of its own, not consent, practice or drive...")
+    if (
+        len({*names}) < len(names)
+        or {*names} & {"consent", "practice", "withdraw"}
+        or any(n.startswith("drive") for n in names)
+    ):
+        raise StudyError(
+            f"{path}: questionnaires: each needs an id of its own, not consent, practice, withdraw or drive..."
+        )
     wanted = set(_yaml_texts())
     if missing := sorted(wanted - study.texts.keys()):
         raise StudyError(f"{path}: texts.{missing[0]} is missing; the template of `ic study new` has it")
@@ -239,98 +262,33 @@ def _yaml_texts() -> dict[str, str]:
 
 
 def _questionnaire(raw: Any, where: str) -> Questionnaire:
-    fields = _Fields(raw, where)
-    items = tuple(_item(one, f"{where}.items[{n}]") for n, one in fields.rows("items"))
+    rows = raw.pop("items", None) if isinstance(raw, dict) else None
+    found = _build(Questionnaire, raw, where)
+    if not isinstance(rows, list):
+        raise StudyError(f"{where}: items must be a list (got {rows!r:.60})")
+    items = tuple(_item(one, f"{where}.items[{n}]") for n, one in enumerate(rows))
     if len({one.id for one in items}) < len(items):
         raise StudyError(f"{where}.items: two items have the same id")
-    found = Questionnaire(
-        fields.name("id"),
-        fields.string("title"),
-        fields.string("intro", ""),
-        fields.one_of("when", WHEN),
-        fields.one_of("score", SCORES, "none"),
-        items,
-    )
+    if not re.fullmatch(NAME, found.id):
+        raise StudyError(f"{where}: id must be a name of lower-case letters, digits and _ (got {found.id!r})")
     if found.score == "sus" and [(one.low, one.high) for one in items] != [(1.0, 5.0)] * 10:
         raise StudyError(f"{where}: score sus needs ten scales from 1 to 5")
     if found.score != "none" and any(one.kind != "scale" or not one.required for one in items):
         raise StudyError(f"{where}: score {found.score} needs required items of the kind scale only")
-    return found
+    return replace(found, items=items)
 
 
 def _item(raw: Any, where: str) -> Item:
-    fields = _Fields(raw, where)
-    item = Item(
-        fields.name("id"),
-        fields.one_of("kind", KINDS),
-        fields.string("text"),
-        fields.number("low", default=1.0),
-        fields.number("high", default=7.0),
-        fields.number("step", 1e-6, default=1.0),
-        fields.strings("ends", ()),
-        fields.strings("options", ()),
-        fields.flag("reverse", False),
-        fields.flag("required", True),
-        fields.string("truth", ""),
-    )
-    if not item.low < item.high or len(item.ends) not in (0, 2) or len(item.points()) > 101:
-        raise StudyError(f"{where}: low must be below high, ends two texts, and a scale has at most 101 points")
+    item = _build(Item, raw, where)
+    if not re.fullmatch(NAME, item.id) or item.id in ("step", "action"):
+        raise StudyError(f"{where}: id must be a name of lower-case letters, digits and _, not step or action "
+                         f"(got {item.id!r})")  # fmt: skip
+    if not item.low < item.high or len(item.ends) not in (0, 2):
+        raise StudyError(f"{where}: low must be below high, and ends two texts")
+    if item.kind == "scale" and (item.high - item.low) / item.step > 100.5:
+        raise StudyError(f"{where}: a scale has at most 101 points")
     if item.kind == "choice" and len(item.options) < 2:
         raise StudyError(f"{where}.options: a choice needs at least two")
+    if item.truth not in TRUTHS or (item.truth and item.kind != "number"):
+        raise StudyError(f"{where}: truth is for numbers, one of {', '.join(TRUTHS[1:])} (got {item.truth!r})")
     return item
-
-
-class _Fields:
-    """A mapping of the YAML file; each method returns a checked value or raises StudyError."""
-
-    def __init__(self, raw: Any, where: str) -> None:
-        if not isinstance(raw, dict):
-            raise StudyError(f"{where} must be a mapping (got {type(raw).__name__})")
-        self.raw, self.where = raw, where
-
-    def _get(self, key: str, kind: type | tuple[type, ...], what: str, default: Any = None) -> Any:
-        value = self.raw.get(key, default)
-        wrong_flag = isinstance(value, bool) and kind is not bool
-        if not isinstance(value, kind) or wrong_flag:
-            raise StudyError(f"{self.where}: {key} must be {what} (got {value!r:.60})")
-        return value
-
-    def string(self, key: str, default: str | None = None) -> str:
-        return str(self._get(key, str, "a text", default))
-
-    def name(self, key: str) -> str:
-        value = self.string(key)
-        if not re.fullmatch(r"[a-z][a-z0-9_]{0,30}", value):
-            raise StudyError(f"{self.where}: {key} must be a name of lower-case letters, digits and _ (got {value!r})")
-        return value
-
-    def one_of(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
-        value = self.string(key, default)
-        if value not in allowed:
-            raise StudyError(f"{self.where}: {key} must be one of {', '.join(allowed)} (got {value!r})")
-        return value
-
-    def number(self, key: str, low: float = -1e9, high: float = 1e9, default: float | None = None) -> float:
-        value = float(self._get(key, (int, float), "a number", default))
-        if not low <= value <= high:
-            raise StudyError(f"{self.where}: {key} must be in [{low:g}, {high:g}] (got {value:g})")
-        return value
-
-    def flag(self, key: str, default: bool) -> bool:
-        return bool(self._get(key, bool, "true or false", default))
-
-    def mapping(self, key: str) -> dict[Any, Any]:
-        return dict(self._get(key, dict, "a mapping"))
-
-    def rows(self, key: str) -> list[tuple[int, Any]]:
-        return list(enumerate(self._get(key, list, "a list")))
-
-    def strings(self, key: str, default: tuple[str, ...] | None = None) -> tuple[str, ...]:
-        value = self._get(key, (list, tuple), "a list of texts", default)
-        return tuple(str(one) for one in value)
-
-    def floats(self, key: str, count: int) -> list[float]:
-        value = self._get(key, list, f"{count} numbers")
-        if len(value) != count or any(isinstance(one, bool) or not isinstance(one, int | float) for one in value):
-            raise StudyError(f"{self.where}: {key} must be {count} numbers (got {value!r:.60})")
-        return [float(one) for one in value]

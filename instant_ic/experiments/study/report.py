@@ -77,15 +77,16 @@ def values_of(drives: Sequence[dict[str, Any]], key: str, conditions: Sequence[s
 def build(study: Study, out: Path, command: str) -> dict[str, Any]:
     """Write ``report.html`` and ``report.json``; return what the JSON has of the participants."""
     records = [Record(study, code) for code in study.participants]
-    done = [one for one in records if one.state == DONE]
+    finished = [one for one in records if one.state == DONE]
+    done = [one for one in finished if not one.simulated] or finished
     drives = rows(study, done)
     order = [name for name in CONDITIONS if any(name in one for one in study.participants.values())]
     counts = {
         "planned": len(records),
-        "finished": len(done),
+        "finished": len(finished),
         "withdrawn, data kept": sum(one.state == WITHDRAWN for one in records),
         "under way": sum(bool(one.steps) and one.state not in (DONE, WITHDRAWN) for one in records),
-        "simulated": sum(one.simulated for one in done),
+        "simulated": sum(one.simulated for one in finished),
     }
     sections = {
         "participants": Section("Participants", _people(study, done, drives, counts, order)),
@@ -107,11 +108,16 @@ def _people(
 ) -> list[Part]:
     parts: list[Part] = [Text("; ".join(f"{name}: {count}" for name, count in counts.items()) + ".")]
     if counts["simulated"]:
+        what = (
+            "They are left out of all figures"
+            if counts["simulated"] < counts["finished"]
+            else ("Nothing can be concluded from them about people")
+        )
         parts.append(
-            Text(f"{counts['simulated']} of {len(done)} participants are programs that answer at random. Nothing can "
-                 "be concluded from them about people.")
+            Text(f"{counts['simulated']} of {counts['finished']} participants are programs that answer at random. "
+                 f"{what}.")
         )  # fmt: skip
-    comparisons = math.comb(len(order), 2)
+    comparisons = max(math.comb(len(order), 2), 1)
     least = stats.least_participants(comparisons)
     if len(done) < least:
         parts.append(
@@ -137,6 +143,11 @@ def _people(
             [[name, *(ends[name, r] for r in reasons)] for name in order],
         )
     )
+    if ends.total() > sum(ends[name, "arrived"] for name in order):
+        parts.append(
+            Text("Time and distance are of all drives. A drive that was ended before the goal is short in both: "
+                 "compare them only where the conditions ended alike.")
+        )  # fmt: skip
     slow = sum(row["slowest_pace"] is not None and row["slowest_pace"] < 0.95 for row in drives)
     if slow:
         parts.append(Text(f"{slow} of {len(drives)} drives ran in slow motion: the machine was too slow or busy."))

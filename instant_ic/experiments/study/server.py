@@ -116,13 +116,18 @@ class StudyServer:
             raise StudyError(f"cannot listen on 127.0.0.1:{self.port}: {self._error}; choose another --port")
 
     def stop(self) -> None:
-        """End a running drive, and the server."""
-        if self._trial is not None:
-            self._trial.end("interrupted", END_S)
+        """End a running drive, store one that has just ended, and end the server."""
+        trial = self._trial
+        if trial is not None:
+            trial.end("interrupted", END_S)
         if self._loop is not None:
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._finish.set)
         self._thread.join(START_S)
+        if trial is None or trial is not self._trial or self._last or trial.status != "done":
+            return
+        if trial.result["end"] != "interrupted" and self.record.step is not None:
+            self.record.finish(self.record.step, trial.result)
 
     def _run(self) -> None:
         try:
@@ -185,6 +190,8 @@ class StudyServer:
     def _present(self, given: dict[str, Any], faults: dict[str, str]) -> web.Response:
         """The participant's present page; with what was sent and what is wrong with it, once more."""
         record, texts = self.record, self.record.study.texts
+        if self._last == "saving":
+            return self._page(forms.paragraphs(texts["saving"]), refresh_s=1)
         if self._last or record.state != OPEN or (step := record.step) is None:
             asyncio.get_running_loop().call_later(1.0, self.over.set)
             key = self._last or ("withdrawn" if record.state == WITHDRAWN else "done")
@@ -257,15 +264,23 @@ class StudyServer:
     async def _withdraw(self, action: Any) -> None:
         if action not in ("keep", "delete"):
             return
-        self._last = "withdrawn" if action == "keep" else "deleted"
-        if self._trial is not None:
-            await asyncio.to_thread(self._trial.end, "withdrawn", END_S)
-            self._trial = None
-        if action == "delete":
-            self.record.delete()
-        else:
-            self.record.state = WITHDRAWN
-            self.record.save()
+        self._last, trial = "saving", self._trial
+        try:
+            if trial is not None:
+                await asyncio.to_thread(trial.end, "withdrawn", END_S)
+                if trial.status not in ("done", "failed"):
+                    raise TimeoutError(f"the drive has not ended within {END_S:g} s")
+                self._trial = None
+            if action == "delete":
+                self.record.delete()
+            else:
+                self.record.state = WITHDRAWN
+                self.record.save()
+            self._last = "withdrawn" if action == "keep" else "deleted"
+        except OSError as error:
+            code, folder = self.record.code, self.record.study.folder
+            logger.error("%s wanted to stop (%s): %s. Run `ic study delete %s %s`", code, action, error, folder, code)
+            self._last = "problem"
 
     # ---- the operator's page
 

@@ -19,9 +19,9 @@ import yaml
 from instant_ic.bag import BagReader
 from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.experiments import teleop_figures
+from instant_ic.experiments.recorded_drive import as_log
 from instant_ic.experiments.stack import Stack, free_ports
 from instant_ic.experiments.study.plan import Study, StudyError, save
-from instant_ic.experiments.teleop_stack import Log
 from instant_ic.msg import ControlState, String, VspaceStatus, pose2_from_message, stamp_ns, twist_values
 from instant_ic.private import make_folder
 
@@ -41,7 +41,7 @@ def scan_of(study: Study, world: str) -> Path:
 
 
 def make_scans(study: Study, code: str) -> None:
-    """Scan the worlds that a participant drives by a scan: as ``ic experiment operators``, without the obstacles.
+    """Check a participant's worlds, and scan those driven by a scan: as ``ic experiment operators``, without obstacles.
 
     Raises:
         StudyError: a world does not exist or has no obstacle course.
@@ -51,19 +51,21 @@ def make_scans(study: Study, code: str) -> None:
     from instant_ic.experiments.teleop_worlds import straight_ahead
     from instant_ic.sim.worlds import make_world
 
-    for number, (world, method) in enumerate(zip(study.worlds, study.participants[code], strict=True)):
+    drives = zip((*study.worlds, study.practice_world), (*study.participants[code], ""), strict=True)
+    for number, (world, method) in enumerate(drives):
         file = scan_of(study, world)
-        if method != "mesh" or file.exists():
-            continue
         try:
-            course = straight_ahead(make_world(world))
+            made = make_world(world)
+            if method != "mesh" or file.exists():
+                continue
+            course = straight_ahead(made)
             free = functools.reduce(without, course.obstacles, course.world)
             make_folder(file.parent, exist_ok=True)
             beside = file.with_suffix(".part")
             scan_world(free, course.world.spawn, QUALITIES["tripod"], study.seed + number, beside)
             beside.replace(file)
         except ValueError as error:
-            raise StudyError(f"{study.folder / 'study.yaml'}: worlds: {world}: {error}") from None
+            raise StudyError(f"{study.folder / 'study.yaml'}: world {world}: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,8 @@ def measures(bag: Path) -> dict[str, Any]:
     Returns:
         ``time_s``; ``driven_m`` of the shown robot; ``obedience`` and ``longest_stall_s`` as in
         :mod:`~instant_ic.experiments.teleop_figures`; ``switches`` into the virtual space; ``virtual_s`` in it;
-        ``contacts``; ``ahead_m``: free distance ahead at the end, None if unknown. Only ``contacts`` without a command.
+        ``contacts``; ``ahead_m``: free distance ahead of the r-bot at the end, None if unknown or another robot is
+        shown. Only ``contacts`` without a command.
 
     Raises:
         BagError: the bag cannot be read.
@@ -212,43 +215,21 @@ def measures(bag: Path) -> dict[str, Any]:
     commanded = [n for n, one in enumerate(states) if any(twist_values(one.operator_command))]
     if not commanded or len(states) - commanded[0] < 3:
         return found
-    drive = log_of(states[commanded[0] :])
+    driven = states[commanded[0] :]
+    drive = as_log([((stamp_ns(one) - stamp_ns(driven[0])) / 1e9, one) for one in driven])
     steps = np.diff(teleop_figures.shown_poses(drive)[:, :2], axis=0)
     virtual = np.array(drive.virtual)
     lengths = np.linalg.norm(steps, axis=1) * (virtual[1:] == virtual[:-1])
     scans = [message for topic, _, message in rows if topic == SCAN]
     return found | {
-        "time_s": drive.time_s[-1] - drive.time_s[0],
+        "time_s": drive.time_s[-1],
         "driven_m": float(lengths.sum()),
         "obedience": teleop_figures.obedience(drive),
         "longest_stall_s": teleop_figures.longest_stall_s(drive),
         "switches": int((virtual[1:] & ~virtual[:-1]).sum()),
         "virtual_s": float(virtual.sum()) * teleop_figures.STEP_S,
-        "ahead_m": ahead_m(scans[-1]) if scans else None,
+        "ahead_m": ahead_m(scans[-1]) if scans and not drive.virtual[-1] else None,
     }
-
-
-def log_of(states: list[Any]) -> Log:
-    """The log of ``ic evaluate teleop`` from recorded ControlState messages, which arrive at uneven times."""
-    stamps = np.array([stamp_ns(one) for one in states])
-    at = (stamps - stamps[0]) / 1e9
-    grid = np.arange(0.0, at[-1] + 1e-9, teleop_figures.STEP_S)
-    last = np.clip(np.searchsorted(at, grid, side="right") - 1, 0, None)
-
-    def poses(name: str) -> list[Any]:
-        found = np.array([pose2_from_message(getattr(one, name)) for one in states])
-        found[:, 2] = np.unwrap(found[:, 2])
-        return list(np.stack([np.interp(grid, at, column) for column in found.T], axis=1))
-
-    held = [states[n] for n in last]
-    return Log(
-        time_s=grid.tolist(),
-        mode=[int(one.mode) for one in held],
-        virtual=[one.shown == ControlState.SHOWN_VIRTUAL for one in held],
-        robot=poses("robot_pose"),
-        vbot=poses("vbot_pose"),
-        command=[(float(v), float(w)) for v, w in (twist_values(one.operator_command) for one in held)],
-    )
 
 
 def ahead_m(scan: Any) -> float | None:
