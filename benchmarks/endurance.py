@@ -141,9 +141,9 @@ class Levels:
     def judge(self) -> dict[str, dict[str, Any]]:
         """Growth in each process's longest life: ``rss_mb``, ``fds``, ``seconds``, ``leak``.
 
-        Memory grows by the fitted line, and leaks if it does so in both halves: a step, as at the first loop closure, is
-        no leak. Descriptors come and go with every process that connects: theirs is the difference of the lowest counts
-        in the first and last third.
+        Memory grows by the fitted line, and leaks if it does so in both halves: a step, as at the first loop closure,
+        is no leak. Descriptors come and go with every process that connects: theirs is the difference of the lowest
+        counts in the first and last third.
         """
         result: dict[str, dict[str, Any]] = {}
         for (name, _), rows in self._rows.items():
