@@ -100,6 +100,9 @@ class Participant:
         """Hold W to the end; stuck, drive around with the keys; stuck again and again, end the drive."""
         page, keys = self.page, self.page.keyboard
         page.evaluate(_WATCH)
+        while not page.locator("body[data-driver=you]").count():  # before, the page ignores keys
+            self._check_time()
+            page.wait_for_timeout(100)
         if step == "practice":
             keys.down("w")
             page.wait_for_timeout(1500)
