@@ -25,7 +25,7 @@ class KeyframeSelectionConfig:
     """
 
     distance_m: Positive = 0.6
-    virtual_distance_m: Positive = 0.3
+    virtual_distance_m: Positive = 0.6
     angle_deg: Positive = 45.0
     refresh_s: Positive = 30.0
     unfit_after_s: NotNegative = 5.0
