@@ -382,8 +382,9 @@ def control_state(mode: int, stamp: int) -> ControlState:
 
 def test_only_a_recent_state_in_which_the_virtual_space_is_shown_brings_keyframes_closer() -> None:
     depth = room_depth(BASE_FROM_CAMERA)
+    closer = KeyframeSelectionConfig(virtual_distance_m=0.3)
     with LockstepBus(START) as bus:
-        bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated")))
+        bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated"), keyframes=closer))
         publish_mounts(bus)
 
         def taken(x: float, second: int, mode: int | None = None) -> bool:
