@@ -632,6 +632,10 @@ class Node(Generic[ConfigT]):
 
     def spin_once(self) -> bool:
         """Run what is due: results of workers, messages in order of arrival, timers. True if anything ran."""
+        ran = self._run_arrived()
+        return self._fire_timers() or ran
+
+    def _run_arrived(self) -> bool:
         ran = False
         while self._soon:
             function, args = self._soon.popleft()
@@ -654,14 +658,14 @@ class Node(Generic[ConfigT]):
                         pending.append((newer.order, subscription, newer))
             self._guard(subscription.label, subscription.callback, received)
             ran = True
-        return self._fire_timers() or ran
+        return ran
 
     def read_all(self) -> None:
-        """Run the callbacks of all messages that have arrived, also of those that are still in the sockets."""
+        """Run the callbacks of all messages that have arrived, also of those still in the sockets, but no timers."""
         # A wait reads one message of each of 64 sockets at most, and all that is left in those of the wait before it.
         for _ in range(2 + len(self.subscriptions) // 64):
             self._wake.wait(0.0)
-        self.spin_once()
+        self._run_arrived()
 
     def _fire_timers(self) -> bool:
         fired = False
