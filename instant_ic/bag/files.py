@@ -150,7 +150,13 @@ class BagReader(Closing):
         for connection in self._reader.connections:
             key = (connection.topic, connection.msgtype)
             first.setdefault(key, connection)
-            counts[key] += int(connection.msgcount)
+            try:
+                counts[key] += int(connection.msgcount)
+            except (TypeError, ValueError, OverflowError):
+                raise BagError(
+                    f"{self.path}: metadata.yaml: message_count of {connection.topic} is {connection.msgcount!r}, "
+                    "not a whole number; ic bag reindex writes the file anew"
+                ) from None
         for topics in self._repeated.values():
             for key in counts:
                 counts[key] -= topics[key[0]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import lz4.frame
 import pytest
+import yaml
 import zstandard
 from mcap.opcode import Opcode
 from rosbags.interfaces import ConnectionExtRosbag1
@@ -212,3 +214,16 @@ def test_whole_frames_come_whole_and_cut_ones_as_far_as_they_go(compression: str
         bounded.decompress(data, compression, len(content) - 1)
     with pytest.raises(ValueError):
         bounded.decompress(b"\0" * 100, compression)
+
+
+@pytest.mark.parametrize("count", [math.inf, None, "5?"])
+def test_a_message_count_that_is_no_number_is_an_error_with_its_topic(tmp_path: Path, count: object) -> None:
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/text", TEXT, typestore=typestore())
+        writer.write(connection, 1, b"\x00\x01\x00\x00\x02\x00\x00\x00x\x00")
+    file = tmp_path / "bag" / "metadata.yaml"
+    content = yaml.safe_load(file.read_text())
+    content["rosbag2_bagfile_information"]["topics_with_message_count"][0]["message_count"] = count
+    file.write_text(yaml.safe_dump(content))
+    with pytest.raises(BagError, match="message_count of /text is"), BagReader(tmp_path / "bag") as bag:
+        _ = bag.topics
