@@ -155,7 +155,7 @@ class BagReader(Closing):
             except (TypeError, ValueError, OverflowError):
                 raise BagError(
                     f"{self.path}: metadata.yaml: message_count of {connection.topic} is {connection.msgcount!r}, "
-                    "not a whole number; ic bag reindex writes the file anew"
+                    "not a whole number; ic bag reindex writes the file again"
                 ) from None
         for topics in self._repeated.values():
             for key in counts:
