@@ -70,6 +70,12 @@ def test_commands_of_a_page_make_what_the_later_ones_read_and_nothing_twice(page
         made |= set(new)
 
 
+def test_explanation_stays_short():
+    words = {page: len((ROOT / page).read_text(encoding="utf-8").split()) for page in PAGES}
+    assert words["README.md"] <= 900
+    assert sum(words.values()) - words["docs/reference.md"] - words["docs/benchmarks.md"] <= 25_000, words
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_pages_name_the_command_in_one_way(page):
     assert ".venv/bin/ic" not in (ROOT / page).read_text(encoding="utf-8")

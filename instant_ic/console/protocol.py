@@ -11,7 +11,7 @@ Binary frame, little endian::
     then               payload: JPEG or PNG; for LAYERS the parts of all layers, by the ranges in the header; for PART
                        a piece of a whole frame from ``start`` on, which has ``size`` bytes
 
-docs/console.md lists the fields of every message and header.
+docs/console.md lists the messages, static/messages.js the fields of those to the page and of the headers.
 """
 
 from __future__ import annotations

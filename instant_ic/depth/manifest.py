@@ -63,7 +63,7 @@ class ModelManifest:
         max_range_m: metric depth above it is cut to it.
         geometry: ``radial`` (distance from the camera) or ``planar`` (along the axis of the cube face that the
             pixel lies on); planar output is turned into radial.
-        prior_input: name of the input that takes incomplete depth, (1, 5, height, width) float32
+        prior_input: name of the input that takes incomplete depth, (1, 6, height, width) float32
             (``depth.completion.prior_channels``); empty for a model that takes the image alone.
         sigma_output: name of the output with the relative standard deviation; required with ``prior_input``.
         mask_output: name of an output that marks where depth is valid; empty for none.

@@ -1,5 +1,5 @@
 // @ts-check
-// Messages of the server, checked where they arrive; docs/console.md lists their fields.
+// Messages of the server, checked where they arrive.
 
 /** @template T @typedef {(value: unknown, name: string) => T} Reader */
 
