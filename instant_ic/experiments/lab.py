@@ -213,7 +213,7 @@ def machine() -> dict[str, str]:
     packages = ("instant-ic", "numpy", "numba", "onnxruntime", "opencv-contrib-python-headless", "scikit-image")
     return {
         "cpu": f"{model}, {os.cpu_count()} cores",
-        "system": platform.platform(terse=True),
+        "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in packages},
     }

@@ -225,6 +225,7 @@ h1 { font-size: 1.5rem; line-height: 1.2; } h2 { margin-top: 2.5rem; border-top:
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
 h3 { font-size: .95rem; margin: 1.4rem 0 .3rem; }
 th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
+td.text { text-align: left; }
 th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper); }
 figure { margin: 0; }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); gap: .5rem; }
@@ -301,11 +302,17 @@ def _part(part: Part) -> str:
             body = f'<div class="plots">{part.source}</div>'
         return f"<h3>{caption}</h3><figure>{body}</figure>{command}"
     head = "".join(f"<th>{html.escape(str(column))}</th>" for column in part.columns)
-    rows = "".join("<tr>" + "".join(f"<td>{_cell(cell)}</td>" for cell in row) + "</tr>" for row in part.rows)
+    rows = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in part.rows)
     return f'<h3>{caption}</h3><div class="wide"><table><tr>{head}</tr>{rows}</table></div>{command}'
 
 
 def _cell(value: Any) -> str:
+    if isinstance(value, str):
+        return f'<td class="text">{html.escape(value)}</td>' if value else "<td></td>"
+    return f"<td>{_number(value)}</td>"
+
+
+def _number(value: Any) -> str:
     if isinstance(value, list):
         known = [abs(one) for one in value if one is not None]
         return spread(value, 3 if known and max(known) <= 1 else 2 if known and max(known) < 100 else 0)

@@ -49,7 +49,7 @@ def save_plot(
 ) -> None:
     """Save figures by method, every course's time and obedience, and maps of the worst courses.
 
-    Below each map: the arbiter's modes over time, one bar per method.
+    Below each map: the arbiter's modes over time, one bar per method. Of a single course: its map and modes alone.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -59,26 +59,31 @@ def save_plot(
     courses = [(settings.course(index), [d for d in drives if d.index == index]) for index in shown]
     columns = min(2, len(shown))
     rows = [courses[k : k + columns] for k in range(0, len(courses), columns)]
-    heights = [1.7, 1.9, *(h for row in rows for h in (max(_map_height(course, of) for course, of in row), 0.75))]
+    heights = [h for row in rows for h in (max(_map_height(course, of) for course, of in row), 0.75)]
+    if len(indices) > 1:
+        heights = [1.7, 1.9, *heights]
     figure = Figure(figsize=(13.0, 1.1 * sum(heights) + 0.6 * len(rows) + 1.0), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
     names = [name for name in METHODS if name in report["methods"]]
-    bars = grid[0].subgridspec(1, len(_BARS))
-    for k, (key, label) in enumerate(_BARS):
-        _draw_bars(figure.add_subplot(bars[k]), label, {name: report["methods"][name][key] for name in names})
-    strips = grid[1].subgridspec(1, len(_COURSES))
-    for k, (key, label) in enumerate(_COURSES):
-        _draw_courses(figure.add_subplot(strips[k]), key, label, drives, names)
+    if len(indices) > 1:
+        bars = grid[0].subgridspec(1, len(_BARS))
+        for k, (key, label) in enumerate(_BARS):
+            _draw_bars(figure.add_subplot(bars[k]), label, {name: report["methods"][name][key] for name in names})
+        strips = grid[1].subgridspec(1, len(_COURSES))
+        for k, (key, label) in enumerate(_COURSES):
+            _draw_courses(figure.add_subplot(strips[k]), key, label, drives, names)
+    first = len(heights) - 2 * len(rows)
     for number, row in enumerate(rows):
-        maps, modes = (grid[2 + 2 * number + k].subgridspec(1, columns) for k in range(2))
+        maps, modes = (grid[first + 2 * number + k].subgridspec(1, columns) for k in range(2))
         for k, (course, of) in enumerate(row):
             _draw_course(figure.add_subplot(maps[k]), course, of)
             draw_modes(figure.add_subplot(modes[k]), of)
     figure.legend(handles=_legend(names), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
-    figure.suptitle(
-        f"{settings.world}, seed {settings.seed}: {len(indices)} courses; the maps are of those that went worst"
-    )
+    if len(indices) > 1:
+        figure.suptitle(
+            f"{settings.world}, seed {settings.seed}: {len(indices)} courses; the maps are of those that went worst"
+        )
     save_figure(figure, path)
 
 
