@@ -275,7 +275,8 @@ class DepthSource:
 def complete(result: DepthResult, completion: Complete) -> DepthResult:
     """Correct a result of the source ``completed``; needs no other state, so that any thread may do it.
 
-    A pixel is changed where the completion is no less certain than the prior, and never to nearer than free space.
+    A pixel is never changed to nearer than free space. The prior's sigma decides nothing: under faults half of the
+    prior's error lies in pixels that it is sure of, and a completion that knows better there says a larger sigma.
     Without a prior, and where the completion fails, the result stays as it is, and its message says why.
     """
     prior = result.prior
@@ -288,10 +289,9 @@ def complete(result: DepthResult, completion: Complete) -> DepthResult:
             raise ValueError(f"it is {found_m.shape}, the depth {result.depth_m.shape}")
     except (InferenceError, ValueError) as error:
         return replace(result, message=f"{result.message}; no completion ({error})")
-    usable = np.isfinite(found_m) & (found_m > 0) & np.isfinite(found_sigma)
-    better = usable & ((result.depth_m <= 0) | (found_sigma <= result.sigma)) & ~prior.fixed
-    depth = np.where(better, np.maximum(found_m, prior.free_m), result.depth_m).astype(np.float32)
-    sigma = np.where(better, found_sigma, result.sigma).astype(np.float32)
+    taken = np.isfinite(found_m) & (found_m > 0) & np.isfinite(found_sigma) & ~prior.fixed
+    depth = np.where(taken, np.maximum(found_m, prior.free_m), result.depth_m).astype(np.float32)
+    sigma = np.where(taken, found_sigma, result.sigma).astype(np.float32)
     message = f"{result.message}; completed"
     return replace(result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message)
 

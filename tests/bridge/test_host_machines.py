@@ -37,7 +37,7 @@ def test_the_operator_drives_a_robot_on_another_machine_and_a_cut_cable_stops_it
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     assert nodes == {"console", "host_bridge", "operator_recorder"} and left == []
-    assert not any("Traceback" in log for log in logs)
+    assert [log[log.index("Traceback") :][:3000] for log in logs if "Traceback" in log] == []
     assert result.picture_age_s < 5.0  # a picture of now; a busy machine makes one a second
     assert result.driven_m > 0.3
     assert result.stop_s < 5.0  # 0.3 s and 0.5 s of braking on a free machine
