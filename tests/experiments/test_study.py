@@ -13,7 +13,7 @@ import pytest
 import yaml
 from study_pages import FakeTrial, fake_console, filled, finished_study, served
 
-from instant_ic.bag.writer import BagWriter
+from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bus import LATCHED
 from instant_ic.cli.main import main
 from instant_ic.experiments.study import forms, stats, trial
@@ -22,7 +22,17 @@ from instant_ic.experiments.study.record import DONE, OPEN, WITHDRAWN, Record
 from instant_ic.experiments.study.report import rows, values_of
 from instant_ic.experiments.study.server import StudyServer, drive_page, from_page, to_page
 from instant_ic.experiments.study.trial import Drive, ahead_m, measures
-from instant_ic.msg import Bool, ControlState, String, header, pose2_message, scan_message, serialize, twist_message
+from instant_ic.msg import (
+    Bool,
+    ControlState,
+    String,
+    deserialize,
+    header,
+    pose2_message,
+    scan_message,
+    serialize,
+    twist_message,
+)
 
 
 @pytest.fixture
@@ -259,6 +269,31 @@ def test_states_at_uneven_times_do_not_look_like_disobedience(tmp_path, virtual)
     found = measures(tmp_path / "bag")
     assert found["obedience"] > 0.95 and found["driven_m"] == pytest.approx(4.0, abs=0.05)
     assert found["ahead_m"] is None if virtual else found["ahead_m"] == pytest.approx(2.5)
+
+
+def test_answers_join_the_bag_of_their_drive(study):
+    """The page after a drive adds its answers; the drive's own messages and what the recorder noted stay."""
+    record = Record(study, "P01")
+    for step in study.steps()[: study.steps().index("distance.1")]:
+        record.finish(step, filled(study, step))
+    bag = record.folder / "drive1"
+    with BagWriter(bag) as writer:
+        writer.set_custom("instant_ic.note", "kept")
+        writer.write(trial.EVENTS, String.__msgtype__, serialize(String(data="begin")), 10**18, LATCHED)
+    with served(record) as server:
+
+        async def go():
+            async with aiohttp.ClientSession() as http:
+                await _post(http, server.url, step="distance.1", driven="6.5", ahead="3", noticed="é")
+
+        asyncio.run(go())
+    with BagReader(bag) as reader:
+        assert reader.custom["instant_ic.note"] == "kept" and not reader.unlisted
+        texts = [deserialize(one.payload, one.type_name).data for one in reader.messages()]
+    assert texts[0] == "begin" and len(texts) == 2
+    expected = {"driven": 6.5, "ahead": 3.0, "noticed": "é"}
+    assert json.loads(texts[1]) == {"questionnaire": "distance.1", "answers": expected}
+    assert record.steps["distance.1"]["answers"] == expected
 
 
 @pytest.mark.parametrize("key", ["worlds", "practice_world"])

@@ -18,11 +18,12 @@ from typing import Any
 import aiohttp
 from aiohttp import WSMsgType, web
 
+from instant_ic.bag import BagError
 from instant_ic.console import server as console
 from instant_ic.experiments.study import forms
 from instant_ic.experiments.study.plan import StudyError
 from instant_ic.experiments.study.record import OPEN, WITHDRAWN, Record
-from instant_ic.experiments.study.trial import Drive, Trial
+from instant_ic.experiments.study.trial import Drive, Trial, add_answers
 from instant_ic.web_access import host_allowed
 
 STATIC = Path(__file__).with_name("static")
@@ -245,7 +246,7 @@ class StudyServer:
                 answers, faults = forms.answers(found, len(record.study.worlds), given)
                 if faults:
                     return self._present(given, faults)
-                record.finish(str(step), {"answers": answers})
+                self._store(str(step), answers)
         raise web.HTTPSeeOther("/")  # also from an old page: the present one is shown
 
     def _steer(self, step: str, action: Any) -> None:
@@ -255,6 +256,17 @@ class StudyServer:
             self._trial = self._make_trial(Drive(record.study, record.code, number), record.bag(step))
         elif action == "finish" and trial is not None and trial.status == "ready":
             trial.end()
+
+    def _store(self, step: str, answers: dict[str, Any]) -> None:
+        """Store answers, those after a drive in its bag too; a bag that cannot be written holds up nobody."""
+        record, (_, _, drive) = self.record, step.partition(".")
+        record.finish(step, {"answers": answers})
+        if drive:
+            bag = record.folder / record.steps[f"drive{drive}"]["bag"]
+            try:
+                add_answers(bag, step, answers)
+            except (OSError, BagError) as error:
+                logger.error("answers %s of %s are in answers.json only: %s", step, record.code, error)
 
     async def _ask_to_withdraw(self, request: web.Request) -> web.StreamResponse:
         texts = self.record.study.texts
