@@ -550,6 +550,19 @@ def test_the_report_of_few_says_so_and_of_none_is_written(study, tmp_path):
     assert stat.S_IMODE((out / "report.json").stat().st_mode) == 0o600
 
 
+def test_the_report_counts_the_answers_about_the_group_without_codes(study, tmp_path):
+    finished_study(study, ["P01", "P02", "P03"])
+    for code, age in (("P01", "18-24"), ("P02", "35-44"), ("P03", "18-24")):
+        record = Record(study, code)
+        record.steps["background"]["answers"] = {"age": age, "robots": None, "games": "never"}
+        record.save()
+    assert main(["study", "report", str(study.folder), "-o", str(tmp_path / "report")]) == 0
+    tables = json.loads((tmp_path / "report" / "report.json").read_text())["tables"]["participants"]
+    found = {one["caption"]: one["rows"] for one in tables}
+    assert found["Your age"] == [["18-24", 2], ["25-34", 0], ["35-44", 1], ["45-54", 0], ["55 or more", 0]]
+    assert found["How often have you driven a robot or a drone?"][-1] == ["no answer", 3]
+
+
 def test_random_answers_of_programs_are_not_mixed_with_those_of_people(study, tmp_path):
     finished_study(study, ["P01", "P02"], simulated=False)
     finished_study(study, ["P03"])
