@@ -58,6 +58,8 @@ PAPER = {
 """Claims of the paper."""
 _MARKS = {True: ("yes", "holds"), False: ("no", "does not hold"), None: ("", "not measured")}
 _SHIPPED_BYTES = 2_000_000
+_LONG_TEXT = 40
+"""More characters wrap, as a participant's answer."""
 LEAST_UNITS = 3
 
 
@@ -225,7 +227,9 @@ h1 { font-size: 1.5rem; line-height: 1.2; } h2 { margin-top: 2.5rem; border-top:
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; }
 h3 { font-size: .95rem; margin: 1.4rem 0 .3rem; }
 th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper); }
+th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper);
+  white-space: normal; min-width: 6rem; max-width: 42vw; }
+td p { margin: 0; text-align: left; white-space: pre-line; } td + td p { min-width: 14rem; }
 figure { margin: 0; }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); gap: .5rem; }
 .plots svg { width: 100%; height: auto; }
@@ -311,4 +315,5 @@ def _cell(value: Any) -> str:
         return spread(value, 3 if known and max(known) <= 1 else 2 if known and max(known) < 100 else 0)
     if isinstance(value, float):
         return f"{value:.3g}"
-    return "–" if value is None else html.escape(str(value))
+    text = "–" if value is None else html.escape(str(value))
+    return f"<p>{text}</p>" if len(text) > _LONG_TEXT else text

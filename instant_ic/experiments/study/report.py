@@ -186,7 +186,8 @@ def _measures(study: Study, drives: Sequence[dict[str, Any]], order: Sequence[st
                 [label, str(test.n), f"{test.chi2:.2f}", str(test.df), _p(test.p), _p(test.p_exact),
                  f"{test.w:.2f} [{test.w_low:.2f}, {test.w_high:.2f}]"]
             )  # fmt: skip
-        plots.append(_plot(label, order, values))
+        if np.ptp(values):
+            plots.append(_plot(label, order, values))
     columns = ("Friedman", "n", "χ²", "df", "p", "p by permutation", "Kendall's W [95 %]")
     return [
         Table("Mean [95 % interval]; participants with all conditions", ("value", "n", *order), lines),
