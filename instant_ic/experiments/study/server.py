@@ -178,9 +178,9 @@ class StudyServer:
 
     # ---- pages
 
-    def _page(self, body: str, refresh_s: int = 0, status: int = 200) -> web.Response:
+    def _page(self, body: str, refresh_s: int = 0, status: int = 200, leave: bool = True) -> web.Response:
         texts = self.record.study.texts
-        if not self._last and self.record.state == OPEN and self.record.step != "consent":
+        if leave and not self._last and self.record.state == OPEN and self.record.step != "consent":
             body += f'<p class=leave><a href="/withdraw">{forms.escape(texts["withdraw"])}</a></p>'
         page = forms.page(texts["title"], body, refresh_s)
         return web.Response(text=page, content_type="text/html", status=status)
@@ -271,7 +271,8 @@ class StudyServer:
     async def _ask_to_withdraw(self, request: web.Request) -> web.StreamResponse:
         texts = self.record.study.texts
         choices = (("back", texts["back"]), ("keep", texts["withdraw_keep"]), ("delete", texts["withdraw_delete"]))
-        return self._page(forms.form("withdraw", forms.paragraphs(texts["withdraw_text"]), *choices))
+        content = f"<h1>{forms.escape(texts['withdraw'])}</h1>{forms.paragraphs(texts['withdraw_text'])}"
+        return self._page(forms.form("withdraw", content, *choices), leave=False)
 
     async def _withdraw(self, action: Any) -> None:
         if action not in ("keep", "delete"):
