@@ -20,6 +20,9 @@ T = TypeVar("T")
 _GONE_S = 30.0
 """A killed process is normally gone at once; a longer wait means that the kernel holds it (a hung file system)."""
 
+_REST_S = 60.0
+"""Longest time from the first byte of a result to the last."""
+
 
 class LostError(RuntimeError):
     """A call without a result: its process died, or was ended because the call took too long."""
@@ -57,13 +60,33 @@ class ProcessPool:
         theirs.close()  # so that ours ends when the process does
         return ours
 
+    def receive(self, pipe: Connection) -> tuple[Any, Exception | None]:
+        """Result of a call, of which the first bytes have arrived.
+
+        Raises:
+            LostError: the process died, or the rest did not arrive within ``60 s``.
+        """
+        began, killer = time.monotonic(), threading.Timer(_REST_S, self._of(pipe).kill)  # its death ends the wait
+        killer.start()
+        try:
+            answer: tuple[Any, Exception | None] = pipe.recv()
+        except (OSError, EOFError):
+            if time.monotonic() - began < _REST_S:
+                raise LostError("its process died (out of memory?)") from None
+            raise LostError(f"the rest of its result did not arrive within {_REST_S:g} s") from None
+        finally:
+            killer.cancel()
+        return answer
+
     def end(self, pipe: Connection) -> None:
         """Kill the process of a pipe."""
-        name = f"pipe{pipe.fileno()}"
-        own = [process for process in self._processes if process.name == name]
-        self._processes = [process for process in self._processes if process.name != name]
+        own = self._of(pipe)
+        self._processes.remove(own)
         pipe.close()
-        self._end(own)
+        self._end([own])
+
+    def _of(self, pipe: Connection) -> SpawnProcess:
+        return next(process for process in self._processes if process.name == f"pipe{pipe.fileno()}")
 
     @staticmethod
     def _end(processes: Sequence[SpawnProcess]) -> None:
@@ -151,18 +174,17 @@ def run_all(
                 answer: tuple[Any, Exception | None]
                 try:
                     if pipe in ready:
-                        answer = pipe.recv()
+                        answer = pool.receive(pipe)
                         idle.append(pipe)
                     elif time.monotonic() > due:
                         raise LostError(f"it took longer than {call_timeout_s:.0f} s and was ended")
                     else:
                         continue
-                except (OSError, EOFError, LostError) as lost:
+                except LostError as lost:
                     pool.end(pipe)
-                    found = LostError("its process died (out of memory?)") if not isinstance(lost, LostError) else lost
                     if on_lost is None:
-                        raise LostError(f"task {number}: {found}; try --jobs 1") from None
-                    answer = on_lost(number, found), None
+                        raise LostError(f"task {number}: {lost}; try --jobs 1") from None
+                    answer = on_lost(number, lost), None
                 del busy[pipe]
                 result, error = answer
                 if error is not None:

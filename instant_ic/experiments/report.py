@@ -58,6 +58,8 @@ PAPER = {
 """Claims of the paper."""
 _MARKS = {True: ("yes", "holds"), False: ("no", "does not hold"), None: ("", "not measured")}
 _SHIPPED_BYTES = 2_000_000
+_LONG_TEXT = 40
+"""More characters wrap, as a participant's answer."""
 LEAST_UNITS = 3
 
 
@@ -226,7 +228,9 @@ table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabul
 h3 { font-size: .95rem; margin: 1.4rem 0 .3rem; }
 th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 td.text { text-align: left; }
-th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper); }
+th:first-child, td:first-child { text-align: left; position: sticky; left: 0; background: var(--paper);
+  white-space: normal; min-width: 6rem; max-width: 42vw; }
+td.long { white-space: pre-line; } td + td.long { min-width: 14rem; }
 figure { margin: 0; }
 .plots { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr)); gap: .5rem; }
 .plots svg { width: 100%; height: auto; }
@@ -308,7 +312,7 @@ def _part(part: Part) -> str:
 
 def _cell(value: Any) -> str:
     if isinstance(value, str):
-        return f'<td class="text">{html.escape(value)}</td>' if value else "<td></td>"
+        return f'<td class="{"text long" if len(value) > _LONG_TEXT else "text"}">{html.escape(value)}</td>'
     return f"<td>{_number(value)}</td>"
 
 

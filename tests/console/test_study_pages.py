@@ -55,7 +55,12 @@ def test_a_participant_fills_every_page_and_sees_no_condition(page, tmp_path, de
         page.evaluate("for (const one of document.querySelectorAll('[required]')) one.required = false")
         page.locator("button.main").click()  # nothing is answered
         assert page.locator(".fault").count() == 6
+        assert "Mental demand" in page.evaluate("document.activeElement.innerText")
         assert "tlx.1" not in record.steps
+        page.set_viewport_size({"width": 390, "height": 800})  # 21 points fit beside each other on a phone
+        inside = "(one) => one.scrollWidth <= one.clientWidth"
+        assert all(field.evaluate(inside) for field in page.locator("fieldset").all())
+        page.set_viewport_size(SIZE)
         for field in page.locator("fieldset").all():
             field.locator("input[value='35']").check()
         seen += [page.url, page.title(), page.locator("body").inner_text()]

@@ -1,7 +1,10 @@
 """What a pool's process does, with a halt at the stage that ``HALT`` names; there it creates the file ``HALTED``."""
 
+import gc
 import os
+import struct
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 
@@ -24,7 +27,11 @@ def nothing() -> None:
 
 
 def behave(how: str) -> str:
-    """Hang, die, raise, or return the word."""
+    """Hang, die, raise, send a part of a result and hang, or return the word."""
+    if how == "send a part":
+        (pipe,) = (one for one in gc.get_objects() if isinstance(one, Connection))
+        os.write(pipe.fileno(), struct.pack("!i", 1000) + b"part")  # the length of a message, then too little
+        time.sleep(600.0)
     if how == "hang":
         time.sleep(600.0)
     if how == "die":

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from instant_ic.experiments import processes
 from instant_ic.experiments.processes import LostError, ProcessPool, run_all
 
 
@@ -132,6 +133,17 @@ def test_without_a_result_for_lost_calls_the_run_ends(started: list[SpawnProcess
         run_all(behave, [("hang",)], 1, nothing, timeout_s=2.0, call_timeout_s=600.0)
     with pytest.raises(ValueError, match="no such thing"):
         run_all(behave, [("raise",), ("one",)], 2, nothing)
+    assert gone(started)
+
+
+def test_the_rest_of_a_result_is_not_awaited_for_ever(
+    started: list[SpawnProcess], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from slow_start import behave, nothing
+
+    monkeypatch.setattr(processes, "_REST_S", 0.5)
+    with pytest.raises(LostError, match=r"task 0: the rest of its result did not arrive within 0.5 s"):
+        run_all(behave, [("send a part",), ("hang",)], 2, nothing)
     assert gone(started)
 
 

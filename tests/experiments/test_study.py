@@ -13,7 +13,7 @@ import pytest
 import yaml
 from study_pages import FakeTrial, fake_console, filled, finished_study, served
 
-from instant_ic.bag.writer import BagWriter
+from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bus import LATCHED
 from instant_ic.cli.main import main
 from instant_ic.experiments.study import forms, stats, trial
@@ -22,7 +22,17 @@ from instant_ic.experiments.study.record import DONE, OPEN, WITHDRAWN, Record
 from instant_ic.experiments.study.report import rows, values_of
 from instant_ic.experiments.study.server import StudyServer, drive_page, from_page, to_page
 from instant_ic.experiments.study.trial import Drive, ahead_m, measures
-from instant_ic.msg import Bool, ControlState, String, header, pose2_message, scan_message, serialize, twist_message
+from instant_ic.msg import (
+    Bool,
+    ControlState,
+    String,
+    deserialize,
+    header,
+    pose2_message,
+    scan_message,
+    serialize,
+    twist_message,
+)
 
 
 @pytest.fixture
@@ -259,6 +269,31 @@ def test_states_at_uneven_times_do_not_look_like_disobedience(tmp_path, virtual)
     found = measures(tmp_path / "bag")
     assert found["obedience"] > 0.95 and found["driven_m"] == pytest.approx(4.0, abs=0.05)
     assert found["ahead_m"] is None if virtual else found["ahead_m"] == pytest.approx(2.5)
+
+
+def test_answers_join_the_bag_of_their_drive(study):
+    """The page after a drive adds its answers; the drive's own messages and what the recorder noted stay."""
+    record = Record(study, "P01")
+    for step in study.steps()[: study.steps().index("distance.1")]:
+        record.finish(step, filled(study, step))
+    bag = record.folder / "drive1"
+    with BagWriter(bag) as writer:
+        writer.set_custom("instant_ic.note", "kept")
+        writer.write(trial.EVENTS, String.__msgtype__, serialize(String(data="begin")), 10**18, LATCHED)
+    with served(record) as server:
+
+        async def go():
+            async with aiohttp.ClientSession() as http:
+                await _post(http, server.url, step="distance.1", driven="6.5", ahead="3", noticed="é")
+
+        asyncio.run(go())
+    with BagReader(bag) as reader:
+        assert reader.custom["instant_ic.note"] == "kept" and not reader.unlisted
+        texts = [deserialize(one.payload, one.type_name).data for one in reader.messages()]
+    assert texts[0] == "begin" and len(texts) == 2
+    expected = {"driven": 6.5, "ahead": 3.0, "noticed": "é"}
+    assert json.loads(texts[1]) == {"questionnaire": "distance.1", "answers": expected}
+    assert record.steps["distance.1"]["answers"] == expected
 
 
 @pytest.mark.parametrize("key", ["worlds", "practice_world"])
@@ -513,6 +548,19 @@ def test_the_report_of_few_says_so_and_of_none_is_written(study, tmp_path):
     assert page.count("<svg") >= 5
     assert stat.S_IMODE(out.stat().st_mode) == 0o700
     assert stat.S_IMODE((out / "report.json").stat().st_mode) == 0o600
+
+
+def test_the_report_counts_the_answers_about_the_group_without_codes(study, tmp_path):
+    finished_study(study, ["P01", "P02", "P03"])
+    for code, age in (("P01", "18-24"), ("P02", "35-44"), ("P03", "18-24")):
+        record = Record(study, code)
+        record.steps["background"]["answers"] = {"age": age, "robots": None, "games": "never"}
+        record.save()
+    assert main(["study", "report", str(study.folder), "-o", str(tmp_path / "report")]) == 0
+    tables = json.loads((tmp_path / "report" / "report.json").read_text())["tables"]["participants"]
+    found = {one["caption"]: one["rows"] for one in tables}
+    assert found["Your age"] == [["18-24", 2], ["25-34", 0], ["35-44", 1], ["45-54", 0], ["55 or more", 0]]
+    assert found["How often have you driven a robot or a drone?"][-1] == ["no answer", 3]
 
 
 def test_random_answers_of_programs_are_not_mixed_with_those_of_people(study, tmp_path):

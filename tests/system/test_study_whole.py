@@ -43,7 +43,14 @@ def test_a_simulated_participant_from_the_plan_to_the_report(
     assert 0.9 < drive["driven_m"] < 2.0 and 0.0 < drive["obedience"] <= 1.0
     with BagReader(folder / "participants/P01/drive1") as bag:
         topics = {one.topic for one in bag.topics}
-    assert {"/study/event", "/operator/cmd_vel", "/ic/state", "/camera/image/compressed", "/lidar/packets"} <= topics
+    assert {
+        "/study/event",
+        "/study/answers",
+        "/operator/cmd_vel",
+        "/ic/state",
+        "/camera/image/compressed",
+        "/lidar/packets",
+    } <= topics
     assert main(["study", "report", str(folder), "-o", str(out)]) == 0
     assert "Too few participants" in (out / "report.html").read_text()
     assert main(["study", "delete", str(folder), "P01"]) == 0

@@ -56,20 +56,16 @@ def _new(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     use_one_thread_for_matrices()
-    from instant_ic.cli.kernels import compile_all
     from instant_ic.experiments.study.plan import load
     from instant_ic.experiments.study.record import OPEN, Record, only_one
     from instant_ic.experiments.study.server import StudyServer
-    from instant_ic.experiments.study.trial import make_scans
 
     study = load(args.folder)
     record = Record(study, args.participant)
     if record.state != OPEN or record.simulated:
         raise UserError(f"{record.code} is {'simulated' if record.simulated else record.state}: take another code", 2)
     with only_one(study, "start the next participant"):
-        print("preparing programs and worlds (up to some minutes, once) ...", flush=True)
-        compile_all(lambda share: None)  # not while the participant waits
-        make_scans(study, record.code)
+        _prepare(record)
         server = StudyServer(record, args.port)
         server.start()
         try:
@@ -82,12 +78,21 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _prepare(record: Any) -> None:
+    """Compile kernels and scan worlds: not while the participant waits, and not in the time that a drive may take."""
+    from instant_ic.cli.kernels import compile_all
+    from instant_ic.experiments.study.trial import make_scans
+
+    print("preparing programs and worlds (up to some minutes, once) ...", flush=True)
+    compile_all(lambda share: None)
+    make_scans(record.study, record.code)
+
+
 def _simulate(args: argparse.Namespace) -> int:
     use_one_thread_for_matrices()
     from instant_ic.experiments.study.plan import load
     from instant_ic.experiments.study.record import DONE, Record, only_one
     from instant_ic.experiments.study.simulate import simulate
-    from instant_ic.experiments.study.trial import make_scans
 
     study = load(args.folder)
     with only_one(study, "simulate"):
@@ -95,7 +100,7 @@ def _simulate(args: argparse.Namespace) -> int:
             record = Record(study, code)
             if record.state == DONE:
                 continue
-            make_scans(study, code)
+            _prepare(record)
             simulate(record, args.timeout)
             print(f"{code}: {record.state}", flush=True)
     return 0

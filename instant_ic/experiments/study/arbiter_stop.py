@@ -8,7 +8,6 @@ from instant_ic.bus import main
 from instant_ic.bus.node_files import node_class
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.snapshot import ArbiterInputs, Vspace
-from instant_ic.experiments.teleop_shared import SharedControl
 
 
 class StopControl(Arbiter):
@@ -16,14 +15,6 @@ class StopControl(Arbiter):
 
     def step(self, inputs: ArbiterInputs, now_ns: int) -> Decision:
         """One step, as ``Arbiter.step``."""
-        return super().step(replace(inputs, vspace=Vspace()), now_ns)
-
-
-class SharedOnly(SharedControl):
-    """``SharedControl`` beside a running virtual space, which it does not hear of."""
-
-    def step(self, inputs: ArbiterInputs, now_ns: int) -> Decision:
-        """One step, as ``SharedControl.step``."""
         return super().step(replace(inputs, vspace=Vspace()), now_ns)
 
 

@@ -50,7 +50,8 @@ def questions(
     for item in found.items:
         fault = f'<p class=fault role="alert">{escape(texts[faults[item.id]])}</p>' if item.id in faults else ""
         field = _field(item, drives, texts, given.get(item.id, ""))
-        parts.append(f"<fieldset><legend>{escape(item.text)}</legend>{fault}{field}</fieldset>")
+        focus = " tabindex=-1 autofocus" if item.id == next(iter(faults), "") else ""  # the page scrolls to it
+        parts.append(f"<fieldset{focus}><legend>{escape(item.text)}</legend>{fault}{field}</fieldset>")
     return "".join(parts)
 
 

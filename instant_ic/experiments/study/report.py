@@ -15,7 +15,7 @@ from instant_ic.experiments.lab import machine
 from instant_ic.experiments.pictures import figure_svg, new_figure, series_colour
 from instant_ic.experiments.report import Figure, Part, Section, Table, Text
 from instant_ic.experiments.study import stats
-from instant_ic.experiments.study.plan import CONDITIONS, Study
+from instant_ic.experiments.study.plan import CONDITIONS, Questionnaire, Study
 from instant_ic.experiments.study.record import DONE, WITHDRAWN, Record
 from instant_ic.private import make_folder
 
@@ -148,10 +148,23 @@ def _people(
             Text("Time and distance are of all drives. A drive that was ended before the goal is short in both: "
                  "compare them only where the conditions ended alike.")
         )  # fmt: skip
+    parts += [part for one in study.questionnaires if one.when == "before" for part in _counts(one, done)]
     slow = sum(row["slowest_pace"] is not None and row["slowest_pace"] < 0.95 for row in drives)
     if slow:
         parts.append(Text(f"{slow} of {len(drives)} drives ran in slow motion: the machine was too slow or busy."))
     return parts
+
+
+def _counts(found: Questionnaire, done: Sequence[Record]) -> list[Table]:
+    """How many gave which answer, without codes; free text is left out: it can name a person."""
+    answers = [record.steps.get(found.id, {}).get("answers", {}) for record in done]
+    tables = []
+    for item in (one for one in found.items if one.kind != "text"):
+        given = Counter(one.get(item.id) for one in answers)
+        values = dict.fromkeys([*item.options, *sorted({*given} - {None}, key=str), *([None] if None in given else [])])
+        lines = [["no answer" if value is None else value, given[value]] for value in values]
+        tables.append(Table(item.text, ("answer", "participants"), lines))
+    return tables
 
 
 def _measures(study: Study, drives: Sequence[dict[str, Any]], order: Sequence[str]) -> list[Part]:
@@ -173,7 +186,8 @@ def _measures(study: Study, drives: Sequence[dict[str, Any]], order: Sequence[st
                 [label, str(test.n), f"{test.chi2:.2f}", str(test.df), _p(test.p), _p(test.p_exact),
                  f"{test.w:.2f} [{test.w_low:.2f}, {test.w_high:.2f}]"]
             )  # fmt: skip
-        plots.append(_plot(label, order, values))
+        if np.ptp(values):
+            plots.append(_plot(label, order, values))
     columns = ("Friedman", "n", "χ²", "df", "p", "p by permutation", "Kendall's W [95 %]")
     return [
         Table("Mean [95 % interval]; participants with all conditions", ("value", "n", *order), lines),

@@ -18,11 +18,12 @@ from typing import Any
 import aiohttp
 from aiohttp import WSMsgType, web
 
+from instant_ic.bag import BagError
 from instant_ic.console import server as console
 from instant_ic.experiments.study import forms
 from instant_ic.experiments.study.plan import StudyError
 from instant_ic.experiments.study.record import OPEN, WITHDRAWN, Record
-from instant_ic.experiments.study.trial import Drive, Trial
+from instant_ic.experiments.study.trial import Drive, Trial, add_answers
 from instant_ic.web_access import host_allowed
 
 STATIC = Path(__file__).with_name("static")
@@ -177,9 +178,9 @@ class StudyServer:
 
     # ---- pages
 
-    def _page(self, body: str, refresh_s: int = 0, status: int = 200) -> web.Response:
+    def _page(self, body: str, refresh_s: int = 0, status: int = 200, leave: bool = True) -> web.Response:
         texts = self.record.study.texts
-        if not self._last and self.record.state == OPEN and self.record.step != "consent":
+        if leave and not self._last and self.record.state == OPEN and self.record.step != "consent":
             body += f'<p class=leave><a href="/withdraw">{forms.escape(texts["withdraw"])}</a></p>'
         page = forms.page(texts["title"], body, refresh_s)
         return web.Response(text=page, content_type="text/html", status=status)
@@ -245,7 +246,7 @@ class StudyServer:
                 answers, faults = forms.answers(found, len(record.study.worlds), given)
                 if faults:
                     return self._present(given, faults)
-                record.finish(str(step), {"answers": answers})
+                self._store(str(step), answers)
         raise web.HTTPSeeOther("/")  # also from an old page: the present one is shown
 
     def _steer(self, step: str, action: Any) -> None:
@@ -256,10 +257,22 @@ class StudyServer:
         elif action == "finish" and trial is not None and trial.status == "ready":
             trial.end()
 
+    def _store(self, step: str, answers: dict[str, Any]) -> None:
+        """Store answers, those after a drive in its bag too; a bag that cannot be written holds up nobody."""
+        record, (_, _, drive) = self.record, step.partition(".")
+        record.finish(step, {"answers": answers})
+        if drive:
+            bag = record.folder / record.steps[f"drive{drive}"]["bag"]
+            try:
+                add_answers(bag, step, answers)
+            except (OSError, BagError) as error:
+                logger.error("answers %s of %s are in answers.json only: %s", step, record.code, error)
+
     async def _ask_to_withdraw(self, request: web.Request) -> web.StreamResponse:
         texts = self.record.study.texts
         choices = (("back", texts["back"]), ("keep", texts["withdraw_keep"]), ("delete", texts["withdraw_delete"]))
-        return self._page(forms.form("withdraw", forms.paragraphs(texts["withdraw_text"]), *choices))
+        content = f"<h1>{forms.escape(texts['withdraw'])}</h1>{forms.paragraphs(texts['withdraw_text'])}"
+        return self._page(forms.form("withdraw", content, *choices), leave=False)
 
     async def _withdraw(self, action: Any) -> None:
         if action not in ("keep", "delete"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import logging
 import math
 import shutil
@@ -17,18 +18,22 @@ import numpy as np
 import yaml
 
 from instant_ic.bag import BagReader
+from instant_ic.bag.mcap_writer import McapWriter
+from instant_ic.bag.metadata import channel_metadata, own_schema
+from instant_ic.bag.recover import reindex
 from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.experiments import teleop_figures
 from instant_ic.experiments.recorded_drive import as_log
 from instant_ic.experiments.stack import Stack, free_ports
 from instant_ic.experiments.study.plan import Study, StudyError, save
-from instant_ic.msg import ControlState, String, VspaceStatus, pose2_from_message, stamp_ns, twist_values
+from instant_ic.msg import ControlState, String, VspaceStatus, pose2_from_message, serialize, stamp_ns, twist_values
 from instant_ic.private import make_folder
 
 READY_S = 240.0
 """Longest start of a stack, seconds of its own time."""
 STOP_S = 60.0
 STATE, EVENTS, CONTACT, SCAN = "/ic/state", "/study/event", "/ground_truth/contact", "/scan"
+ANSWERS = "/study/answers"
 AHEAD_RAD = math.radians(3.0)
 """Half the sector whose median range is the distance ahead."""
 ARBITERS = {name: Path(__file__).with_name(f"arbiter_{name}.py") for name in ("stop", "shared")}
@@ -185,6 +190,22 @@ class Trial:
         """Whether the r-bot has driven far enough, and is the robot shown."""
         x, _, _ = pose2_from_message(state.robot_pose)
         return bool(self.drive.number and state.mode == ControlState.REAL and x >= self.drive.study.goal_m)
+
+
+def add_answers(bag: Path, step: str, answers: dict[str, Any]) -> None:
+    """Add the answers after a drive to its bag: one message, as JSON, in a file of its own.
+
+    Raises:
+        OSError, BagError: it cannot be written; the drive's own messages stay as they are.
+    """
+    file = McapWriter(bag / f"{bag.name}_{step}.mcap")
+    schema = own_schema(String.__msgtype__)
+    channel = file.add_channel(ANSWERS, file.add_schema(schema), channel_metadata(LATCHED))
+    text = json.dumps({"questionnaire": step, "answers": answers}, ensure_ascii=False)
+    file.write(channel, time.time_ns(), serialize(String(data=text)))
+    if (full := file.finish()) is not None:
+        raise full
+    reindex(bag)
 
 
 def measures(bag: Path) -> dict[str, Any]:
