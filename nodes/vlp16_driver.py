@@ -54,7 +54,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         elif self.lockstep:
             raise NodeError("source udp cannot run in lockstep: use source:=pcap or source:=topic")
         else:
-            self.receiver = PacketReceiver(config.receiver(), self.feed.sources, self.clock.steady_ns)
+            self.receiver = PacketReceiver(config, self.feed.sources, self.clock.steady_ns)
             try:
                 self.receiver.connect()
             except ReceiverError as error:

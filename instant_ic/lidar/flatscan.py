@@ -29,14 +29,12 @@ class FlatScan:
         angle_min: direction of the first beam, rad; the centre of its sector.
         angle_increment: angle between beams, rad.
         stamp_ns: instant of all ranges: the end of the revolution.
-        compensated: whether the base's motion during the revolution was compensated.
     """
 
     ranges: NDArray[np.float32]
     angle_min: float
     angle_increment: float
     stamp_ns: int
-    compensated: bool
 
 
 def flat_scan(
@@ -85,7 +83,6 @@ def flat_scan(
         angle_min=-np.pi,
         angle_increment=2.0 * np.pi / config.beams,
         stamp_ns=revolution.end_ns,
-        compensated=motion is not None,
     )
 
 
@@ -110,24 +107,6 @@ def coverage(revolution: Revolution) -> float:
     """
     degrees = np.floor(np.degrees(revolution.firing_azimuth)).astype(np.int64) % 360
     return float(len(np.unique(degrees))) / 360.0
-
-
-def deskew(revolution: Revolution, base_from_lidar: NDArray[np.float64], motion: PlanarMotion) -> NDArray[np.float32]:
-    """Positions of all points in the sensor's frame at the end of the revolution, (N, 3).
-
-    Raises:
-        MotionError: the poses do not cover the revolution.
-    """
-    rotation, translation = base_from_lidar[:3, :3], base_from_lidar[:3, 3]
-    stamps_ns = revolution.stamp_ns + (revolution.points["time"].astype(np.float64) * 1e9).astype(np.int64)
-    shift = motion.end_from_time(revolution.end_ns, stamps_ns)
-    base = revolution.xyz.astype(np.float64) @ rotation.T + translation
-    c, s = np.cos(shift[:, 2]), np.sin(shift[:, 2])
-    moved = np.stack(
-        [c * base[:, 0] - s * base[:, 1] + shift[:, 0], s * base[:, 0] + c * base[:, 1] + shift[:, 1], base[:, 2]],
-        axis=-1,
-    )
-    return np.asarray((moved - translation) @ rotation, np.float32)
 
 
 def warm_up() -> None:

@@ -8,9 +8,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 from instant_ic.closing import Closing
+from instant_ic.config.ranges import Range, check_ranges
 from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES, check_data_packet
 from instant_ic.lidar.sources import SourceGuard
 from instant_ic.pace import current
@@ -36,20 +37,17 @@ class ReceiverConfig:
     Attributes:
         host: local address; 0.0.0.0 also receives the broadcasts of a sensor with factory settings.
         port: UDP port of data packets; 0 lets the system choose (see `PacketReceiver.port`).
-        position_port: UDP port of position packets; -1 disables it.
-        sensor: IPv4 address of the sensor; empty locks onto the first sender.
+        position_port: UDP port of position packets; -1: not received.
+        sensor: the sensor's IPv4 address; empty: the first sender until the driver restarts.
     """
 
     host: str = "0.0.0.0"
-    port: int = 2368
-    position_port: int = 8308
+    port: Annotated[int, Range(0, 65535)] = 2368
+    position_port: Annotated[int, Range(-1, 65535)] = 8308
     sensor: str = ""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise ValueError(f"port must be in 0..65535 (got {self.port})")
-        if not -1 <= self.position_port <= 65535:
-            raise ValueError(f"position_port must be in -1..65535 (got {self.position_port})")
+        check_ranges(self)
         if self.sensor:
             try:
                 ipaddress.IPv4Address(self.sensor)
