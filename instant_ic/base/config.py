@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from instant_ic.base.protocol import BAUD_RATES
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, Range, check_ranges, require
+from instant_ic.config.ranges import NotNegativeInt, Positive, Range, check_ranges, require
 from instant_ic.config.robot import MotionLimits
 
 
@@ -54,28 +54,6 @@ class LimitsConfig(MotionLimits):
         super().__post_init__()
         soft = self.max_linear_accel_m_s2
         require(self, "hard_decel_m_s2", self.hard_decel_m_s2 >= soft, "at least max_linear_accel_m_s2")
-
-
-@dataclass(frozen=True)
-class OdometryNoiseConfig:
-    """Growth of the odometry's uncertainty.
-
-    Attributes:
-        position_per_metre: variance added to the position per metre driven, m^2/m.
-        yaw_per_metre: variance added to the yaw per metre driven, rad^2/m.
-        yaw_per_radian: variance added to the yaw per radian turned, because tracks slip, rad^2/rad.
-        v_floor: standard deviation of the speed at rest, m/s.
-        w_floor: standard deviation of the turn rate at rest, rad/s.
-    """
-
-    position_per_metre: NotNegative = 0.0004
-    yaw_per_metre: NotNegative = 0.0004
-    yaw_per_radian: NotNegative = 0.01
-    v_floor: NotNegative = 0.005
-    w_floor: NotNegative = 0.01
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)
