@@ -29,13 +29,7 @@ class ReconnectConfig:
 
 
 class CameraLoop(threading.Thread):
-    """Thread that reads a camera until `end`.
-
-    Attributes:
-        frames: images read.
-        connections: successful connections.
-        failures: attempts and connections that ended with an error.
-    """
+    """Thread that reads a camera until `end`."""
 
     def __init__(
         self,
@@ -53,9 +47,6 @@ class CameraLoop(threading.Thread):
             reconnect: waits between attempts.
         """
         super().__init__(name="camera", daemon=True)
-        self.frames = 0
-        self.connections = 0
-        self.failures = 0
         self._camera = camera
         self._on_frame = on_frame
         self._on_event = on_event
@@ -68,15 +59,12 @@ class CameraLoop(threading.Thread):
             while not self._end.is_set():
                 try:
                     self._on_event(True, self._camera.connect())
-                    self.connections += 1
                     while not self._end.is_set():
                         frame = self._camera.read()
                         # Only an image proves that the connection works.
                         backoff.succeed()
-                        self.frames += 1
                         self._on_frame(frame)
                 except Exception as error:  # noqa: BLE001 - nothing else reports an exception of this thread
-                    self.failures += 1
                     wait_s = backoff.fail(time.monotonic())
                     text = str(error) if isinstance(error, CameraError) else f"unexpected {error!r}"
                     self._on_event(False, f"{text.rstrip('.')}. Reconnecting in {wait_s:g} s")
