@@ -73,11 +73,6 @@ class ClockFilter:
         return self.best.offset_ns
 
     @property
-    def rtt_ns(self) -> int:
-        """Round trip of the newest exchange."""
-        return self._samples[-1].rtt_ns if self._samples else 0
-
-    @property
     def min_rtt_ns(self) -> int:
         """Shortest round trip of the window."""
         return self.best.rtt_ns

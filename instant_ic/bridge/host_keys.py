@@ -137,18 +137,11 @@ class KeyStore:
             KeyFileError: the file is missing or damaged, or others can read it.
         """
         path = self.identity_path
+        text = _text(path, 0o077, "read")
+        if text is None:
+            raise KeyFileError(f"{path} does not exist: create this host's key with `ic keys new`")
         try:
-            with path.open() as file:
-                mode = os.fstat(file.fileno()).st_mode
-                words = file.read().split()
-        except FileNotFoundError:
-            raise KeyFileError(f"{path} does not exist: create this host's key with `ic keys new`") from None
-        except OSError as error:
-            raise KeyFileError(f"{path} cannot be read: {error.strerror}") from error
-        if mode & 0o077:
-            raise KeyFileError(f"{path} can be read by others (mode {mode & 0o777:04o}): chmod 600 {path}")
-        try:
-            name, public, secret = words
+            name, public, secret = text.split()
             return Identity(check_name(name), parse_key(public), parse_key(secret))
         except (ValueError, KeyFileError):
             raise KeyFileError(f"{path} is damaged: create a new key with `ic keys new --force`") from None
@@ -180,18 +173,8 @@ class KeyStore:
             KeyFileError: the file cannot be read, others can write it, or one of its lines is wrong.
         """
         path = self.allowed_path
-        try:
-            with path.open() as file:
-                mode = os.fstat(file.fileno()).st_mode
-                lines = file.read().splitlines()
-        except FileNotFoundError:
-            return []
-        except (OSError, UnicodeDecodeError) as error:
-            raise KeyFileError(f"{path} cannot be read: {error}") from error
-        if mode & 0o022:
-            raise KeyFileError(f"{path} can be written by others (mode {mode & 0o777:04o}): chmod 600 {path}")
         peers: list[Peer] = []
-        for number, line in enumerate(lines, 1):
+        for number, line in enumerate((_text(path, 0o022, "written") or "").splitlines(), 1):
             words = line.partition("#")[0].split()
             if not words:
                 continue
@@ -299,6 +282,21 @@ class KeyStore:
         raise KeyFileError(f"{path} cannot be written: {error.strerror}; give another folder with --dir") from error
 
 
+def _text(path: Path, closed: int, verb: str) -> str | None:
+    """Text of a file, None if it is missing; refused if others have one of the mode bits ``closed``."""
+    try:
+        with path.open() as file:
+            mode = os.fstat(file.fileno()).st_mode
+            text = file.read()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise KeyFileError(f"{path} cannot be read: {error}") from error
+    if mode & closed:
+        raise KeyFileError(f"{path} can be {verb} by others (mode {mode & 0o777:04o}): chmod 600 {path}")
+    return text
+
+
 class AllowList:
     """The current allow-list, read again when the file changes.
 
@@ -307,10 +305,9 @@ class AllowList:
 
     def __init__(self, store: KeyStore) -> None:
         self._store = store
-        self._seen: tuple[int, int, int] | None = None
+        self._seen: tuple[int, ...] | None = ()
         self._peers: dict[bytes, Peer] = {}
         self.problem = ""
-        self._read = False
 
     def refresh(self) -> bool:
         """Read the file if it changed; return True if the list is different."""
@@ -319,9 +316,9 @@ class AllowList:
             seen = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
         except OSError:
             seen = None
-        if self._read and seen == self._seen:
+        if seen == self._seen:
             return False
-        self._read, self._seen = True, seen
+        self._seen = seen
         try:
             peers = {peer.public_key: peer for peer in self._store.peers()}
         except KeyFileError as error:

@@ -19,6 +19,7 @@ from instant_ic.bridge.host_protocol import (
     Announce,
     Bye,
     Data,
+    Greeting,
     Hello,
     Message,
     Notice,
@@ -272,7 +273,7 @@ class Session:
             self._pings += 1
             period_s = _FIRST_PING_S if self._pings < _FIRST_PINGS else self.times.ping_s
             self._next_ping_ns = now + int(period_s * 1e9)
-            yield Ping(self._pings, self.clocks.mono_ns(), self.clocks.epoch_ns()).encode()
+            yield Ping(self._pings & 0xFFFFFFFF, self.clocks.mono_ns(), self.clocks.epoch_ns()).encode()
         while self.up and (message := self.outbox.next(self.clocks.mono_ns())) is not None:
             yield message.encode()
 
@@ -355,14 +356,7 @@ class Session:
         match message:
             case Bye():
                 return self.end(_text(message.code), _text(message.reason))
-            case Hello() if not self._connecting and not self.up:
-                if message.version != VERSION:
-                    return self._wrong_version(message)
-                self._replies.append(Welcome(VERSION, self.side.name, self.side.instance, self._wants()))
-                return self._begin(message)
-            case Welcome() if self._connecting and not self.up:
-                if message.version != VERSION:
-                    return self._wrong_version(message)
+            case Greeting() if isinstance(message, Welcome) == self._connecting and not self.up:
                 return self._begin(message)
             case _ if not self.up:
                 raise ProtocolError(f"{type(message).__name__} before the greeting")
@@ -396,15 +390,16 @@ class Session:
                 return self._data(message, now)
         raise ProtocolError(f"{type(message).__name__} is not expected here")
 
-    def _wrong_version(self, message: Hello | Welcome) -> list[Event]:
-        return self.end(
-            "version",
-            f"{message.name} uses bridge protocol version {message.version}, {self.side.name} version {VERSION}: "
-            "install the same Instant IC on both",
-            inform=True,
-        )
-
-    def _begin(self, message: Hello | Welcome) -> list[Event]:
+    def _begin(self, message: Greeting) -> list[Event]:
+        if message.version != VERSION:
+            return self.end(
+                "version",
+                f"{message.name} uses bridge protocol version {message.version}, {self.side.name} version {VERSION}: "
+                "install the same Instant IC on both",
+                inform=True,
+            )
+        if not self._connecting:
+            self._replies.append(Welcome(VERSION, self.side.name, self.side.instance, self._wants()))
         wants = message.wants
         for topic, rate in wants.items():
             if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:

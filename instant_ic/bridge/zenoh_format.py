@@ -202,23 +202,18 @@ class Token:
         if kind in ("SS", "SC"):
             return None
         try:
-            numbers = [int(parts[index]) for index in (1, 3, 4)]
+            domain, node_id, entity_id = (int(parts[index]) for index in (1, 3, 4))
         except ValueError:
             raise FormatError(f"{key!r}: domain and ids must be numbers") from None
         namespace, node = (parts[index].replace("%", "/") for index in (7, 8))
-        domain, node_id, entity_id = numbers
+        entity = (domain, parts[2], node_id, entity_id, namespace, node)
         if kind == "NN":
-            return cls("NN", domain, parts[2], node_id, entity_id, namespace, node)
+            return cls("NN", *entity)
         if kind not in ("MP", "MS") or len(parts) != _ENDPOINT_PARTS:
             raise FormatError(f"{key!r} is not a liveliness token of rmw_zenoh")
         return cls(
             "MP" if kind == "MP" else "MS",
-            domain,
-            parts[2],
-            node_id,
-            entity_id,
-            namespace,
-            node,
+            *entity,
             topic=parts[9].replace("%", "/"),
             type_name=ros_type(parts[10]),
             type_hash=parts[11],
