@@ -28,7 +28,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     live_parameters = ("silence_s", "scan")
 
     def setup(self) -> None:
-        """Create the topics, the mount and the packet source."""
         config = self.config
         warm_up()
         self.thread: ReceiverThread | None = None
@@ -67,7 +66,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.call_soon(self.stop)
 
     def on_packets(self, message: Any) -> None:
-        """Take the packets of a bag."""
         for packet in message.packets:
             self.take(packet.data.tobytes(), stamp_ns(packet))
 
@@ -80,7 +78,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             raise NodeError(f"pcap: {error}") from error
 
     def play(self) -> None:
-        """Take the packets of the capture that are due."""
         if self.player.ended:
             return
         for stamp, port, payload in self.player.due(self.clock.steady_ns()):
@@ -120,7 +117,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.call_soon(self.on_revolution, revolution, packets)
 
     def on_revolution(self, revolution: Revolution, packets: Packets) -> None:
-        """Publish packets, points and scan of one revolution."""
         config = self.config
         if self.thread is not None:
             self.waiting -= 1
@@ -131,9 +127,9 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             return
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))
         if self.report.covers(revolution, config.scan.min_coverage):
-            scan, state = compensated_scan(revolution, self.base_from_lidar, config.scan, self.tf)
+            ranges, state = compensated_scan(revolution, self.base_from_lidar, config.scan, self.tf)
             self.diagnose_all(state)
-            self.scan.publish(flat_scan_message(scan, revolution, config))
+            self.scan.publish(flat_scan_message(ranges, revolution, config))
 
     def check(self) -> None:
         """Report silence and losses; each second."""

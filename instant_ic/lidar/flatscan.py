@@ -1,7 +1,5 @@
 """Flat scan: one range per direction from the points in a height interval, motion-compensated to one instant."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -19,31 +17,13 @@ MAX_TILT_DEG = 5.0
 """A flat scan lies in the sensor's plane. At this tilt, a point 0.7 m above or below the sensor is 6 cm off."""
 
 
-@dataclass(frozen=True)
-class FlatScan:
-    """A planar scan in the sensor's frame.
-
-    Attributes:
-        ranges: metres as in REP-117: +inf no return, -inf too close, nan not measured; (beams,). Beam i points
-            to angle_min + i * angle_increment, counter-clockwise from ahead.
-        angle_min: direction of the first beam, rad; the centre of its sector.
-        angle_increment: angle between beams, rad.
-        stamp_ns: instant of all ranges: the end of the revolution.
-    """
-
-    ranges: NDArray[np.float32]
-    angle_min: float
-    angle_increment: float
-    stamp_ns: int
-
-
 def flat_scan(
     revolution: Revolution,
     base_from_lidar: NDArray[np.float64],
     config: FlatScanConfig,
     motion: PlanarMotion | None = None,
-) -> FlatScan:
-    """Project a revolution to a planar scan.
+) -> NDArray[np.float32]:
+    """Project a revolution to a planar scan in the sensor's frame.
 
     Each point is moved by the base's motion from its firing to the end of the revolution. Each beam takes its smallest
     range.
@@ -53,6 +33,10 @@ def flat_scan(
         base_from_lidar: mount of the sensor; the origin of base_link is on the ground, (4, 4).
         config: height interval and beams.
         motion: poses of the base around the revolution; without them the base is assumed to stand still.
+
+    Returns:
+        Ranges at the end of the revolution, metres as in REP-117: +inf no return, -inf too close, nan not measured;
+        (beams,). Beam i points to -pi + i * 2 pi / beams, counter-clockwise from ahead.
 
     Raises:
         MotionError: the poses do not cover the revolution.
@@ -78,12 +62,7 @@ def flat_scan(
         config.range_max,
         ranges,
     )
-    return FlatScan(
-        ranges=ranges,
-        angle_min=-np.pi,
-        angle_increment=2.0 * np.pi / config.beams,
-        stamp_ns=revolution.end_ns,
-    )
+    return ranges
 
 
 def check_level(base_from_lidar: NDArray[np.float64]) -> None:
