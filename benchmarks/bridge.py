@@ -81,7 +81,6 @@ class Host:
             self.node.spin_once()
 
     def close(self) -> None:
-        """Close the node."""
         self.stop.set()
         self.thread.join(5)
         self.node.close()
@@ -113,7 +112,6 @@ def bridges(folder: Path, network: list[str]) -> Iterator[list[psutil.Process]]:
 
 
 def summary(ages_ms: list[float]) -> dict[str, float]:
-    """Percentiles of the ages."""
     if not ages_ms:
         return {"count": 0}
     p50, p99 = np.percentile(ages_ms, [50, 99])
@@ -121,7 +119,6 @@ def summary(ages_ms: list[float]) -> dict[str, float]:
 
 
 def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
-    """Run one scenario."""
     with tempfile.TemporaryDirectory(prefix="icb") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         processes = [] if network is None else stack.enter_context(bridges(folder, network))

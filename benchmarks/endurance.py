@@ -194,7 +194,6 @@ class Recording:
 
     @property
     def pid(self) -> int:
-        """Process id of the recorder."""
         assert self._process is not None
         return self._process.pid
 
@@ -505,7 +504,6 @@ class Soak:
 
 
 def fresh(made: Rig) -> bool:
-    """Whether the arbiter's state is recent."""
     stamp = made.state.header.stamp
     return bool(made.pace.now_ns() - (stamp.sec * 10**9 + stamp.nanosec) < 1e9)
 

@@ -73,7 +73,6 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             self.link.stop()
 
     def reconfigure(self, config: HostBridgeConfig) -> None:
-        """Apply a change of the driving host."""
         super().reconfigure(config)
         if isinstance(self.link, ListeningLink):
             self.link.wanted_driver = config.driver
@@ -123,11 +122,9 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 self.update()
 
     def trouble(self, topic: str, text: str) -> None:
-        """Report a topic that is not transferred."""
         self.report.trouble(topic, text)
 
     def update(self) -> None:
-        """Report the state of the link, clocks, topics and refused hosts."""
         self.report.update(self.config.max_offset_ms)
 
 

@@ -18,7 +18,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
     live_parameters = ("silence_s", "camera_mount")
 
     def setup(self) -> None:
-        """Create the topics, the mount and the loop that reads the camera."""
         config = self.config
         self.loop: CameraLoop | None = None
         self.out = self.publisher("/camera/image/compressed", CompressedImage, qos=SENSOR)
@@ -44,7 +43,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.loop.start()
 
     def broadcast_mount(self) -> None:
-        """Broadcast the camera's mount on the robot."""
         self.tf_broadcast_static("base_link", self.config.frame_id, pose_matrix(*self.config.camera_mount.pose))
 
     def reconfigure(self, config: ThetaCameraConfig) -> None:
@@ -69,7 +67,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.published += 1
 
     def on_event(self, connected: bool, text: str) -> None:
-        """Report a connection or its loss."""
         self.diagnose("camera", OK if connected else ERROR, text)
 
     def check(self) -> None:

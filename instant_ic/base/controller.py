@@ -325,10 +325,8 @@ class SteppedController(ControllerThread):
         """Start no thread."""
 
     def hurry(self) -> None:
-        """Run a step."""
         self._on_state(self._controller.step())
 
     def end(self, timeout_s: float = 0.0) -> bool:
-        """Stop the motors; return True."""
         self._on_end(None, self._controller.close())
         return True

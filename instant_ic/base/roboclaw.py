@@ -69,12 +69,10 @@ class Status:
 
     @property
     def faults(self) -> list[str]:
-        """Texts of the faults."""
         return describe_status(self.value, self.size)[0]
 
     @property
     def warnings(self) -> list[str]:
-        """Texts of the warnings."""
         return describe_status(self.value, self.size)[1]
 
 

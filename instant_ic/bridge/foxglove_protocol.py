@@ -52,7 +52,6 @@ def message_data(subscription: int, log_ns: int, payload: bytes | memoryview) ->
 
 
 def time_data(now_ns: int) -> bytes:
-    """Return a message with the server's time."""
     return _TIME.pack(2, now_ns)
 
 

@@ -677,7 +677,6 @@ class _Channel:
             self._server.hand_out(self, received)
 
     def drop(self) -> None:
-        """End the subscription."""
         if self.subscription is not None:
             self._node.drop(self.subscription)
             self.subscription = None

@@ -69,7 +69,6 @@ class ClockFilter:
 
     @property
     def offset_ns(self) -> int:
-        """The other clock minus ours."""
         return self.best.offset_ns
 
     @property

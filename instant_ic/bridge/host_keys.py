@@ -81,7 +81,6 @@ def fingerprint(public_key: bytes) -> str:
 
 
 def key_text(public_key: bytes) -> str:
-    """Return a public key as text."""
     check = hashlib.sha256(public_key).digest()[-_CHECK_SIZE:]
     return _PREFIX + base64.urlsafe_b64encode(public_key + check).decode()
 
@@ -330,7 +329,6 @@ class AllowList:
         return changed
 
     def get(self, public_key: bytes) -> Peer | None:
-        """Return the allowed host with this key."""
         return self._peers.get(public_key)
 
     def __len__(self) -> int:

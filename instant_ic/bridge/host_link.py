@@ -226,7 +226,6 @@ class HostLink(ABC):
         return channel
 
     def peers(self) -> list[PeerStatus]:
-        """State of all current links."""
         with self._lock:
             return [self._status(connection) for connection in self._connections() if connection.session.up]
 

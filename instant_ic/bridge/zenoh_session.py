@@ -199,11 +199,9 @@ class RosSession(Closing):
             self.zenoh.close()
 
     def routers(self) -> list[str]:
-        """Return the ids of the connected routers."""
         return [str(zid) for zid in self.zenoh.info.routers_zid()]
 
     def peers(self) -> list[str]:
-        """Return the ids of the connected peers."""
         return [str(zid) for zid in self.zenoh.info.peers_zid()]
 
     def token(self, kind: Kind, node: RosNode | None, namespace: str, name: str, *endpoint: Any) -> tuple[Token, Any]:
@@ -250,7 +248,6 @@ class RosNode:
         return self.session.token(kind, self, self.namespace, self.name, topic, type_name, type_hash, qos)[1]
 
     def close(self) -> None:
-        """Remove the node from the graph."""
         self._declaration.undeclare()
 
 
@@ -303,7 +300,6 @@ class RosPublisher:
                 raise ZenohError(f"Zenoh: {error}") from None
 
     def close(self) -> None:
-        """Remove the publisher from the graph."""
         self._token.undeclare()
         self._publisher.undeclare()
 
@@ -390,6 +386,5 @@ class RosSubscription:
         self._on_message(sample.payload.to_bytes(), attachment)
 
     def close(self) -> None:
-        """Remove the subscription from the graph."""
         self._token.undeclare()
         self._subscriber.undeclare()

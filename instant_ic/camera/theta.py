@@ -268,7 +268,6 @@ class ThetaCamera(Camera):
                 self.bad_frames += 1
 
     def close(self) -> None:
-        """End the preview and close both connections."""
         self._end_preview()
         self.client.close()
 

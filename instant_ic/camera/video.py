@@ -46,7 +46,6 @@ class VideoCamera(Camera):
         return f"video {self.url}, {width}x{height} by {capture.getBackendName()}"
 
     def read(self) -> Frame:
-        """Return the next frame as JPEG."""
         import cv2
 
         if self._capture is None:

@@ -53,11 +53,9 @@ class CapturePlayer:
 
     @property
     def played(self) -> int:
-        """Number of datagrams of the capture read so far."""
         return self._reader.counters.datagrams
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """What has been played and what was left out."""
         text = f"{self.played} datagrams played" + (f"; left out: {self.skipped}" if self.skipped else "")
         return Diagnosis("capture", Level.WARN if self.skipped else Level.OK, text)

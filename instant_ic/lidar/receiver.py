@@ -189,7 +189,6 @@ class ReceiverThread(threading.Thread):
         self.ending = threading.Event()
 
     def run(self) -> None:
-        """Read until `end`."""
         try:
             while not self.ending.is_set():
                 for received in self.receiver.read(timeout_s=0.2):
@@ -198,7 +197,6 @@ class ReceiverThread(threading.Thread):
             self._on_fault(error)
 
     def end(self) -> None:
-        """End the thread and close the receiver."""
         self.ending.set()
         self.join(2.0)
         self.receiver.close()
