@@ -67,8 +67,6 @@ class RoboclawConfig:
         reply_timeout_s: longest wait for a reply; then the motors are stopped before the command is repeated.
         retries: repeats of a command before the link counts as lost.
         watchdog_s: the controller itself stops the motors after this time without a packet; steps of 0.1 s.
-        reconnect_min_s: first wait before the port is reopened.
-        reconnect_max_s: longest wait before the port is reopened; waits double up to it, at the start only after 15 s.
     """
 
     port: str = "/dev/ttyACM0"
@@ -77,14 +75,11 @@ class RoboclawConfig:
     reply_timeout_s: Positive = 0.1
     retries: NotNegativeInt = 2
     watchdog_s: Annotated[float, Range(0.1, 1)] = 0.3
-    reconnect_min_s: Positive = 0.2
-    reconnect_max_s: Positive = 2.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
         require(self, "port", self.port != "", "the path of a serial device")
         require(self, "baud", self.baud in BAUD_RATES, f"one of {BAUD_RATES}")
-        require(self, "reconnect_min_s", self.reconnect_min_s <= self.reconnect_max_s, "at most reconnect_max_s")
 
 
 @dataclass(frozen=True)

@@ -223,7 +223,7 @@ class Roboclaw:
 
     def stop(self) -> None:
         """Set both motors to speed zero without a ramp (command 37)."""
-        self._acknowledge(Command.SPEED_BOTH, self._stop_frame)
+        self._transact(Command.SPEED_BOTH, _acknowledged, self._stop_frame)
 
     def set_watchdog(self, timeout_s: float) -> None:
         """Make the controller stop the motors after this time without a packet; rounded down to 0.1 s (command 14)."""
@@ -286,11 +286,8 @@ class Roboclaw:
             # port has already raised a LinkError.
             return
 
-    def _write(self, command: int, data: bytes = b"") -> None:
-        self._acknowledge(command, write_frame(self.config.address, command, data))
-
-    def _acknowledge(self, command: int, frame: bytes) -> None:
-        self._transact(command, _acknowledged, frame)
+    def _write(self, command: int, data: bytes) -> None:
+        self._transact(command, _acknowledged, write_frame(self.config.address, command, data))
 
     def _read(self, command: int, size: int) -> bytes:
         return self._transact(command, self._reply(size))

@@ -72,7 +72,6 @@ class ServerConfig:
     """Parameters of the server.
 
     Attributes:
-        title: name that Foxglove shows.
         host: address to listen on; 0.0.0.0 opens the server to the network (there is no sign-in).
         port: TCP port; 0: any free port, reported in the log.
         tls_cert: certificate in PEM; with tls_key the server speaks wss:// only.
@@ -87,7 +86,6 @@ class ServerConfig:
         set_parameters: whether clients may change parameters, except safety parameters.
     """
 
-    title: str = "Instant IC"
     host: str = "127.0.0.1"
     port: Annotated[int, Range(0, 65535)] = 8765
     tls_cert: str = ""
@@ -404,7 +402,7 @@ class FoxgloveServer:
         capabilities += ["clientPublish"] * config.accept_operator + ["time"] * self._server_time
         return protocol.text(
             "serverInfo",
-            name=config.title,
+            name="Instant IC",
             capabilities=capabilities,
             supportedEncodings=["cdr", "json"] if config.accept_operator else None,
             metadata={},

@@ -116,7 +116,7 @@ def check_name(name: str) -> str:
 
 
 class KeyStore:
-    """The key files of one folder.
+    """The key files of one folder. Each method raises :class:`KeyFileError` with where and what to do.
 
     Args:
         folder: the folder; None takes :func:`key_dir`.
@@ -130,11 +130,7 @@ class KeyStore:
     # -- this host -------------------------------------------------------------------------------
 
     def identity(self) -> Identity:
-        """Return this host's key pair.
-
-        Raises:
-            KeyFileError: the file is missing or damaged, or others can read it.
-        """
+        """Return this host's key pair, from a file that only its owner can read."""
         path = self.identity_path
         text = _text(path, 0o077, "read")
         if text is None:
@@ -146,11 +142,7 @@ class KeyStore:
             raise KeyFileError(f"{path} is damaged: create a new key with `ic keys new --force`") from None
 
     def create(self, name: str, force: bool = False) -> Identity:
-        """Create this host's key pair.
-
-        Raises:
-            KeyFileError: there is one already (and not ``force``), or the folder cannot be written.
-        """
+        """Create this host's key pair; ``force`` replaces the present one."""
         import zmq
         from zmq.utils import z85
 
@@ -166,11 +158,7 @@ class KeyStore:
     # -- the others ------------------------------------------------------------------------------
 
     def peers(self) -> list[Peer]:
-        """Return the allowed hosts; empty if the file is missing.
-
-        Raises:
-            KeyFileError: the file cannot be read, others can write it, or one of its lines is wrong.
-        """
+        """Return the allowed hosts, from a file that only its owner can write; empty if the file is missing."""
         path = self.allowed_path
         peers: list[Peer] = []
         for number, line in enumerate((_text(path, 0o022, "written") or "").splitlines(), 1):
@@ -190,11 +178,7 @@ class KeyStore:
         return peers
 
     def peer(self, name: str = "") -> Peer:
-        """Return the allowed host with a name, or the only allowed host.
-
-        Raises:
-            KeyFileError: there is no such host, or several hosts and no name.
-        """
+        """Return the allowed host with a name, or the only allowed host."""
         peers = self.peers()
         found = [peer for peer in peers if not name or peer.name == name]
         if len(found) == 1:
@@ -208,11 +192,7 @@ class KeyStore:
         )
 
     def allow(self, peer: Peer) -> str:
-        """Add a host to the list, or replace the one with the same name. Return what was done.
-
-        Raises:
-            KeyFileError: the name is not valid, or the key is listed under another name.
-        """
+        """Add a host to the list, or replace the one with the same name. Return what was done."""
         check_name(peer.name)
         with self._locked():
             others = [other for other in self.peers() if other.name != peer.name]
@@ -226,11 +206,7 @@ class KeyStore:
             return "added" if before is None else "replaced"
 
     def revoke(self, name: str) -> Peer:
-        """Remove a host from the list; a running bridge disconnects it immediately.
-
-        Raises:
-            KeyFileError: there is no host of this name.
-        """
+        """Remove a host from the list; a running bridge disconnects it immediately."""
         with self._locked():
             peer = self.peer(name)
             self._write_peers([other for other in self.peers() if other.name != name])

@@ -1,7 +1,8 @@
 """rmw_zenoh's conventions as strings and bytes: data keys, attachments, liveliness tokens (rmw_zenoh, docs/design.md).
 
 ROS 2 nodes (Jazzy and newer) on rmw_zenoh exchange CDR, as our bus does. A program that follows these conventions
-takes part in their graph. Nothing here needs Zenoh itself.
+takes part in their graph. Nothing here needs Zenoh itself. Each function raises :class:`FormatError` for what does not
+follow them.
 """
 
 from __future__ import annotations
@@ -53,11 +54,7 @@ class Attachment:
         return self.gid[:SENDER_SIZE].hex()
 
     def pack(self) -> bytes:
-        """Return the 33 bytes, as Zenoh's serializer writes ``(i64, i64, bytes)``.
-
-        Raises:
-            FormatError: the id has another length, or a number is out of range.
-        """
+        """Return the 33 bytes, as Zenoh's serializer writes ``(i64, i64, bytes)``."""
         if len(self.gid) != GID_SIZE:
             raise FormatError(f"publisher id of {len(self.gid)} bytes, {GID_SIZE} expected")
         try:
@@ -67,11 +64,7 @@ class Attachment:
 
     @classmethod
     def unpack(cls, data: bytes) -> Attachment:
-        """Decode the 33 bytes.
-
-        Raises:
-            FormatError: the data or the id have another length.
-        """
+        """Decode the 33 bytes."""
         if len(data) != _ATTACHMENT.size:
             raise FormatError(f"attachment of {len(data)} bytes, {_ATTACHMENT.size} expected")
         sequence, source_ns, size, gid = _ATTACHMENT.unpack(data)
@@ -81,22 +74,14 @@ class Attachment:
 
 
 def dds_type(type_name: str) -> str:
-    """Return the DDS name of a type: ``std_msgs::msg::dds_::String_`` for ``std_msgs/msg/String``.
-
-    Raises:
-        FormatError: the name is not a full type name.
-    """
+    """Return the DDS name of a type: ``std_msgs::msg::dds_::String_`` for ``std_msgs/msg/String``."""
     if not (match := _ROS_TYPE.match(type_name)):
         raise FormatError(f"type name {type_name!r} does not look like std_msgs/msg/String")
     return "{}::{}::dds_::{}_".format(*match.groups())
 
 
 def ros_type(dds_name: str) -> str:
-    """Return the ROS name of a type; the inverse of :func:`dds_type`.
-
-    Raises:
-        FormatError: the name is not a DDS type name.
-    """
+    """Return the ROS name of a type; the inverse of :func:`dds_type`."""
     if not (match := _DDS_TYPE.match(dds_name)):
         raise FormatError(f"type name {dds_name!r} does not look like std_msgs::msg::dds_::String_")
     return "{}/{}/{}".format(*match.groups())
@@ -136,11 +121,7 @@ class TopicQoS:
 
     @classmethod
     def decode(cls, text: str) -> TopicQoS:
-        """Parse the QoS part of a token.
-
-        Raises:
-            FormatError: the text does not have six parts, or the depth is not a number.
-        """
+        """Parse the QoS part of a token."""
         parts = text.split(":")
         if len(parts) != 6:
             raise FormatError(f"quality of service {text!r} has {len(parts)} parts, 6 expected")
@@ -190,11 +171,7 @@ class Token:
 
     @classmethod
     def parse(cls, key: str) -> Token | None:
-        """Parse the token of a node, publisher or subscription; return None for a service's, which is not used here.
-
-        Raises:
-            FormatError: the key is not an rmw_zenoh token.
-        """
+        """Parse the token of a node, publisher or subscription; return None for a service's, which is not used here."""
         parts = key.split("/")
         if len(parts) < 9 or parts[0] != ADMIN_SPACE or not all(parts):
             raise FormatError(f"{key!r} is not a liveliness token of rmw_zenoh")

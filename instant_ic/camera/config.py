@@ -75,13 +75,11 @@ class FilesConfig:
         rate_hz: images per second.
         loop: whether to restart after the last image; otherwise the last image is repeated.
         quality: JPEG quality for files in other formats, 1-100.
-        latency_s: subtracted from the stamps.
     """
 
     rate_hz: Positive = 5.0
     loop: bool = True
     quality: Percent = 90
-    latency_s: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         check_ranges(self)

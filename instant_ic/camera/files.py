@@ -26,7 +26,7 @@ class FileCamera(Camera):
         """Create the camera for an image or a folder of images without reading a file."""
         self.path = Path(path)
         self.config = config or FilesConfig()
-        super().__init__(self.config.latency_s, now_ns)
+        super().__init__(0.0, now_ns)
         self._sleep = sleep
         self._paths: list[Path] = []
         self._loaded: dict[Path, tuple[bytes, int, int]] = {}

@@ -335,8 +335,8 @@ def test_topics_of_no_list_that_a_peer_names_share_one_diagnosis(hosts):
     robot = hosts.bridge("robot").node
     before = set(robot.diagnoses())
     for number in range(100):
-        robot.trouble(f"/x{number}", "refused here: it is not on the topic list of robot")
-    robot.trouble("/operator/cmd_vel", "refused here: different fields")
+        robot.report.trouble(f"/x{number}", "refused here: it is not on the topic list of robot")
+    robot.report.trouble("/operator/cmd_vel", "refused here: different fields")
     assert set(robot.diagnoses()) - before == {"topic of no list", "topic /operator/cmd_vel"}
     assert robot.diagnoses()["topic of no list"][1].startswith("/x99: refused")
 
