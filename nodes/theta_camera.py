@@ -34,7 +34,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             self.camera,
             on_frame=self.publish,
             on_event=lambda connected, text: self.call_soon(self.on_event, connected, text),
-            reconnect=config.reconnect,
         )
         if isinstance(self.camera, ThetaCamera):
             worker = self.background(health, self.diagnose_all)

@@ -5,8 +5,7 @@ import termios
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,9 +143,9 @@ class Roboclaw:
     has acknowledged it.
 
     Example:
-        >>> with Roboclaw(RoboclawConfig(port="/dev/ttyACM0")) as roboclaw:   # doctest: +SKIP
+        >>> with closing(Roboclaw(RoboclawConfig(port="/dev/ttyACM0"))) as roboclaw:   # doctest: +SKIP
+        ...     print(roboclaw.connect(), roboclaw.battery_v())
         ...     roboclaw.drive([1000.0, 1000.0], acceleration_pps2=4000.0)
-        ...     print(roboclaw.encoders(), roboclaw.battery_v())
     """
 
     def __init__(
@@ -201,20 +200,6 @@ class Roboclaw:
         port, self._port = self._port, None
         if port is not None:
             port.close()
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop the motors and release the port in every case."""
-        try:
-            if self.connected:
-                self.stop()
-        finally:
-            self.close()
 
     def drive(self, speed_pps: NDArray[np.float64] | list[float], acceleration_pps2: float) -> None:
         """Set closed-loop speeds of M1 and M2, pulses/s, with a ramp, pulses/s^2 (command 40)."""

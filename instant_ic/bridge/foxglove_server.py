@@ -147,7 +147,6 @@ class FoxgloveServer:
         self._time_ns: int | None = None
         self._flush_due = False
         self.parameters = Parameters(run_dir)
-        self.may_set = config.set_parameters
         self.commands = Commands(node, gate, self._tell_client) if config.accept_operator else None
         self.wake = threading.Event()
         self.count = 0
@@ -562,7 +561,7 @@ class FoxgloveServer:
         if request["op"] == "setParameters":
             entries = protocol.objects(request, "parameters")
             names = protocol.strings({"names": [entry.get("name") for entry in entries]}, "names")
-            if self.may_set:
+            if self._config.set_parameters:
                 refused = self.parameters.set({name: _value(e) for name, e in zip(names, entries, strict=True)})
             else:
                 refused = ["parameters are read-only (set_parameters: false)"]

@@ -134,14 +134,12 @@ class Arrived:
         announce: topic, type, QoS and publisher.
         payload: CDR bytes.
         publish_ns: time of publication, by this host's time of day.
-        age_ns: time since publication.
         born_ns: time of publication by this host's monotonic clock; never in the future.
     """
 
     announce: Announce
     payload: bytes | bytearray = field(repr=False)
     publish_ns: int
-    age_ns: int
     born_ns: int = 0
 
 
@@ -503,9 +501,8 @@ class Session:
             counts.lost += data.sequence - last - 1
         _remember(self.memory.received, key, data.sequence)
         born_ns = min(data.born_ns - self.clock.offset_ns, now)  # by our monotonic clock
-        age_ns = now - born_ns
         rule = incoming.rule
-        if rule.max_age_s and age_ns > rule.max_age_s * 1e9:
+        if rule.max_age_s and now - born_ns > rule.max_age_s * 1e9:
             counts.expired += 1
             return []
         publish_ns = data.publish_ns
@@ -513,7 +510,7 @@ class Session:
             publish_ns -= offset
         if not 0 <= publish_ns < 1 << 63:
             raise ProtocolError(f"{announce.topic}: time of publication {publish_ns} ns is impossible")
-        arrived = Arrived(announce, payload, publish_ns, age_ns, born_ns)
+        arrived = Arrived(announce, payload, publish_ns, born_ns)
         if not self.drives and (not rule.shared or releases(announce.type_name, payload)):
             counts.not_driving += 1
             # A refused release is gone: the lease must not end an emergency stop when it is handed over.
@@ -533,7 +530,6 @@ class Session:
             _remember(self.memory.latched, key, born_ns)
         counts.messages += 1
         counts.bytes += len(arrived.payload)
-        counts.newest_age_ns = arrived.age_ns
         return [arrived]
 
 

@@ -354,10 +354,6 @@ class RosSubscription:
             self._subscriber = session.zenoh.declare_subscriber(key, self._heard, allowed_origin=remote)
         self._token = node.endpoint("MS", topic, type_name, type_hash, qos)
 
-    @property
-    def lost(self) -> int:
-        return sum(self.lost_by.values())
-
     def _heard(self, sample: Any) -> None:
         try:
             if sample.attachment is None:

@@ -6,9 +6,10 @@ import pytest
 from fake_theta import Behaviour, FakeTheta, jpeg, part
 
 from instant_ic.camera.config import ThetaConfig
-from instant_ic.camera.loop import CameraLoop, ReconnectConfig
+from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.camera.theta import NEVER, ThetaCamera, ThetaClient, ThetaError
+from instant_ic.reconnect import Backoff
 
 FRAMES = [jpeg(value) for value in (40, 80, 120, 160)]
 CONFIG = ThetaConfig(settle_s=0.0, busy_wait_s=0.01, connect_timeout_s=20.0, read_timeout_s=20.0)
@@ -158,7 +159,7 @@ def test_loop_connects_again_after_each_end_and_backs_off() -> None:
             ThetaCamera(theta.url, CONFIG),
             lambda frame: received.append(frame.jpeg),
             on_event,
-            ReconnectConfig(min_s=0.1, max_s=0.4),
+            Backoff(0.1, 0.4),
         )
         loop.start()
         assert enough.wait(60.0)
@@ -177,7 +178,7 @@ def test_loop_ends_while_it_waits() -> None:
             ThetaCamera(theta.url, CONFIG),
             lambda frame: None,
             lambda connected, text: failed.set(),
-            ReconnectConfig(min_s=600.0, max_s=600.0),
+            Backoff(600.0, 600.0),
         )
         loop.start()
         assert failed.wait(30.0)
@@ -209,7 +210,7 @@ def test_loop_outlives_and_tells_unexpected_exceptions() -> None:
         FlakyCamera(0.0),
         lambda frame: arrived.set(),
         lambda connected, text: events.append(text),
-        ReconnectConfig(min_s=0.01, max_s=0.01),
+        Backoff(0.01, 0.01),
     )
     loop.start()
     assert arrived.wait(30.0)
