@@ -20,6 +20,7 @@ from typing import Annotated, Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bridge import foxglove_protocol as protocol
 from instant_ic.bridge.commands import CommandGate
 from instant_ic.bridge.foxglove_commands import Commands
@@ -29,7 +30,6 @@ from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Received
 from instant_ic.config.ranges import Range, check_ranges
-from instant_ic.msg import MessageError, typestore
 from instant_ic.web_access import TokenBucket, refusal
 
 _START_S = 10.0
@@ -53,18 +53,6 @@ _http_log.setLevel(logging.CRITICAL)  # a line per malformed request would let s
 
 class FoxgloveError(RuntimeError):
     """The server cannot start; the message says what to do."""
-
-
-def schema_text(type_name: str) -> str:
-    """Return the ``ros2msg`` definition of a type, including nested types.
-
-    Raises:
-        MessageError: the type is unknown.
-    """
-    try:
-        return typestore().generate_msgdef(type_name, ros_version=2)[0]
-    except Exception as error:  # rosbags raises its own error and KeyError
-        raise MessageError(f"no definition of {type_name}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -108,7 +96,6 @@ class FoxgloveServer:
 
     Args:
         node: the bridge's node, on whose bus the server subscribes.
-        config: see :class:`ServerConfig`.
         takes: whether to offer a topic.
         gate: checks the clients' commands.
         server_time: whether to send the time to clients (for simulated time).
@@ -207,10 +194,9 @@ class FoxgloveServer:
         self._tell_graph(present, nodes)
 
     def _offer(self, topic: str, type_name: str) -> bool:
-        try:
-            schema = schema_text(type_name)
-        except MessageError as error:
-            self._node.diagnose(f"topic {topic}", ERROR, str(error))
+        schema = schema_or_unknown(type_name).text
+        if not schema:
+            self._node.diagnose(f"topic {topic}", ERROR, f"no definition of {type_name} here: not offered to Foxglove")
             return False
         with self._lock:
             channel = _Channel(self, self._node, self._next_channel, topic, type_name, schema)

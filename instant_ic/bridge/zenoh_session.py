@@ -307,12 +307,11 @@ class RosPublisher:
 class RosSubscription:
     """A subscription in the ROS graph. It receives only from other sessions, so our own messages do not return.
 
+    Messages of another definition have another key and are not received. A latched subscription requests earlier
+    messages from the publishers.
+
     Args:
-        node: node of the subscription.
-        topic: full name, including the namespace.
-        type_name: ``std_msgs/msg/String``.
-        type_hash: RIHS01 hash of the type; messages of another definition have another key and are not received.
-        qos: quality of service; a latched subscription requests earlier messages from the publishers.
+        node, topic, type_name, type_hash, qos: as for :class:`RosPublisher`.
         on_message: called with ``(payload, attachment)``, in order per publisher, on a Zenoh thread.
 
     Attributes:
