@@ -36,7 +36,7 @@ class ReceiverConfig:
 
     Attributes:
         host: local address; 0.0.0.0 also receives the broadcasts of a sensor with factory settings.
-        port: UDP port of data packets; 0 lets the system choose (see `PacketReceiver.port`).
+        port: UDP port of data packets; 0: any free port.
         position_port: UDP port of position packets; -1: not received.
         sensor: the sensor's IPv4 address; empty: the first sender until the driver restarts.
     """
