@@ -31,7 +31,7 @@ from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_session import Ended, LinkTimes, Side, Up
 from instant_ic.bridge.host_topics import TopicRule
-from instant_ic.bus import SENSOR, Node
+from instant_ic.bus import SENSOR
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.experiments.impaired_link import ImpairedLink, Impairment
@@ -62,9 +62,7 @@ class Host:
     """A node that publishes and subscribes, spinning on its own thread."""
 
     def __init__(self, run_dir: Path, name: str) -> None:
-        self.node: Node[Any] = Observer(
-            _NoParameters(), LocalTransport(run_dir, name, time.time_ns), SystemClock(), name
-        )
+        self.node = Observer(_NoParameters(), LocalTransport(run_dir, name, time.time_ns), SystemClock(), name)
         self.ages_ms: dict[str, list[float]] = {}
         self.thread = threading.Thread(target=self._spin, daemon=True)
         self.stop = threading.Event()
@@ -76,8 +74,7 @@ class Host:
 
     def _spin(self) -> None:
         while not self.stop.is_set():
-            self.node._wake.wait(0.1)
-            self.node._wake.clear()
+            self.node.rest(0.1)
             self.node.spin_once()
 
     def close(self) -> None:
