@@ -53,9 +53,8 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         elif self.lockstep:
             raise NodeError("source udp cannot run in lockstep: use source:=pcap or source:=topic")
         else:
-            self.receiver = PacketReceiver(config, self.feed.sources, self.clock.steady_ns)
             try:
-                self.receiver.connect()
+                self.receiver = PacketReceiver(config, self.feed.sources, self.clock.steady_ns)
             except ReceiverError as error:
                 raise NodeError(str(error)) from error
             self.thread = ReceiverThread(self.receiver, self.on_datagram, self.on_fault)
