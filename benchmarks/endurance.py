@@ -98,7 +98,6 @@ class Figures:
     stacks: int = 0
     ends: Counter[str] = field(default_factory=Counter)
     bags: Counter[str] = field(default_factory=Counter)
-    modes: Counter[int] = field(default_factory=Counter)
     driven_m: float = 0.0
     found: list[dict[str, Any]] = field(default_factory=list)
 
@@ -385,7 +384,6 @@ class Soak:
             truth, lasted_s = made.truth[-1], (made.pace.now_ns() - began_ns) / 1e9
             self.figures.driven_m += float(np.hypot(truth.x - place.x, truth.y - place.y))
             place = truth
-            self.figures.modes[int(made.state.mode)] += 1
             forward = 1.0 if truth.x < 1.0 else -1.0 if truth.x > 6.0 else self._forward
             self._forward = forward
             if made.state.mode == ControlState.STOPPED:

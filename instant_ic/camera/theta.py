@@ -91,7 +91,7 @@ class ThetaClient:
         self._password = password
         self._sleep = sleep
         self._lock = threading.Lock()
-        self._session = self._new_session()
+        self._session = Session(user, password)
 
     def close(self) -> None:
         self._session.close()
@@ -139,7 +139,7 @@ class ThetaClient:
 
     def open_preview(self) -> tuple[Session, requests.Response]:
         """Start ``camera.getLivePreview`` on its own connection; the caller must close both."""
-        session = self._new_session()
+        session = Session(self._user, self._password)
         try:
             body, timeout_s = {"name": "camera.getLivePreview"}, current().timeout_s(self.config.read_timeout_s)
             response = self._request(session, "POST", "/osc/commands/execute", body, timeout_s)
@@ -187,9 +187,6 @@ class ThetaClient:
         refusal = _refusal(self.url + path, body, response.status_code, _json(response) or {})
         response.close()
         raise refusal
-
-    def _new_session(self) -> Session:
-        return Session(self._user, self._password)
 
 
 class ThetaCamera(Camera):
