@@ -89,7 +89,7 @@ class ThetaClient:
         self.config = config
         self._user = user
         self._password = password
-        self._sleep = sleep
+        self.sleep = sleep
         self._lock = threading.Lock()
         self._session = Session(user, password)
 
@@ -120,7 +120,7 @@ class ThetaClient:
         while reply.get("state") == "inProgress":
             if time.monotonic() > deadline:
                 raise CameraError(f"{self.url}: {name} did not finish within {self.config.connect_timeout_s} s")
-            self._sleep(0.1)
+            self.sleep(0.1)
             reply = self._call("POST", "/osc/commands/status", {"id": reply.get("id", "")})
         results = reply.get("results", {})
         return results if isinstance(results, dict) else {}
@@ -180,7 +180,7 @@ class ThetaClient:
                 break
             if attempt < self.config.busy_retries:
                 response.close()
-                self._sleep(wait_s)
+                self.sleep(wait_s)
                 wait_s *= 2.0
         if response.status_code == 200:
             return response
@@ -192,20 +192,10 @@ class ThetaClient:
 class ThetaCamera(Camera):
     """Live preview of a Theta Z1."""
 
-    def __init__(
-        self,
-        url: str,
-        config: ThetaConfig | None = None,
-        user: str = "",
-        password: str = "",
-        now_ns: Callable[[], int] = time.time_ns,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        """Take the same arguments as `ThetaClient`."""
-        self.config = config or ThetaConfig()
+    def __init__(self, client: ThetaClient, now_ns: Callable[[], int] = time.time_ns) -> None:
+        self.config = client.config
         super().__init__(self.config.latency_s, now_ns)
-        self.client = ThetaClient(url, self.config, user, password, sleep)
-        self._sleep = sleep
+        self.client = client
         self._session: Session | None = None
         self._response: requests.Response | None = None
         self._parser = PreviewParser()
@@ -223,7 +213,7 @@ class ThetaCamera(Camera):
         if self.client.options(list(wanted)) != wanted:
             self.client.set_options(wanted)
             # If started sooner, the preview has the previous format or stops at once.
-            self._sleep(config.settle_s)
+            self.client.sleep(config.settle_s)
         self._session, self._response = self.client.open_preview()
         found = re.search(r"boundary=\"?([^\";]+)", self._response.headers.get("Content-Type", ""))
         self._parser = PreviewParser(found.group(1) if found else "")
