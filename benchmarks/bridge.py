@@ -179,8 +179,8 @@ class LinkEnd:
         self.link = link_class(*where, side, {exports.topic: exports}, store, self._note, LinkTimes())
         self.link.start()
 
-    def _note(self, event: Any) -> None:
-        self.events.append((time.monotonic(), event.event))
+    def _note(self, peer: str, event: Any) -> None:
+        self.events.append((time.monotonic(), event))
 
     def since(self, begin_s: float, kind: Any) -> float:
         """Seconds from a time to the first later event of a kind.

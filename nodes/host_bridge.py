@@ -6,7 +6,6 @@ import functools
 import os
 import time
 from pathlib import Path
-from typing import Any
 
 from instant_ic.bridge.host_bus import ExportedTopics, ImportedTopics
 from instant_ic.bridge.host_config import HostBridgeConfig
@@ -73,16 +72,16 @@ class HostBridgeNode(Node[HostBridgeConfig]):
 
     # -- from the link -----------------------------------------------------------------------------
 
-    def on_event(self, event: LinkEvent) -> None:
+    def on_event(self, peer: str, event: LinkEvent) -> None:
         """Publish arriving messages at once, on the link's thread; pass all other events to the node's thread."""
-        if isinstance(event.event, Arrived):
-            self.incoming.take(event.event)
-        elif isinstance(event.event, Announced):
-            self.incoming.open(event.event.announce)
+        if isinstance(event, Arrived):
+            self.incoming.take(event)
+        elif isinstance(event, Announced):
+            self.incoming.open(event.announce)
         else:
-            self.call_soon(self.on_change, event.peer, event.event)
+            self.call_soon(self.on_change, peer, event)
 
-    def on_change(self, peer: str, event: Any) -> None:
+    def on_change(self, peer: str, event: LinkEvent) -> None:
         """Report new and lost links, and refused hosts."""
         match event:
             case Up():
