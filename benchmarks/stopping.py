@@ -46,6 +46,7 @@ from reporting import parser_of, report
 
 from instant_ic import pace
 from instant_ic.bus import LATCHED, registry
+from instant_ic.closing import Closing
 from instant_ic.console.client import ConsoleClient
 from instant_ic.control.states import Reason
 from instant_ic.experiments.drive import pump
@@ -102,7 +103,7 @@ class Truth(NamedTuple):
     speed: float
 
 
-class PacketRelay:
+class PacketRelay(Closing):
     """Forwards UDP packets between two ports of this machine, unless it is cut."""
 
     def __init__(self, source: int, target: int) -> None:
@@ -130,7 +131,7 @@ class PacketRelay:
         self._socket.close()
 
 
-class SerialRelay:
+class SerialRelay(Closing):
     """Serial line between the base driver and the simulated controller that can lose replies or be disconnected."""
 
     def __init__(self, link: Path, controller: Path) -> None:
@@ -208,15 +209,14 @@ class Rig:
 
     stack: Stack
     run_dir: Path
-    console_port: int
     page_link: ImpairedLink
     camera_link: ImpairedLink
     packets: PacketRelay
     serial: SerialRelay
+    pace: pace.Pace
     truth: list[Truth] = field(default_factory=list)
     commands: list[tuple[int, float]] = field(default_factory=list)
     state: Any = None
-    pace: pace.Pace = field(default_factory=pace.Pace)
 
     def watch(self) -> None:
         """Record the true motion, the commands and the arbiter's state."""
@@ -334,25 +334,22 @@ def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
         ends.callback(shutil.rmtree, run_dir, ignore_errors=True)
         page_link = ends.enter_context(ImpairedLink(("127.0.0.1", ports["console"])))
         camera_link = ends.enter_context(ImpairedLink(("127.0.0.1", ports["camera"])))
-        packets = PacketRelay(ports["lidar"], ports["lidar_link"])
-        ends.callback(packets.close)
-        serial = SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw")
-        ends.callback(serial.close)
+        packets = ends.enter_context(PacketRelay(ports["lidar"], ports["lidar_link"]))
+        serial = ends.enter_context(SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw"))
         launch.write_text(text.format(**ports, camera_link=camera_link.port, folder=share_dir("launch")))
         stack = ends.enter_context(Stack(str(launch), run_dir, {}, log, pace=factor))
-        made = Rig(stack, run_dir, ports["console"], page_link, camera_link, packets, serial)
         stack.wait_for(lambda: registry.list_nodes(run_dir), 60, "first node")
-        made.pace = pace.read(run_dir)
+        made = Rig(stack, run_dir, page_link, camera_link, packets, serial, pace.read(run_dir))
         pace.use(made.pace)
         made.watch()
         yield made
 
 
 @contextlib.asynccontextmanager
-async def driver(rig: Rig, tries: int = 40) -> AsyncIterator[ConsoleClient]:
+async def driver(rig: Rig) -> AsyncIterator[ConsoleClient]:
     """A page that drives; retries, because the console may just be restarting."""
     page = ConsoleClient(f"http://127.0.0.1:{rig.page_link.port}/")
-    for left in reversed(range(tries)):
+    for left in reversed(range(40)):
         try:
             await page.connect(5.0)
             break
