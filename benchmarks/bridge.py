@@ -31,7 +31,7 @@ from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_session import Ended, LinkTimes, Side, Up
 from instant_ic.bridge.host_topics import TopicRule
-from instant_ic.bus import SENSOR, Node
+from instant_ic.bus import SENSOR
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.experiments.impaired_link import ImpairedLink, Impairment
@@ -62,9 +62,7 @@ class Host:
     """A node that publishes and subscribes, spinning on its own thread."""
 
     def __init__(self, run_dir: Path, name: str) -> None:
-        self.node: Node[Any] = Observer(
-            _NoParameters(), LocalTransport(run_dir, name, time.time_ns), SystemClock(), name
-        )
+        self.node = Observer(_NoParameters(), LocalTransport(run_dir, name, time.time_ns), SystemClock(), name)
         self.ages_ms: dict[str, list[float]] = {}
         self.thread = threading.Thread(target=self._spin, daemon=True)
         self.stop = threading.Event()
@@ -76,12 +74,10 @@ class Host:
 
     def _spin(self) -> None:
         while not self.stop.is_set():
-            self.node._wake.wait(0.1)
-            self.node._wake.clear()
+            self.node.rest(0.1)
             self.node.spin_once()
 
     def close(self) -> None:
-        """Close the node."""
         self.stop.set()
         self.thread.join(5)
         self.node.close()
@@ -113,7 +109,6 @@ def bridges(folder: Path, network: list[str]) -> Iterator[list[psutil.Process]]:
 
 
 def summary(ages_ms: list[float]) -> dict[str, float]:
-    """Percentiles of the ages."""
     if not ages_ms:
         return {"count": 0}
     p50, p99 = np.percentile(ages_ms, [50, 99])
@@ -121,7 +116,6 @@ def summary(ages_ms: list[float]) -> dict[str, float]:
 
 
 def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
-    """Run one scenario."""
     with tempfile.TemporaryDirectory(prefix="icb") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         processes = [] if network is None else stack.enter_context(bridges(folder, network))
@@ -185,8 +179,8 @@ class LinkEnd:
         self.link = link_class(*where, side, {exports.topic: exports}, store, self._note, LinkTimes())
         self.link.start()
 
-    def _note(self, event: Any) -> None:
-        self.events.append((time.monotonic(), event.event))
+    def _note(self, peer: str, event: Any) -> None:
+        self.events.append((time.monotonic(), event))
 
     def since(self, begin_s: float, kind: Any) -> float:
         """Seconds from a time to the first later event of a kind.

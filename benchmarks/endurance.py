@@ -55,7 +55,7 @@ from instant_ic.experiments.stack import StackError, processes_of
 from instant_ic.launch.nodes import NODE_MAIN
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.launch.process import dies_with_us
-from instant_ic.msg import ControlState
+from instant_ic.msg import ControlState, stamp_ns
 from instant_ic.paths import node_file
 
 MOVES_M_S = 0.02
@@ -98,7 +98,6 @@ class Figures:
     stacks: int = 0
     ends: Counter[str] = field(default_factory=Counter)
     bags: Counter[str] = field(default_factory=Counter)
-    modes: Counter[int] = field(default_factory=Counter)
     driven_m: float = 0.0
     found: list[dict[str, Any]] = field(default_factory=list)
 
@@ -194,7 +193,6 @@ class Recording:
 
     @property
     def pid(self) -> int:
-        """Process id of the recorder."""
         assert self._process is not None
         return self._process.pid
 
@@ -293,20 +291,19 @@ class Soak:
         self.figures.stacks += 1
         self.ending = ""
         log = folder / f"stack{self.figures.stacks}.log"
-        recording: Recording | None = None
         try:
             with rig(self.factor, log, text) as made:
-                recording = Recording(made, folder / "disk", self.figures)
+                self.recording = Recording(made, folder / "disk", self.figures)
                 try:
-                    recording.begin()
-                    asyncio.run(self._drive(made, recording))
+                    self.recording.begin()
+                    asyncio.run(self._drive(made))
                     how = "time is up"
                 except StackError as error:
                     how = self.ending or "by itself"
                     if not self.ending:
                         self.figures.report("not back", "", error=str(error)[-1500:], log=str(log))
                 finally:
-                    recording.end("end of the stack")
+                    self.recording.end("end of the stack")
                 status = self._stop(made)
                 note(f"stack {self.figures.stacks} ended: {how}, status {status}")
                 self.figures.ends[how] += 1
@@ -335,25 +332,25 @@ class Soak:
 
     # -- one drive after another -------------------------------------------------------------------
 
-    async def _drive(self, made: Rig, recording: Recording) -> None:
+    async def _drive(self, made: Rig) -> None:
         async with pump(made.stack) as until:
-            beside = asyncio.create_task(self._look(made, recording))
+            beside = asyncio.create_task(self._look(made))
             try:
                 await until(made.ready, 240, "stack that can be driven")
                 while time.monotonic() < self.end_s:
-                    await self._one(made, recording, until)
+                    await self._one(made, until)
             finally:
                 beside.cancel()
                 with contextlib.suppress(asyncio.CancelledError):
                     await beside
 
-    async def _look(self, made: Rig, recording: Recording) -> None:
+    async def _look(self, made: Rig) -> None:
         while True:
             await asyncio.sleep(0.5)
             self.levels.look(made.run_dir)
-            recording.look()
+            self.recording.look()
 
-    async def _one(self, made: Rig, recording: Recording, until: Any) -> None:
+    async def _one(self, made: Rig, until: Any) -> None:
         """Drive for a while, cause one fault, and check that the robot can be driven again."""
         fault = self.rng.choice(self.faults)
         if fault in RARE and self.rng.random() < 0.8 and len(self.faults) > len(RARE):
@@ -372,7 +369,7 @@ class Soak:
                 if fault.startswith("emergency stop"):
                     await self._estop(made, page, until, fault)
                 else:
-                    await self._lose(made, page, until, recording, fault, lets_go, holds_s)
+                    await self._lose(made, page, until, fault, lets_go, holds_s)
         if self.ending:
             await until(lambda: False, 0.0, "end")
         await self._again(made, fault)
@@ -387,7 +384,6 @@ class Soak:
             truth, lasted_s = made.truth[-1], (made.pace.now_ns() - began_ns) / 1e9
             self.figures.driven_m += float(np.hypot(truth.x - place.x, truth.y - place.y))
             place = truth
-            self.figures.modes[int(made.state.mode)] += 1
             forward = 1.0 if truth.x < 1.0 else -1.0 if truth.x > 6.0 else self._forward
             self._forward = forward
             if made.state.mode == ControlState.STOPPED:
@@ -401,25 +397,17 @@ class Soak:
     _forward = 1.0
 
     async def _lose(
-        self,
-        made: Rig,
-        page: ConsoleClient,
-        until: Any,
-        recording: Recording,
-        fault: str,
-        lets_go: bool,
-        holds_s: float,
+        self, made: Rig, page: ConsoleClient, until: Any, fault: str, lets_go: bool, holds_s: float
     ) -> None:
         modes = {int(made.state.mode)}
         lost_ns = made.pace.now_ns()
         name, _, how = fault.partition(" ")
-        back_ns: int | None = None
         if fault == "recorder killed":
-            recording.end(fault, killed=True)
-            recording.begin()
+            self.recording.end(fault, killed=True)
+            self.recording.begin()
             return
         if fault == "disk full":
-            await recording.fill_disk(holds_s)
+            await self.recording.fill_disk(holds_s)
             return
         if fault == "launcher killed":
             self.ending = fault
@@ -505,9 +493,7 @@ class Soak:
 
 
 def fresh(made: Rig) -> bool:
-    """Whether the arbiter's state is recent."""
-    stamp = made.state.header.stamp
-    return bool(made.pace.now_ns() - (stamp.sec * 10**9 + stamp.nanosec) < 1e9)
+    return bool(made.pace.now_ns() - stamp_ns(made.state) < 1e9)
 
 
 def alive(made: Rig, name: str, other_than: int) -> bool:

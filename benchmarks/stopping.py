@@ -46,6 +46,7 @@ from reporting import parser_of, report
 
 from instant_ic import pace
 from instant_ic.bus import LATCHED, registry
+from instant_ic.closing import Closing
 from instant_ic.console.client import ConsoleClient
 from instant_ic.control.states import Reason
 from instant_ic.experiments.drive import pump
@@ -102,7 +103,7 @@ class Truth(NamedTuple):
     speed: float
 
 
-class PacketRelay:
+class PacketRelay(Closing):
     """Forwards UDP packets between two ports of this machine, unless it is cut."""
 
     def __init__(self, source: int, target: int) -> None:
@@ -125,13 +126,12 @@ class PacketRelay:
                 continue
 
     def close(self) -> None:
-        """Stop forwarding."""
         self._ends.set()
         self._thread.join(2.0)
         self._socket.close()
 
 
-class SerialRelay:
+class SerialRelay(Closing):
     """Serial line between the base driver and the simulated controller that can lose replies or be disconnected."""
 
     def __init__(self, link: Path, controller: Path) -> None:
@@ -165,7 +165,6 @@ class SerialRelay:
             self._master = self._slave = -1
 
     def close(self) -> None:
-        """Close the line."""
         self._ends.set()
         self._thread.join(2.0)
         for descriptor in (self._master, self._slave, self._far):
@@ -210,15 +209,14 @@ class Rig:
 
     stack: Stack
     run_dir: Path
-    console_port: int
     page_link: ImpairedLink
     camera_link: ImpairedLink
     packets: PacketRelay
     serial: SerialRelay
+    pace: pace.Pace
     truth: list[Truth] = field(default_factory=list)
     commands: list[tuple[int, float]] = field(default_factory=list)
     state: Any = None
-    pace: pace.Pace = field(default_factory=pace.Pace)
 
     def watch(self) -> None:
         """Record the true motion, the commands and the arbiter's state."""
@@ -258,48 +256,42 @@ class Rig:
         raise StackError(f"node {node} does not run")
 
 
-@dataclass(frozen=True)
-class Fault:
-    """A fault: functions that cause it and end it, given the rig and the operator's page."""
+Act = Callable[[Rig, ConsoleClient], Awaitable[None] | None]
+
+
+class Fault(NamedTuple):
+    """A fault: functions that cause it and end it, given the rig and the operator's page.
+
+    Most end by themselves: the launcher restarts a killed process, and each drive has its own page.
+    """
 
     name: str
-    breaks: Callable[[Rig, ConsoleClient], Awaitable[None]]
-    mends: Callable[[Rig, ConsoleClient], Awaitable[None]]
+    breaks: Act
+    mends: Act = lambda rig, page: None
 
 
-async def nothing(rig: Rig, page: ConsoleClient) -> None:
-    """Recovery without action: the launcher restarts a killed process, and each drive has its own page."""
-
-
-def at_once(does: Callable[[Rig], object]) -> Callable[[Rig, ConsoleClient], Awaitable[None]]:
-    """Wrap a function that needs only the rig."""
-
-    async def act(rig: Rig, page: ConsoleClient) -> None:
-        does(rig)
-
-    return act
+async def act(does: Act, rig: Rig, page: ConsoleClient) -> None:
+    """Cause or end a fault."""
+    if (pending := does(rig, page)) is not None:
+        await pending
 
 
 def process_faults(node: str) -> list[Fault]:
-    """Faults of a node: frozen and killed."""
     frozen: list[int] = []
 
-    def freeze(rig: Rig) -> None:
+    def freeze(rig: Rig, page: ConsoleClient) -> None:
         frozen[:] = [rig.pid(node)]
         os.kill(frozen[0], signal.SIGSTOP)
 
     return [
-        Fault(f"{node} frozen", at_once(freeze), at_once(lambda rig: os.kill(frozen[0], signal.SIGCONT))),
-        Fault(f"{node} killed", at_once(lambda rig: os.kill(rig.pid(node), signal.SIGKILL)), nothing),
+        Fault(f"{node} frozen", freeze, lambda rig, page: os.kill(frozen[0], signal.SIGCONT)),
+        Fault(f"{node} killed", lambda rig, page: os.kill(rig.pid(node), signal.SIGKILL)),
     ]
 
 
-async def let_go(rig: Rig, page: ConsoleClient) -> None:
-    await page.stop()
-
-
-async def press_estop(rig: Rig, page: ConsoleClient) -> None:
-    await page.estop()
+def link_fault(name: str) -> Fault:
+    breaks, mends = LINKS[name]
+    return Fault(name, lambda rig, page: breaks(rig), lambda rig, page: mends(rig))
 
 
 async def release_estop(rig: Rig, page: ConsoleClient) -> None:
@@ -307,16 +299,12 @@ async def release_estop(rig: Rig, page: ConsoleClient) -> None:
     await page.release_estop()
 
 
-async def close_page(rig: Rig, page: ConsoleClient) -> None:
-    await page.close()
-
-
-async def silence_page(rig: Rig, page: ConsoleClient) -> None:
+def silence_page(rig: Rig, page: ConsoleClient) -> None:
     for task in page._tasks:
         task.cancel()
 
 
-LINKS: dict[str, tuple[Callable[[Rig], object], Callable[[Rig], object]]] = {
+LINKS: dict[str, tuple[Callable[[Rig], None], Callable[[Rig], None]]] = {
     "page link cut": (lambda rig: rig.page_link.cut(), lambda rig: rig.page_link.mend()),
     "camera link cut": (lambda rig: rig.camera_link.cut(), lambda rig: rig.camera_link.mend()),
     "LiDAR packets cease": (lambda r: setattr(r.packets, "cut", True), lambda r: setattr(r.packets, "cut", False)),
@@ -326,11 +314,11 @@ LINKS: dict[str, tuple[Callable[[Rig], object], Callable[[Rig], object]]] = {
 """Faults of links: functions that cause and end them."""
 FAULTS = [
     *(fault for node in PROCESSES for fault in process_faults(node)),
-    Fault("emergency stop pressed", press_estop, release_estop),
-    Fault("key let go (no loss; soft ramp)", let_go, nothing),
-    Fault("page closed", close_page, nothing),
-    Fault("page silent", silence_page, nothing),
-    *(Fault(name, at_once(breaks), at_once(mends)) for name, (breaks, mends) in LINKS.items()),
+    Fault("emergency stop pressed", lambda rig, page: page.estop(), release_estop),
+    Fault("key let go (no loss; soft ramp)", lambda rig, page: page.stop()),
+    Fault("page closed", lambda rig, page: page.close()),
+    Fault("page silent", silence_page),
+    *map(link_fault, LINKS),
 ]
 
 
@@ -346,25 +334,22 @@ def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
         ends.callback(shutil.rmtree, run_dir, ignore_errors=True)
         page_link = ends.enter_context(ImpairedLink(("127.0.0.1", ports["console"])))
         camera_link = ends.enter_context(ImpairedLink(("127.0.0.1", ports["camera"])))
-        packets = PacketRelay(ports["lidar"], ports["lidar_link"])
-        ends.callback(packets.close)
-        serial = SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw")
-        ends.callback(serial.close)
+        packets = ends.enter_context(PacketRelay(ports["lidar"], ports["lidar_link"]))
+        serial = ends.enter_context(SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw"))
         launch.write_text(text.format(**ports, camera_link=camera_link.port, folder=share_dir("launch")))
         stack = ends.enter_context(Stack(str(launch), run_dir, {}, log, pace=factor))
-        made = Rig(stack, run_dir, ports["console"], page_link, camera_link, packets, serial)
         stack.wait_for(lambda: registry.list_nodes(run_dir), 60, "first node")
-        made.pace = pace.read(run_dir)
+        made = Rig(stack, run_dir, page_link, camera_link, packets, serial, pace.read(run_dir))
         pace.use(made.pace)
         made.watch()
         yield made
 
 
 @contextlib.asynccontextmanager
-async def driver(rig: Rig, tries: int = 40) -> AsyncIterator[ConsoleClient]:
+async def driver(rig: Rig) -> AsyncIterator[ConsoleClient]:
     """A page that drives; retries, because the console may just be restarting."""
     page = ConsoleClient(f"http://127.0.0.1:{rig.page_link.port}/")
-    for left in reversed(range(tries)):
+    for left in reversed(range(40)):
         try:
             await page.connect(5.0)
             break
@@ -410,11 +395,10 @@ async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> 
 
 
 async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[str, Any]:
-    """Run one drive that ends with one fault."""
     async with driver(rig) as page:
         cruise = await at_speed(rig, until, page, 0.7 + rng.uniform(0.0, 0.1))  # not in phase with any timer
         lost_ns = rig.pace.now_ns()
-        await fault.breaks(rig, page)
+        await act(fault.breaks, rig, page)
         try:
 
             def over() -> bool:
@@ -428,7 +412,7 @@ async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[st
                 with contextlib.suppress(ConnectionError, OSError):
                     await page.stop()
         finally:
-            await fault.mends(rig, page)
+            await act(fault.mends, rig, page)
     return figures
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from instant_ic.lidar.config import Vlp16DriverConfig
 from instant_ic.lidar.feed import Packets
-from instant_ic.lidar.flatscan import FlatScan
 from instant_ic.lidar.stream import Revolution
 from instant_ic.msg import VelodynePacket, VelodyneScan, header, scan_message, to_time
 
@@ -20,8 +20,8 @@ def packets_message(packets: Packets, revolution: Revolution, frame: str) -> Any
     return VelodyneScan(header=header(frame, stamp), packets=data)
 
 
-def flat_scan_message(scan: FlatScan, revolution: Revolution, config: Vlp16DriverConfig) -> Any:
-    """LaserScan of a revolution's flat scan."""
-    angles, limits = (scan.angle_min, scan.angle_increment), (config.scan.range_min, config.scan.range_max)
+def flat_scan_message(ranges: NDArray[np.float32], revolution: Revolution, config: Vlp16DriverConfig) -> Any:
+    """LaserScan of the flat scan's ranges (beams,) of a revolution."""
+    angles, limits = (-np.pi, 2.0 * np.pi / len(ranges)), (config.scan.range_min, config.scan.range_max)
     duration_s = (revolution.end_ns - revolution.stamp_ns) * 1e-9
-    return scan_message(scan.ranges, *angles, *limits, config.frame_id, scan.stamp_ns, scan_time=duration_s)
+    return scan_message(ranges, *angles, *limits, config.frame_id, revolution.end_ns, scan_time=duration_s)

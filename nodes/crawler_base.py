@@ -25,7 +25,6 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     open_port: Callable[[RoboclawConfig], SerialPort] = staticmethod(open_serial)
 
     def setup(self) -> None:
-        """Create the topics and the control loop."""
         config = self.config
         try:
             refuse_pace(current(), config.roboclaw.port, self.run_dir)
@@ -102,7 +101,6 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.call_soon(self.on_state, state)
 
     def on_state(self, state: BaseState) -> None:
-        """Publish the state of link and controller."""
         if state.link:
             self.diagnose_all(self.report.link(state.connected, state.link, self.clock.steady_ns()))
         if state.health is not None:

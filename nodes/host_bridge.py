@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import time
 from pathlib import Path
-from typing import Any
 
 from instant_ic.bridge.host_bus import ExportedTopics, ImportedTopics
 from instant_ic.bridge.host_config import HostBridgeConfig
 from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyFileError, KeyStore
-from instant_ic.bridge.host_link import (
-    Failed,
-    HostLink,
-    LinkError,
-    LinkEvent,
-    Problem,
-    Stranger,
-)
+from instant_ic.bridge.host_link import Failed, HostLink, LinkError, LinkEvent, Problem, Stranger
 from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_report import LinkReport
 from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, Ended, Refused, Side, Up
@@ -45,7 +38,6 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         to_station, to_robot = parse_rules(config.to_station), parse_rules(config.to_robot)
         exports, imports = (to_station, to_robot) if listening else (to_robot, to_station)
         store = KeyStore(Path(config.keys).expanduser() if config.keys else None)
-        self.incoming = ImportedTopics(self, imports, lambda topic, text: self.call_soon(self.trouble, topic, text))
         try:
             identity = store.identity()
             side = Side(identity.name, os.urandom(8).hex(), imports, type_hash)
@@ -59,8 +51,9 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 self.log.info("connects to %s at %s as %s", robot.name, config.connect, identity.name)
         except (KeyFileError, LinkError) as error:
             raise NodeError(str(error)) from None
-        self.outgoing = ExportedTopics(self, exports, self.link, self.trouble)
         self.report = LinkReport(self.link, self.diagnose, {*to_station, *to_robot})
+        self.outgoing = ExportedTopics(self, exports, self.link, self.report.trouble)
+        self.incoming = ImportedTopics(self, imports, functools.partial(self.call_soon, self.report.trouble))
         self.next_step_s = 0.0
         self.outgoing.look()
         self.link.start()
@@ -73,23 +66,22 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             self.link.stop()
 
     def reconfigure(self, config: HostBridgeConfig) -> None:
-        """Apply a change of the driving host."""
         super().reconfigure(config)
         if isinstance(self.link, ListeningLink):
             self.link.wanted_driver = config.driver
 
     # -- from the link -----------------------------------------------------------------------------
 
-    def on_event(self, event: LinkEvent) -> None:
+    def on_event(self, peer: str, event: LinkEvent) -> None:
         """Publish arriving messages at once, on the link's thread; pass all other events to the node's thread."""
-        if isinstance(event.event, Arrived):
-            self.incoming.take(event.event)
-        elif isinstance(event.event, Announced):
-            self.incoming.open(event.event.announce)
+        if isinstance(event, Arrived):
+            self.incoming.take(event)
+        elif isinstance(event, Announced):
+            self.incoming.open(event.announce)
         else:
-            self.call_soon(self.on_change, event.peer, event.event)
+            self.call_soon(self.on_change, peer, event)
 
-    def on_change(self, peer: str, event: Any) -> None:
+    def on_change(self, peer: str, event: LinkEvent) -> None:
         """Report new and lost links, and refused hosts."""
         match event:
             case Up():
@@ -102,7 +94,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 self.update()
             case Refused():
                 where = "here" if event.here else f"by {peer}"
-                self.trouble(event.topic, f"refused {where}: {event.reason}")
+                self.report.trouble(event.topic, f"refused {where}: {event.reason}")
             case ClockStepped():
                 if time.monotonic() >= self.next_step_s:  # a peer must not fill the disk
                     self.next_step_s = time.monotonic() + 1.0
@@ -122,12 +114,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 self.report.problem = event.text
                 self.update()
 
-    def trouble(self, topic: str, text: str) -> None:
-        """Report a topic that is not transferred."""
-        self.report.trouble(topic, text)
-
     def update(self) -> None:
-        """Report the state of the link, clocks, topics and refused hosts."""
         self.report.update(self.config.max_offset_ms)
 
 

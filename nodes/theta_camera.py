@@ -18,7 +18,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
     live_parameters = ("silence_s", "camera_mount")
 
     def setup(self) -> None:
-        """Create the topics, the mount and the loop that reads the camera."""
         config = self.config
         self.loop: CameraLoop | None = None
         self.out = self.publisher("/camera/image/compressed", CompressedImage, qos=SENSOR)
@@ -35,7 +34,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             self.camera,
             on_frame=self.publish,
             on_event=lambda connected, text: self.call_soon(self.on_event, connected, text),
-            reconnect=config.reconnect,
         )
         if isinstance(self.camera, ThetaCamera):
             worker = self.background(health, self.diagnose_all)
@@ -44,7 +42,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.loop.start()
 
     def broadcast_mount(self) -> None:
-        """Broadcast the camera's mount on the robot."""
         self.tf_broadcast_static("base_link", self.config.frame_id, pose_matrix(*self.config.camera_mount.pose))
 
     def reconfigure(self, config: ThetaCameraConfig) -> None:
@@ -69,7 +66,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.published += 1
 
     def on_event(self, connected: bool, text: str) -> None:
-        """Report a connection or its loss."""
         self.diagnose("camera", OK if connected else ERROR, text)
 
     def check(self) -> None:

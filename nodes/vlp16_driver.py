@@ -28,7 +28,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     live_parameters = ("silence_s", "scan")
 
     def setup(self) -> None:
-        """Create the topics, the mount and the packet source."""
         config = self.config
         warm_up()
         self.thread: ReceiverThread | None = None
@@ -54,9 +53,8 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         elif self.lockstep:
             raise NodeError("source udp cannot run in lockstep: use source:=pcap or source:=topic")
         else:
-            self.receiver = PacketReceiver(config.receiver(), self.feed.sources, self.clock.steady_ns)
             try:
-                self.receiver.connect()
+                self.receiver = PacketReceiver(config, self.feed.sources, self.clock.steady_ns)
             except ReceiverError as error:
                 raise NodeError(str(error)) from error
             self.thread = ReceiverThread(self.receiver, self.on_datagram, self.on_fault)
@@ -67,7 +65,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.call_soon(self.stop)
 
     def on_packets(self, message: Any) -> None:
-        """Take the packets of a bag."""
         for packet in message.packets:
             self.take(packet.data.tobytes(), stamp_ns(packet))
 
@@ -80,7 +77,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             raise NodeError(f"pcap: {error}") from error
 
     def play(self) -> None:
-        """Take the packets of the capture that are due."""
         if self.player.ended:
             return
         for stamp, port, payload in self.player.due(self.clock.steady_ns()):
@@ -120,7 +116,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.call_soon(self.on_revolution, revolution, packets)
 
     def on_revolution(self, revolution: Revolution, packets: Packets) -> None:
-        """Publish packets, points and scan of one revolution."""
         config = self.config
         if self.thread is not None:
             self.waiting -= 1
@@ -131,9 +126,9 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             return
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))
         if self.report.covers(revolution, config.scan.min_coverage):
-            scan, state = compensated_scan(revolution, self.base_from_lidar, config.scan, self.tf)
+            ranges, state = compensated_scan(revolution, self.base_from_lidar, config.scan, self.tf)
             self.diagnose_all(state)
-            self.scan.publish(flat_scan_message(scan, revolution, config))
+            self.scan.publish(flat_scan_message(ranges, revolution, config))
 
     def check(self) -> None:
         """Report silence and losses; each second."""

@@ -90,7 +90,6 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self.look()
 
     def try_again(self) -> None:
-        """Try the router again."""
         if self.session is None and not self._opener.busy:
             self._opener.submit(None)
 
@@ -101,7 +100,6 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self.incoming.reconcile()
 
     def report(self) -> None:
-        """Report links, counts and losses."""
         if self.session is None:
             return
         routers, peers = self.session.routers(), self.session.peers()

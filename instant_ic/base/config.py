@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from instant_ic.base.protocol import BAUD_RATES
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, Range, check_ranges, require
+from instant_ic.config.ranges import NotNegativeInt, Positive, Range, check_ranges, require
 from instant_ic.config.robot import MotionLimits
 
 
@@ -57,28 +57,6 @@ class LimitsConfig(MotionLimits):
 
 
 @dataclass(frozen=True)
-class OdometryNoiseConfig:
-    """Growth of the odometry's uncertainty.
-
-    Attributes:
-        position_per_metre: variance added to the position per metre driven, m^2/m.
-        yaw_per_metre: variance added to the yaw per metre driven, rad^2/m.
-        yaw_per_radian: variance added to the yaw per radian turned, because tracks slip, rad^2/rad.
-        v_floor: standard deviation of the speed at rest, m/s.
-        w_floor: standard deviation of the turn rate at rest, rad/s.
-    """
-
-    position_per_metre: NotNegative = 0.0004
-    yaw_per_metre: NotNegative = 0.0004
-    yaw_per_radian: NotNegative = 0.01
-    v_floor: NotNegative = 0.005
-    w_floor: NotNegative = 0.01
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
-
-@dataclass(frozen=True)
 class RoboclawConfig:
     """Serial link to the motor controller.
 
@@ -89,8 +67,6 @@ class RoboclawConfig:
         reply_timeout_s: longest wait for a reply; then the motors are stopped before the command is repeated.
         retries: repeats of a command before the link counts as lost.
         watchdog_s: the controller itself stops the motors after this time without a packet; steps of 0.1 s.
-        reconnect_min_s: first wait before the port is reopened.
-        reconnect_max_s: longest wait before the port is reopened; waits double up to it, at the start only after 15 s.
     """
 
     port: str = "/dev/ttyACM0"
@@ -99,14 +75,11 @@ class RoboclawConfig:
     reply_timeout_s: Positive = 0.1
     retries: NotNegativeInt = 2
     watchdog_s: Annotated[float, Range(0.1, 1)] = 0.3
-    reconnect_min_s: Positive = 0.2
-    reconnect_max_s: Positive = 2.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
         require(self, "port", self.port != "", "the path of a serial device")
         require(self, "baud", self.baud in BAUD_RATES, f"one of {BAUD_RATES}")
-        require(self, "reconnect_min_s", self.reconnect_min_s <= self.reconnect_max_s, "at most reconnect_max_s")
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from instant_ic.reconnect import Backoff
 
 _COUNTED_SINCE_M = 0.2
 """Largest count, in metres of track, that a restarted controller can reach before the next reading."""
-
-
+_RECONNECT_MIN_S, RECONNECT_MAX_S = 0.2, 2.0
+"""Waits before the port is reopened; see :class:`Backoff`."""
 _SURE_WITHIN_S = 0.025
 """A reading that took longer may be as much older than its stamp: the process had to wait for the processor."""
 _UNSURE_AFTER_S = 0.2
@@ -100,7 +100,7 @@ class BaseController:
         self._placed_ns: int | None = None  # the last reading that the odometry took
         self._next_health_ns = 0
         self._next_connect_ns = 0
-        self._backoff = Backoff(config.roboclaw.reconnect_min_s, config.roboclaw.reconnect_max_s)
+        self._backoff = Backoff(_RECONNECT_MIN_S, RECONNECT_MAX_S)
 
     def command(self, v: float, w: float, given_ns: int, hard: bool = False) -> None:
         """Set the command that the base follows from now on.
@@ -325,10 +325,8 @@ class SteppedController(ControllerThread):
         """Start no thread."""
 
     def hurry(self) -> None:
-        """Run a step."""
         self._on_state(self._controller.step())
 
     def end(self, timeout_s: float = 0.0) -> bool:
-        """Stop the motors; return True."""
         self._on_end(None, self._controller.close())
         return True

@@ -5,13 +5,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from instant_ic.base.config import OdometryNoiseConfig, SkidSteerConfig
+from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
 from instant_ic.geometry.poses import planar_covariance
 
 _MAX_TRACK_SPEED = 3.0  # m/s; a reading that implies more is rejected
 UNMEASURED_VARIANCE = 1e6
 """Variance of z, roll and pitch, which encoders do not measure."""
+
+# Growth of the uncertainty: variance added per metre driven or per radian turned (tracks slip), and the standard
+# deviations at rest.
+_POSITION_PER_METRE = 0.0004  # m^2/m
+_YAW_PER_METRE = 0.0004  # rad^2/m
+_YAW_PER_RADIAN = 0.01  # rad^2/rad
+_V_FLOOR = 0.005  # m/s
+_W_FLOOR = 0.01  # rad/s
 
 
 @dataclass(frozen=True)
@@ -41,15 +49,9 @@ class WheelOdometry:
             stays, and integration continues from the new reading.
     """
 
-    def __init__(self, geometry: SkidSteerConfig, noise: OdometryNoiseConfig | None = None) -> None:
-        """Start at the origin of odom.
-
-        Args:
-            geometry: tracks and encoders.
-            noise: growth of the uncertainty.
-        """
+    def __init__(self, geometry: SkidSteerConfig) -> None:
+        """Start at the origin of odom."""
         self.kinematics = SkidSteer(geometry)
-        self.noise = noise or OdometryNoiseConfig()
         self.rejected = 0
         self._pose = np.zeros(3)
         self._covariance = np.zeros((3, 3))
@@ -108,8 +110,8 @@ class WheelOdometry:
         jacobian[:2, 2] = (-moved[1], moved[0])
         gained = np.zeros((3, 3))
         distance = float(np.hypot(dx, dy))
-        gained[:2, :2] = np.eye(2) * self.noise.position_per_metre * distance
-        gained[2, 2] = self.noise.yaw_per_metre * distance + self.noise.yaw_per_radian * abs(dyaw)
+        gained[:2, :2] = np.eye(2) * _POSITION_PER_METRE * distance
+        gained[2, 2] = _YAW_PER_METRE * distance + _YAW_PER_RADIAN * abs(dyaw)
         self._covariance = jacobian @ self._covariance @ jacobian.T + gained
 
         self._pose[:2] += moved
@@ -118,14 +120,9 @@ class WheelOdometry:
     def _twist_covariance(self, step: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
         """Covariance of the mean twist over the step: growth of the pose variance per second plus a floor, (6, 6)."""
         distance, turn = abs(float(step[0])), abs(float(step[2]))
-        planar = np.diag(
-            [
-                self.noise.v_floor**2 + self.noise.position_per_metre * distance / dt_s,
-                self.noise.v_floor**2 + self.noise.position_per_metre * distance / dt_s,
-                self.noise.w_floor**2 + (self.noise.yaw_per_metre * distance + self.noise.yaw_per_radian * turn) / dt_s,
-            ]
-        )
-        return planar_covariance(planar, UNMEASURED_VARIANCE)
+        v_variance = _V_FLOOR**2 + _POSITION_PER_METRE * distance / dt_s
+        w_variance = _W_FLOOR**2 + (_YAW_PER_METRE * distance + _YAW_PER_RADIAN * turn) / dt_s
+        return planar_covariance(np.diag([v_variance, v_variance, w_variance]), UNMEASURED_VARIANCE)
 
 
 def unwrap_counts(before: NDArray[np.int64], now: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -3,9 +3,9 @@
 Source: Basicmicro, RoboClaw User Manual, chapter "Packet Serial".
 """
 
+import binascii
 import struct
 from enum import IntEnum
-from functools import cache
 
 BAUD_RATES = (2400, 9600, 19200, 38400, 57600, 115200, 230400, 460800)
 ADDRESSES = range(0x80, 0x88)
@@ -73,24 +73,9 @@ class ProtocolError(Exception):
     """A missing, truncated or damaged reply; the text names the command and the received bytes."""
 
 
-@cache
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte << 8
-        for _ in range(8):
-            crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
-        table.append(crc)
-    return tuple(table)
-
-
 def crc16(data: bytes) -> int:
     """CRC-16/XMODEM: polynomial 0x1021, initial 0, most significant bit first."""
-    table = _crc_table()
-    crc = 0
-    for byte in data:
-        crc = ((crc << 8) & 0xFFFF) ^ table[(crc >> 8) ^ byte]
-    return crc
+    return binascii.crc_hqx(data, 0)
 
 
 def write_frame(address: int, command: int, data: bytes = b"") -> bytes:

@@ -58,7 +58,6 @@ class BaseReport:
         yield Diagnosis("encoders", Level.WARN if jumps else Level.OK, text, {"rejected": rejected})
 
     def health(self, health: Health) -> Iterator[Diagnosis]:
-        """Battery and faults."""
         empty_v = self.config.battery_empty_v
         low = health.battery_v < empty_v
         text = f"{health.battery_v:.1f} V" + (f", below {empty_v} V: charge it" if low else "")

@@ -5,8 +5,7 @@ import termios
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,12 +68,10 @@ class Status:
 
     @property
     def faults(self) -> list[str]:
-        """Texts of the faults."""
         return describe_status(self.value, self.size)[0]
 
     @property
     def warnings(self) -> list[str]:
-        """Texts of the warnings."""
         return describe_status(self.value, self.size)[1]
 
 
@@ -146,9 +143,9 @@ class Roboclaw:
     has acknowledged it.
 
     Example:
-        >>> with Roboclaw(RoboclawConfig(port="/dev/ttyACM0")) as roboclaw:   # doctest: +SKIP
+        >>> with closing(Roboclaw(RoboclawConfig(port="/dev/ttyACM0"))) as roboclaw:   # doctest: +SKIP
+        ...     print(roboclaw.connect(), roboclaw.battery_v())
         ...     roboclaw.drive([1000.0, 1000.0], acceleration_pps2=4000.0)
-        ...     print(roboclaw.encoders(), roboclaw.battery_v())
     """
 
     def __init__(
@@ -204,20 +201,6 @@ class Roboclaw:
         if port is not None:
             port.close()
 
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop the motors and release the port in every case."""
-        try:
-            if self.connected:
-                self.stop()
-        finally:
-            self.close()
-
     def drive(self, speed_pps: NDArray[np.float64] | list[float], acceleration_pps2: float) -> None:
         """Set closed-loop speeds of M1 and M2, pulses/s, with a ramp, pulses/s^2 (command 40)."""
         m1, m2 = (round(float(speed)) for speed in speed_pps)
@@ -225,7 +208,7 @@ class Roboclaw:
 
     def stop(self) -> None:
         """Set both motors to speed zero without a ramp (command 37)."""
-        self._acknowledge(Command.SPEED_BOTH, self._stop_frame)
+        self._transact(Command.SPEED_BOTH, _acknowledged, self._stop_frame)
 
     def set_watchdog(self, timeout_s: float) -> None:
         """Make the controller stop the motors after this time without a packet; rounded down to 0.1 s (command 14)."""
@@ -288,11 +271,8 @@ class Roboclaw:
             # port has already raised a LinkError.
             return
 
-    def _write(self, command: int, data: bytes = b"") -> None:
-        self._acknowledge(command, write_frame(self.config.address, command, data))
-
-    def _acknowledge(self, command: int, frame: bytes) -> None:
-        self._transact(command, _acknowledged, frame)
+    def _write(self, command: int, data: bytes) -> None:
+        self._transact(command, _acknowledged, write_frame(self.config.address, command, data))
 
     def _read(self, command: int, size: int) -> bytes:
         return self._transact(command, self._reply(size))

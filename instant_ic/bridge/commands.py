@@ -33,7 +33,7 @@ class CommandLimits:
 
 
 class CommandGate:
-    """Accepts or refuses each command; independent of bus and clock.
+    """Accepts or refuses each command; independent of bus and clock. Each check raises :class:`CommandRefused`.
 
     Attributes:
         refused: reason → number of refused commands.
@@ -46,11 +46,7 @@ class CommandGate:
         self._driver_ns = 0
 
     def check_age(self, source_ns: int, now_ns: int) -> None:
-        """Refuse an old command, or one from the future, whose age is unknown.
-
-        Raises:
-            CommandRefused: the stamp is too old or too far ahead.
-        """
+        """Refuse an old command, or one from the future, whose age is unknown."""
         age_s = (now_ns - source_ns) / 1e9
         if age_s > self.limits.max_age_s:
             raise self.refuse("old", f"{age_s:.2f} s old, at most {self.limits.max_age_s:g} s allowed")
@@ -61,9 +57,6 @@ class CommandGate:
         """Refuse implausible values (m/s, rad/s), and a second driver.
 
         ``steady_ns`` comes from a clock that is never set, since it measures the lease.
-
-        Raises:
-            CommandRefused: a value is not finite or beyond the limits, or another sender drives.
         """
         if not (math.isfinite(v) and math.isfinite(w)):
             raise self.refuse("not finite", f"v {v}, w {w}: not finite")
@@ -75,11 +68,7 @@ class CommandGate:
         self._driver, self._driver_ns = sender, steady_ns
 
     def check_release(self, sender: str, steady_ns: int) -> None:
-        """Refuse to release the emergency stop unless the sender is the driver and its commands are current.
-
-        Raises:
-            CommandRefused: the sender does not drive.
-        """
+        """Refuse to release the emergency stop unless the sender is the driver and its commands are current."""
         if self._driver != sender or steady_ns - self._driver_ns > self.limits.lease_s * 1e9:
             raise self.refuse("release", f"{sender} does not drive; only the driver may release the emergency stop")
 

@@ -35,7 +35,6 @@ class Commands:
         self._stop: Publisher = node.publisher(STOP, message_type("Bool"), LATCHED)
 
     def advertised(self, client: int, channel: ClientChannel) -> None:
-        """Handle a client's ``advertise``."""
         kinds = _COMMAND_TYPES.get(channel.topic)
         name = channel.schema_name.rsplit("/", 1)[-1]
         if kinds is None or name not in kinds or channel.encoding not in ("cdr", "json"):
@@ -58,7 +57,6 @@ class Commands:
         self._told.pop(client, None)
 
     def message(self, client: int, channel_id: int, data: bytes) -> None:
-        """Handle a client's message."""
         channel = self._channels.get((client, channel_id))
         if channel is None:  # reported when it was advertised
             return

@@ -52,7 +52,6 @@ def message_data(subscription: int, log_ns: int, payload: bytes | memoryview) ->
 
 
 def time_data(now_ns: int) -> bytes:
-    """Return a message with the server's time."""
     return _TIME.pack(2, now_ns)
 
 
@@ -128,15 +127,11 @@ def _graph_text(published: _Names, subscribed: _Names, removed: Sequence[str]) -
     )
 
 
-# -- client to server ----------------------------------------------------------------------------------
+# -- client to server: each function raises ProtocolError for a frame or field of another form ----------
 
 
 def parse_text(data: str) -> dict[str, Any]:
-    """Parse a client's text message: a JSON object with a text field ``op``.
-
-    Raises:
-        ProtocolError: the message is anything else.
-    """
+    """Parse a client's text message: a JSON object with a text field ``op``."""
     try:
         content = json.loads(data, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
@@ -151,70 +146,44 @@ def _no_constant(name: str) -> Any:
 
 
 def parse_data(data: bytes) -> tuple[int, bytes]:
-    """Return channel and payload of a client's message.
-
-    Raises:
-        ProtocolError: the frame is of another kind, or too short.
-    """
+    """Return channel and payload of a client's message."""
     if len(data) < _CLIENT_DATA.size or data[0] != 1:
         raise ProtocolError(f"unknown binary message ({data[:1].hex() or 'empty'}, {len(data)} bytes)")
     return int(_CLIENT_DATA.unpack_from(data)[1]), data[_CLIENT_DATA.size :]
 
 
 def objects(content: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
-    """Return a field that must be a list of objects.
+    """Return a field that must be a list of objects."""
+    return _listed(content, key, dict, "objects")
 
-    Raises:
-        ProtocolError: the field is missing or of another type.
-    """
-    value = content.get(key)
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise ProtocolError(f"{content.get('op')}: {key} must be a list of objects")
-    return value
+
+def strings(content: Mapping[str, Any], key: str) -> list[str]:
+    """Return a field that must be a list of strings."""
+    return _listed(content, key, str, "strings")
 
 
 def numbers(content: Mapping[str, Any], key: str) -> list[int]:
-    """Return a field that must be a list of channel or subscription numbers.
+    """Return a field that must be a list of channel or subscription numbers."""
+    return [number({key: item}, key) for item in _listed(content, key, object, "numbers")]
 
-    Raises:
-        ProtocolError: the field is missing or of another type.
-    """
+
+def _listed(content: Mapping[str, Any], key: str, kind: type, what: str) -> list[Any]:
     value = content.get(key)
-    if not isinstance(value, list):
-        raise ProtocolError(f"{content.get('op')}: {key} must be a list of numbers")
-    return [number({key: item}, key) for item in value]
+    if not isinstance(value, list) or not all(isinstance(item, kind) for item in value):
+        raise ProtocolError(f"{content.get('op')}: {key} must be a list of {what}")
+    return value
 
 
 def number(content: Mapping[str, Any], key: str) -> int:
-    """Return a field that must be a 32-bit number.
-
-    Raises:
-        ProtocolError: the field is missing or of another type.
-    """
+    """Return a field that must be a 32-bit number."""
     value = content.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _MAX_NUMBER:
         raise ProtocolError(f"{key} must be a 32-bit number (got {value!r:.40})")
     return value
 
 
-def strings(content: Mapping[str, Any], key: str) -> list[str]:
-    """Return a field that must be a list of strings.
-
-    Raises:
-        ProtocolError: the field is missing or of another type.
-    """
-    value = content.get(key)
-    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise ProtocolError(f"{content.get('op')}: {key} must be a list of strings")
-    return value
-
-
 def client_channel(content: Mapping[str, Any]) -> ClientChannel:
-    """Parse one entry of a client's ``advertise``.
-
-    Raises:
-        ProtocolError: a field is missing or wrong.
-    """
+    """Parse one entry of a client's ``advertise``."""
     fields = [content.get(key) for key in ("topic", "encoding", "schemaName")]
     if not all(isinstance(field, str) for field in fields):
         raise ProtocolError("advertise: topic, encoding and schemaName must be strings")

@@ -20,6 +20,7 @@ from typing import Annotated, Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bridge import foxglove_protocol as protocol
 from instant_ic.bridge.commands import CommandGate
 from instant_ic.bridge.foxglove_commands import Commands
@@ -29,7 +30,6 @@ from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Received
 from instant_ic.config.ranges import Range, check_ranges
-from instant_ic.msg import MessageError, typestore
 from instant_ic.web_access import TokenBucket, refusal
 
 _START_S = 10.0
@@ -55,24 +55,11 @@ class FoxgloveError(RuntimeError):
     """The server cannot start; the message says what to do."""
 
 
-def schema_text(type_name: str) -> str:
-    """Return the ``ros2msg`` definition of a type, including nested types.
-
-    Raises:
-        MessageError: the type is unknown.
-    """
-    try:
-        return typestore().generate_msgdef(type_name, ros_version=2)[0]
-    except Exception as error:  # rosbags raises its own error and KeyError
-        raise MessageError(f"no definition of {type_name}: {error}") from error
-
-
 @dataclass(frozen=True)
 class ServerConfig:
     """Parameters of the server.
 
     Attributes:
-        title: name that Foxglove shows.
         host: address to listen on; 0.0.0.0 opens the server to the network (there is no sign-in).
         port: TCP port; 0: any free port, reported in the log.
         tls_cert: certificate in PEM; with tls_key the server speaks wss:// only.
@@ -87,7 +74,6 @@ class ServerConfig:
         set_parameters: whether clients may change parameters, except safety parameters.
     """
 
-    title: str = "Instant IC"
     host: str = "127.0.0.1"
     port: Annotated[int, Range(0, 65535)] = 8765
     tls_cert: str = ""
@@ -110,7 +96,6 @@ class FoxgloveServer:
 
     Args:
         node: the bridge's node, on whose bus the server subscribes.
-        config: see :class:`ServerConfig`.
         takes: whether to offer a topic.
         gate: checks the clients' commands.
         server_time: whether to send the time to clients (for simulated time).
@@ -149,7 +134,6 @@ class FoxgloveServer:
         self._time_ns: int | None = None
         self._flush_due = False
         self.parameters = Parameters(run_dir)
-        self.may_set = config.set_parameters
         self.commands = Commands(node, gate, self._tell_client) if config.accept_operator else None
         self.wake = threading.Event()
         self.count = 0
@@ -210,10 +194,9 @@ class FoxgloveServer:
         self._tell_graph(present, nodes)
 
     def _offer(self, topic: str, type_name: str) -> bool:
-        try:
-            schema = schema_text(type_name)
-        except MessageError as error:
-            self._node.diagnose(f"topic {topic}", ERROR, str(error))
+        schema = schema_or_unknown(type_name).text
+        if not schema:
+            self._node.diagnose(f"topic {topic}", ERROR, f"no definition of {type_name} here: not offered to Foxglove")
             return False
         with self._lock:
             channel = _Channel(self, self._node, self._next_channel, topic, type_name, schema)
@@ -404,7 +387,7 @@ class FoxgloveServer:
         capabilities += ["clientPublish"] * config.accept_operator + ["time"] * self._server_time
         return protocol.text(
             "serverInfo",
-            name=config.title,
+            name="Instant IC",
             capabilities=capabilities,
             supportedEncodings=["cdr", "json"] if config.accept_operator else None,
             metadata={},
@@ -564,7 +547,7 @@ class FoxgloveServer:
         if request["op"] == "setParameters":
             entries = protocol.objects(request, "parameters")
             names = protocol.strings({"names": [entry.get("name") for entry in entries]}, "names")
-            if self.may_set:
+            if self._config.set_parameters:
                 refused = self.parameters.set({name: _value(e) for name, e in zip(names, entries, strict=True)})
             else:
                 refused = ["parameters are read-only (set_parameters: false)"]
@@ -677,7 +660,6 @@ class _Channel:
             self._server.hand_out(self, received)
 
     def drop(self) -> None:
-        """End the subscription."""
         if self.subscription is not None:
             self._node.drop(self.subscription)
             self.subscription = None

@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -61,8 +60,7 @@ class ExportedTopics:
                 qos = PRESETS.get(publisher.qos, SENSOR)
                 self._offered[name, publisher.node] = qos
                 if publisher.node not in self._bridges and (name, publisher.node) not in before:
-                    with self._told(name):
-                        self._link.open(name, publisher.node, publisher.type_name, _fields(qos))
+                    self._pass(self._link.open, name, publisher.node, publisher.type_name, qos)
         for name, origin in before.keys() - self._offered.keys():
             self._link.forget(name, origin)
 
@@ -73,24 +71,15 @@ class ExportedTopics:
             self._offered.setdefault((name, origin), SENSOR)  # already gone
         if origin in self._bridges:
             return
-        qos = self._offered[name, origin]
-        wall_time = not self._node.use_sim_time
-        with self._told(name):
-            self._link.offer(
-                name, origin, received.type_name, _fields(qos), received.payload, received.publish_ns, wall_time
-            )
+        message = (received.payload, received.publish_ns, not self._node.use_sim_time)
+        self._pass(self._link.offer, name, origin, received.type_name, self._offered[name, origin], *message)
 
-    @contextmanager
-    def _told(self, name: str) -> Iterator[None]:
-        """Report a type unknown to this host once, instead of a traceback per message."""
+    def _pass(self, method: Callable[..., None], name: str, origin: str, type_name: str, qos: QoS, *rest: Any) -> None:
+        """Call a method of the link; report a type unknown to this host instead of a traceback per message."""
         try:
-            yield
+            method(name, origin, type_name, (qos.name, qos.latched, qos.reliable), *rest)
         except ValueError as error:
             self._on_trouble(name, str(error))
-
-
-def _fields(qos: QoS) -> tuple[str, bool, bool]:
-    return qos.name, qos.latched, qos.reliable
 
 
 @dataclass

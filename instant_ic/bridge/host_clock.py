@@ -69,13 +69,7 @@ class ClockFilter:
 
     @property
     def offset_ns(self) -> int:
-        """The other clock minus ours."""
         return self.best.offset_ns
-
-    @property
-    def rtt_ns(self) -> int:
-        """Round trip of the newest exchange."""
-        return self._samples[-1].rtt_ns if self._samples else 0
 
     @property
     def min_rtt_ns(self) -> int:

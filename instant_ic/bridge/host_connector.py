@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
 
 import zmq
 from zmq.utils import z85
@@ -16,7 +15,7 @@ from instant_ic.bridge.host_link import (
     RECEIVE_MOST,
     Connection,
     HostLink,
-    LinkEvent,
+    OnEvent,
     Problem,
     check_endpoint,
 )
@@ -45,7 +44,7 @@ class ConnectingLink(HostLink):
         side: Side,
         exports: dict[str, TopicRule],
         store: KeyStore,
-        on_event: Callable[[LinkEvent], None],
+        on_event: OnEvent,
         times: LinkTimes | None = None,
     ) -> None:
         check_endpoint(endpoint, listening=False)

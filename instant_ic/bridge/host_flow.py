@@ -47,10 +47,8 @@ class Channel:
     """One publisher's topic on the sending side.
 
     Attributes:
-        number: number that identifies the channel in messages.
+        number, origin, type_name, digest, qos: see :class:`Announce`.
         rule: how it goes over the link.
-        origin: the node that publishes it.
-        type_name, digest, qos: of the topic, for the other side.
         latched: send the last value to every host that connects.
         queued: send every message; otherwise only the newest.
         sequence: number of the newest message of a queued channel.

@@ -81,7 +81,6 @@ def fingerprint(public_key: bytes) -> str:
 
 
 def key_text(public_key: bytes) -> str:
-    """Return a public key as text."""
     check = hashlib.sha256(public_key).digest()[-_CHECK_SIZE:]
     return _PREFIX + base64.urlsafe_b64encode(public_key + check).decode()
 
@@ -117,7 +116,7 @@ def check_name(name: str) -> str:
 
 
 class KeyStore:
-    """The key files of one folder.
+    """The key files of one folder. Each method raises :class:`KeyFileError` with where and what to do.
 
     Args:
         folder: the folder; None takes :func:`key_dir`.
@@ -131,34 +130,19 @@ class KeyStore:
     # -- this host -------------------------------------------------------------------------------
 
     def identity(self) -> Identity:
-        """Return this host's key pair.
-
-        Raises:
-            KeyFileError: the file is missing or damaged, or others can read it.
-        """
+        """Return this host's key pair, from a file that only its owner can read."""
         path = self.identity_path
+        text = _text(path, 0o077, "read")
+        if text is None:
+            raise KeyFileError(f"{path} does not exist: create this host's key with `ic keys new`")
         try:
-            with path.open() as file:
-                mode = os.fstat(file.fileno()).st_mode
-                words = file.read().split()
-        except FileNotFoundError:
-            raise KeyFileError(f"{path} does not exist: create this host's key with `ic keys new`") from None
-        except OSError as error:
-            raise KeyFileError(f"{path} cannot be read: {error.strerror}") from error
-        if mode & 0o077:
-            raise KeyFileError(f"{path} can be read by others (mode {mode & 0o777:04o}): chmod 600 {path}")
-        try:
-            name, public, secret = words
+            name, public, secret = text.split()
             return Identity(check_name(name), parse_key(public), parse_key(secret))
         except (ValueError, KeyFileError):
             raise KeyFileError(f"{path} is damaged: create a new key with `ic keys new --force`") from None
 
     def create(self, name: str, force: bool = False) -> Identity:
-        """Create this host's key pair.
-
-        Raises:
-            KeyFileError: there is one already (and not ``force``), or the folder cannot be written.
-        """
+        """Create this host's key pair; ``force`` replaces the present one."""
         import zmq
         from zmq.utils import z85
 
@@ -174,24 +158,10 @@ class KeyStore:
     # -- the others ------------------------------------------------------------------------------
 
     def peers(self) -> list[Peer]:
-        """Return the allowed hosts; empty if the file is missing.
-
-        Raises:
-            KeyFileError: the file cannot be read, others can write it, or one of its lines is wrong.
-        """
+        """Return the allowed hosts, from a file that only its owner can write; empty if the file is missing."""
         path = self.allowed_path
-        try:
-            with path.open() as file:
-                mode = os.fstat(file.fileno()).st_mode
-                lines = file.read().splitlines()
-        except FileNotFoundError:
-            return []
-        except (OSError, UnicodeDecodeError) as error:
-            raise KeyFileError(f"{path} cannot be read: {error}") from error
-        if mode & 0o022:
-            raise KeyFileError(f"{path} can be written by others (mode {mode & 0o777:04o}): chmod 600 {path}")
         peers: list[Peer] = []
-        for number, line in enumerate(lines, 1):
+        for number, line in enumerate((_text(path, 0o022, "written") or "").splitlines(), 1):
             words = line.partition("#")[0].split()
             if not words:
                 continue
@@ -208,11 +178,7 @@ class KeyStore:
         return peers
 
     def peer(self, name: str = "") -> Peer:
-        """Return the allowed host with a name, or the only allowed host.
-
-        Raises:
-            KeyFileError: there is no such host, or several hosts and no name.
-        """
+        """Return the allowed host with a name, or the only allowed host."""
         peers = self.peers()
         found = [peer for peer in peers if not name or peer.name == name]
         if len(found) == 1:
@@ -226,11 +192,7 @@ class KeyStore:
         )
 
     def allow(self, peer: Peer) -> str:
-        """Add a host to the list, or replace the one with the same name. Return what was done.
-
-        Raises:
-            KeyFileError: the name is not valid, or the key is listed under another name.
-        """
+        """Add a host to the list, or replace the one with the same name. Return what was done."""
         check_name(peer.name)
         with self._locked():
             others = [other for other in self.peers() if other.name != peer.name]
@@ -244,11 +206,7 @@ class KeyStore:
             return "added" if before is None else "replaced"
 
     def revoke(self, name: str) -> Peer:
-        """Remove a host from the list; a running bridge disconnects it immediately.
-
-        Raises:
-            KeyFileError: there is no host of this name.
-        """
+        """Remove a host from the list; a running bridge disconnects it immediately."""
         with self._locked():
             peer = self.peer(name)
             self._write_peers([other for other in self.peers() if other.name != name])
@@ -299,6 +257,21 @@ class KeyStore:
         raise KeyFileError(f"{path} cannot be written: {error.strerror}; give another folder with --dir") from error
 
 
+def _text(path: Path, closed: int, verb: str) -> str | None:
+    """Text of a file, None if it is missing; refused if others have one of the mode bits ``closed``."""
+    try:
+        with path.open() as file:
+            mode = os.fstat(file.fileno()).st_mode
+            text = file.read()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise KeyFileError(f"{path} cannot be read: {error}") from error
+    if mode & closed:
+        raise KeyFileError(f"{path} can be {verb} by others (mode {mode & 0o777:04o}): chmod 600 {path}")
+    return text
+
+
 class AllowList:
     """The current allow-list, read again when the file changes.
 
@@ -307,10 +280,9 @@ class AllowList:
 
     def __init__(self, store: KeyStore) -> None:
         self._store = store
-        self._seen: tuple[int, int, int] | None = None
+        self._seen: tuple[int, ...] | None = ()
         self._peers: dict[bytes, Peer] = {}
         self.problem = ""
-        self._read = False
 
     def refresh(self) -> bool:
         """Read the file if it changed; return True if the list is different."""
@@ -319,9 +291,9 @@ class AllowList:
             seen = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
         except OSError:
             seen = None
-        if self._read and seen == self._seen:
+        if seen == self._seen:
             return False
-        self._read, self._seen = True, seen
+        self._seen = seen
         try:
             peers = {peer.public_key: peer for peer in self._store.peers()}
         except KeyFileError as error:
@@ -333,7 +305,6 @@ class AllowList:
         return changed
 
     def get(self, public_key: bytes) -> Peer | None:
-        """Return the allowed host with this key."""
         return self._peers.get(public_key)
 
     def __len__(self) -> int:

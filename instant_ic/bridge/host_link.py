@@ -56,16 +56,9 @@ class Failed:
     text: str
 
 
-@dataclass(frozen=True)
-class LinkEvent:
-    """An event on a link.
-
-    Attributes:
-        peer: name of the other host in this host's allow-list; empty for the link as a whole.
-    """
-
-    peer: str
-    event: Event | Stranger | Problem | Failed
+LinkEvent = Event | Stranger | Problem | Failed
+OnEvent = Callable[[str, LinkEvent], None]
+"""Takes the other host's name in this host's allow-list (empty for the link as a whole), and the event."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +108,11 @@ class HostLink(ABC):
         side: Side,
         exports: dict[str, TopicRule],
         store: KeyStore,
-        on_event: Callable[[LinkEvent], None],
+        on_event: OnEvent,
         times: LinkTimes | None = None,
     ) -> None:
         self.side, self.exports, self.times = side, exports, times or LinkTimes()
-        self._on_event = on_event
+        self._emit = on_event
         try:
             self.identity = store.identity()
         except KeyFileError as error:
@@ -226,7 +219,6 @@ class HostLink(ABC):
         return channel
 
     def peers(self) -> list[PeerStatus]:
-        """State of all current links."""
         with self._lock:
             return [self._status(connection) for connection in self._connections() if connection.session.up]
 
@@ -306,9 +298,6 @@ class HostLink(ABC):
         if not self._woken and threading.current_thread() is not self._thread:
             self._woken = True
             self._wake_out.send(b"", zmq.NOBLOCK)
-
-    def _emit(self, peer: str, event: Event | Stranger | Problem | Failed) -> None:
-        self._on_event(LinkEvent(peer, event))
 
     def _new_session(self, peer: Peer, connecting: bool, may_send: bool = True) -> Session:
         memory = self._memories.setdefault(peer.public_key, Memory())

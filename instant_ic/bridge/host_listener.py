@@ -6,7 +6,6 @@ import contextlib
 import os
 import socket
 import time
-from collections.abc import Callable
 from typing import Any
 
 import zmq
@@ -18,7 +17,7 @@ from instant_ic.bridge.host_link import (
     Connection,
     HostLink,
     LinkError,
-    LinkEvent,
+    OnEvent,
     Problem,
     Stranger,
     check_endpoint,
@@ -49,7 +48,7 @@ class ListeningLink(HostLink):
         side: Side,
         exports: dict[str, TopicRule],
         store: KeyStore,
-        on_event: Callable[[LinkEvent], None],
+        on_event: OnEvent,
         times: LinkTimes | None = None,
     ) -> None:
         host, port = check_endpoint(endpoint, listening=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
+from typing import Any, ClassVar, Self, get_origin, get_type_hints
 
 VERSION = 1
 """Protocol version, compared in the handshake. Increase it with every incompatible change."""
@@ -22,9 +22,6 @@ LANES = ("command", "state", "bulk")
 """Priority classes on the link; a later lane never delays an earlier one."""
 
 _DATA = struct.Struct("<BBHIIQqqq")
-_PING = struct.Struct("<BIqq")
-_PONG = struct.Struct("<BIqqqq")
-_ACK = struct.Struct("<Bq3Q")
 
 
 class ProtocolError(ValueError):
@@ -43,7 +40,7 @@ class _Json:
         return bytes([self.KIND]) + body
 
     @classmethod
-    def decode(cls, data: memoryview) -> Any:
+    def decode(cls, data: memoryview) -> Self:
         try:
             content = json.loads(bytes(data[1:]))
         except (ValueError, RecursionError) as error:
@@ -66,8 +63,8 @@ class _Json:
 
 
 @dataclass(frozen=True)
-class Hello(_Json):
-    """First message of the host that connects; the answer is :class:`Welcome` or :class:`Bye`.
+class Greeting(_Json):
+    """First message of a host.
 
     Attributes:
         version: :data:`VERSION`.
@@ -76,22 +73,22 @@ class Hello(_Json):
         wants: topic → most messages per second that this host takes from the other (0: all).
     """
 
-    KIND: ClassVar[int] = 1
     version: int
     name: str
     instance: str
     wants: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Welcome(_Json):
-    """Answer to :class:`Hello`, with the same fields."""
+class Hello(Greeting):
+    """Greeting of the host that connects; the answer is :class:`Welcome` or :class:`Bye`."""
+
+    KIND: ClassVar[int] = 1
+
+
+class Welcome(Greeting):
+    """Answer to :class:`Hello`."""
 
     KIND: ClassVar[int] = 2
-    version: int
-    name: str
-    instance: str
-    wants: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -157,51 +154,58 @@ class Notice(_Json):
     text: str
 
 
+class _Fixed:
+    """A message of numbers, in the order of the class's fields; ``FORM`` begins with the kind."""
+
+    KIND: ClassVar[int]
+    FORM: ClassVar[struct.Struct]
+
+    def encode(self) -> bytes:
+        return self.FORM.pack(self.KIND, *vars(self).values())
+
+    @classmethod
+    def decode(cls, data: memoryview) -> Self:
+        return cls(*cls._numbers(data))
+
+    @classmethod
+    def _numbers(cls, data: memoryview) -> tuple[int, ...]:
+        if len(data) != cls.FORM.size:
+            raise ProtocolError(f"message of kind {data[0]} has {len(data)} bytes, {cls.FORM.size} expected")
+        return cls.FORM.unpack(data)[1:]
+
+
 @dataclass(frozen=True)
-class Ping:
+class Ping(_Fixed):
     """Heartbeat and time request.
 
     Attributes:
-        number: increases by one.
+        number: increases by one, modulo 2^32.
         mono_ns: the sender's monotonic clock.
         epoch_ns: time of day at which that clock was zero.
     """
 
     KIND: ClassVar[int] = 16
+    FORM: ClassVar[struct.Struct] = struct.Struct("<BIqq")
     number: int
     mono_ns: int
     epoch_ns: int
 
-    def encode(self) -> bytes:
-        return _PING.pack(self.KIND, self.number & 0xFFFFFFFF, self.mono_ns, self.epoch_ns)
-
-    @classmethod
-    def decode(cls, data: memoryview) -> Ping:
-        return cls(*_unpack(_PING, data)[1:])
-
 
 @dataclass(frozen=True)
-class Pong:
+class Pong(_Fixed):
     """Answer to a ping: its number and ``mono_ns``, and the answering host's clock at arrival and departure."""
 
     KIND: ClassVar[int] = 17
+    FORM: ClassVar[struct.Struct] = struct.Struct("<BIqqqq")
     number: int
     echo_ns: int
     arrived_ns: int
     mono_ns: int
     epoch_ns: int
 
-    def encode(self) -> bytes:
-        number = self.number & 0xFFFFFFFF
-        return _PONG.pack(self.KIND, number, self.echo_ns, self.arrived_ns, self.mono_ns, self.epoch_ns)
-
-    @classmethod
-    def decode(cls, data: memoryview) -> Pong:
-        return cls(*_unpack(_PONG, data)[1:])
-
 
 @dataclass(frozen=True)
-class Ack:
+class Ack(_Fixed):
     """Bytes received so far in each lane since the session began.
 
     Attributes:
@@ -210,15 +214,16 @@ class Ack:
     """
 
     KIND: ClassVar[int] = 18
+    FORM: ClassVar[struct.Struct] = struct.Struct("<Bq3Q")
     echo_ns: int
     taken: tuple[int, ...]
 
     def encode(self) -> bytes:
-        return _ACK.pack(self.KIND, self.echo_ns, *self.taken)
+        return self.FORM.pack(self.KIND, self.echo_ns, *self.taken)
 
     @classmethod
-    def decode(cls, data: memoryview) -> Ack:
-        _, echo_ns, *taken = _unpack(_ACK, data)
+    def decode(cls, data: memoryview) -> Self:
+        echo_ns, *taken = cls._numbers(data)
         return cls(echo_ns, tuple(taken))
 
 
@@ -251,19 +256,8 @@ class Data:
     wall_time: bool = True
 
     def encode(self) -> bytes:
-        flags = self.lane << 1 | self.wall_time
-        head = _DATA.pack(
-            self.KIND,
-            flags,
-            self.channel,
-            self.total,
-            self.offset,
-            self.sequence,
-            self.publish_ns,
-            self.born_ns,
-            self.sent_ns,
-        )
-        return head + self.chunk
+        head = (self.KIND, self.lane << 1 | self.wall_time, self.channel, self.total, self.offset, self.sequence)
+        return _DATA.pack(*head, self.publish_ns, self.born_ns, self.sent_ns) + self.chunk
 
     @classmethod
     def decode(cls, data: memoryview) -> Data:
@@ -285,8 +279,6 @@ _KINDS: dict[int, Any] = {
 }
 DATA_OVERHEAD = _DATA.size
 
-_T = TypeVar("_T")
-
 
 def decode(data: bytes | memoryview) -> Message:
     """Decode a message; the chunk of a ``Data`` is a view of ``data``.
@@ -300,9 +292,3 @@ def decode(data: bytes | memoryview) -> Message:
         raise ProtocolError(f"unknown message ({bytes(view[:8]).hex() or 'empty'})")
     message: Message = kind.decode(view)
     return message
-
-
-def _unpack(form: struct.Struct, data: memoryview) -> tuple[Any, ...]:
-    if len(data) != form.size:
-        raise ProtocolError(f"message of kind {data[0]} has {len(data)} bytes, {form.size} expected")
-    return form.unpack(data)

@@ -119,8 +119,7 @@ def _counts(direction: str, topics: dict[str, TopicCounts]) -> dict[str, str]:
     lines = {}
     for topic, counts in sorted(topics.items()):
         parts = [f"{counts.messages} messages", f"{counts.bytes} bytes"]
-        for name in ("thinned", "superseded", "expired", "overflowed", "lost", "not_driving"):
-            if number := getattr(counts, name):
-                parts.append(f"{number} {name.replace('_', ' ')}")
+        missed = {name: number for name, number in vars(counts).items() if name not in ("messages", "bytes")}
+        parts += [f"{number} {name.replace('_', ' ')}" for name, number in missed.items() if number]
         lines[f"{direction} {topic}"] = ", ".join(parts)
     return lines

@@ -19,6 +19,7 @@ from instant_ic.bridge.host_protocol import (
     Announce,
     Bye,
     Data,
+    Greeting,
     Hello,
     Message,
     Notice,
@@ -133,14 +134,12 @@ class Arrived:
         announce: topic, type, QoS and publisher.
         payload: CDR bytes.
         publish_ns: time of publication, by this host's time of day.
-        age_ns: time since publication.
         born_ns: time of publication by this host's monotonic clock; never in the future.
     """
 
     announce: Announce
     payload: bytes | bytearray = field(repr=False)
     publish_ns: int
-    age_ns: int
     born_ns: int = 0
 
 
@@ -272,7 +271,7 @@ class Session:
             self._pings += 1
             period_s = _FIRST_PING_S if self._pings < _FIRST_PINGS else self.times.ping_s
             self._next_ping_ns = now + int(period_s * 1e9)
-            yield Ping(self._pings, self.clocks.mono_ns(), self.clocks.epoch_ns()).encode()
+            yield Ping(self._pings & 0xFFFFFFFF, self.clocks.mono_ns(), self.clocks.epoch_ns()).encode()
         while self.up and (message := self.outbox.next(self.clocks.mono_ns())) is not None:
             yield message.encode()
 
@@ -355,14 +354,7 @@ class Session:
         match message:
             case Bye():
                 return self.end(_text(message.code), _text(message.reason))
-            case Hello() if not self._connecting and not self.up:
-                if message.version != VERSION:
-                    return self._wrong_version(message)
-                self._replies.append(Welcome(VERSION, self.side.name, self.side.instance, self._wants()))
-                return self._begin(message)
-            case Welcome() if self._connecting and not self.up:
-                if message.version != VERSION:
-                    return self._wrong_version(message)
+            case Greeting() if isinstance(message, Welcome) == self._connecting and not self.up:
                 return self._begin(message)
             case _ if not self.up:
                 raise ProtocolError(f"{type(message).__name__} before the greeting")
@@ -396,15 +388,16 @@ class Session:
                 return self._data(message, now)
         raise ProtocolError(f"{type(message).__name__} is not expected here")
 
-    def _wrong_version(self, message: Hello | Welcome) -> list[Event]:
-        return self.end(
-            "version",
-            f"{message.name} uses bridge protocol version {message.version}, {self.side.name} version {VERSION}: "
-            "install the same Instant IC on both",
-            inform=True,
-        )
-
-    def _begin(self, message: Hello | Welcome) -> list[Event]:
+    def _begin(self, message: Greeting) -> list[Event]:
+        if message.version != VERSION:
+            return self.end(
+                "version",
+                f"{message.name} uses bridge protocol version {message.version}, {self.side.name} version {VERSION}: "
+                "install the same Instant IC on both",
+                inform=True,
+            )
+        if not self._connecting:
+            self._replies.append(Welcome(VERSION, self.side.name, self.side.instance, self._wants()))
         wants = message.wants
         for topic, rate in wants.items():
             if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:
@@ -508,9 +501,8 @@ class Session:
             counts.lost += data.sequence - last - 1
         _remember(self.memory.received, key, data.sequence)
         born_ns = min(data.born_ns - self.clock.offset_ns, now)  # by our monotonic clock
-        age_ns = now - born_ns
         rule = incoming.rule
-        if rule.max_age_s and age_ns > rule.max_age_s * 1e9:
+        if rule.max_age_s and now - born_ns > rule.max_age_s * 1e9:
             counts.expired += 1
             return []
         publish_ns = data.publish_ns
@@ -518,7 +510,7 @@ class Session:
             publish_ns -= offset
         if not 0 <= publish_ns < 1 << 63:
             raise ProtocolError(f"{announce.topic}: time of publication {publish_ns} ns is impossible")
-        arrived = Arrived(announce, payload, publish_ns, age_ns, born_ns)
+        arrived = Arrived(announce, payload, publish_ns, born_ns)
         if not self.drives and (not rule.shared or releases(announce.type_name, payload)):
             counts.not_driving += 1
             # A refused release is gone: the lease must not end an emergency stop when it is handed over.
@@ -538,7 +530,6 @@ class Session:
             _remember(self.memory.latched, key, born_ns)
         counts.messages += 1
         counts.bytes += len(arrived.payload)
-        counts.newest_age_ns = arrived.age_ns
         return [arrived]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 from instant_ic.bridge.host_protocol import LANES
 from instant_ic.msg import MessageError, deserialize
@@ -109,7 +109,6 @@ class TopicCounts:
         overflowed: dropped from the full queue of a reliable topic.
         lost: gaps in the sequence, on the receiving side.
         not_driving: from a host that does not drive.
-        newest_age_ns: age of the newest message on arrival.
     """
 
     messages: int = 0
@@ -120,7 +119,6 @@ class TopicCounts:
     overflowed: int = 0
     lost: int = 0
     not_driving: int = 0
-    newest_age_ns: int = field(default=0, compare=False)
 
     @property
     def bad(self) -> int:
@@ -128,6 +126,5 @@ class TopicCounts:
         return self.expired + self.overflowed + self.lost
 
     def add(self, other: TopicCounts) -> None:
-        for name in ("messages", "bytes", "thinned", "superseded", "expired", "overflowed", "lost", "not_driving"):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.newest_age_ns = other.newest_age_ns or self.newest_age_ns
+        for each in fields(self):
+            setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))

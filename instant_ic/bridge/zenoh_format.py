@@ -1,7 +1,8 @@
 """rmw_zenoh's conventions as strings and bytes: data keys, attachments, liveliness tokens (rmw_zenoh, docs/design.md).
 
 ROS 2 nodes (Jazzy and newer) on rmw_zenoh exchange CDR, as our bus does. A program that follows these conventions
-takes part in their graph. Nothing here needs Zenoh itself.
+takes part in their graph. Nothing here needs Zenoh itself. Each function raises :class:`FormatError` for what does not
+follow them.
 """
 
 from __future__ import annotations
@@ -53,11 +54,7 @@ class Attachment:
         return self.gid[:SENDER_SIZE].hex()
 
     def pack(self) -> bytes:
-        """Return the 33 bytes, as Zenoh's serializer writes ``(i64, i64, bytes)``.
-
-        Raises:
-            FormatError: the id has another length, or a number is out of range.
-        """
+        """Return the 33 bytes, as Zenoh's serializer writes ``(i64, i64, bytes)``."""
         if len(self.gid) != GID_SIZE:
             raise FormatError(f"publisher id of {len(self.gid)} bytes, {GID_SIZE} expected")
         try:
@@ -67,11 +64,7 @@ class Attachment:
 
     @classmethod
     def unpack(cls, data: bytes) -> Attachment:
-        """Decode the 33 bytes.
-
-        Raises:
-            FormatError: the data or the id have another length.
-        """
+        """Decode the 33 bytes."""
         if len(data) != _ATTACHMENT.size:
             raise FormatError(f"attachment of {len(data)} bytes, {_ATTACHMENT.size} expected")
         sequence, source_ns, size, gid = _ATTACHMENT.unpack(data)
@@ -81,22 +74,14 @@ class Attachment:
 
 
 def dds_type(type_name: str) -> str:
-    """Return the DDS name of a type: ``std_msgs::msg::dds_::String_`` for ``std_msgs/msg/String``.
-
-    Raises:
-        FormatError: the name is not a full type name.
-    """
+    """Return the DDS name of a type: ``std_msgs::msg::dds_::String_`` for ``std_msgs/msg/String``."""
     if not (match := _ROS_TYPE.match(type_name)):
         raise FormatError(f"type name {type_name!r} does not look like std_msgs/msg/String")
     return "{}::{}::dds_::{}_".format(*match.groups())
 
 
 def ros_type(dds_name: str) -> str:
-    """Return the ROS name of a type; the inverse of :func:`dds_type`.
-
-    Raises:
-        FormatError: the name is not a DDS type name.
-    """
+    """Return the ROS name of a type; the inverse of :func:`dds_type`."""
     if not (match := _DDS_TYPE.match(dds_name)):
         raise FormatError(f"type name {dds_name!r} does not look like std_msgs::msg::dds_::String_")
     return "{}/{}/{}".format(*match.groups())
@@ -136,11 +121,7 @@ class TopicQoS:
 
     @classmethod
     def decode(cls, text: str) -> TopicQoS:
-        """Parse the QoS part of a token.
-
-        Raises:
-            FormatError: the text does not have six parts, or the depth is not a number.
-        """
+        """Parse the QoS part of a token."""
         parts = text.split(":")
         if len(parts) != 6:
             raise FormatError(f"quality of service {text!r} has {len(parts)} parts, 6 expected")
@@ -190,11 +171,7 @@ class Token:
 
     @classmethod
     def parse(cls, key: str) -> Token | None:
-        """Parse the token of a node, publisher or subscription; return None for a service's, which is not used here.
-
-        Raises:
-            FormatError: the key is not an rmw_zenoh token.
-        """
+        """Parse the token of a node, publisher or subscription; return None for a service's, which is not used here."""
         parts = key.split("/")
         if len(parts) < 9 or parts[0] != ADMIN_SPACE or not all(parts):
             raise FormatError(f"{key!r} is not a liveliness token of rmw_zenoh")
@@ -202,23 +179,18 @@ class Token:
         if kind in ("SS", "SC"):
             return None
         try:
-            numbers = [int(parts[index]) for index in (1, 3, 4)]
+            domain, node_id, entity_id = (int(parts[index]) for index in (1, 3, 4))
         except ValueError:
             raise FormatError(f"{key!r}: domain and ids must be numbers") from None
         namespace, node = (parts[index].replace("%", "/") for index in (7, 8))
-        domain, node_id, entity_id = numbers
+        entity = (domain, parts[2], node_id, entity_id, namespace, node)
         if kind == "NN":
-            return cls("NN", domain, parts[2], node_id, entity_id, namespace, node)
+            return cls("NN", *entity)
         if kind not in ("MP", "MS") or len(parts) != _ENDPOINT_PARTS:
             raise FormatError(f"{key!r} is not a liveliness token of rmw_zenoh")
         return cls(
             "MP" if kind == "MP" else "MS",
-            domain,
-            parts[2],
-            node_id,
-            entity_id,
-            namespace,
-            node,
+            *entity,
             topic=parts[9].replace("%", "/"),
             type_name=ros_type(parts[10]),
             type_hash=parts[11],

@@ -106,7 +106,6 @@ class Incoming:
 
     @property
     def topics(self) -> list[str]:
-        """Imported topics, by local name."""
         return sorted(self._topics)
 
     @property
@@ -121,7 +120,6 @@ class Incoming:
         return {topic: dict(s.lost_by) for topic, s in held.items() if s is not None and s.lost_by}
 
     def malformed(self) -> int:
-        """Return the number of messages without a readable attachment."""
         return sum(entry.subscription.malformed for entry in self._topics.values() if entry.subscription is not None)
 
     def on_token(self, token: Token, alive: bool) -> None:

@@ -199,11 +199,9 @@ class RosSession(Closing):
             self.zenoh.close()
 
     def routers(self) -> list[str]:
-        """Return the ids of the connected routers."""
         return [str(zid) for zid in self.zenoh.info.routers_zid()]
 
     def peers(self) -> list[str]:
-        """Return the ids of the connected peers."""
         return [str(zid) for zid in self.zenoh.info.peers_zid()]
 
     def token(self, kind: Kind, node: RosNode | None, namespace: str, name: str, *endpoint: Any) -> tuple[Token, Any]:
@@ -250,7 +248,6 @@ class RosNode:
         return self.session.token(kind, self, self.namespace, self.name, topic, type_name, type_hash, qos)[1]
 
     def close(self) -> None:
-        """Remove the node from the graph."""
         self._declaration.undeclare()
 
 
@@ -303,7 +300,6 @@ class RosPublisher:
                 raise ZenohError(f"Zenoh: {error}") from None
 
     def close(self) -> None:
-        """Remove the publisher from the graph."""
         self._token.undeclare()
         self._publisher.undeclare()
 
@@ -311,12 +307,11 @@ class RosPublisher:
 class RosSubscription:
     """A subscription in the ROS graph. It receives only from other sessions, so our own messages do not return.
 
+    Messages of another definition have another key and are not received. A latched subscription requests earlier
+    messages from the publishers.
+
     Args:
-        node: node of the subscription.
-        topic: full name, including the namespace.
-        type_name: ``std_msgs/msg/String``.
-        type_hash: RIHS01 hash of the type; messages of another definition have another key and are not received.
-        qos: quality of service; a latched subscription requests earlier messages from the publishers.
+        node, topic, type_name, type_hash, qos: as for :class:`RosPublisher`.
         on_message: called with ``(payload, attachment)``, in order per publisher, on a Zenoh thread.
 
     Attributes:
@@ -358,10 +353,6 @@ class RosSubscription:
             self._subscriber = session.zenoh.declare_subscriber(key, self._heard, allowed_origin=remote)
         self._token = node.endpoint("MS", topic, type_name, type_hash, qos)
 
-    @property
-    def lost(self) -> int:
-        return sum(self.lost_by.values())
-
     def _heard(self, sample: Any) -> None:
         try:
             if sample.attachment is None:
@@ -390,6 +381,5 @@ class RosSubscription:
         self._on_message(sample.payload.to_bytes(), attachment)
 
     def close(self) -> None:
-        """Remove the subscription from the graph."""
         self._token.undeclare()
         self._subscriber.undeclare()

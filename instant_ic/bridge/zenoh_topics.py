@@ -57,7 +57,6 @@ class Namespace:
         return f"/{self.name}"
 
     def to_ros(self, topic: str) -> str:
-        """Return the ROS name of a topic."""
         return f"/{self.name}{topic}" if self.name else topic
 
     def to_local(self, topic: str) -> str | None:

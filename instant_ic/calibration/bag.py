@@ -24,31 +24,13 @@ PICTURE, CLOUD, PACKETS = (
     "velodyne_msgs/msg/VelodyneScan",
 )
 _FIELDS = ("x", "y", "z", "intensity", "ring", "time")
+_BASE, _ODOM = "base_link", "odom"
 _NEAREST_M = 0.3
 _FEW = 12
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Parameters of reading a recording.
-
-    Attributes:
-        image_topic, points_topic: topics; empty selects the defaults (``/camera/image/compressed``, ``/lidar/points``,
-            otherwise ``/lidar/packets``).
-        base_frame, odom_frame: frames of the transforms.
-        most_frames: largest number of images.
-        distance_m, angle_deg: motion after which a new place begins.
-        most_gap_s: largest time between an image and the middle of its revolution.
-    """
-
-    image_topic: str = ""
-    points_topic: str = ""
-    base_frame: str = "base_link"
-    odom_frame: str = "odom"
-    most_frames: int = 24
-    distance_m: float = 0.25
-    angle_deg: float = 15.0
-    most_gap_s: float = 0.15
+_DISTANCE_M, _ANGLE_DEG = 0.25, 15.0
+"""Motion after which a new place begins."""
+_MOST_GAP_S = 0.15
+"""Largest time between an image and the middle of its revolution."""
 
 
 @dataclass(frozen=True)
@@ -83,27 +65,32 @@ class Cloud:
         return self.stamp_ns + round(0.5e9 * float(time.min() + time.max()))
 
 
-def read_recording(path: Path, selection: Selection | None = None) -> CalibrationRecording:
+def read_recording(
+    path: Path, image_topic: str = "", points_topic: str = "", most_frames: int = 24
+) -> CalibrationRecording:
     """Read a bag.
+
+    Args:
+        path: the bag.
+        image_topic: empty selects ``/camera/image/compressed``.
+        points_topic: empty selects ``/lidar/points``, otherwise ``/lidar/packets``.
+        most_frames: largest number of images.
 
     Raises:
         BagError: the path is not a bag, or the bag is damaged.
         CalibrationError: the bag lacks images or revolutions, or none of them coincide in time.
     """
-    selection = selection or Selection()
     with BagReader(path) as bag:
         types = {topic.topic: topic.type_name for topic in bag.topics}
-        image_topic = _choose(path, types, (PICTURE,), selection.image_topic, ("/camera/image/compressed",))
-        points_topic = _choose(
-            path, types, (CLOUD, PACKETS), selection.points_topic, ("/lidar/points", "/lidar/packets")
-        )
+        image_topic = _choose(path, types, (PICTURE,), image_topic, ("/camera/image/compressed",))
+        points_topic = _choose(path, types, (CLOUD, PACKETS), points_topic, ("/lidar/points", "/lidar/packets"))
         transforms = _transforms(bag, types)
         stamps, camera = _stamps(path, bag, image_topic)
-        moves = _knows(transforms, selection)
-        chosen, places = _places(stamps, transforms if moves else None, selection)
+        moves = {_BASE, _ODOM} <= transforms.frames()
+        chosen, places = _places(stamps, transforms if moves else None, most_frames)
         if not chosen:
             raise CalibrationError(f"{path}: odometry on /tf does not overlap in time with the {len(stamps)} images")
-        clouds = _nearest_clouds(path, bag, points_topic, types[points_topic], list(chosen), selection)
+        clouds = _nearest_clouds(path, bag, points_topic, types[points_topic], list(chosen))
         frames = []
         for message in bag.messages([image_topic]):
             picture = deserialize(message.payload, message.type_name)
@@ -111,16 +98,14 @@ def read_recording(path: Path, selection: Selection | None = None) -> Calibratio
             if stamp in clouds:
                 rgb = _decoded(path, picture)
                 try:
-                    frames.append(
-                        _frame(rgb, clouds[stamp], stamp, chosen[stamp], transforms if moves else None, selection)
-                    )
+                    frames.append(_frame(rgb, clouds[stamp], stamp, chosen[stamp], transforms if moves else None))
                 except TransformError as error:
                     raise CalibrationError(f"{path}: no odometry at {stamp / 1e9:.3f} s: {error}") from None
     lidar = next(iter(clouds.values())).frame_id
     return CalibrationRecording(
         frames=frames,
         camera_from_lidar=_known(transforms, camera, lidar),
-        base_from_lidar=_known(transforms, selection.base_frame, lidar),
+        base_from_lidar=_known(transforms, _BASE, lidar),
         pictures=len(stamps),
         places=places,
         moves=moves,
@@ -177,10 +162,6 @@ def _stamps(path: Path, bag: BagReader, topic: str) -> tuple[list[int], str]:
     return sorted(stamps), frame
 
 
-def _knows(transforms: TransformBuffer, selection: Selection) -> bool:
-    return {selection.base_frame, selection.odom_frame} <= transforms.frames()
-
-
 def _known(transforms: TransformBuffer, target: str, source: str) -> Matrix | None:
     try:
         return transforms.lookup(target, source)
@@ -188,7 +169,7 @@ def _known(transforms: TransformBuffer, target: str, source: str) -> Matrix | No
         return None
 
 
-def _places(stamps: list[int], transforms: TransformBuffer | None, selection: Selection) -> tuple[dict[int, int], int]:
+def _places(stamps: list[int], transforms: TransformBuffer | None, most_frames: int) -> tuple[dict[int, int], int]:
     """Select images: stamp → number of its place; and the number of places.
 
     The drive is divided into sections, each of which ends when the robot has moved or turned enough. Each section
@@ -204,27 +185,26 @@ def _places(stamps: list[int], transforms: TransformBuffer | None, selection: Se
         if transforms is not None:
             try:
                 before, pose, after = (
-                    transforms.lookup(selection.odom_frame, selection.base_frame, stamp + shift)
-                    for shift in (-50_000_000, 0, 50_000_000)
+                    transforms.lookup(_ODOM, _BASE, stamp + shift) for shift in (-50_000_000, 0, 50_000_000)
                 )
             except TransformError:
                 continue  # outside the odometry: cannot be compensated
             speed = sum(_moved(before, after)) / 0.1
         else:
             pose = np.eye(4)
-        near = [k for k, xyz in enumerate(centres) if np.linalg.norm(xyz - pose[:3, 3]) < selection.distance_m]
+        near = [k for k, xyz in enumerate(centres) if np.linalg.norm(xyz - pose[:3, 3]) < _DISTANCE_M]
         if not near:
             centres.append(pose[:3, 3])
         place[stamp] = near[0] if near else len(centres) - 1
         distance, angle = (np.inf, 0.0) if start is None else _moved(start, pose)
-        if distance >= selection.distance_m or np.degrees(angle) >= selection.angle_deg:
+        if distance >= _DISTANCE_M or np.degrees(angle) >= _ANGLE_DEG:
             start = pose
             best.append((speed, stamp))
         elif speed < best[-1][0]:
             best[-1] = (speed, stamp)
-    chosen = _evenly([stamp for _, stamp in best], selection.most_frames)
+    chosen = _evenly([stamp for _, stamp in best], most_frames)
     rest = [stamp for stamp in place if stamp not in chosen]
-    chosen += _evenly(rest, max(min(_FEW, selection.most_frames) - len(chosen), 0))
+    chosen += _evenly(rest, max(min(_FEW, most_frames) - len(chosen), 0))
     return {stamp: place[stamp] for stamp in sorted(chosen)}, len(centres)
 
 
@@ -258,9 +238,7 @@ def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) 
                 yield Cloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
 
 
-def _nearest_clouds(
-    path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int], selection: Selection
-) -> dict[int, Cloud]:
+def _nearest_clouds(path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int]) -> dict[int, Cloud]:
     """Revolution nearest in time to each stamp, where one is near enough."""
     # The bag stamps messages on arrival, up to a second late on a busy machine.
     at = np.array(stamps)
@@ -276,11 +254,11 @@ def _nearest_clouds(
         middle = cloud.middle_ns
         for stamp in stamps:
             gap = abs(middle - stamp)
-            if gap <= selection.most_gap_s * 1e9 and (stamp not in found or gap < abs(found[stamp].middle_ns - stamp)):
+            if gap <= _MOST_GAP_S * 1e9 and (stamp not in found or gap < abs(found[stamp].middle_ns - stamp)):
                 found[stamp] = cloud
     if not found:
         raise CalibrationError(
-            f"{path}: {count} revolutions on {topic}, none within {selection.most_gap_s} s of "
+            f"{path}: {count} revolutions on {topic}, none within {_MOST_GAP_S} s of "
             f"one of the {len(stamps)} selected images. Check that both clocks were synchronised."
         )
     return found
@@ -297,14 +275,7 @@ def _decoded(path: Path, picture: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(bgr[..., ::-1])
 
 
-def _frame(
-    rgb: NDArray[np.uint8],
-    cloud: Cloud,
-    stamp: int,
-    place: int,
-    transforms: TransformBuffer | None,
-    selection: Selection,
-) -> Frame:
+def _frame(rgb: NDArray[np.uint8], cloud: Cloud, stamp: int, place: int, transforms: TransformBuffer | None) -> Frame:
     """Frame of image and revolution, with the points moved to the LiDAR's pose at the time of the image."""
     cloud_points = cloud.points
     xyz = np.stack([cloud_points[name] for name in "xyz"], axis=1).astype(np.float64)
@@ -312,9 +283,8 @@ def _frame(
     usable &= np.linalg.norm(np.where(usable[:, None], xyz, 0), axis=1) > _NEAREST_M
     xyz, kept = xyz[usable], cloud_points[usable]
     if transforms is not None:
-        odom = selection.odom_frame
-        lidar_from_odom = inverse(transforms.lookup(odom, cloud.frame_id, stamp))
+        lidar_from_odom = inverse(transforms.lookup(_ODOM, cloud.frame_id, stamp))
         xyz = points_at(
-            xyz, kept["time"], cloud.stamp_ns, lambda at: lidar_from_odom @ transforms.lookup(odom, cloud.frame_id, at)
+            xyz, kept["time"], cloud.stamp_ns, lambda at: lidar_from_odom @ transforms.lookup(_ODOM, cloud.frame_id, at)
         )
     return Frame(rgb, xyz, kept["intensity"].astype(np.float64), kept["ring"].astype(np.int64), place)

@@ -14,6 +14,9 @@ CUES = ("jump", "shade", "floor", "shade_across")
 of a wall, intensity step between rings."""
 UPRIGHT = ("jump", "shade")
 _MARGIN = 32
+_COLUMNS = 900
+_INTENSITY_STEP = 6.0
+"""Smallest step of the LiDAR's intensity that counts as an edge."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +73,7 @@ def find_floor(points: Floats, most_tilt_deg: float = 15.0, seed: int = 0) -> Fl
     return FloorPlane(normal, float(normal @ centre))
 
 
-def lidar_edges(
-    points: Floats, intensity: Floats, ring: NDArray[np.integer], floor: FloorPlane | None, intensity_step: float = 6.0
-) -> LidarEdges:
+def lidar_edges(points: Floats, intensity: Floats, ring: NDArray[np.integer], floor: FloorPlane | None) -> LidarEdges:
     """Find the edges in one revolution.
 
     Args:
@@ -80,7 +81,6 @@ def lidar_edges(
         intensity: (N,).
         ring: number of the laser, from the lowest upwards, (N,).
         floor: floor plane for the feet of walls; None leaves them out.
-        intensity_step: smallest intensity step that counts as an edge.
     """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     order = np.lexsort((azimuth, ring))
@@ -89,8 +89,8 @@ def lidar_edges(
     range_m = np.linalg.norm(points, axis=1)
     found = [
         _jumps(points, range_m, rings, azimuth),
-        _shades(points, range_m, intensity, rings, azimuth, intensity_step),
-        *_across_rings(points, range_m, intensity, rings, azimuth, floor, intensity_step),
+        _shades(points, range_m, intensity, rings, azimuth),
+        *_across_rings(points, range_m, intensity, rings, azimuth, floor),
     ]
     cue = np.repeat(np.arange(len(found), dtype=np.int8), [len(part) for part in found])
     return LidarEdges(np.concatenate(found), cue)
@@ -112,9 +112,7 @@ def _jumps(points: Floats, range_m: Floats, ring: NDArray[np.int64], azimuth: Fl
     return _between(points, range_m, a, a + 1, np.minimum(range_m[a], range_m[a + 1]))
 
 
-def _shades(
-    points: Floats, range_m: Floats, intensity: Floats, ring: NDArray[np.int64], azimuth: Floats, step: float
-) -> Floats:
+def _shades(points: Floats, range_m: Floats, intensity: Floats, ring: NDArray[np.int64], azimuth: Floats) -> Floats:
     """Points on one surface where the mean intensities of the three points before and after differ most."""
     if len(range_m) < 7:
         return np.empty((0, 3))
@@ -125,7 +123,7 @@ def _shades(
     total = np.concatenate([[0.0], np.cumsum(intensity)])
     change = np.abs(total[i + 3] - 2 * total[i] + total[i - 3]) / 3 * (one_surface & beside)
     before, after = np.append(0.0, change[:-1]), np.append(change[1:], 0.0)
-    i = i[(change > step) & (change >= before) & (change > after)]
+    i = i[(change > _INTENSITY_STEP) & (change >= before) & (change > after)]
     return _between(points, range_m, i - 1, i, (range_m[i - 1] + range_m[i]) / 2)
 
 
@@ -136,18 +134,16 @@ def _across_rings(
     ring: NDArray[np.int64],
     azimuth: Floats,
     floor: FloorPlane | None,
-    step: float,
-    columns: int = 900,
 ) -> tuple[Floats, Floats]:
     """Feet of walls, and intensity steps between neighbouring rings."""
-    table = np.full((int(ring.max(initial=0)) + 1, columns), -1)
-    table[ring, ((azimuth + np.pi) * (columns / (2 * np.pi))).astype(np.intp) % columns] = np.arange(len(ring))
+    table = np.full((int(ring.max(initial=0)) + 1, _COLUMNS), -1)
+    table[ring, ((azimuth + np.pi) * (_COLUMNS / (2 * np.pi))).astype(np.intp) % _COLUMNS] = np.arange(len(ring))
     low, high = table[:-1].ravel(), table[1:].ravel()
     both = (low >= 0) & (high >= 0)
     low, high = low[both], high[both]
     near = np.minimum(range_m[low], range_m[high])
     one_surface = np.abs(range_m[low] - range_m[high]) < 0.1 + 0.05 * near
-    shade = one_surface & (np.abs(intensity[low] - intensity[high]) > 1.5 * step)
+    shade = one_surface & (np.abs(intensity[low] - intensity[high]) > 1.5 * _INTENSITY_STEP)
     lying = _between(points, range_m, low[shade], high[shade], near[shade])
     if floor is None:
         return np.empty((0, 3)), lying

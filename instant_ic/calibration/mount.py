@@ -11,14 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from instant_ic.calibration.edges import CUES, UPRIGHT, find_floor, lidar_edges, picture_edges
-from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.geometry.poses import Matrix, pose_matrix, transform_points
 
 Floats = NDArray[np.floating]
@@ -35,6 +33,11 @@ _RIVAL_REACH = 12
 """Search radius for other maxima, in units: 12 cm, 2.4 degrees."""
 _UNIT = np.array([0.01] * 3 + [math.radians(0.2)] * 3)
 """Unit of the search: a centimetre, and the angle that moves an edge 3 m away by about as much."""
+_REACH_M, _REACH_DEG = 0.15, 5.0
+"""Standard deviations of the given pose; a weak prior for directions without other evidence."""
+_MOST_SIGMA_M, _MOST_SIGMA_DEG = 0.03, 0.5
+"""A direction with a larger standard deviation is not constrained and keeps its given value."""
+_MIN_EDGES = 500
 
 
 class CalibrationError(ValueError):
@@ -58,37 +61,6 @@ class Frame:
     intensity: Floats
     ring: NDArray[np.integer]
     place: int = 0
-
-
-@dataclass(frozen=True)
-class CalibrationConfig:
-    """Parameters of the pose search.
-
-    Attributes:
-        blur_px: blur of the image edges at each level, for 1024 columns.
-        yaw_step_deg: step of the yaw search around the full circle.
-        full_circle: whether to search the full circle; false if the given yaw is right within a few degrees.
-        reach_m, reach_deg: standard deviations of the given pose; a weak prior for directions without other evidence.
-        most_sigma_m, most_sigma_deg: a direction with a larger standard deviation is not constrained and keeps its
-            given value.
-        min_edges: smallest number of edge points in all frames.
-        intensity_step: smallest step of the LiDAR's intensity that counts as an edge.
-    """
-
-    blur_px: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0)
-    yaw_step_deg: Annotated[float, Range(0.5, 10)] = 2.0
-    full_circle: bool = True
-    reach_m: Positive = 0.15
-    reach_deg: Positive = 5.0
-    most_sigma_m: Positive = 0.03
-    most_sigma_deg: Positive = 0.5
-    min_edges: Annotated[int, Range(50)] = 500
-    intensity_step: Positive = 6.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        if not self.blur_px or min(self.blur_px) <= 0:
-            raise ValueError(f"blur_px values must be > 0 (got {self.blur_px})")
 
 
 @dataclass(frozen=True)
@@ -164,38 +136,41 @@ def _reduced(rgb: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 def calibrate(
     frames: Sequence[Frame],
     camera_from_lidar: Matrix,
-    config: CalibrationConfig | None = None,
+    full_circle: bool = True,
     report: Callable[[str], None] = lambda line: None,
+    blur_px: Sequence[float] = (8.0, 4.0, 2.0, 1.0),
+    yaw_step_deg: float = 2.0,
 ) -> Calibration:
     """Estimate the pose of the LiDAR in the camera's frame.
 
     Args:
         frames: pairs of image and revolution, preferably from many places.
         camera_from_lidar: (4, 4) measured by hand; with ``full_circle`` the yaw may be far off.
-        config: parameters of the search.
+        full_circle: whether to search the full circle; false if the given yaw is right within a few degrees.
         report: called with progress messages.
+        blur_px: blur of the image edges at each level, for 1024 columns.
+        yaw_step_deg: step of the yaw search around the full circle.
 
     Raises:
         CalibrationError: no frames, too few edges, or no pose fits better than chance.
     """
-    config = config or CalibrationConfig()
     if not frames:
         raise CalibrationError("no pair of image and LiDAR revolution")
     if len({frame.rgb.shape for frame in frames}) != 1:
         raise CalibrationError(f"images have different sizes: {sorted({frame.rgb.shape for frame in frames})}")
-    edges = _edges(frames, camera_from_lidar, config)
+    edges = _edges(frames, camera_from_lidar)
     report(f"{len(frames)} frames, edges: " + ", ".join(f"{count} {cue}" for cue, count in edges.counts.items()))
     start, rival = camera_from_lidar, 0.0
-    level = _Level(edges, frames, config.blur_px[0])
-    if config.full_circle:
-        start, rival = _around(level, camera_from_lidar, config.yaw_step_deg)
+    level = _Level(edges, frames, blur_px[0])
+    if full_circle:
+        start, rival = _around(level, camera_from_lidar, yaw_step_deg)
         report(f"yaw {_correction(camera_from_lidar, start)[5] / math.radians(1):+.1f} deg around the full circle")
     found = start
-    for number, blur_px in enumerate(config.blur_px):
-        level = level if number == 0 else _Level(edges, frames, blur_px)
-        found = _climb(level, start, found, config)
-        report(f"blur {blur_px:g} px: score {level.score(found):.3f}")
-    found, rivals = _among_rivals(level, start, found, config)
+    for number, blur in enumerate(blur_px):
+        level = level if number == 0 else _Level(edges, frames, blur)
+        found = _climb(level, start, found)
+        report(f"blur {blur:g} px: score {level.score(found):.3f}")
+    found, rivals = _among_rivals(level, start, found)
     for other in rivals:
         shift = _correction(found, other)
         centimetres = ", ".join(f"{value:+.1f}" for value in shift[:3] * 100)
@@ -216,7 +191,7 @@ def calibrate(
         covariance += 0.5 * np.outer(shift, shift)
     units = _correction(start, found) / _UNIT
     values, vectors = np.linalg.eigh(covariance)
-    limit = np.array([config.most_sigma_m] * 3 + [math.radians(config.most_sigma_deg)] * 3)
+    limit = np.array([_MOST_SIGMA_M] * 3 + [math.radians(_MOST_SIGMA_DEG)] * 3)
     loose = vectors[:, np.sqrt(values) > (limit / _UNIT).max()]
     units = units - loose @ (loose.T @ units)
     sigma = np.hypot(np.sqrt(np.diag(covariance)) * _UNIT, _SYSTEMATIC)
@@ -231,14 +206,14 @@ def calibrate(
     )
 
 
-def _edges(frames: Sequence[Frame], camera_from_lidar: Matrix, config: CalibrationConfig) -> _Edges:
+def _edges(frames: Sequence[Frame], camera_from_lidar: Matrix) -> _Edges:
     floor = find_floor(np.concatenate([frame.points[::7] for frame in frames]))
-    found = [lidar_edges(f.points, f.intensity, f.ring, floor, config.intensity_step) for f in frames]
+    found = [lidar_edges(f.points, f.intensity, f.ring, floor) for f in frames]
     cue = np.concatenate([edges.cue for edges in found])
     counts = {name: int((cue == k).sum()) for k, name in enumerate(CUES)}
-    if len(cue) < config.min_edges:
+    if len(cue) < _MIN_EDGES:
         raise CalibrationError(
-            f"only {len(cue)} edge points in {len(frames)} frames, {config.min_edges} are needed. "
+            f"only {len(cue)} edge points in {len(frames)} frames, {_MIN_EDGES} are needed. "
             "Record in a furnished room, from several places."
         )
     points = np.concatenate([edges.points for edges in found]).astype(np.float64)
@@ -292,11 +267,11 @@ def _around(level: _Level, camera_from_lidar: Matrix, step_deg: float) -> tuple[
     return _turned(camera_from_lidar, float(yaws[best])), max(rival, 0.0)
 
 
-def _climb(level: _Level, start: Matrix, found: Matrix, config: CalibrationConfig) -> Matrix:
+def _climb(level: _Level, start: Matrix, found: Matrix) -> Matrix:
     """Pose of the highest score near ``found``, with a weak prior towards ``start``."""
     from scipy.optimize import minimize
 
-    reach = np.array([config.reach_m] * 3 + [math.radians(config.reach_deg)] * 3) / _UNIT
+    reach = np.array([_REACH_M] * 3 + [math.radians(_REACH_DEG)] * 3) / _UNIT
     base = max(level.score(found), 1e-9)
 
     def cost(units: Floats) -> float:
@@ -312,9 +287,7 @@ def _climb(level: _Level, start: Matrix, found: Matrix, config: CalibrationConfi
     return _moved(start, result.x)
 
 
-def _among_rivals(
-    level: _Level, start: Matrix, found: Matrix, config: CalibrationConfig
-) -> tuple[Matrix, list[Matrix]]:
+def _among_rivals(level: _Level, start: Matrix, found: Matrix) -> tuple[Matrix, list[Matrix]]:
     """Select the maximum, and return other maxima that fit as well because parallel edges can be confused.
 
     With a camera height that is too low, the foot of a wall falls on the upper edge of its skirting board. From several
@@ -332,7 +305,7 @@ def _among_rivals(
     maxima = [found]
     up_and_down = [_moved(found, k * np.eye(6)[2]) for k in (-8, 8)]
     for pose in [pose for _, pose in peaks[:2]] + up_and_down:
-        other = _climb(level, start, pose, config)
+        other = _climb(level, start, pose)
         if all(np.abs(_correction(known, other) / _UNIT).max() > 2 for known in maxima):
             maxima.append(other)
     best = max(maxima, key=level.score)

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from instant_ic.camera.loop import ReconnectConfig
 from instant_ic.config.ranges import NotNegative, NotNegativeInt, Percent, Positive, PositiveInt, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
 
@@ -75,13 +74,11 @@ class FilesConfig:
         rate_hz: images per second.
         loop: whether to restart after the last image; otherwise the last image is repeated.
         quality: JPEG quality for files in other formats, 1-100.
-        latency_s: subtracted from the stamps.
     """
 
     rate_hz: Positive = 5.0
     loop: bool = True
     quality: Percent = 90
-    latency_s: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -101,7 +98,6 @@ class ThetaCameraConfig:
         theta: live preview.
         video: stream through OpenCV.
         files: images from files.
-        reconnect: delays between connection attempts.
     """
 
     source: Literal["theta", "video", "files"] = "theta"
@@ -113,7 +109,6 @@ class ThetaCameraConfig:
     theta: ThetaConfig = field(default_factory=ThetaConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     files: FilesConfig = field(default_factory=FilesConfig)
-    reconnect: ReconnectConfig = field(default_factory=ReconnectConfig)
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -24,7 +24,7 @@ def open_camera(config: ThetaCameraConfig, now_ns: Callable[[], int]) -> Camera:
     """The camera of ``config.source``, not connected yet; ``now_ns`` stamps its images."""
     if config.source == "theta":
         user, password = os.environ.get(USER_VARIABLE, ""), os.environ.get(PASSWORD_VARIABLE, "")
-        return ThetaCamera(config.url, config.theta, user, password, now_ns)
+        return ThetaCamera(ThetaClient(config.url, config.theta, user, password), now_ns)
     if config.source == "video":
         return VideoCamera(config.url, config.video, now_ns)
     return FileCamera(config.url, config.files, now_ns)

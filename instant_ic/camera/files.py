@@ -23,17 +23,10 @@ class FileCamera(Camera):
         now_ns: Callable[[], int] = time.time_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Create the camera without reading a file.
-
-        Args:
-            path: image, or folder of images.
-            config: rate and order.
-            now_ns: clock of the stamps and of the rate.
-            sleep: waits until the next image is due.
-        """
+        """Create the camera for an image or a folder of images without reading a file."""
         self.path = Path(path)
         self.config = config or FilesConfig()
-        super().__init__(self.config.latency_s, now_ns)
+        super().__init__(0.0, now_ns)
         self._sleep = sleep
         self._paths: list[Path] = []
         self._loaded: dict[Path, tuple[bytes, int, int]] = {}
@@ -41,11 +34,7 @@ class FileCamera(Camera):
         self._due_ns: int | None = None
 
     def connect(self) -> str:
-        """Find the images and read the first.
-
-        Raises:
-            CameraError: there is no image, or the first one cannot be read.
-        """
+        """Find the images and read the first."""
         self.close()
         if self.path.is_dir():
             self._paths = sorted(p for p in self.path.iterdir() if p.suffix.lower() in SUFFIXES)
@@ -57,11 +46,7 @@ class FileCamera(Camera):
         return f"{len(self._paths)} images from {self.path}, {width}x{height} at {self.config.rate_hz} Hz"
 
     def read(self) -> Frame:
-        """Wait until the next image is due and return it.
-
-        Raises:
-            CameraError: not connected, or the file cannot be read.
-        """
+        """Wait until the next image is due and return it."""
         period_ns = round(1e9 / self.config.rate_hz)
         now_ns = self._now_ns()
         if self._due_ns is None or self._due_ns > now_ns + period_ns:  # the first, or the clock was set back

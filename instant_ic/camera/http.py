@@ -135,27 +135,20 @@ class Session(requests.Session):
         if user:
             self.auth = _Digest(user, password)
         self.headers["Accept-Encoding"] = "identity"
+        self.headers["Content-Type"] = "application/json;charset=utf-8"
         self.adapters.clear()
         self.mount("http://", _Adapter(self.deadline))
 
     def get_redirect_target(self, resp: requests.Response) -> None:
         """Return None: redirects are neither followed nor read."""
 
-    def ask(
-        self,
-        method: str,
-        url: str,
-        body: Mapping[str, Any] | None,
-        headers: Mapping[str, str],
-        timeout_s: float,
-    ) -> requests.Response:
+    def ask(self, method: str, url: str, body: Mapping[str, Any] | None, timeout_s: float) -> requests.Response:
         """Send one request and read its reply; the parts of a multipart reply are left for streaming.
 
         Args:
             method: HTTP method.
             url: complete address.
             body: sent as JSON.
-            headers: request headers.
             timeout_s: time-out of the connection and of the whole reply.
 
         Raises:
@@ -164,9 +157,7 @@ class Session(requests.Session):
         """
         self.deadline.start(timeout_s)
         try:
-            return self.request(
-                method, url, json=body, headers=dict(headers), timeout=timeout_s, stream=True, allow_redirects=False
-            )
+            return self.request(method, url, json=body, timeout=timeout_s, stream=True, allow_redirects=False)
         finally:
             self.deadline.at_s = math.inf
 

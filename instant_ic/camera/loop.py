@@ -3,46 +3,20 @@
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from instant_ic.camera.source import Camera, CameraError, Frame
-from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.reconnect import Backoff
 
 
-@dataclass(frozen=True)
-class ReconnectConfig:
-    """Waits between attempts to connect.
-
-    Attributes:
-        min_s: first wait.
-        max_s: longest wait; waits double up to it, at the start only after 15 s.
-    """
-
-    min_s: Positive = 0.25
-    max_s: Positive = 2.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        if not self.min_s <= self.max_s:
-            raise ValueError(f"min_s must be at most max_s (got {self.min_s}, {self.max_s})")
-
-
 class CameraLoop(threading.Thread):
-    """Thread that reads a camera until `end`.
-
-    Attributes:
-        frames: images read.
-        connections: successful connections.
-        failures: attempts and connections that ended with an error.
-    """
+    """Thread that reads a camera until `end`."""
 
     def __init__(
         self,
         camera: Camera,
         on_frame: Callable[[Frame], None],
         on_event: Callable[[bool, str], None],
-        reconnect: ReconnectConfig | None = None,
+        backoff: Backoff | None = None,
     ) -> None:
         """Create the thread without starting it.
 
@@ -50,34 +24,27 @@ class CameraLoop(threading.Thread):
             camera: used by this thread only.
             on_frame: called on this thread with each image.
             on_event: called on this thread when the connection opens (True) or ends (False), with a text.
-            reconnect: waits between attempts.
+            backoff: waits between attempts.
         """
         super().__init__(name="camera", daemon=True)
-        self.frames = 0
-        self.connections = 0
-        self.failures = 0
         self._camera = camera
         self._on_frame = on_frame
         self._on_event = on_event
-        self._reconnect = reconnect or ReconnectConfig()
+        self._backoff = backoff or Backoff(0.25, 2.0)
         self._end = threading.Event()
 
     def run(self) -> None:
-        backoff = Backoff(self._reconnect.min_s, self._reconnect.max_s)
         try:
             while not self._end.is_set():
                 try:
                     self._on_event(True, self._camera.connect())
-                    self.connections += 1
                     while not self._end.is_set():
                         frame = self._camera.read()
                         # Only an image proves that the connection works.
-                        backoff.succeed()
-                        self.frames += 1
+                        self._backoff.succeed()
                         self._on_frame(frame)
                 except Exception as error:  # noqa: BLE001 - nothing else reports an exception of this thread
-                    self.failures += 1
-                    wait_s = backoff.fail(time.monotonic())
+                    wait_s = self._backoff.fail(time.monotonic())
                     text = str(error) if isinstance(error, CameraError) else f"unexpected {error!r}"
                     self._on_event(False, f"{text.rstrip('.')}. Reconnecting in {wait_s:g} s")
                     self._end.wait(wait_s)

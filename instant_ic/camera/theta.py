@@ -1,5 +1,6 @@
 """Ricoh Theta Z1 over its Web API (Open Spherical Camera API, level 2, with Ricoh's options)."""
 
+import contextlib
 import json
 import re
 import threading
@@ -22,7 +23,6 @@ from instant_ic.pace import current
 NEVER = 65535
 """Value of sleepDelay and offDelay that keeps the camera from sleeping or switching itself off."""
 
-_JSON = {"Content-Type": "application/json;charset=utf-8"}
 _CHUNK = 64 << 10
 _MOST_TEXT = 200
 """Characters of a text from the camera that go into logs and diagnostics."""
@@ -60,6 +60,8 @@ class ThetaState:
 class ThetaClient:
     """Sends commands to the camera over one persistent connection; safe to use from several threads.
 
+    Its methods raise `CameraError` if the camera does not answer, and `ThetaError` if it refuses a command.
+
     Example:
         >>> client = ThetaClient("http://192.168.1.1", ThetaConfig())       # doctest: +SKIP
         >>> client.info()["model"], client.state().battery                  # doctest: +SKIP
@@ -85,31 +87,21 @@ class ThetaClient:
         """
         self.url = url.rstrip("/")
         self.config = config
-        self.busy_replies = 0
-        """Number of replies that reported a busy camera (503)."""
         self._user = user
         self._password = password
-        self._sleep = sleep
+        self.sleep = sleep
         self._lock = threading.Lock()
-        self._session = self._new_session()
+        self._session = Session(user, password)
 
     def close(self) -> None:
         self._session.close()
 
     def info(self) -> dict[str, Any]:
-        """``GET /osc/info``: model, serial number, firmware.
-
-        Raises:
-            CameraError: no answer.
-        """
+        """``GET /osc/info``: model, serial number, firmware."""
         return self._call("GET", "/osc/info", None)
 
     def state(self) -> ThetaState:
-        """``POST /osc/state``: battery, temperatures, error codes.
-
-        Raises:
-            CameraError: no answer.
-        """
+        """``POST /osc/state``: battery, temperatures, error codes."""
         state = self._call("POST", "/osc/state", {}).get("state")
         state = state if isinstance(state, dict) else {}
         errors = state.get("_cameraError")
@@ -122,28 +114,19 @@ class ThetaClient:
         )
 
     def execute(self, name: str, parameters: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Run a command, wait until it ends and return its results.
-
-        Raises:
-            ThetaError: the camera refused it.
-            CameraError: no answer.
-        """
+        """Run a command, wait until it ends and return its results."""
         reply = self._call("POST", "/osc/commands/execute", {"name": name, "parameters": dict(parameters or {})})
         deadline = time.monotonic() + self.config.connect_timeout_s
         while reply.get("state") == "inProgress":
             if time.monotonic() > deadline:
                 raise CameraError(f"{self.url}: {name} did not finish within {self.config.connect_timeout_s} s")
-            self._sleep(0.1)
+            self.sleep(0.1)
             reply = self._call("POST", "/osc/commands/status", {"id": reply.get("id", "")})
         results = reply.get("results", {})
         return results if isinstance(results, dict) else {}
 
     def options(self, names: Sequence[str]) -> dict[str, Any]:
-        """``camera.getOptions``; empty if the camera refuses the command.
-
-        Raises:
-            CameraError: no answer.
-        """
+        """``camera.getOptions``; empty if the camera refuses the command."""
         try:
             options = self.execute("camera.getOptions", {"optionNames": list(names)}).get("options")
         except ThetaError:
@@ -151,30 +134,15 @@ class ThetaClient:
         return options if isinstance(options, dict) else {}
 
     def set_options(self, options: Mapping[str, Any]) -> None:
-        """``camera.setOptions``.
-
-        Raises:
-            ThetaError: the camera does not know an option or its value.
-            CameraError: no answer.
-        """
+        """``camera.setOptions``; refused if the camera does not know an option or its value."""
         self.execute("camera.setOptions", {"options": dict(options)})
 
     def open_preview(self) -> tuple[Session, requests.Response]:
-        """Start ``camera.getLivePreview`` on its own connection; the caller must close both.
-
-        Raises:
-            ThetaError: the camera refused it.
-            CameraError: no answer.
-        """
-        session = self._new_session()
+        """Start ``camera.getLivePreview`` on its own connection; the caller must close both."""
+        session = Session(self._user, self._password)
         try:
-            response = self._request(
-                session,
-                "POST",
-                "/osc/commands/execute",
-                {"name": "camera.getLivePreview"},
-                current().timeout_s(self.config.read_timeout_s),
-            )
+            body, timeout_s = {"name": "camera.getLivePreview"}, current().timeout_s(self.config.read_timeout_s)
+            response = self._request(session, "POST", "/osc/commands/execute", body, timeout_s)
             if not is_multipart(response):
                 kind = response.headers.get("Content-Type", "")[:_MOST_TEXT]
                 raise CameraError(f"{self.url}: the preview is {kind or 'of no type'} instead of multipart")
@@ -196,18 +164,13 @@ class ThetaClient:
         return reply
 
     def _request(
-        self,
-        session: Session,
-        method: str,
-        path: str,
-        body: Mapping[str, Any] | None,
-        timeout_s: float,
+        self, session: Session, method: str, path: str, body: Mapping[str, Any] | None, timeout_s: float
     ) -> requests.Response:
         """Send one request; repeat it with growing waits while the camera is busy."""
         wait_s = self.config.busy_wait_s
         for attempt in range(self.config.busy_retries + 1):
             try:
-                response = session.ask(method, self.url + path, body, _JSON, timeout_s)
+                response = session.ask(method, self.url + path, body, timeout_s)
             except requests.RequestException as error:
                 raise CameraError(
                     f"{self.url}{path}: no answer ({_cause(error)}). Check that the camera is on, in the same network, "
@@ -215,10 +178,9 @@ class ThetaClient:
                 ) from error
             if response.status_code != 503:
                 break
-            self.busy_replies += 1
             if attempt < self.config.busy_retries:
                 response.close()
-                self._sleep(wait_s)
+                self.sleep(wait_s)
                 wait_s *= 2.0
         if response.status_code == 200:
             return response
@@ -226,40 +188,20 @@ class ThetaClient:
         response.close()
         raise refusal
 
-    def _new_session(self) -> Session:
-        return Session(self._user, self._password)
-
 
 class ThetaCamera(Camera):
     """Live preview of a Theta Z1."""
 
-    def __init__(
-        self,
-        url: str,
-        config: ThetaConfig | None = None,
-        user: str = "",
-        password: str = "",
-        now_ns: Callable[[], int] = time.time_ns,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
-        """Take the same arguments as `ThetaClient`."""
-        self.config = config or ThetaConfig()
+    def __init__(self, client: ThetaClient, now_ns: Callable[[], int] = time.time_ns) -> None:
+        self.config = client.config
         super().__init__(self.config.latency_s, now_ns)
-        self.client = ThetaClient(url, self.config, user, password, sleep)
-        self._sleep = sleep
+        self.client = client
         self._session: Session | None = None
         self._response: requests.Response | None = None
         self._parser = PreviewParser()
 
     def connect(self) -> str:
-        """Set the camera up, if it is not set up already, and start its preview.
-
-        Returns:
-            Model, firmware and preview format.
-
-        Raises:
-            CameraError: no answer, or the camera refused a command.
-        """
+        """Set the camera up, if it is not set up already, start its preview, and return model, firmware and format."""
         self._end_preview()
         config = self.config
         info = self.client.info()
@@ -271,7 +213,7 @@ class ThetaCamera(Camera):
         if self.client.options(list(wanted)) != wanted:
             self.client.set_options(wanted)
             # If started sooner, the preview has the previous format or stops at once.
-            self._sleep(config.settle_s)
+            self.client.sleep(config.settle_s)
         self._session, self._response = self.client.open_preview()
         found = re.search(r"boundary=\"?([^\";]+)", self._response.headers.get("Content-Type", ""))
         self._parser = PreviewParser(found.group(1) if found else "")
@@ -282,12 +224,7 @@ class ThetaCamera(Camera):
         )
 
     def read(self) -> Frame:
-        """Return the newest complete image.
-
-        Raises:
-            CameraError: no image within the read time-out, or the camera ended the preview (button, shooting,
-                change of mode).
-        """
+        """Return the newest complete image; the camera ends the preview at its button, shooting or change of mode."""
         response, session = self._response, self._session
         if response is None or session is None:
             raise CameraError(f"{self.client.url}: not connected; call connect() first")
@@ -311,28 +248,21 @@ class ThetaCamera(Camera):
             self.bad_frames += self._parser.bad_frames - bad_before
             stamp_ns = self._stamp_ns()
             for jpeg in reversed(frames):
-                try:
+                with contextlib.suppress(JpegError):
                     width, height = jpeg_size(jpeg)
-                except JpegError:
-                    self.bad_frames += 1
-                    continue
-                if width * height > MOST_PIXELS:  # 60 kB can declare 65535 x 65535
-                    self.bad_frames += 1
-                    continue
-                return Frame(jpeg, stamp_ns, width, height)
+                    if width * height <= MOST_PIXELS:  # 60 kB can declare 65535 x 65535
+                        return Frame(jpeg, stamp_ns, width, height)
+                self.bad_frames += 1
 
     def close(self) -> None:
-        """End the preview and close both connections."""
         self._end_preview()
         self.client.close()
 
     def _end_preview(self) -> None:
-        response, self._response = self._response, None
-        session, self._session = self._session, None
-        if response is not None:
-            response.close()
-        if session is not None:
-            session.close()
+        for each in (self._response, self._session):
+            if each is not None:
+                each.close()
+        self._response = self._session = None
 
     def _ended(self, reason: str) -> CameraError:
         self._end_preview()

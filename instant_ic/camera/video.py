@@ -16,24 +16,12 @@ class VideoCamera(Camera):
     """
 
     def __init__(self, url: str, config: VideoConfig | None = None, now_ns: Callable[[], int] = time.time_ns) -> None:
-        """Create the camera without opening it.
-
-        Args:
-            url: device path or number, stream address, or file.
-            config: size, quality, time-outs.
-            now_ns: clock of the stamps.
-        """
         self.url = url
         self.config = config or VideoConfig()
         super().__init__(self.config.latency_s, now_ns)
         self._capture: Any = None
 
     def connect(self) -> str:
-        """Open the device or stream.
-
-        Raises:
-            CameraError: OpenCV cannot open it.
-        """
         import cv2
 
         self.close()
@@ -58,11 +46,6 @@ class VideoCamera(Camera):
         return f"video {self.url}, {width}x{height} by {capture.getBackendName()}"
 
     def read(self) -> Frame:
-        """Return the next frame as JPEG.
-
-        Raises:
-            CameraError: the stream ended.
-        """
         import cv2
 
         if self._capture is None:

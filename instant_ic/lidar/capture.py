@@ -40,12 +40,10 @@ class CaptureCounters:
     """Counts of a capture's contents.
 
     Attributes:
-        records: frames read.
         datagrams: UDP payloads returned.
         skipped: skipped frames by reason.
     """
 
-    records: int = 0
     datagrams: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
 
@@ -83,7 +81,6 @@ class CaptureReader:
         frames = self._pcapng() if self._data[:4] == _PCAPNG_MAGIC else self._pcap()
         counters = self.counters
         for stamp_ns, link, start, end in frames:
-            counters.records += 1
             found = _udp(self._data, start, end, link)
             if isinstance(found, str):
                 counters.skipped[found] += 1
@@ -110,7 +107,6 @@ class CaptureReader:
                 return
             if captured < original:
                 # The snapshot length truncated this frame, so its payload is incomplete.
-                self.counters.records += 1
                 self.counters.skipped["cut frame"] += 1
             else:
                 yield seconds * 1_000_000_000 + fraction * unit_ns, link, at, at + captured
@@ -141,7 +137,6 @@ class CaptureReader:
                 if interface >= len(interfaces) or body + 20 + captured > end:
                     self.counters.skipped["broken packet block"] += 1
                 elif captured < original:
-                    self.counters.records += 1
                     self.counters.skipped["cut frame"] += 1
                 else:
                     link, tick_ns = interfaces[interface]

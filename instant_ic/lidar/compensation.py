@@ -9,7 +9,7 @@ from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.lidar.config import FlatScanConfig
-from instant_ic.lidar.flatscan import FlatScan, flat_scan
+from instant_ic.lidar.flatscan import flat_scan
 from instant_ic.lidar.motion import MotionError, PlanarMotion
 from instant_ic.lidar.stream import Revolution
 
@@ -19,8 +19,8 @@ _LEAST_NS = 50_000_000
 
 def compensated_scan(
     revolution: Revolution, base_from_lidar: NDArray[np.float64], config: FlatScanConfig, tf: TransformBuffer
-) -> tuple[FlatScan, Diagnosis]:
-    """Scan of a revolution, and whether it is motion-compensated; without odometry the base is taken to stand still.
+) -> tuple[NDArray[np.float32], Diagnosis]:
+    """Ranges (beams,) of a revolution, and whether they are motion-compensated; without odometry the base stands still.
 
     Args:
         revolution: decoded points.

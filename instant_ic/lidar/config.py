@@ -57,15 +57,11 @@ class FlatScanConfig:
 
 
 @dataclass(frozen=True)
-class Vlp16DriverConfig:
-    """Parameters of the node ``vlp16_driver``.
+class Vlp16DriverConfig(ReceiverConfig):
+    """Parameters of the node ``vlp16_driver``, in addition to those of the receiver.
 
     Attributes:
         source: ``udp``, ``pcap``, or ``topic`` (packets of a bag from /lidar/packets).
-        host: local address; 0.0.0.0 also takes broadcasts.
-        port: port of data packets.
-        position_port: port of position packets; -1: not received.
-        sensor: the sensor's IPv4 address; empty: the first sender until the driver restarts.
         pcap: capture file, for source pcap.
         rate: playback rate of the capture; 1 is the recorded rate.
         loop: restart the capture at its end.
@@ -77,10 +73,6 @@ class Vlp16DriverConfig:
     """
 
     source: Literal["udp", "pcap", "topic"] = "udp"
-    host: str = "0.0.0.0"
-    port: Annotated[int, Range(0, 65535)] = 2368
-    position_port: Annotated[int, Range(-1, 65535)] = 8308
-    sensor: str = ""
     pcap: str = ""
     rate: Positive = 1.0
     loop: bool = False
@@ -91,11 +83,6 @@ class Vlp16DriverConfig:
     scan: FlatScanConfig = field(default_factory=FlatScanConfig)
 
     def __post_init__(self) -> None:
-        check_ranges(self)
+        super().__post_init__()
         if self.source == "pcap" and not self.pcap:
             raise ValueError("pcap must name a capture file where source is pcap (got '')")
-        self.receiver()
-
-    def receiver(self) -> ReceiverConfig:
-        """The receiver's part of the parameters."""
-        return ReceiverConfig(self.host, self.port, self.position_port, self.sensor)

@@ -44,7 +44,6 @@ class PacketFeed:
         return self._with_packets(revolution)
 
     def finish(self) -> tuple[Revolution, Packets] | None:
-        """Return the rest as the last revolution."""
         return self._with_packets(self.stream.finish())
 
     def _with_packets(self, revolution: Revolution | None) -> tuple[Revolution, Packets] | None:

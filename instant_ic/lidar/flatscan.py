@@ -1,7 +1,5 @@
 """Flat scan: one range per direction from the points in a height interval, motion-compensated to one instant."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -19,33 +17,13 @@ MAX_TILT_DEG = 5.0
 """A flat scan lies in the sensor's plane. At this tilt, a point 0.7 m above or below the sensor is 6 cm off."""
 
 
-@dataclass(frozen=True)
-class FlatScan:
-    """A planar scan in the sensor's frame.
-
-    Attributes:
-        ranges: metres as in REP-117: +inf no return, -inf too close, nan not measured; (beams,). Beam i points
-            to angle_min + i * angle_increment, counter-clockwise from ahead.
-        angle_min: direction of the first beam, rad; the centre of its sector.
-        angle_increment: angle between beams, rad.
-        stamp_ns: instant of all ranges: the end of the revolution.
-        compensated: whether the base's motion during the revolution was compensated.
-    """
-
-    ranges: NDArray[np.float32]
-    angle_min: float
-    angle_increment: float
-    stamp_ns: int
-    compensated: bool
-
-
 def flat_scan(
     revolution: Revolution,
     base_from_lidar: NDArray[np.float64],
     config: FlatScanConfig,
     motion: PlanarMotion | None = None,
-) -> FlatScan:
-    """Project a revolution to a planar scan.
+) -> NDArray[np.float32]:
+    """Project a revolution to a planar scan in the sensor's frame.
 
     Each point is moved by the base's motion from its firing to the end of the revolution. Each beam takes its smallest
     range.
@@ -55,6 +33,10 @@ def flat_scan(
         base_from_lidar: mount of the sensor; the origin of base_link is on the ground, (4, 4).
         config: height interval and beams.
         motion: poses of the base around the revolution; without them the base is assumed to stand still.
+
+    Returns:
+        Ranges at the end of the revolution, metres as in REP-117: +inf no return, -inf too close, nan not measured;
+        (beams,). Beam i points to -pi + i * 2 pi / beams, counter-clockwise from ahead.
 
     Raises:
         MotionError: the poses do not cover the revolution.
@@ -80,13 +62,7 @@ def flat_scan(
         config.range_max,
         ranges,
     )
-    return FlatScan(
-        ranges=ranges,
-        angle_min=-np.pi,
-        angle_increment=2.0 * np.pi / config.beams,
-        stamp_ns=revolution.end_ns,
-        compensated=motion is not None,
-    )
+    return ranges
 
 
 def check_level(base_from_lidar: NDArray[np.float64]) -> None:
@@ -110,24 +86,6 @@ def coverage(revolution: Revolution) -> float:
     """
     degrees = np.floor(np.degrees(revolution.firing_azimuth)).astype(np.int64) % 360
     return float(len(np.unique(degrees))) / 360.0
-
-
-def deskew(revolution: Revolution, base_from_lidar: NDArray[np.float64], motion: PlanarMotion) -> NDArray[np.float32]:
-    """Positions of all points in the sensor's frame at the end of the revolution, (N, 3).
-
-    Raises:
-        MotionError: the poses do not cover the revolution.
-    """
-    rotation, translation = base_from_lidar[:3, :3], base_from_lidar[:3, 3]
-    stamps_ns = revolution.stamp_ns + (revolution.points["time"].astype(np.float64) * 1e9).astype(np.int64)
-    shift = motion.end_from_time(revolution.end_ns, stamps_ns)
-    base = revolution.xyz.astype(np.float64) @ rotation.T + translation
-    c, s = np.cos(shift[:, 2]), np.sin(shift[:, 2])
-    moved = np.stack(
-        [c * base[:, 0] - s * base[:, 1] + shift[:, 0], s * base[:, 0] + c * base[:, 1] + shift[:, 1], base[:, 2]],
-        axis=-1,
-    )
-    return np.asarray((moved - translation) @ rotation, np.float32)
 
 
 def warm_up() -> None:

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+_MAX_EXTRAPOLATION_S = 0.2
+"""Largest extrapolation beyond the first and the last pose."""
+
 
 class MotionError(ValueError):
     """The poses do not cover the requested time; the text says which part is missing."""
@@ -17,12 +20,10 @@ class PlanarMotion:
     Attributes:
         stamps_ns: stamps in rising order, (M,), M >= 1.
         odom_from_base: (x, y, yaw), metres and radians, (M, 3).
-        max_extrapolation_s: largest extrapolation of `at` beyond the first and the last pose.
     """
 
     stamps_ns: NDArray[np.int64]
     odom_from_base: NDArray[np.float64]
-    max_extrapolation_s: float = 0.2
 
     def __post_init__(self) -> None:
         if self.stamps_ns.ndim != 1 or self.odom_from_base.shape != (len(self.stamps_ns), 3):
@@ -39,9 +40,9 @@ class PlanarMotion:
         wanted = np.asarray(stamps_ns, np.int64)
         first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
         outside_s = max(first - int(wanted.min()), int(wanted.max()) - last) * 1e-9
-        if outside_s > self.max_extrapolation_s:
+        if outside_s > _MAX_EXTRAPOLATION_S:
             raise MotionError(
-                f"no pose of the base within {self.max_extrapolation_s} s (the nearest is {outside_s:.3f} s away)"
+                f"no pose of the base within {_MAX_EXTRAPOLATION_S} s (the nearest is {outside_s:.3f} s away)"
             )
         if len(self.stamps_ns) == 1:
             return np.broadcast_to(self.odom_from_base[0], (*wanted.shape, 3)).copy()

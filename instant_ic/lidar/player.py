@@ -47,17 +47,8 @@ class CapturePlayer:
             yield datagram._replace(stamp_ns=self._start_ns + datagram.stamp_ns - self._first_ns)
 
     @property
-    def skipped(self) -> str:
-        """Packets of the capture that are not UDP datagrams, by reason; empty if there are none."""
-        return ", ".join(f"{count} x {reason}" for reason, count in self._reader.counters.skipped.items())
-
-    @property
-    def played(self) -> int:
-        """Number of datagrams of the capture read so far."""
-        return self._reader.counters.datagrams
-
-    @property
     def diagnosis(self) -> Diagnosis:
-        """What has been played and what was left out."""
-        text = f"{self.played} datagrams played" + (f"; left out: {self.skipped}" if self.skipped else "")
-        return Diagnosis("capture", Level.WARN if self.skipped else Level.OK, text)
+        counters = self._reader.counters
+        skipped = ", ".join(f"{count} x {reason}" for reason, count in counters.skipped.items())
+        text = f"{counters.datagrams} datagrams played" + (f"; left out: {skipped}" if skipped else "")
+        return Diagnosis("capture", Level.WARN if skipped else Level.OK, text)

@@ -8,9 +8,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Annotated, NamedTuple
 
 from instant_ic.closing import Closing
+from instant_ic.config.ranges import Range, check_ranges
 from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES, check_data_packet
 from instant_ic.lidar.sources import SourceGuard
 from instant_ic.pace import current
@@ -35,21 +36,18 @@ class ReceiverConfig:
 
     Attributes:
         host: local address; 0.0.0.0 also receives the broadcasts of a sensor with factory settings.
-        port: UDP port of data packets; 0 lets the system choose (see `PacketReceiver.port`).
-        position_port: UDP port of position packets; -1 disables it.
-        sensor: IPv4 address of the sensor; empty locks onto the first sender.
+        port: UDP port of data packets; 0: any free port.
+        position_port: UDP port of position packets; -1: not received.
+        sensor: the sensor's IPv4 address; empty: the first sender until the driver restarts.
     """
 
     host: str = "0.0.0.0"
-    port: int = 2368
-    position_port: int = 8308
+    port: Annotated[int, Range(0, 65535)] = 2368
+    position_port: Annotated[int, Range(-1, 65535)] = 8308
     sensor: str = ""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise ValueError(f"port must be in 0..65535 (got {self.port})")
-        if not -1 <= self.position_port <= 65535:
-            raise ValueError(f"position_port must be in -1..65535 (got {self.position_port})")
+        check_ranges(self)
         if self.sensor:
             try:
                 ipaddress.IPv4Address(self.sensor)
@@ -76,6 +74,10 @@ class PacketReceiver(Closing):
 
     Attributes:
         sources: decides which senders' packets are accepted.
+        port, position_port: the bound UDP ports; -1 for none.
+
+    Raises:
+        ReceiverError: a port is in use or not permitted.
     """
 
     def __init__(
@@ -84,63 +86,30 @@ class PacketReceiver(Closing):
         sources: SourceGuard | None = None,
         steady_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.config = config
         self.sources = sources or SourceGuard(config.sensor)
         self._steady_ns = steady_ns
-        self._selector: selectors.BaseSelector | None = None
-        self._data: socket.socket | None = None
-        self._position: socket.socket | None = None
-
-    @property
-    def port(self) -> int:
-        return int(self._data.getsockname()[1]) if self._data else self.config.port
-
-    @property
-    def position_port(self) -> int:
-        return int(self._position.getsockname()[1]) if self._position else self.config.position_port
-
-    def connect(self) -> None:
-        """Bind the ports.
-
-        Raises:
-            ReceiverError: a port is in use or not permitted.
-        """
-        self.close()
         self._selector = selectors.DefaultSelector()
+        self._sockets: list[socket.socket] = []
         try:
-            self._data = self._bind(self.config.port)
-            if self.config.position_port >= 0:
-                self._position = self._bind(self.config.position_port)
-        except OSError:
+            self.port = self._bind(config.host, config.port, is_data=True)
+            position = config.position_port
+            self.position_port = self._bind(config.host, position, is_data=False) if position >= 0 else -1
+        except ReceiverError:
             self.close()
             raise
 
     def close(self) -> None:
-        for bound in (self._data, self._position):
-            if bound is not None:
-                bound.close()
-        if self._selector is not None:
-            self._selector.close()
-        self._selector = self._data = self._position = None
-
-    def __enter__(self) -> Self:
-        self.connect()
-        return self
+        for bound in self._sockets:
+            bound.close()
+        self._selector.close()
 
     def read(self, timeout_s: float) -> Iterator[Received]:
-        """Yield the sensor's datagrams; wait at most ``timeout_s`` for the first one and yield nothing on a time-out.
-
-        Raises:
-            ReceiverError: not connected.
-        """
-        if self._selector is None:
-            raise ReceiverError("the receiver is not connected; call connect() first")
+        """Yield the sensor's datagrams; wait at most ``timeout_s`` for the first one, and yield nothing after that."""
         if self._selector.select(timeout_s):
             time.sleep(_GATHER_S)
         for key, _ in self._selector.select(0.0):
-            bound = key.fileobj
+            bound, is_data = key.fileobj, bool(key.data)
             assert isinstance(bound, socket.socket)
-            is_data = bound is self._data
             for _ in range(_MOST_AT_ONCE):
                 try:
                     payload, ancillary, _, sender = bound.recvmsg(DATA_PACKET_BYTES + 512, 64)
@@ -150,27 +119,26 @@ class PacketReceiver(Closing):
                 if self.sources.admit(sender, is_data, well_formed, self._steady_ns()):
                     yield Received(_stamp_ns(ancillary), payload, is_data)
 
-    def _bind(self, port: int) -> socket.socket:
+    def _bind(self, host: str, port: int, is_data: bool) -> int:
         bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sockets.append(bound)
         try:
             bound.setblocking(False)
             # Room for half a second of packets, because the decoder's thread may be delayed.
             bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
             bound.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-            bound.bind((self.config.host, port))
+            bound.bind((host, port))
         except OSError as error:
-            bound.close()
             raise ReceiverError(
-                f"UDP {self.config.host}:{port} cannot be bound ({error.strerror}). "
+                f"UDP {host}:{port} cannot be bound ({error.strerror}). "
                 "Stop the program that uses the port: 'ss -ulpn' shows it."
             ) from error
-        assert self._selector is not None
-        self._selector.register(bound, selectors.EVENT_READ)
-        return bound
+        self._selector.register(bound, selectors.EVENT_READ, is_data)
+        return int(bound.getsockname()[1])
 
 
 class ReceiverThread(threading.Thread):
-    """Reads a connected receiver on a thread of its own.
+    """Reads a receiver on a thread of its own.
 
     Args:
         receiver: closed at the end.
@@ -191,7 +159,6 @@ class ReceiverThread(threading.Thread):
         self.ending = threading.Event()
 
     def run(self) -> None:
-        """Read until `end`."""
         try:
             while not self.ending.is_set():
                 for received in self.receiver.read(timeout_s=0.2):
@@ -200,7 +167,6 @@ class ReceiverThread(threading.Thread):
             self._on_fault(error)
 
     def end(self) -> None:
-        """End the thread and close the receiver."""
         self.ending.set()
         self.join(2.0)
         self.receiver.close()

@@ -1,14 +1,17 @@
 """Splits the stream of data packets into revolutions and counts missing packets."""
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.lidar.capture import CaptureReader
 from instant_ic.lidar.clock import DeviceClock
 from instant_ic.lidar.config import DecoderConfig
-from instant_ic.lidar.decode import decode_packets
+from instant_ic.lidar.decode import DecodedPackets, decode_packets
 from instant_ic.lidar.packets import (
     BLOCK_PERIOD_US,
     BLOCKS,
@@ -39,30 +42,18 @@ _MAX_PACKETS = 400
 
 
 @dataclass(frozen=True)
-class Revolution:
+class Revolution(DecodedPackets):
     """One revolution of the sensor.
 
     Attributes:
-        points: `instant_ic.lidar.decode.POINT_DTYPE`, (N,); ``time`` counts seconds from ``stamp_ns``.
         stamp_ns: host time of the first firing.
         end_ns: host time of the end of the last firing.
-        firing_azimuth: azimuth of each firing sequence, rad, clockwise from ahead, (F,).
-        firing_time: time of each firing sequence after ``stamp_ns``, seconds, (F,).
-        firing_too_close: whether the firing sequence had a return nearer than the decoder's min_range, (F,).
         complete: whether both ends are at the cut angle and no packet is missing.
-        missing_packets: packets that never arrived, found in the sensor's clock.
-        dual: whether the sensor was in dual return mode.
     """
 
-    points: NDArray[np.void]
     stamp_ns: int
     end_ns: int
-    firing_azimuth: NDArray[np.float32]
-    firing_time: NDArray[np.float32]
-    firing_too_close: NDArray[np.bool_]
     complete: bool
-    missing_packets: int
-    dual: bool
 
     @property
     def xyz(self) -> NDArray[np.float32]:
@@ -177,6 +168,18 @@ class PacketStream:
         """Return the rest as the last revolution, for example at the end of a capture."""
         return self._end_early()
 
+    def revolutions(self, path: str | Path) -> Iterator[Revolution]:
+        """Yield all revolutions of a capture file, including the partial first and last ones.
+
+        Raises:
+            CaptureError: the file is not a capture.
+        """
+        for stamp_ns, _, payload in CaptureReader(path):
+            if len(payload) == DATA_PACKET_BYTES and (revolution := self.feed(payload, stamp_ns)) is not None:
+                yield revolution
+        if (last := self.finish()) is not None:
+            yield last
+
     def _end_at_cut(self, turned: int) -> Revolution | None:
         """End the revolution inside the newest packet, where the azimuth passes the cut angle."""
         packet = self._payloads[-1]
@@ -230,13 +233,8 @@ class PacketStream:
         start_us = first_us + block_us
         self.counters.revolutions += 1
         return Revolution(
-            points=decoded.points,
+            **vars(decoded),
             stamp_ns=self.clock.host_ns(start_us),
             end_ns=self.clock.host_ns(start_us + decoded.duration_s * 1e6),
-            firing_azimuth=decoded.firing_azimuth,
-            firing_time=decoded.firing_time,
-            firing_too_close=decoded.firing_too_close,
             complete=self._cut_before and cut_after and self._missing == 0,
-            missing_packets=self._missing,
-            dual=self._dual,
         )

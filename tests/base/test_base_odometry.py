@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from instant_ic.base.config import LimitsConfig, OdometryNoiseConfig, RoboclawConfig, SkidSteerConfig
+from instant_ic.base.config import LimitsConfig, RoboclawConfig, SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import UNMEASURED_VARIANCE, WheelOdometry, unwrap_counts
@@ -72,10 +72,8 @@ def test_half_circle_lands_where_geometry_says() -> None:
 
 
 def test_covariance_grows_with_distance_and_more_with_turns() -> None:
-    noise = OdometryNoiseConfig(position_per_metre=1e-3, yaw_per_metre=1e-3, yaw_per_radian=1e-2)
-
     def after(left: int, right: int) -> np.ndarray:
-        odometry = WheelOdometry(GEOMETRY, noise)
+        odometry = WheelOdometry(GEOMETRY)
         odometry.update([0, 0], SECOND)
         estimate = odometry.update([left % 2**32, right % 2**32], 2 * SECOND)
         assert estimate is not None
@@ -84,7 +82,7 @@ def test_covariance_grows_with_distance_and_more_with_turns() -> None:
 
     still, half, one, turn = after(0, 0), after(2000, 2000), after(4000, 4000), after(-1200, 1200)
     assert still[5, 5] == 0.0
-    np.testing.assert_allclose([half[5, 5], one[5, 5]], [0.5e-3, 1e-3])  # yaw_per_metre * metres
+    np.testing.assert_allclose([half[5, 5], one[5, 5]], [0.2e-3, 0.4e-3])  # 0.0004 rad^2/m
     np.testing.assert_allclose(turn[5, 5], 1e-2, rtol=1e-9)  # one radian
     assert one[2, 2] == one[3, 3] == one[4, 4] == UNMEASURED_VARIANCE
 

@@ -10,7 +10,7 @@ import pytest
 from base_ports import EmulatorPort, opener
 
 from instant_ic.base.config import RoboclawConfig
-from instant_ic.base.controller import BaseController, ControllerConfig, ControllerThread
+from instant_ic.base.controller import RECONNECT_MAX_S, BaseController, ControllerConfig, ControllerThread
 from instant_ic.base.recent import RecentCount
 from instant_ic.bus import ERROR, OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
@@ -263,7 +263,7 @@ def test_clock_set_back_delays_neither_the_next_connection_nor_the_next_battery_
     port.unplugged = False
     now[0] -= 3600 * 1000 * MILLISECOND  # an hour back, while a new try is planned by the old time
     for _ in range(2):
-        steady[0] += int(config.roboclaw.reconnect_max_s * 1000) * MILLISECOND
+        steady[0] += int(RECONNECT_MAX_S * 1000) * MILLISECOND
         state = controller.step()
     assert state.connected
     steady[0] += int(config.health_period_s * 1000) * MILLISECOND

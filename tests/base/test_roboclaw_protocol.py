@@ -3,6 +3,7 @@
 import os
 import struct
 import threading
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -133,7 +134,7 @@ def test_driver_reads_and_writes_what_the_emulator_holds() -> None:
     assert roboclaw.battery_v() == pytest.approx(24.1)
     emulator.status = 0x1
     assert roboclaw.status().faults == ["emergency stop"]
-    with roboclaw:
+    with closing(roboclaw):
         roboclaw.drive([500.0, 500.0], 0.0)
     assert port.closed
     assert emulator.target_speed_pps.tolist() == [0.0, 0.0]
@@ -214,10 +215,12 @@ def pty_controller():  # type: ignore[no-untyped-def]
 
 
 def test_driver_over_a_real_pseudo_terminal(pty_controller: PtyController) -> None:
-    with Roboclaw(RoboclawConfig(port=pty_controller.path, reply_timeout_s=2.0)) as roboclaw:
+    with closing(Roboclaw(RoboclawConfig(port=pty_controller.path, reply_timeout_s=2.0))) as roboclaw:
+        roboclaw.connect()
         roboclaw.drive([1000.0, -1000.0], 0.0)
         assert pty_controller.emulator.target_speed_pps.tolist() == [1000.0, -1000.0]
         assert roboclaw.battery_v() == pytest.approx(24.1)
+        roboclaw.stop()
     assert pty_controller.emulator.target_speed_pps.tolist() == [0.0, 0.0]
 
 

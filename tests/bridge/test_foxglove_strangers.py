@@ -13,6 +13,7 @@ from foxglove_client import Client, FoxgloveWorld
 from live_nodes import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from instant_ic.bag.metadata import own_schema
 from instant_ic.bridge import foxglove_server
 from instant_ic.bridge.parameter_guard import never_set
 from instant_ic.bus import LATCHED, RELIABLE
@@ -399,7 +400,7 @@ def test_frames_are_those_of_foxgloves_own_server(world):
     out.publish(String("hello"))
     wait_for(lambda: "/latched" in bridge.server.topics, "the topic")
     try:
-        definition = foxglove_server.schema_text("std_msgs/msg/String").encode()
+        definition = own_schema("std_msgs/msg/String").text.encode()
         schema = foxglove.Schema(name="std_msgs/msg/String", encoding="ros2msg", data=definition)
         channel = foxglove.Channel("/latched", message_encoding="cdr", schema=schema, context=context)
         answers = []

@@ -291,7 +291,7 @@ def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_
     bus = LockstepBus()
     importer = bus.add(Importer)
     words = [
-        Arrived(Announce(1, "/operator/estop", origin, Bool.__msgtype__, "", "latched"), payload, born_ns, 0, born_ns)
+        Arrived(Announce(1, "/operator/estop", origin, Bool.__msgtype__, "", "latched"), payload, born_ns, born_ns)
         for origin, payload, born_ns in (
             ("tablet", bytes(serialize(Bool(data=True))), 1_000_000_000),
             ("station", bytes(serialize(Bool(data=False))), release_ms * 1_000_000 - 1),
@@ -324,7 +324,7 @@ def test_latched_values_that_a_peer_makes_are_limited_with_a_clear_error():
     collector = bus.add(Collector)
     for number in range(100):
         announce = Announce(number, "/state", f"node{number}", Bool.__msgtype__, "", "latched")
-        collector.incoming.take(Arrived(announce, bytes(serialize(Bool(data=True))), number, 0, number))
+        collector.incoming.take(Arrived(announce, bytes(serialize(Bool(data=True))), number, number))
     last = collector.incoming._topics["/state"].last
     assert list(last) == [f"node{number}" for number in range(36, 100)]  # the newest 64
     assert collector.troubles[0] == ("/state", "more than 64 nodes publish it: the value of node0 was dropped")
@@ -335,8 +335,8 @@ def test_topics_of_no_list_that_a_peer_names_share_one_diagnosis(hosts):
     robot = hosts.bridge("robot").node
     before = set(robot.diagnoses())
     for number in range(100):
-        robot.trouble(f"/x{number}", "refused here: it is not on the topic list of robot")
-    robot.trouble("/operator/cmd_vel", "refused here: different fields")
+        robot.report.trouble(f"/x{number}", "refused here: it is not on the topic list of robot")
+    robot.report.trouble("/operator/cmd_vel", "refused here: different fields")
     assert set(robot.diagnoses()) - before == {"topic of no list", "topic /operator/cmd_vel"}
     assert robot.diagnoses()["topic of no list"][1].startswith("/x99: refused")
 

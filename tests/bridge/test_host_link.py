@@ -48,12 +48,12 @@ class End:
         self.link = link_class(*where, side, by_topic(*exports), store, self.on_event, times)
         self.link.start()
 
-    def on_event(self, event):
+    def on_event(self, peer, event):
         self.times.append(time.monotonic())
         self.events.append(event)
 
     def of(self, kind):
-        return [event.event for event in self.events if isinstance(event.event, kind)]
+        return [event for event in self.events if isinstance(event, kind)]
 
     def payloads(self, topic):
         return [bytes(e.payload) for e in self.of(Arrived) if e.announce.topic == topic]
@@ -334,9 +334,9 @@ def test_stalled_link_brings_no_old_pictures_and_no_old_commands(ends, keys):
         late = {"/camera": [], "/operator/cmd_vel": []}
         for end in (a, b):
             for at, event in zip(end.times, end.events, strict=False):
-                if isinstance(event.event, Arrived) and at > stall_end + 0.05:
-                    born = int.from_bytes(event.event.payload[:8], "little") / 1e9
-                    late[event.event.announce.topic].append(at - born)
+                if isinstance(event, Arrived) and at > stall_end + 0.05:
+                    born = int.from_bytes(event.payload[:8], "little") / 1e9
+                    late[event.announce.topic].append(at - born)
         assert len(late["/camera"]) > 6 and max(late["/camera"][5:]) < 0.5
         assert max(late["/operator/cmd_vel"]) < 0.5  # its limit is 0.25; the test's own thread may be late
         assert a.link.counts()[1]["/operator/cmd_vel"].expired > 0

@@ -6,9 +6,10 @@ import pytest
 from fake_theta import Behaviour, FakeTheta, jpeg, part
 
 from instant_ic.camera.config import ThetaConfig
-from instant_ic.camera.loop import CameraLoop, ReconnectConfig
+from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.camera.theta import NEVER, ThetaCamera, ThetaClient, ThetaError
+from instant_ic.reconnect import Backoff
 
 FRAMES = [jpeg(value) for value in (40, 80, 120, 160)]
 CONFIG = ThetaConfig(settle_s=0.0, busy_wait_s=0.01, connect_timeout_s=20.0, read_timeout_s=20.0)
@@ -26,7 +27,7 @@ def one_by_one(behaviour: Behaviour) -> Behaviour:
 def test_frames_pass_byte_for_byte_and_the_newest_counts(chunked: bool, boundary: str) -> None:
     pieces = [b"".join(part(frame, boundary) for frame in FRAMES)]
     with FakeTheta(Behaviour(previews=[pieces], chunked=chunked)) as theta:
-        with ThetaCamera(theta.url, CONFIG, now_ns=lambda: 5_000_000_000) as camera:
+        with ThetaCamera(ThetaClient(theta.url, CONFIG), lambda: 5_000_000_000) as camera:
             frame = camera.read()
             assert frame == Frame(FRAMES[-1], 4_800_000_000, 64, 32)  # 0.2 s of latency
             with pytest.raises(CameraError, match="the camera ended it"):
@@ -36,7 +37,7 @@ def test_frames_pass_byte_for_byte_and_the_newest_counts(chunked: bool, boundary
 def test_options_are_set_then_a_second_is_waited_then_the_preview_starts() -> None:
     waits: list[float] = []
     with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]])) as theta:
-        camera = ThetaCamera(theta.url, ThetaConfig(), sleep=lambda s: waits.append(s))
+        camera = ThetaCamera(ThetaClient(theta.url, ThetaConfig(), sleep=waits.append))
         text = camera.connect()
         camera.close()
         assert theta.behaviour.commands == ["camera.getOptions", "camera.setOptions", "camera.getLivePreview"]
@@ -52,7 +53,7 @@ def test_options_are_set_then_a_second_is_waited_then_the_preview_starts() -> No
 def test_a_camera_with_the_right_options_starts_its_preview_at_once() -> None:
     waits: list[float] = []
     with FakeTheta(Behaviour(previews=[[part(FRAMES[0])], [part(FRAMES[1])]])) as theta:
-        camera = ThetaCamera(theta.url, ThetaConfig(), sleep=lambda s: waits.append(s))
+        camera = ThetaCamera(ThetaClient(theta.url, ThetaConfig(), sleep=waits.append))
         camera.connect()
         camera.connect()
         camera.close()
@@ -62,7 +63,7 @@ def test_a_camera_with_the_right_options_starts_its_preview_at_once() -> None:
 
 def test_digest_authentication_for_commands_and_preview() -> None:
     with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]], password="00105307")) as theta:
-        with ThetaCamera(theta.url, CONFIG, SERIAL, "00105307") as camera:
+        with ThetaCamera(ThetaClient(theta.url, CONFIG, SERIAL, "00105307")) as camera:
             assert camera.read().jpeg == FRAMES[0]
         # One challenge for each of the two connections; after it the nonce is kept.
         assert theta.behaviour.unauthorised == 2
@@ -76,7 +77,7 @@ def test_busy_camera_is_asked_again_with_growing_waits() -> None:
     with FakeTheta(Behaviour(busy=3)) as theta:
         client = ThetaClient(theta.url, ThetaConfig(busy_wait_s=0.25), sleep=waits.append)
         assert client.info()["model"] == "RICOH THETA Z1"
-        assert (waits, client.busy_replies) == ([0.25, 0.5, 1.0], 3)
+        assert waits == [0.25, 0.5, 1.0]
         theta.behaviour.busy = 99
         with pytest.raises(ThetaError, match="serviceUnavailable") as caught:
             client.info()
@@ -111,7 +112,7 @@ def test_state_with_errors() -> None:
 def test_stall_is_given_up_after_the_read_timeout() -> None:
     config = ThetaConfig(settle_s=0.0, read_timeout_s=0.2)
     with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]], stall=True)) as theta:
-        with ThetaCamera(theta.url, config) as camera:
+        with ThetaCamera(ThetaClient(theta.url, config)) as camera:
             assert camera.read().jpeg == FRAMES[0]
             with pytest.raises(CameraError, match=r"preview ended: .*[Tt]ime"):
                 camera.read()
@@ -121,7 +122,7 @@ def test_frame_that_stalls_in_the_middle_is_never_given_out() -> None:
     config = ThetaConfig(settle_s=0.0, read_timeout_s=0.2)
     half = part(FRAMES[1])[:300]
     with FakeTheta(Behaviour(previews=[[part(FRAMES[0]) + half]], stall=True)) as theta:
-        with ThetaCamera(theta.url, config) as camera:
+        with ThetaCamera(ThetaClient(theta.url, config)) as camera:
             assert camera.read().jpeg == FRAMES[0]
             with pytest.raises(CameraError):
                 camera.read()
@@ -130,7 +131,7 @@ def test_frame_that_stalls_in_the_middle_is_never_given_out() -> None:
 def test_cut_frame_is_counted_and_the_next_one_given() -> None:
     stream = part(FRAMES[0][:200], length=len(FRAMES[0])) + part(FRAMES[1])
     with FakeTheta(Behaviour(previews=[[stream]])) as theta:
-        with ThetaCamera(theta.url, CONFIG) as camera:
+        with ThetaCamera(ThetaClient(theta.url, CONFIG)) as camera:
             assert camera.read().jpeg == FRAMES[1]
             assert camera.bad_frames == 1
 
@@ -155,16 +156,15 @@ def test_loop_connects_again_after_each_end_and_backs_off() -> None:
 
     with FakeTheta(one_by_one(Behaviour())) as theta:
         loop = CameraLoop(
-            ThetaCamera(theta.url, CONFIG),
+            ThetaCamera(ThetaClient(theta.url, CONFIG)),
             lambda frame: received.append(frame.jpeg),
             on_event,
-            ReconnectConfig(min_s=0.1, max_s=0.4),
+            Backoff(0.1, 0.4),
         )
         loop.start()
         assert enough.wait(60.0)
         assert loop.end(30.0)
     assert received == FRAMES
-    assert loop.frames == loop.connections == 4
     waits = [text.rsplit(" in ", 1)[1] for connected, text in events if not connected]
     # A picture makes the next wait short again; refusals make it longer.
     assert waits[:7] == ["0.1 s"] * 4 + ["0.2 s", "0.4 s", "0.4 s"]
@@ -175,10 +175,10 @@ def test_loop_ends_while_it_waits() -> None:
     with FakeTheta() as theta:
         failed = threading.Event()
         loop = CameraLoop(
-            ThetaCamera(theta.url, CONFIG),
+            ThetaCamera(ThetaClient(theta.url, CONFIG)),
             lambda frame: None,
             lambda connected, text: failed.set(),
-            ReconnectConfig(min_s=600.0, max_s=600.0),
+            Backoff(600.0, 600.0),
         )
         loop.start()
         assert failed.wait(30.0)
@@ -210,7 +210,7 @@ def test_loop_outlives_and_tells_unexpected_exceptions() -> None:
         FlakyCamera(0.0),
         lambda frame: arrived.set(),
         lambda connected, text: events.append(text),
-        ReconnectConfig(min_s=0.01, max_s=0.01),
+        Backoff(0.01, 0.01),
     )
     loop.start()
     assert arrived.wait(30.0)

@@ -17,7 +17,6 @@ from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.camera.config import FilesConfig, ThetaConfig
 from instant_ic.camera.device import PASSWORD_VARIABLE, USER_VARIABLE
-from instant_ic.camera.loop import ReconnectConfig
 from instant_ic.config.params import build, load_file
 from instant_ic.msg import CompressedImage, stamp_ns, transform_matrix
 from nodes.theta_camera import ThetaCameraConfig, ThetaCameraNode
@@ -80,7 +79,6 @@ def test_theta_over_real_sockets(run_dir: Path, monkeypatch: pytest.MonkeyPatch)
             url=theta.url,
             health_period_s=0.05,
             theta=ThetaConfig(settle_s=0.0, busy_wait_s=0.01),
-            reconnect=ReconnectConfig(min_s=0.05, max_s=0.05),
         )
         nodes: list[Node[Any]] = []
         for kind in (Probe, ThetaCameraNode):

@@ -120,7 +120,7 @@ def test_preview_whose_chunk_head_drips_ends_by_the_deadline() -> None:
             yield b"0"
 
     with Stranger(drip, pause_s=0.05) as stranger:
-        camera = ThetaCamera(stranger.url, QUICK)
+        camera = ThetaCamera(ThetaClient(stranger.url, QUICK))
         camera._session, camera._response = camera.client.open_preview()
         with pytest.raises(CameraError, match="preview ended"):
             camera.read()
@@ -161,7 +161,7 @@ def test_image_that_declares_more_pixels_than_a_camera_has_is_dropped() -> None:
     at = good.index(b"\xff\xc0")
     bomb = good[: at + 5] + b"\xff\xff\xff\xff" + good[at + 9 :]
     with FakeTheta(Behaviour(previews=[[part(bomb)]])) as theta:
-        camera = ThetaCamera(theta.url, PATIENT)
+        camera = ThetaCamera(ThetaClient(theta.url, PATIENT))
         camera.connect()
         with pytest.raises(CameraError, match="the camera ended it"):
             camera.read()

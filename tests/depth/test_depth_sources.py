@@ -25,7 +25,7 @@ from instant_ic.depth.sources import SOURCES, DepthResult, DepthSource, SourceCo
 from instant_ic.depth.visibility import nearest_points
 from instant_ic.geometry.poses import rotation_matrix
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.lidar.recording import Recording
+from instant_ic.lidar.stream import PacketStream
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 
@@ -125,7 +125,7 @@ def test_a_real_revolution_tells_the_ranges_that_it_was_not_shown() -> None:
     path = DATA / "vlp16" / "einride_recording.pcap"
     if not path.exists():
         pytest.skip(f"{path} is not there")
-    revolution = next(each for each in Recording(path) if each.complete)
+    revolution = next(each for each in PacketStream().revolutions(path) if each.complete)
     points = revolution.xyz.astype(np.float64) - [0, 0, 0.6]
     # Every fourth sector of three degrees is kept back.
     kept_back = (np.degrees(np.arctan2(points[:, 1], points[:, 0])) // 3) % 4 == 0

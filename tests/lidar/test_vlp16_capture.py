@@ -25,7 +25,7 @@ def read(tmp_path: Path, data: bytes) -> tuple[list[Datagram], CaptureReader]:
 def test_pcap_in_both_endiannesses_and_both_resolutions(tmp_path: Path, order: str, nano: bool, stamp: int) -> None:
     datagrams, reader = read(tmp_path, pcap(FRAMES, order, nano))
     assert datagrams == [(stamp, 2368, b"first"), (stamp + SECOND, 8308, b"second")]
-    assert reader.counters.records == reader.counters.datagrams == 2
+    assert reader.counters.datagrams == 2
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -71,9 +71,8 @@ def test_what_is_no_datagram_is_counted_by_reason(tmp_path: Path) -> None:
         "cut datagram": 1,
         "cut record": 1,
     }
-    assert reader.counters.records == 6
     assert [datagram.payload for datagram in reader] == [b"payload"]  # it can be read again
-    assert reader.counters.records == 6
+    assert reader.counters.datagrams == 1
 
 
 def test_file_that_is_no_capture_is_refused_in_words(tmp_path: Path) -> None:
@@ -94,7 +93,7 @@ def test_damaged_captures_never_raise(tmp_path_factory: pytest.TempPathFactory, 
     path = tmp_path_factory.getbasetemp() / "damaged"
     path.write_bytes(bytes(data[: max(4, cut)]))
     reader = CaptureReader(path)
-    assert len(list(reader)) == reader.counters.datagrams <= reader.counters.records
+    assert len(list(reader)) == reader.counters.datagrams
 
 
 @pytest.mark.real_data

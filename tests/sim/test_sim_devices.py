@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -295,7 +296,8 @@ def test_a_driver_can_come_back(controller: tuple[RoboclawEmulator, RoboClawServ
     emulator, server = controller
     for count in (5, 7):
         emulator.encoder[:] = count
-        with Roboclaw(RoboclawConfig(port=str(server.link), reply_timeout_s=TIMEOUT_S)) as driver:
+        with closing(Roboclaw(RoboclawConfig(port=str(server.link), reply_timeout_s=TIMEOUT_S))) as driver:
+            driver.connect()
             assert driver.encoders().tolist() == [count, count]
             assert "Roboclaw" in driver.version()
             assert driver.battery_v() == pytest.approx(24.1)

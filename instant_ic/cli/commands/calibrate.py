@@ -44,15 +44,15 @@ def add_parser(subparsers: Any) -> None:
 
 
 def camera_lidar(args: argparse.Namespace) -> int:
-    from instant_ic.calibration.bag import Selection, read_recording
-    from instant_ic.calibration.mount import CalibrationConfig, calibrate
+    from instant_ic.calibration.bag import read_recording
+    from instant_ic.calibration.mount import calibrate
 
     if args.frames < 1:
         raise UserError(f"--frames must be at least 1 (got {args.frames})", 2)
     guess = _guess(args.guess) if args.guess else None
     check_files(args.out, args.plot, args.json)
     print(f"reading {args.bag}", flush=True)
-    recording = read_recording(args.bag, Selection(args.images, args.points, most_frames=args.frames))
+    recording = read_recording(args.bag, args.images, args.points, args.frames)
     given = guess if guess is not None else recording.camera_from_lidar
     if given is None:
         raise UserError(
@@ -62,9 +62,7 @@ def camera_lidar(args: argparse.Namespace) -> int:
     print(f"{recording.pictures} images, {len(recording.frames)} used, from {recording.places} places"
           + ("" if recording.moves else "; no odometry on /tf: the robot is assumed to stand still"),
           flush=True)  # fmt: skip
-    result = calibrate(
-        recording.frames, given, CalibrationConfig(full_circle=not args.near), lambda line: print(line, flush=True)
-    )
+    result = calibrate(recording.frames, given, not args.near, lambda line: print(line, flush=True))
     summary = _summary(args.bag, recording, given, result)
     _tell(summary)
     if args.json:
