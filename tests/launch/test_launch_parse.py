@@ -274,6 +274,15 @@ def test_a_parameter_arrives_as_it_was_written(value: object) -> None:
     assert parse_override(word)[1].value == value
 
 
+def test_a_list_of_aliases_to_a_long_text_is_refused_before_it_is_expanded(tmp_path: Path) -> None:
+    """11 110 uses of a variable of 100 kB would be 1 GB."""
+    lines = [f"      - &a{i} [{', '.join(['$(var long)' if i == 0 else f'*a{i - 1}'] * 10)}]\n" for i in range(4)]
+    text = "launch:\n- arg: {name: long, default: " + "x" * 100_000 + "}\n"
+    text += "- set_parameter:\n    name: p\n    value:\n" + "".join(lines)
+    [problem] = problems_of(write(tmp_path, text))
+    assert "6: its texts have more than 131072 characters" in problem
+
+
 def test_problem_is_told_as_file_and_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     file = write(tmp_path, "launch:\n- node: {exec: warp}\n")
