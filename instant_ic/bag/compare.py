@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.files import BagMessage, BagReader
+from instant_ic.bag.files import BagReader
+from instant_ic.bag.message import BagMessage
 
 
 @dataclass(frozen=True)

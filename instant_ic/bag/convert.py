@@ -12,7 +12,7 @@ from pathlib import Path
 from instant_ic.bag.choice import EVERYTHING, TopicChoice
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagReader, TopicSummary
-from instant_ic.bag.latched import LatchedValue, LatchedValues
+from instant_ic.bag.latched import LatchedValues
 from instant_ic.bag.metadata import REPEATED
 from instant_ic.bag.writer import BagWriter
 
@@ -140,7 +140,7 @@ def _write_latched(
     values = LatchedValues()
     latched = {topic.topic for topic in topics.values() if topic.qos.latched}
     for message in reader.messages(latched, None, start_ns) if latched else ():
-        values.put(LatchedValue(message.topic, message.type_name, message.payload, message.stamp_ns))
+        values.put(message)
     for value in values.values():
         source = topics[value.topic, value.type_name]
         name = names[value.topic, value.type_name]

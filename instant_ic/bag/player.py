@@ -5,13 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.files import BagMessage, BagReader, TopicSummary
+from instant_ic.bag.files import BagReader, TopicSummary
+from instant_ic.bag.latched import LatchedValues
+from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.upgrade import upgrade_of
@@ -284,15 +286,8 @@ class BagPlayer:
         latched = {topic.topic for topic in self.topics if topic.qos.latched}
         if begin_ns == self._reader.start_ns or not latched:
             return
-        newest: dict[str, BagMessage] = {}
+        values = LatchedValues()
         for message in self._messages(latched, None, begin_ns):
-            if message.topic == "/tf_static":  # each publisher sends its own
-                send(_at(message, begin_ns))
-            else:
-                newest[message.topic] = message
-        for message in newest.values():
-            send(_at(message, begin_ns))
-
-
-def _at(message: BagMessage, stamp_ns: int) -> BagMessage:
-    return BagMessage(message.topic, message.type_name, message.payload, stamp_ns, message.qos)
+            values.put(message)
+        for value in values.values():
+            send(replace(value, stamp_ns=begin_ns))

@@ -16,7 +16,8 @@ import yaml
 
 from instant_ic import paths
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.files import BagMessage, BagReader
+from instant_ic.bag.files import BagReader
+from instant_ic.bag.message import BagMessage
 from instant_ic.bag.player import NEVER_PLAYED
 from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag import BagError, BagMessage, BagReader, BagWriter
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, RECORDING, Recorder, RecordOptions
-from instant_ic.bag.snapshot import Entry, SnapshotCache
+from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
@@ -248,9 +248,9 @@ def test_clock_set_back_while_recording(tmp_path: Path) -> None:
     assert [m[2][0] for m in read(tmp_path / "bag")] == [40, 41, 100, 101]
 
 
-def entry(value: int, size: int = 10, latched: bool = False, publisher: str = "") -> Entry:
+def entry(value: int, size: int = 10, latched: bool = False, publisher: str = "") -> BagMessage:
     qos = LATCHED if latched else SENSOR
-    return Entry("/estop" if latched else "/scan", BOOL, bytes([value]) * size, value * S, qos, publisher)
+    return BagMessage("/estop" if latched else "/scan", BOOL, bytes([value]) * size, value * S, qos, publisher)
 
 
 def test_snapshot_cache_keeps_the_last_seconds_and_what_was_latched_before() -> None:

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from instant_ic.bag import BagReader, BagWriter
+from instant_ic.bag import BagMessage, BagReader, BagWriter
 from instant_ic.bag.compare import compare, digest
-from instant_ic.bag.files import BagMessage
 from instant_ic.bag.replay import ReplayResult, make_node, replay
 from instant_ic.bus import SENSOR
 from instant_ic.geometry.poses import pose_matrix
