@@ -11,8 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -56,7 +55,8 @@ def compile_all(report: Callable[[float], None]) -> list[str]:
     Returns:
         A text for each part that cannot be compiled. The nodes that need it try again at their start.
     """
-    with _lock():
+    with (_folder() / "kernels.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
         if are_compiled():
             return []
         key = _key()
@@ -117,13 +117,6 @@ def _folder() -> Path:
         folder = beside if os.access(beside if beside.exists() else _PACKAGE, os.W_OK) else paths.cache_dir()
     folder.mkdir(parents=True, exist_ok=True)
     return folder
-
-
-@contextmanager
-def _lock() -> Iterator[None]:
-    with (_folder() / "kernels.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 def _key() -> str:

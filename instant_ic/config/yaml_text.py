@@ -87,6 +87,12 @@ def dump_yaml(value: object, **style: Any) -> str:
     return str(yaml.safe_dump(value, sort_keys=False, **style))
 
 
+def one_line(value: object) -> str:
+    """A value as one line of YAML."""
+    text = dump_yaml(value, default_flow_style=True, allow_unicode=True, width=1 << 20)
+    return text.removesuffix("...\n").rstrip("\n")
+
+
 def _most_levels(text: str) -> int:
     """Upper bound of the levels of nesting in a text."""
     if len(text) <= _MOST_FAST:

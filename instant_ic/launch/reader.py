@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from instant_ic import paths
+from instant_ic.config.yaml_text import one_line
 from instant_ic.launch import nodes
 from instant_ic.launch.description import (
     Announcement,
@@ -24,7 +25,6 @@ from instant_ic.launch.source import LaunchFileError, Problem, Value, load
 from instant_ic.launch.substitutions import Context, truth
 from instant_ic.launch.values import (
     CONDITION,
-    as_yaml,
     flag_of,
     holds,
     parameter_value,
@@ -358,7 +358,7 @@ class _Actions:
     def _set_parameter(self, body: Value) -> None:
         if fields := self._fields(body, ("name", "value"), ("name", "value")):
             value = parameter_value(fields["value"], "", self.context)
-            self.scope.options += ["-p", f"{plain_text(fields['name'])}:={as_yaml(value)}"]
+            self.scope.options += ["-p", f"{plain_text(fields['name'])}:={one_line(value)}"]
 
     def _set_parameters_from_file(self, body: Value) -> None:
         if fields := self._fields(body, ("filename",), ("filename",)):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 import yaml
 
-from instant_ic.config.yaml_text import dump_yaml, read_yaml
+from instant_ic.config.yaml_text import read_yaml
 from instant_ic.launch.source import Value
 from instant_ic.launch.substitutions import MOST_TEXT, Context, SubstitutionError, has_substitution, substitute, truth
 
@@ -155,9 +155,3 @@ def _texts_replaced(value: Value, context: Context) -> object:
     except OverflowError:
         value.problem(f"its texts have more than {MOST_TEXT} characters, each alias counted where it is used")
         return None
-
-
-def as_yaml(value: object) -> str:
-    """A value as one line of YAML."""
-    text = dump_yaml(value, default_flow_style=True, allow_unicode=True, width=1 << 20)
-    return text.removesuffix("...\n").rstrip("\n")

@@ -18,7 +18,7 @@ from instant_ic.launch import NodeSpec, outlet, process
 from instant_ic.launch import supervisor as supervision
 from instant_ic.launch.outlet import LogFile, Outlet
 from instant_ic.launch.process import ManagedProcess, RespawnLimit, State
-from instant_ic.launch.rundir import StackLock
+from instant_ic.launch.rundir import stack_lock
 from instant_ic.launch.supervisor import STOP_SCHEDULE, Supervisor
 
 SLEEPER = "import time; print('ready', flush=True); time.sleep(600)"
@@ -443,7 +443,7 @@ def test_two_stacks_in_one_run_directory_also_where_it_is_a_groups(
     file = launch_file(tmp_path, group)
     (tmp_path / "r" / "left").mkdir(parents=True)
     for held in (tmp_path / "r", tmp_path / "r" / "left"):
-        with StackLock(held, "sim.yaml"):
+        with stack_lock(held, "sim.yaml"):
             assert main(["launch", file, "--run-dir", str(tmp_path / "r")]) == 1
         assert f"a stack already runs in {held} (pid {os.getpid()}, sim.yaml)" in capsys.readouterr().err
 

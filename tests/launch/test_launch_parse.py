@@ -6,9 +6,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from instant_ic.config.params import parse_override
+from instant_ic.config.yaml_text import one_line
 from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
 from instant_ic.launch.substitutions import Context, SubstitutionError, substitute, truth
-from instant_ic.launch.values import as_yaml
 
 
 @pytest.fixture
@@ -269,7 +269,7 @@ def test_mistake(tmp_path: Path, program: Path, text: str, expected: str) -> Non
     )
 )
 def test_a_parameter_arrives_as_it_was_written(value: object) -> None:
-    word = f"key:={as_yaml(value)}"
+    word = f"key:={one_line(value)}"
     assert "\n" not in word
     assert parse_override(word)[1].value == value
 

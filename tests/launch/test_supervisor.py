@@ -14,7 +14,7 @@ import pytest
 
 from instant_ic.launch import NodeSpec
 from instant_ic.launch.process import ManagedProcess, RespawnLimit
-from instant_ic.launch.rundir import StackLock, StackRunningError
+from instant_ic.launch.rundir import StackRunningError, stack_lock
 from instant_ic.launch.supervisor import STOP_SCHEDULE, Supervisor
 
 IGNORES = """
@@ -216,11 +216,11 @@ Supervisor(nodes, pathlib.Path({str(run_dir)!r}), Output()).run()
 
 
 def test_second_stack_in_the_run_directory_is_refused(run_dir: Path) -> None:
-    with StackLock(run_dir, "sim.yaml"):
+    with stack_lock(run_dir, "sim.yaml"):
         with pytest.raises(StackRunningError, match=rf"pid {os.getpid()}, sim\.yaml"):
-            with StackLock(run_dir, "other.yaml"):
+            with stack_lock(run_dir, "other.yaml"):
                 pass
-    with StackLock(run_dir, "other.yaml"):
+    with stack_lock(run_dir, "other.yaml"):
         pass
 
 
