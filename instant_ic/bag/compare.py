@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
-import hashlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -134,16 +133,6 @@ def compare(
         topics = names[0] & names[1] if common else names[0] | names[1]
         chosen = [t for t in sorted(topics) if not any(fnmatch.fnmatchcase(t, pattern) for pattern in ignore)]
         return [_Comparison(topic, one, two, tolerance).run() for topic in chosen]
-
-
-def digest(bag: Path) -> str:
-    """Return the SHA-256 of the topics, types, stamps and bytes of all messages, in bag order."""
-    total = hashlib.sha256()
-    with BagReader(bag) as reader:
-        for message in reader.messages():
-            total.update(f"{message.topic} {message.type_name} {message.stamp_ns} {len(message.payload)}\n".encode())
-            total.update(message.payload)
-    return total.hexdigest()
 
 
 class _Comparison:

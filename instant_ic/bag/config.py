@@ -22,7 +22,6 @@ class BagPlayerConfig(PlayOptions):
         publish_clock: whether to publish ``/clock``.
         delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
         wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
-        linger_s: seconds that the player stays after the last message, so that other nodes finish their work.
         force: play commands and states although a base is running, which may move the robot.
     """
 
@@ -31,7 +30,6 @@ class BagPlayerConfig(PlayOptions):
     publish_clock: bool = True
     delay_s: NotNegative = 0.5
     wait_for: tuple[str, ...] = ()
-    linger_s: NotNegative = 1.0
     force: bool = False
 
     def __post_init__(self) -> None:

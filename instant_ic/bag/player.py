@@ -23,6 +23,9 @@ from instant_ic.config.ranges import NotNegative, Range, check_ranges
 NEVER_PLAYED = ("/clock", *EVERY_NODES)
 """The time itself, and what nodes report about themselves: the running nodes publish their own."""
 
+CLOCK_HZ = 40.0
+"""Lowest rate of ``/clock``, also while paused and in gaps of the bag."""
+
 RATES = (0.01, 100.0)
 """Smallest and largest rate that can be set during playback."""
 
@@ -39,7 +42,6 @@ class PlayOptions:
         start_paused: wait at the start until resumed or stepped.
         topics: names or patterns of the topics to play; empty plays everything.
         exclude: names or patterns of the topics to leave out.
-        clock_hz: lowest rate of ``/clock``, also while paused and in gaps of the bag.
     """
 
     rate: Annotated[float, Range(*RATES)] = 1.0
@@ -49,7 +51,6 @@ class PlayOptions:
     start_paused: bool = False
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
-    clock_hz: Annotated[float, Range(1, 1000)] = 40.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -246,7 +247,7 @@ class BagPlayer:
         on_clock: Callable[[int], None],
     ) -> bool:
         """Return True at the end of the messages, False when playback must stop or jump."""
-        period_s = 1.0 / self.options.clock_hz
+        period_s = 1.0 / CLOCK_HZ
         next_clock_s = self._now_s() + period_s
         for message in messages:
             while True:

@@ -166,7 +166,7 @@ class Recorder:
     ) -> None:
         self.path = path
         self.options = options or RecordOptions()
-        self.counts: Counter[str] = Counter()
+        self._kept = 0  # in memory
         self.early = 0
         self.error = ""
         """Why recording failed or waits."""
@@ -217,7 +217,7 @@ class Recorder:
     @property
     def count(self) -> int:
         """Messages written; in snapshot mode, messages in memory or written."""
-        return self._writer.count if self._writer is not None else sum(self.counts.values())
+        return self._writer.count if self._writer is not None else self._kept
 
     def discover(self, topics: Collection[TopicInfo], nodes: Collection[NodeInfo] = ()) -> None:
         """Subscribe to new selected topics and store the parameters of nodes."""
@@ -407,7 +407,7 @@ class Recorder:
         elif not self._queue.put(message):
             self.dropped.overflow[message.topic] += 1
             return
-        self.counts[message.topic] += 1
+        self._kept += 1
 
     def _hand_on_missed(self) -> None:
         missed, self._missed = self._missed, LatchedValues()

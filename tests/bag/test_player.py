@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from instant_ic.bag import BagError, BagMessage, BagWriter, Schema
+from instant_ic.bag import BagError, BagMessage, BagWriter, Schema, player
 from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.player import BagPlayer, PlayOptions
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
@@ -50,6 +50,11 @@ def bag(tmp_path: Path) -> Path:
         for index in range(5):
             writer.write("/scan", BOOL, bytes([index]), 1_000_000_000 + index * 500_000_000, SENSOR)
     return tmp_path / "bag"
+
+
+@pytest.fixture(autouse=True)
+def clock_at_20_hz(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(player, "CLOCK_HZ", 20.0)
 
 
 def played(bag: Path, options: PlayOptions, time: FakeTime | None = None) -> list[tuple[float, str, bytes]]:
@@ -160,7 +165,7 @@ SCANS = ("/scan",)  # at 0, 0.5, 1, 1.5, 2 s
 
 
 def steered(bag: Path, at: dict[float, Callable[[BagPlayer], None]], **options: Any) -> Steered:
-    return Steered(bag, PlayOptions(topics=SCANS, clock_hz=20.0, **options), at)
+    return Steered(bag, PlayOptions(topics=SCANS, **options), at)
 
 
 def near(sent: list[tuple[float, int]]) -> list[tuple[float, int]]:
