@@ -89,8 +89,6 @@ class TopicDifference:
     """How one topic of two bags differs.
 
     Attributes:
-        count_a: messages in the first bag.
-        count_b: messages in the second bag.
         first: text of the first difference; empty where the topic is the same in both bags, within the tolerance.
         only_a: messages of the first bag without a partner, when pairing by stamp.
         only_b: messages of the second bag without a partner, when pairing by stamp.
@@ -119,11 +117,8 @@ def compare(
     """Compare every topic of two bags, in the order of the names.
 
     Args:
-        a: first bag.
-        b: second bag.
         ignore: topics to leave out, names or patterns.
         common: compare only topics that both bags have.
-        tolerance: allowed differences.
 
     Raises:
         BagError: a bag cannot be read.

@@ -63,7 +63,6 @@ def convert(
     Args:
         sources: anything that :class:`BagReader` opens.
         target: folder of the new bag, which must not exist.
-        options: what to copy, and how to write it.
         on_progress: called with the completed share, 0 to 1.
 
     Raises:

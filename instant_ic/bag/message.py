@@ -12,7 +12,6 @@ class BagMessage:
     """A message in a bag, or on its way into one.
 
     Attributes:
-        topic: name of the topic.
         type_name: message type, for example ``sensor_msgs/msg/Image``.
         payload: CDR bytes.
         stamp_ns: time of publication, nanoseconds since the epoch.

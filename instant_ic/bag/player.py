@@ -59,9 +59,6 @@ class PlayOptions:
 class BagPlayer:
     """Paces the messages of a bag, independent of the bus. Its controls may be called from any thread.
 
-    Args:
-        options: how to play it.
-
     Raises:
         BagError: there is no bag, or it has nothing to play.
     """
@@ -212,7 +209,6 @@ class BagPlayer:
         Args:
             send: called with each message when it is due.
             stop: ends playback; also interrupts waiting.
-            now_s: clock for the pace.
             on_clock: called with the bag's time, first at the start and then periodically; in between,
                 :attr:`position_ns` is valid.
 

@@ -144,11 +144,9 @@ class Recorder:
 
     Args:
         path: the bag's folder; with snapshots, the parent folder of one bag per snapshot.
-        choice: topics to record.
         subscribe: ``(topic, take)`` subscribes to raw bytes and returns the counter of lost messages.
         sim_now_ns: the simulated clock, if there is one. Nodes that do not follow it (the recorder itself, the console)
             stamp with the machine's time; their messages get the simulated time of their arrival instead.
-        options: see :class:`RecordOptions`.
         free_bytes: free space on the bag's disk; replaced in tests.
 
     Raises:

@@ -51,7 +51,6 @@ def parse(text: str, node: str, end_s: float) -> list[LogLine]:
     later time of day than the next one, midnight lies between them.
 
     Args:
-        text: content of the file.
         node: owner of the file; a line in another format (output of a library) is attributed to it.
         end_s: when the file was last written, seconds since the epoch.
     """

@@ -28,7 +28,6 @@ class Observer(Closing):
     Args:
         topics: one or several names, with or without the leading slash.
         use_sim_time: take arrival times and :attr:`clock` from ``/clock``.
-        run_dir: run directory of the stack.
 
     Raises:
         RegistryError: the run directory cannot be used, or a name is invalid.

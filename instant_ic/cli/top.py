@@ -112,7 +112,6 @@ def make_rows(
 
     Args:
         infos: nodes listed in the registry.
-        beats: node → its newest heartbeat.
         look: returns CPU, memory and threads of a process.
         nominal: returns the expected rate of a topic.
         now_ns: system time.

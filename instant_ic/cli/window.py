@@ -8,11 +8,7 @@ from statistics import fmean, pstdev
 
 
 class Window:
-    """Sliding window over the newest values.
-
-    Args:
-        size: maximum number of values.
-    """
+    """Sliding window over the newest values."""
 
     def __init__(self, size: int) -> None:
         self.values: deque[float] = deque(maxlen=size)
@@ -30,11 +26,7 @@ class Window:
 
 
 class Rate:
-    """Rate of a topic from the arrival times of its messages.
-
-    Args:
-        size: number of messages in the window.
-    """
+    """Rate of a topic from the arrival times of its messages."""
 
     def __init__(self, size: int) -> None:
         self.gaps = Window(size)

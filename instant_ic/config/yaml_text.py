@@ -74,11 +74,7 @@ def construct(node: yaml.Node) -> Any:
 
 
 def dump_yaml(value: object, **style: Any) -> str:
-    """``yaml.safe_dump`` with keys in their order; by the C emitter where there is one.
-
-    Args:
-        style: options of ``yaml.dump``.
-    """
+    """``yaml.safe_dump`` with keys in their order; by the C emitter where there is one."""
     if (fast := getattr(yaml, "CSafeDumper", None)) is not None:
         try:
             return str(yaml.dump(value, Dumper=fast, sort_keys=False, **style))

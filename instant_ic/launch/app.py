@@ -37,7 +37,6 @@ def run_stack(
     """Start everything, show its state, and stop it at the end.
 
     Args:
-        description: what to start.
         run_dir: run directory; created if missing, with those of the groups inside.
         live: show a table of the nodes below the lines; default: only if standard output is a terminal.
         pace: of the stack's time. Default: what the machine can do, if the devices are simulated; else the machine's.

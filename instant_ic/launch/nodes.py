@@ -122,7 +122,6 @@ def read_executable(body: Value, scope: Scope, taken: set[str]) -> NodeSpec | No
     """Read an ``executable`` (any program); None if it is wrong or its conditions do not hold.
 
     Args:
-        scope: scope of the entry.
         taken: names of the processes before it.
     """
     context = scope.context

@@ -45,7 +45,6 @@ class Outlet:
 
         Args:
             function: runs on the outlet's thread.
-            size: size of the call.
             always: queue it even then; for the few calls that matter.
         """
         with self._condition:
@@ -89,7 +88,6 @@ class LogFile:
     """A node's log file, mode 0600; the previous run's file is kept. Errors are reported once and never raised.
 
     Args:
-        path: of the file; its folder need not exist yet.
         tell: called with a text when writing fails and when it works again; runs on the writing thread.
         max_bytes: a larger file is renamed to ``.log.1``, and a new one is started.
     """

@@ -102,12 +102,8 @@ class ManagedProcess:
     """A process in a session of its own, with its log file.
 
     Args:
-        spec: what to start.
-        run_dir: run directory of the stack.
         mark: text that the process and everything it starts carry in their environment.
-        disk: outlet that writes the log.
         tell: called with texts about the log.
-        limit: on its restarts.
     """
 
     def __init__(

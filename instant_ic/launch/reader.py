@@ -57,8 +57,6 @@ class Reader:
     """Collects the contents of a launch file and all its includes.
 
     Args:
-        run_dir: run directory of the stack.
-        given: arguments of the command line.
         conditions: if false, read every include and group as if its conditions held, to list all arguments.
     """
 
@@ -91,14 +89,7 @@ class Reader:
         return declared
 
     def include(self, file: Path, scope: Scope, given: dict[str, str], place: Value, depth: int) -> None:
-        """Read an included file.
-
-        Args:
-            scope: scope of the include.
-            given: the arguments that the include sets.
-            place: place of the include.
-            depth: nesting depth of the includes.
-        """
+        """Read an included file."""
         if depth >= _MAX_INCLUDE_DEPTH:
             place.problem(f"files include each other more than {_MAX_INCLUDE_DEPTH} deep")
             return
@@ -404,7 +395,6 @@ def read_launch_file(
     """Read and check a launch file with everything that it includes.
 
     Args:
-        arguments: values for its ``arg`` entries.
         run_dir: value of ``$(run-dir)``; default: ``paths.run_dir()``.
 
     Raises:

@@ -55,7 +55,6 @@ class Context:
         launch_file: the file that contains the text.
         run_dir: run directory of the stack.
         variables: launch arguments and ``let`` values in scope.
-        environment: environment variables.
     """
 
     launch_file: Path

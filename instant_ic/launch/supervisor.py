@@ -87,14 +87,9 @@ class Supervisor:
     nodes.
 
     Args:
-        nodes: what to start.
-        run_dir: prepared run directory.
-        output: destination of lines and events.
         make_limit: creates the respawn limit of a node; for tests.
         stop_schedule: signals at shutdown, with the wait after each.
         make_health: called once all processes are started; None: heartbeats are not watched.
-        announcements: texts to print at their time.
-        shutdown: when to end by itself.
     """
 
     def __init__(
