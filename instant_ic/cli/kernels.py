@@ -133,12 +133,6 @@ def _key() -> str:
     return digest.hexdigest()
 
 
-def _compile(part: str) -> None:
-    """Run every kernel of a part once, as its node does before its first message."""
-    for module in PARTS[part]:
-        import_module(f"instant_ic.{part}.{module}").warm_up()
-
-
 def main() -> None:
     """Entry point of a compiling process: ``python -m instant_ic.cli.kernels PART``."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, even inside the compiler
@@ -161,7 +155,9 @@ def main() -> None:
             print(min(1.0, finished / len(kernels)), flush=True)
 
     with event.install_listener("numba:compile", Counter()):
-        _compile(sys.argv[1])
+        part = sys.argv[1]
+        for module in PARTS[part]:
+            import_module(f"instant_ic.{part}.{module}").warm_up()
 
 
 if __name__ == "__main__":

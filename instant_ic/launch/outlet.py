@@ -28,8 +28,6 @@ class Outlet:
     """
 
     def __init__(self, name: str, limit: int) -> None:
-        self.left_out = 0
-        """Sum of the sizes that were refused."""
         self.broken: OSError | None = None
         """Set once a call fails because its destination is gone; no further call is run."""
         self._limit = limit
@@ -49,7 +47,6 @@ class Outlet:
         """
         with self._condition:
             if self.broken is not None or (self._waiting + size > self._limit and not always):
-                self.left_out += size
                 return False
             self._waiting += size
             self._calls.append((size, function, args))

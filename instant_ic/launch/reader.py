@@ -27,6 +27,7 @@ from instant_ic.launch.values import (
     CONDITION,
     flag_of,
     holds,
+    pairs_of,
     parameter_value,
     plain_text,
     seconds_of,
@@ -270,13 +271,8 @@ class _Actions:
     def _include(self, body: Value) -> None:
         fields = body.fields(known=("file", "arg", "let", *CONDITION), required=("file",))
         name = text_of(fields.get("file"), self.context)
-        given: dict[str, str] = {}
-        for key in ("arg", "let"):
-            for entry in fields[key].items() if key in fields else []:
-                pair = entry.fields(known=("name", "value"), required=("name", "value"))
-                argument, value = plain_text(pair.get("name")), text_of(pair.get("value"), self.context)
-                if argument and value is not None:
-                    given[argument] = value
+        entries = [pairs_of(fields.get(key), "name", "value", self.context) for key in ("arg", "let")]
+        given = dict(pair for pairs in entries for pair in pairs)
         if name is None or (self.conditions and not holds(fields, self.context)):
             return
         file = self._find(name)

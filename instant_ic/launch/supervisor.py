@@ -10,9 +10,8 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
 from typing import Protocol
 
 from instant_ic.closing import on_end_signal
@@ -140,7 +139,8 @@ class Supervisor:
             ended and at least one of them failed.
         """
         try:
-            with self._reaper(), self._signals():
+            # A second signal hurries the end.
+            with self._reaper(), on_end_signal(lambda *_: self.request_stop(hurry=self._stop)):
                 self._start_s = self._last_look_s = time.monotonic()
                 for process in self.processes:
                     process.start_s = self._start_s + process.spec.start_delay_s
@@ -188,25 +188,12 @@ class Supervisor:
             for line in left.decode(errors="replace").splitlines():
                 self._output.event(f"killed a process that a node left behind: {line}", bad=True)
 
-    def _signals(self) -> AbstractContextManager[None]:
-        """Let SIGINT, SIGTERM and SIGHUP request the end; a second signal hurries it."""
-
-        def on_signal(signum: int, frame: FrameType | None) -> None:
-            self.request_stop(hurry=self._stop)
-
-        return on_end_signal(on_signal)
-
     # -- one round -------------------------------------------------------------------------------
 
     def _step(self, wait_s: float) -> None:
         """Forward the nodes' output, then move every process towards its wanted state."""
         flooded = False
-        if self._selector.get_map():
-            ready = self._selector.select(wait_s)
-        else:
-            time.sleep(wait_s)
-            ready = []
-        for key, _ in ready:
+        for key, _ in self._selector.select(wait_s):
             flooded |= self._pass_on(key.data)
         if self._health is not None:
             self._health.poll()
@@ -301,9 +288,9 @@ class Supervisor:
         return process.flooding
 
     def _forget_output(self, process: ManagedProcess) -> None:
-        watched = {key.fileobj for key in self._selector.get_map().values()}
-        if process.output is not None and process.output in watched:
-            self._selector.unregister(process.output)
+        if process.output is not None:
+            with suppress(KeyError):  # its output has been closed before
+                self._selector.unregister(process.output)
 
     def _reap(self, process: ManagedProcess) -> None:
         self._forget_output(process)

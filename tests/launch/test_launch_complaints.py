@@ -312,7 +312,7 @@ def test_a_terminal_that_takes_nothing_does_not_hold_up_the_launcher() -> None:
     outlet.put(lambda: (held.wait(240), None)[1])
     taken = [outlet.put(lambda: None) for _ in range(1000)]
     assert not held.is_set()  # nobody waited for the terminal
-    assert 9 <= sum(taken) <= 10 and outlet.left_out == 1000 - sum(taken)
+    assert 9 <= sum(taken) <= 10
     assert outlet.put(done.set, always=True)  # the few words that matter
     assert not outlet.close(timeout_s=0.05)
     held.set()
