@@ -18,7 +18,7 @@ from instant_ic.closing import on_end_signal
 from instant_ic.launch.description import Announcement, NodeSpec, Shutdown
 from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.outlet import Outlet
-from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, RespawnLimit, Schedule, State, describe_exit
+from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, Schedule, State, describe_exit
 from instant_ic.launch.reaper import kill_marked
 
 STOP_SCHEDULE: Schedule = (
@@ -86,7 +86,6 @@ class Supervisor:
     nodes.
 
     Args:
-        make_limit: creates the respawn limit of a node; for tests.
         stop_schedule: signals at shutdown, with the wait after each.
         make_health: called once all processes are started; None: heartbeats are not watched.
     """
@@ -96,7 +95,6 @@ class Supervisor:
         nodes: Sequence[NodeSpec],
         run_dir: Path,
         output: Output,
-        make_limit: Callable[[NodeSpec], RespawnLimit] | None = None,
         stop_schedule: Schedule = STOP_SCHEDULE,
         make_health: Callable[[], HealthMonitor] | None = None,
         announcements: Sequence[Announcement] = (),
@@ -108,12 +106,7 @@ class Supervisor:
         self._disk = Outlet("log files", _LOG_BYTES)
         self._told: deque[str] = deque()
         """Texts from the thread that writes the logs."""
-        self.processes = [
-            ManagedProcess(
-                node, run_dir, self._mark, self._disk, self._told.append, make_limit(node) if make_limit else None
-            )
-            for node in nodes
-        ]
+        self.processes = [ManagedProcess(node, run_dir, self._mark, self._disk, self._told.append) for node in nodes]
         self._make_health = make_health
         self._health: HealthMonitor | None = None
         self._silences = {process: _Silence() for process in self.processes}
@@ -319,7 +312,7 @@ class Supervisor:
             delay_s = process.limit.next_delay_s(time.monotonic())
             if delay_s is not None:
                 process.state, process.start_s = State.WAITING, time.monotonic() + delay_s
-                used, most = process.limit.used, process.limit.max_starts
+                used, most = process.limit.used, process.limit.MAX_STARTS
                 self._output.event(f"{what}; restarts in {delay_s:.1f} s ({used} of {most})", bad=True)
                 return
             process.state = State.FAILED

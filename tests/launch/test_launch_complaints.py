@@ -280,7 +280,7 @@ def test_a_launcher_that_was_held_up_itself_does_not_blame_the_nodes() -> None:
 
 
 def test_respawn_max_retries_counts_in_all() -> None:
-    limit = RespawnLimit(0.0, window_s=1.0, max_starts=5, max_retries=2)
+    limit = RespawnLimit(0.0, max_retries=2)
     assert [limit.next_delay_s(now) for now in (0.0, 100.0, 200.0)] == [0.0, 0.0, None]
     assert str(limit) == "2 restarts"
 
