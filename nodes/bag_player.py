@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bag import BagError, BagMessage
-from instant_ic.bag.config import BagPlayerConfig
 from instant_ic.bag.live_nodes import refuse_base, wait_for_readers
-from instant_ic.bag.player import CLOCK_HZ, BagPlayer
+from instant_ic.bag.player import CLOCK_HZ, BagPlayer, BagPlayerConfig
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock

@@ -12,10 +12,9 @@ from typing import Any
 
 from instant_ic.bag import BagError
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.config import BagRecorderConfig
 from instant_ic.bag.live_nodes import LiveTopics
 from instant_ic.bag.on_demand import OnDemand
-from instant_ic.bag.recorder import Recorder, RecordOptions, TakeMessage
+from instant_ic.bag.recorder import BagRecorderConfig, Recorder, TakeMessage
 from instant_ic.bus import RECORD, Node, NodeError, main
 from instant_ic.bus.transport import Received, Stats
 from instant_ic.msg import Bool, ControlState
@@ -71,7 +70,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             if self.config.duration_s and time.monotonic() >= self._began_s + self.config.duration_s:
                 self.stop()
 
-    def _recorder(self, path: Path, options: RecordOptions, taken: ExitStack) -> Recorder:
+    def _recorder(self, path: Path, options: BagRecorderConfig, taken: ExitStack) -> Recorder:
         def listen(topic: str, take: TakeMessage) -> Stats:
             def forward(message: Received) -> None:
                 take(message.topic, message.type_name, message.payload, message.publish_ns, message.publisher)

@@ -56,6 +56,32 @@ class PlayOptions:
         check_ranges(self)
 
 
+@dataclass(frozen=True)
+class BagPlayerConfig(PlayOptions):
+    """Parameters of ``bag_player``, in addition to those of playing.
+
+    Attributes:
+        bag: folder of the bag, or a ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
+        drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
+        publish_clock: whether to publish ``/clock``.
+        delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
+        wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
+        force: play commands and states although a base is running, which may move the robot.
+    """
+
+    bag: str = ""
+    drop_transforms: tuple[str, ...] = ()
+    publish_clock: bool = True
+    delay_s: NotNegative = 0.5
+    wait_for: tuple[str, ...] = ()
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.bag:
+            raise ValueError("bag must name a folder (got '')")
+        super().__post_init__()
+
+
 class BagPlayer:
     """Paces the messages of a bag, independent of the bus. Its controls may be called from any thread.
 

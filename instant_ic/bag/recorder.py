@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.errors import BagError, DiskFullError
@@ -28,7 +28,7 @@ from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, check_ranges
+from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, Range, check_ranges
 from instant_ic.diagnosis import Diagnosis, Level
 
 FOREIGN_CLOCK_NS = 10_000_000_000
@@ -52,8 +52,8 @@ Subscribe = Callable[[str, TakeMessage], Stats]
 
 
 @dataclass(frozen=True)
-class RecordOptions:
-    """How a recording is written.
+class BagRecorderConfig:
+    """Parameters of ``bag_recorder``.
 
     Attributes:
         compressed: compress with zstd.
@@ -65,6 +65,14 @@ class RecordOptions:
             Between the commands ``record`` and ``stop`` (the page's button) it records into a bag of its own.
         snapshot_seconds: seconds before the request that a snapshot holds.
         max_cache_mb: memory for the last seconds, MB; with more traffic the snapshot is shorter.
+        path: folder of the bag, which must not exist; empty creates ``runs/bag_DATE_TIME`` in the working directory. In
+            snapshot mode, the folder for the snapshots.
+        topics: names or patterns of the topics to record; empty records everything.
+        exclude: names or patterns of the topics to leave out.
+        discovery_period_s: seconds between searches for new topics.
+        duration_s: seconds after which recording ends; 0 records until stopped.
+        start_paused: record only after a resume command.
+        snapshot_after_s: seconds after the request that a snapshot also holds.
     """
 
     compressed: bool = False
@@ -75,9 +83,22 @@ class RecordOptions:
     snapshot: bool = False
     snapshot_seconds: Positive = 30.0
     max_cache_mb: PositiveInt = 256
+    path: str = ""
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
+    duration_s: NotNegative = 0.0
+    start_paused: bool = False
+    snapshot_after_s: NotNegative = 2.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
+
+    def folder(self) -> Path:
+        """Folder of the bag."""
+        if self.path:
+            return Path(self.path).expanduser()
+        return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
 
 
 class _Queue:
@@ -159,11 +180,11 @@ class Recorder:
         choice: TopicChoice,
         subscribe: Subscribe,
         sim_now_ns: Callable[[], int] | None = None,
-        options: RecordOptions | None = None,
+        options: BagRecorderConfig | None = None,
         free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
     ) -> None:
         self.path = path
-        self.options = options or RecordOptions()
+        self.options = options or BagRecorderConfig()
         self._kept = 0  # in memory
         self.early = 0
         self.error = ""

@@ -13,7 +13,7 @@ import pytest
 
 from instant_ic.bag import BagError, BagMessage, BagReader, BagWriter
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, RECORDING, Recorder, RecordOptions
+from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, RECORDING, BagRecorderConfig, Recorder
 from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS
@@ -42,7 +42,7 @@ def make(path: Path, free: Callable[[Path], int] = lambda path: 10**12, **option
         TopicChoice(),
         lambda topic, take: Losses(),
         None,
-        RecordOptions(**options),
+        BagRecorderConfig(**options),
         free,  # type: ignore[arg-type]
     )
     recorder.discover([topic_info("/scan", SENSOR), topic_info("/estop", LATCHED)])
@@ -340,7 +340,7 @@ def test_recorder_that_writes_at_once_keeps_no_snapshots(tmp_path: Path) -> None
 )
 def test_bad_options_name_the_key(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(bad))} must be"):
-        RecordOptions(**bad)  # type: ignore[arg-type]
+        BagRecorderConfig(**bad)  # type: ignore[arg-type]
 
 
 def test_bag_that_exists_is_not_overwritten(tmp_path: Path) -> None:
