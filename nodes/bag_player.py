@@ -8,22 +8,22 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bag import BagError, BagMessage
-from instant_ic.bag.config import BagPlayerConfig
 from instant_ic.bag.live_nodes import refuse_base, wait_for_readers
-from instant_ic.bag.player import BagPlayer
+from instant_ic.bag.player import CLOCK_HZ, BagPlayer, BagPlayerConfig
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
 from instant_ic.msg import message_type, register_type, to_time
 
 _BASE_PERIOD_S = 0.5
+_LINGER_S = 1.0  # after the last message, so that other nodes finish their work
 
 
 class BagPlayerNode(Node[BagPlayerConfig]):
     """Publishes a bag's messages from its own thread; with ``use_sim_time`` the node's clock is the bag's."""
 
     name = "bag_player"
-    live_parameters = ("rate", "linger_s")
+    live_parameters = ("rate",)
     player: BagPlayer | None = None
     _thread: threading.Thread | None = None
     _failed = ""
@@ -80,7 +80,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             if self.player.play(self._send, self._stop, on_clock=self._publish_time):
                 late = f", up to {self.player.latest_s:.2f} s late" if self.player.latest_s > 0.1 else ""
                 self.log.info("played to the end in %.1f s%s", time.monotonic() - began_s, late)
-                self._stop.wait(self.config.linger_s)
+                self._stop.wait(_LINGER_S)
         except (BagError, NodeError) as error:
             self._failed = str(error)
         except Exception as error:  # otherwise the thread would be gone and the node would wait for ever
@@ -92,9 +92,8 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         if (now_s := time.monotonic()) >= self._next_base_s:
             self._next_base_s = now_s + _BASE_PERIOD_S
             self.check_base()
-        payload: bytes | None = message.payload
-        if self.config.drop_transforms and message.topic in TRANSFORM_TOPICS:
-            payload = without_children(message, self.config.drop_transforms)
+        drops = self.config.drop_transforms if message.topic in TRANSFORM_TOPICS else ()
+        payload = without_children(message, drops) if drops else message.payload
         self._publish_time(message.stamp_ns)
         if payload is not None:
             # Not from the clock: this node also receives its own /clock, a little later, which sets the time back.
@@ -129,7 +128,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             return self._stop.wait(seconds)
 
         begin_s = time.monotonic() + self.config.delay_s
-        while self.run_dir is not None and time.monotonic() < begin_s and not wait(1.0 / self.config.clock_hz):
+        while self.run_dir is not None and time.monotonic() < begin_s and not wait(1.0 / CLOCK_HZ):
             pass
         if self.run_dir is not None and self.config.wait_for:
             wait_for_readers(self.config.wait_for, self.run_dir, self._out, wait)

@@ -12,10 +12,9 @@ from typing import Any
 
 from instant_ic.bag import BagError
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.config import BagRecorderConfig
 from instant_ic.bag.live_nodes import LiveTopics
 from instant_ic.bag.on_demand import OnDemand
-from instant_ic.bag.recorder import Recorder, RecordOptions, TakeMessage
+from instant_ic.bag.recorder import BagRecorderConfig, Recorder, TakeMessage
 from instant_ic.bus import RECORD, Node, NodeError, main
 from instant_ic.bus.transport import Received, Stats
 from instant_ic.msg import Bool, ControlState
@@ -35,10 +34,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             raise NodeError("the recorder needs the real bus; lockstep replay records by itself")
         self._live = LiveTopics(self.run_dir)
         self._choice = TopicChoice(self.config.topics, self.config.exclude)
-        try:
-            self.recorder = self._recorder(self.config.folder(), self.config, ExitStack())
-        except BagError as error:
-            raise NodeError(str(error)) from None
+        self.recorder = self._recorder(self.config.folder(), self.config, ExitStack())
         if self.config.start_paused:
             self.recorder.pause()
         what = f"keeping the last {self.config.snapshot_seconds:g} s for" if self.config.snapshot else "recording into"
@@ -56,7 +52,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             "split": self.recorder.split,
             "snapshot": self._snapshot,
             "record": self._record,
-            "stop": self._end,
+            "stop": lambda: {"path": str(self._on_request().stop())},
             "status": self._status,
         }
         self._began_s = time.monotonic()
@@ -74,7 +70,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             if self.config.duration_s and time.monotonic() >= self._began_s + self.config.duration_s:
                 self.stop()
 
-    def _recorder(self, path: Path, options: RecordOptions, taken: ExitStack) -> Recorder:
+    def _recorder(self, path: Path, options: BagRecorderConfig, taken: ExitStack) -> Recorder:
         def listen(topic: str, take: TakeMessage) -> Stats:
             def forward(message: Received) -> None:
                 take(message.topic, message.type_name, message.payload, message.publish_ns, message.publisher)
@@ -83,7 +79,10 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             taken.callback(self.drop, subscription)
             return subscription.raw.stats
 
-        return Recorder(path, self._choice, listen, self.clock.now_ns if self.use_sim_time else None, options)
+        try:
+            return Recorder(path, self._choice, listen, self.clock.now_ns if self.use_sim_time else None, options)
+        except BagError as error:
+            raise NodeError(str(error)) from None
 
     def _begin(self, path: Path) -> tuple[Recorder, Callable[[], None]]:
         """Return a recorder with its own subscriptions, which get the latched messages, and a function to end them."""
@@ -103,20 +102,15 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         return {"path": str(made.path)}
 
     def _record(self, name: str = "") -> dict[str, Any]:
-        if self.on_demand is None:
-            raise NodeError("this recorder records all the time; only one with snapshot: true records on request")
-        try:
-            path = self.on_demand.start(name)
-        except BagError as error:
-            raise NodeError(str(error)) from None
-        self.on_demand.discover(*self._live.look(again=True))
+        path = self._on_request().start(name)
+        self._on_request().discover(*self._live.look(again=True))
         self.log.info("recording into %s", path)
         return {"path": str(path)}
 
-    def _end(self) -> dict[str, Any]:
+    def _on_request(self) -> OnDemand:
         if self.on_demand is None:
-            raise NodeError("this recorder records all the time, until it is shut down")
-        return {"path": str(self.on_demand.stop())}
+            raise NodeError("this recorder records all the time; only one with snapshot: true records on request")
+        return self.on_demand
 
     def _status(self) -> dict[str, Any]:
         status = self.recorder.status()

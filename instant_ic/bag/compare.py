@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
-import hashlib
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.files import BagMessage, BagReader
+from instant_ic.bag.files import BagReader
+from instant_ic.bag.message import BagMessage
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,6 @@ class TopicDifference:
     """How one topic of two bags differs.
 
     Attributes:
-        count_a: messages in the first bag.
-        count_b: messages in the second bag.
         first: text of the first difference; empty where the topic is the same in both bags, within the tolerance.
         only_a: messages of the first bag without a partner, when pairing by stamp.
         only_b: messages of the second bag without a partner, when pairing by stamp.
@@ -119,11 +117,8 @@ def compare(
     """Compare every topic of two bags, in the order of the names.
 
     Args:
-        a: first bag.
-        b: second bag.
         ignore: topics to leave out, names or patterns.
         common: compare only topics that both bags have.
-        tolerance: allowed differences.
 
     Raises:
         BagError: a bag cannot be read.
@@ -133,16 +128,6 @@ def compare(
         topics = names[0] & names[1] if common else names[0] | names[1]
         chosen = [t for t in sorted(topics) if not any(fnmatch.fnmatchcase(t, pattern) for pattern in ignore)]
         return [_Comparison(topic, one, two, tolerance).run() for topic in chosen]
-
-
-def digest(bag: Path) -> str:
-    """Return the SHA-256 of the topics, types, stamps and bytes of all messages, in bag order."""
-    total = hashlib.sha256()
-    with BagReader(bag) as reader:
-        for message in reader.messages():
-            total.update(f"{message.topic} {message.type_name} {message.stamp_ns} {len(message.payload)}\n".encode())
-            total.update(message.payload)
-    return total.hexdigest()
 
 
 class _Comparison:

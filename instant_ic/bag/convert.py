@@ -12,7 +12,8 @@ from pathlib import Path
 from instant_ic.bag.choice import EVERYTHING, TopicChoice
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagReader, TopicSummary
-from instant_ic.bag.latched import LatchedValue, LatchedValues
+from instant_ic.bag.latched import LatchedValues
+from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import REPEATED
 from instant_ic.bag.writer import BagWriter
 
@@ -62,7 +63,6 @@ def convert(
     Args:
         sources: anything that :class:`BagReader` opens.
         target: folder of the new bag, which must not exist.
-        options: what to copy, and how to write it.
         on_progress: called with the completed share, 0 to 1.
 
     Raises:
@@ -88,27 +88,27 @@ def convert(
                 if key != REPEATED:
                     writer.set_custom(key, value)
         writer.set_custom("converted_from", ", ".join(source.name for source in sources))
-        named = [
-            {topic: options.remap.get(topic[0], topic[0]) for topic in topics} for topics in chosen
-        ]  # by (topic, type)
-        for topics, names in zip(chosen, named, strict=True):
-            for entry, summary in topics.items():
-                writer.add_topic(names[entry], summary.type_name, summary.qos, summary.schema)
+
+        def write(message: BagMessage, topic: TopicSummary, stamp_ns: int) -> None:
+            name = options.remap.get(message.topic, message.topic)
+            writer.write(name, message.type_name, message.payload, stamp_ns, topic.qos, topic.schema)
+            result.counts[name] += 1
+
+        for topic in (topic for topics in chosen for topic in topics.values()):
+            writer.add_topic(options.remap.get(topic.topic, topic.topic), topic.type_name, topic.qos, topic.schema)
         if start_ns > begin_ns:
-            for number, reader in enumerate(filled):
-                _write_latched(reader, chosen[number], named[number], start_ns, writer, result)
+            for reader, topics in zip(filled, chosen, strict=True):
+                for value in _latched(reader, topics, start_ns):
+                    write(value, topics[value.topic, value.type_name], start_ns)
         streams = [
             ((m.stamp_ns, number, m) for m in reader.messages({t[0] for t in topics}, start_ns, stop_ns))
             for number, (reader, topics) in enumerate(zip(filled, chosen, strict=True))
         ]
         span_ns = max(1, min(stop_ns, last_ns) - start_ns)
         for stamp_ns, number, message in heapq.merge(*streams, key=lambda entry: entry[0]):
-            entry = (message.topic, message.type_name)
-            if entry not in chosen[number]:
+            if (summary := chosen[number].get((message.topic, message.type_name))) is None:
                 continue
-            topic, name = chosen[number][entry], named[number][entry]
-            writer.write(name, message.type_name, message.payload, stamp_ns, topic.qos, topic.schema)
-            result.counts[name] += 1
+            write(message, summary, stamp_ns)
             if on_progress is not None:
                 on_progress(min(1.0, (stamp_ns - start_ns) / span_ns))
         result.files = writer.parts
@@ -128,21 +128,11 @@ def _chosen(reader: BagReader, options: ConvertOptions, result: Converted) -> di
     return {(topic.topic, topic.type_name): topic for topic in wanted if topic.schema.encoding}
 
 
-def _write_latched(
-    reader: BagReader,
-    topics: dict[tuple[str, str], TopicSummary],
-    names: dict[tuple[str, str], str],
-    start_ns: int,
-    writer: BagWriter,
-    result: Converted,
-) -> None:
-    """Write the latched values valid at the start of the selected span, with the stamp of that start."""
+def _latched(reader: BagReader, topics: dict[tuple[str, str], TopicSummary], start_ns: int) -> list[BagMessage]:
+    """The latched values valid at the start of the selected span."""
     values = LatchedValues()
     latched = {topic.topic for topic in topics.values() if topic.qos.latched}
     for message in reader.messages(latched, None, start_ns) if latched else ():
-        values.put(LatchedValue(message.topic, message.type_name, message.payload, message.stamp_ns))
-    for value in values.values():
-        source = topics[value.topic, value.type_name]
-        name = names[value.topic, value.type_name]
-        writer.write(name, value.type_name, value.payload, start_ns, source.qos, source.schema)
-        result.counts[name] += 1
+        if (message.topic, message.type_name) in topics:
+            values.put(message)
+    return values.values()

@@ -17,6 +17,7 @@ from rosbags.rosbag2 import Reader, ReaderError
 from instant_ic.bag.bounded import guard_rosbags
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
 from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.qos import QoS
@@ -24,25 +25,6 @@ from instant_ic.closing import Closing
 from instant_ic.msg import deserialize
 
 guard_rosbags()
-
-
-@dataclass(frozen=True)
-class BagMessage:
-    """A message in a bag.
-
-    Attributes:
-        topic: name of the topic.
-        type_name: message type, for example ``sensor_msgs/msg/Image``.
-        payload: CDR bytes.
-        stamp_ns: time of publication, nanoseconds since the epoch.
-        qos: preset closest to the QoS that its publisher offered.
-    """
-
-    topic: str
-    type_name: str
-    payload: bytes
-    stamp_ns: int
-    qos: QoS
 
 
 @dataclass(frozen=True)

@@ -2,28 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-from instant_ic.bag.mcap_writer import Buffer
+from instant_ic.bag.message import BagMessage
 from instant_ic.bag.transforms import TRANSFORM_TOPICS
 from instant_ic.msg import MessageError, deserialize
-
-Key = tuple[str, frozenset[str]]
-
-
-@dataclass(frozen=True)
-class LatchedValue:
-    """A message of a latched topic that is still valid.
-
-    Attributes:
-        payload: CDR bytes.
-        publish_ns: time of publication.
-    """
-
-    topic: str
-    type_name: str
-    payload: Buffer
-    publish_ns: int
 
 
 class LatchedValues:
@@ -34,27 +15,27 @@ class LatchedValues:
     """
 
     def __init__(self) -> None:
-        self._values: dict[Key, LatchedValue] = {}
+        self._values: dict[tuple[str, frozenset[str]], BagMessage] = {}
 
-    def put(self, value: LatchedValue, publisher: str = "") -> None:
+    def put(self, message: BagMessage) -> None:
         """Store a newer value."""
-        key = (value.topic, self._names(value, publisher))
-        for other in [k for k in self._values if k[0] == value.topic and k[1] <= key[1]]:
-            del self._values[other]
-        self._values[key] = value
+        topic, names = message.topic, _names(message)
+        self._values = {key: v for key, v in self._values.items() if not (key[0] == topic and key[1] <= names)}
+        self._values[topic, names] = message
 
-    def values(self, but: LatchedValue | None = None, publisher: str = "") -> list[LatchedValue]:
+    def values(self, but: BagMessage | None = None) -> list[BagMessage]:
         """Return all current values, oldest first, without those that ``but`` is about to replace."""
-        names = (but.topic, self._names(but, publisher)) if but is not None else ("", frozenset())
-        kept = [v for k, v in self._values.items() if not (k[0] == names[0] and k[1] <= names[1])]
-        return sorted(kept, key=lambda value: value.publish_ns)
+        topic, names = ("", frozenset[str]()) if but is None else (but.topic, _names(but))
+        kept = [v for key, v in self._values.items() if not (key[0] == topic and key[1] <= names)]
+        return sorted(kept, key=lambda value: value.stamp_ns)
 
-    @staticmethod
-    def _names(value: LatchedValue, publisher: str) -> frozenset[str]:
-        if value.topic in TRANSFORM_TOPICS:
-            try:
-                message = deserialize(value.payload, value.type_name)
-                return frozenset(transform.child_frame_id for transform in message.transforms)
-            except (MessageError, AttributeError):  # bytes of another type: recorded anyway, keyed by publisher
-                pass
-        return frozenset([publisher])
+
+def _names(message: BagMessage) -> frozenset[str]:
+    """What a newer message replaces: child frames, or the publisher."""
+    if message.topic in TRANSFORM_TOPICS:
+        try:
+            decoded = deserialize(message.payload, message.type_name)
+            return frozenset(transform.child_frame_id for transform in decoded.transforms)
+        except (MessageError, AttributeError):  # bytes of another type: recorded anyway, keyed by publisher
+            pass
+    return frozenset([message.publisher])

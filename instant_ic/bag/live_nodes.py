@@ -101,7 +101,6 @@ def wait_for_readers(
 
     Args:
         wait_for: names of the nodes, which must subscribe to at least one played topic.
-        run_dir: where they run.
         publishers: topic in the bag → its publisher.
         wait: waits for some seconds; returns True to give up.
 

@@ -26,11 +26,9 @@ class ScannedMessage:
     """A message in an MCAP file.
 
     Attributes:
-        schema: definition of its type.
         encoding: encoding of the payload; ``cdr`` in ROS 2 bags.
         metadata: metadata of its topic, where rosbag2 stores the QoS.
         stamp_ns: log time.
-        payload: message bytes.
         repeated: whether it repeats a latched value of an earlier file of the bag.
     """
 
@@ -54,7 +52,6 @@ class McapScan:
         stopped_by: reason why reading stopped before the end of the file; empty when it did not.
         damaged: descriptions of damaged chunks that were skipped.
         metadata: metadata records, name → values; the last record of each name.
-        library: library that wrote the file.
     """
 
     def __init__(self, path: Path) -> None:

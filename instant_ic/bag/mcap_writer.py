@@ -285,13 +285,12 @@ class McapWriter:
         """Return everything after the last chunk: data end, schemas, channels, indexes, statistics, footer."""
         data_end = _encode(records.DataEnd(0))
         start_ns, end_ns = self.span_ns
-        counts = self.counts
         statistics = records.Statistics(
             attachment_count=0,
             channel_count=len(self._channels),
-            channel_message_counts=counts,
+            channel_message_counts=self.counts,
             chunk_count=len(self._chunks),
-            message_count=sum(counts.values()),
+            message_count=self.count,
             message_start_time=start_ns,
             message_end_time=end_ns,
             metadata_count=len(self._metadata),

@@ -51,8 +51,6 @@ class PartInfo:
 
     Attributes:
         path: file name in the bag's folder.
-        start_ns: first stamp.
-        end_ns: last stamp.
         counts: messages by topic, including repeated ones.
         repeated: topic → latched messages at the start of the file that repeat those of an earlier file.
         repeated_ns: stamp of the repeated messages in this file.
@@ -77,11 +75,6 @@ def write_metadata(
     custom: dict[str, str],
 ) -> None:
     """Write ``metadata.yaml`` (rosbag2, version 9) atomically: readers see either the old or the new file.
-
-    Args:
-        parts: its files, in order.
-        topics: QoS and definition of each topic.
-        custom: ``custom_data``.
 
     Raises:
         OSError: the file cannot be written.

@@ -5,13 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.files import BagMessage, BagReader, TopicSummary
+from instant_ic.bag.files import BagReader, TopicSummary
+from instant_ic.bag.latched import LatchedValues
+from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.upgrade import upgrade_of
@@ -20,6 +22,9 @@ from instant_ic.config.ranges import NotNegative, Range, check_ranges
 
 NEVER_PLAYED = ("/clock", *EVERY_NODES)
 """The time itself, and what nodes report about themselves: the running nodes publish their own."""
+
+CLOCK_HZ = 40.0
+"""Lowest rate of ``/clock``, also while paused and in gaps of the bag."""
 
 RATES = (0.01, 100.0)
 """Smallest and largest rate that can be set during playback."""
@@ -37,7 +42,6 @@ class PlayOptions:
         start_paused: wait at the start until resumed or stepped.
         topics: names or patterns of the topics to play; empty plays everything.
         exclude: names or patterns of the topics to leave out.
-        clock_hz: lowest rate of ``/clock``, also while paused and in gaps of the bag.
     """
 
     rate: Annotated[float, Range(*RATES)] = 1.0
@@ -47,17 +51,39 @@ class PlayOptions:
     start_paused: bool = False
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
-    clock_hz: Annotated[float, Range(1, 1000)] = 40.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
 
 
+@dataclass(frozen=True)
+class BagPlayerConfig(PlayOptions):
+    """Parameters of ``bag_player``, in addition to those of playing.
+
+    Attributes:
+        bag: folder of the bag, or a ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
+        drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
+        publish_clock: whether to publish ``/clock``.
+        delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
+        wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
+        force: play commands and states although a base is running, which may move the robot.
+    """
+
+    bag: str = ""
+    drop_transforms: tuple[str, ...] = ()
+    publish_clock: bool = True
+    delay_s: NotNegative = 0.5
+    wait_for: tuple[str, ...] = ()
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.bag:
+            raise ValueError("bag must name a folder (got '')")
+        super().__post_init__()
+
+
 class BagPlayer:
     """Paces the messages of a bag, independent of the bus. Its controls may be called from any thread.
-
-    Args:
-        options: how to play it.
 
     Raises:
         BagError: there is no bag, or it has nothing to play.
@@ -209,7 +235,6 @@ class BagPlayer:
         Args:
             send: called with each message when it is due.
             stop: ends playback; also interrupts waiting.
-            now_s: clock for the pace.
             on_clock: called with the bag's time, first at the start and then periodically; in between,
                 :attr:`position_ns` is valid.
 
@@ -244,7 +269,7 @@ class BagPlayer:
         on_clock: Callable[[int], None],
     ) -> bool:
         """Return True at the end of the messages, False when playback must stop or jump."""
-        period_s = 1.0 / self.options.clock_hz
+        period_s = 1.0 / CLOCK_HZ
         next_clock_s = self._now_s() + period_s
         for message in messages:
             while True:
@@ -284,15 +309,8 @@ class BagPlayer:
         latched = {topic.topic for topic in self.topics if topic.qos.latched}
         if begin_ns == self._reader.start_ns or not latched:
             return
-        newest: dict[str, BagMessage] = {}
+        values = LatchedValues()
         for message in self._messages(latched, None, begin_ns):
-            if message.topic == "/tf_static":  # each publisher sends its own
-                send(_at(message, begin_ns))
-            else:
-                newest[message.topic] = message
-        for message in newest.values():
-            send(_at(message, begin_ns))
-
-
-def _at(message: BagMessage, stamp_ns: int) -> BagMessage:
-    return BagMessage(message.topic, message.type_name, message.payload, stamp_ns, message.qos)
+            values.put(message)
+        for value in values.values():
+            send(replace(value, stamp_ns=begin_ns))

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Iterator
 
-from instant_ic.bag.files import BagMessage
+from instant_ic.bag.message import BagMessage
 from instant_ic.closing import Closing
 
 _MOST_BYTES = 64_000_000

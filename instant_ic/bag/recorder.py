@@ -14,20 +14,21 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.errors import BagError, DiskFullError
-from instant_ic.bag.latched import LatchedValue, LatchedValues
-from instant_ic.bag.snapshot import Entry, SnapshotCache
+from instant_ic.bag.latched import LatchedValues
+from instant_ic.bag.message import BagMessage
+from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, check_ranges
+from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, Range, check_ranges
 from instant_ic.diagnosis import Diagnosis, Level
 
 FOREIGN_CLOCK_NS = 10_000_000_000
@@ -51,8 +52,8 @@ Subscribe = Callable[[str, TakeMessage], Stats]
 
 
 @dataclass(frozen=True)
-class RecordOptions:
-    """How a recording is written.
+class BagRecorderConfig:
+    """Parameters of ``bag_recorder``.
 
     Attributes:
         compressed: compress with zstd.
@@ -64,6 +65,14 @@ class RecordOptions:
             Between the commands ``record`` and ``stop`` (the page's button) it records into a bag of its own.
         snapshot_seconds: seconds before the request that a snapshot holds.
         max_cache_mb: memory for the last seconds, MB; with more traffic the snapshot is shorter.
+        path: folder of the bag, which must not exist; empty creates ``runs/bag_DATE_TIME`` in the working directory. In
+            snapshot mode, the folder for the snapshots.
+        topics: names or patterns of the topics to record; empty records everything.
+        exclude: names or patterns of the topics to leave out.
+        discovery_period_s: seconds between searches for new topics.
+        duration_s: seconds after which recording ends; 0 records until stopped.
+        start_paused: record only after a resume command.
+        snapshot_after_s: seconds after the request that a snapshot also holds.
     """
 
     compressed: bool = False
@@ -74,9 +83,22 @@ class RecordOptions:
     snapshot: bool = False
     snapshot_seconds: Positive = 30.0
     max_cache_mb: PositiveInt = 256
+    path: str = ""
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
+    duration_s: NotNegative = 0.0
+    start_paused: bool = False
+    snapshot_after_s: NotNegative = 2.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
+
+    def folder(self) -> Path:
+        """Folder of the bag."""
+        if self.path:
+            return Path(self.path).expanduser()
+        return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
 
 
 class _Queue:
@@ -85,28 +107,28 @@ class _Queue:
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
         self.bytes = 0
-        self._items: deque[Entry | Callable[[], None]] = deque()
+        self._items: deque[BagMessage | Callable[[], None]] = deque()
         self._condition = threading.Condition()
 
-    def put(self, item: Entry | Callable[[], None]) -> bool:
+    def put(self, item: BagMessage | Callable[[], None]) -> bool:
         """Queue an item; return False if a message does not fit. Latched messages and calls always fit."""
-        size = len(item.payload) if isinstance(item, Entry) else 0
+        size = len(item.payload) if isinstance(item, BagMessage) else 0
         with self._condition:
-            if isinstance(item, Entry) and not item.qos.latched and self.bytes + size > self.max_bytes:
+            if isinstance(item, BagMessage) and not item.qos.latched and self.bytes + size > self.max_bytes:
                 return False
             self._items.append(item)
             self.bytes += size
             self._condition.notify()
         return True
 
-    def take(self, timeout_s: float) -> Entry | Callable[[], None] | None:
+    def take(self, timeout_s: float) -> BagMessage | Callable[[], None] | None:
         """Return the next item, or None after `timeout_s`."""
         with self._condition:
             if not self._items and not self._condition.wait_for(lambda: bool(self._items), timeout_s):
                 return None
             return self._items.popleft()
 
-    def done(self, item: Entry) -> None:
+    def done(self, item: BagMessage) -> None:
         """Release the bytes of a message that has been written."""
         with self._condition:
             self.bytes -= len(item.payload)
@@ -143,11 +165,9 @@ class Recorder:
 
     Args:
         path: the bag's folder; with snapshots, the parent folder of one bag per snapshot.
-        choice: topics to record.
         subscribe: ``(topic, take)`` subscribes to raw bytes and returns the counter of lost messages.
         sim_now_ns: the simulated clock, if there is one. Nodes that do not follow it (the recorder itself, the console)
             stamp with the machine's time; their messages get the simulated time of their arrival instead.
-        options: see :class:`RecordOptions`.
         free_bytes: free space on the bag's disk; replaced in tests.
 
     Raises:
@@ -160,12 +180,12 @@ class Recorder:
         choice: TopicChoice,
         subscribe: Subscribe,
         sim_now_ns: Callable[[], int] | None = None,
-        options: RecordOptions | None = None,
+        options: BagRecorderConfig | None = None,
         free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
     ) -> None:
         self.path = path
-        self.options = options or RecordOptions()
-        self.counts: Counter[str] = Counter()
+        self.options = options or BagRecorderConfig()
+        self._kept = 0  # in memory
         self.early = 0
         self.error = ""
         """Why recording failed or waits."""
@@ -180,9 +200,9 @@ class Recorder:
         self._paused = False
         self._state = RECORDING
         self._begun_ns = 0
-        self._held: list[tuple[str, str, bytes, int, str]] = []
+        self._held: list[BagMessage] = []
         self._missed = LatchedValues()
-        self._not_written: deque[Entry] = deque()
+        self._not_written: deque[BagMessage] = deque()
         self._losses: dict[str, Stats] = {}
         self._qos: dict[str, QoS] = {}
         self._parameters: dict[str, object] = {}
@@ -216,7 +236,7 @@ class Recorder:
     @property
     def count(self) -> int:
         """Messages written; in snapshot mode, messages in memory or written."""
-        return self._writer.count if self._writer is not None else sum(self.counts.values())
+        return self._writer.count if self._writer is not None else self._kept
 
     def discover(self, topics: Collection[TopicInfo], nodes: Collection[NodeInfo] = ()) -> None:
         """Subscribe to new selected topics and store the parameters of nodes."""
@@ -238,14 +258,16 @@ class Recorder:
             self.dropped.no_type[topic] += 1
         elif stamp_ns <= 0:  # a node on simulated time before the first /clock: the message has no time
             self.early += 1
-        elif self._begun_ns:
-            self._hand_on(topic, type_name, bytes(payload), stamp_ns, publisher)
-        elif self._qos.get(topic, SENSOR).latched:
-            # The value may be minutes old: keep it until the first other message sets the start of this bag.
-            self._held.append((topic, type_name, bytes(payload), stamp_ns, publisher))
         else:
-            self._begin(stamp_ns)
-            self._hand_on(topic, type_name, bytes(payload), stamp_ns, publisher)
+            qos = self._qos.get(topic, SENSOR)
+            message = BagMessage(topic, type_name, bytes(payload), stamp_ns, qos, publisher)
+            if not self._begun_ns and qos.latched:
+                # The value may be minutes old: keep it until the first other message sets the start of this bag.
+                self._held.append(message)
+                return
+            if not self._begun_ns:
+                self._begin(stamp_ns)
+            self._hand_on(message)
 
     def pause(self) -> None:
         """Stop recording; latched values received meanwhile are recorded on resume."""
@@ -293,8 +315,7 @@ class Recorder:
     def tick(self) -> None:
         """Run periodic work: start due snapshots, and queue latched values again after a full disk."""
         while self._not_written:
-            entry = self._not_written.popleft()
-            self._missed.put(LatchedValue(entry.topic, entry.type_name, entry.payload, entry.stamp_ns), entry.publisher)
+            self._missed.put(self._not_written.popleft())
         if self.state == RECORDING:
             self._hand_on_missed()
         for waiting in self.snapshots:
@@ -324,7 +345,7 @@ class Recorder:
             "topics": len(self._losses),
             "messages": self.count,
             "queued_bytes": self._queue.bytes,
-            "lost": self.lost_by() or self.lost(),
+            "lost": self.lost_by(),
             "overflow": dict(self.dropped.overflow),
         }
         if writer is not None:
@@ -367,7 +388,7 @@ class Recorder:
             BagError: the bag could not be written completely.
         """
         if self._held:
-            self._begin(max(stamp_ns for _, _, _, stamp_ns, _ in self._held))
+            self._begin(max(message.stamp_ns for message in self._held))
         for waiting in self.snapshots:
             if waiting.state == "waiting":
                 self._write_snapshot(waiting)
@@ -389,30 +410,28 @@ class Recorder:
     def _begin(self, stamp_ns: int) -> None:
         self._begun_ns = stamp_ns
         held, self._held = self._held, []
-        for entry in held:
-            self._hand_on(*entry)
+        for message in held:
+            self._hand_on(message)
 
-    def _hand_on(self, topic: str, type_name: str, payload: bytes, stamp_ns: int, publisher: str) -> None:
-        qos = self._qos.get(topic, SENSOR)
-        if qos.latched:
-            stamp_ns = max(stamp_ns, self._begun_ns)
-        entry = Entry(topic, type_name, payload, stamp_ns, qos, publisher)
+    def _hand_on(self, message: BagMessage) -> None:
+        if message.qos.latched:
+            message = replace(message, stamp_ns=max(message.stamp_ns, self._begun_ns))
         if self._paused or self._state in (DISK_FULL, FAILED):
-            if qos.latched:
-                self._not_written.append(entry)
-            self._count(self.dropped.paused if self._paused else self.dropped.disk_full, topic)
+            if message.qos.latched:
+                self._not_written.append(message)
+            self._count(self.dropped.paused if self._paused else self.dropped.disk_full, message.topic)
             return
         if self._cache is not None:
-            self._cache.add(entry, time.monotonic())
-        elif not self._queue.put(entry):
-            self.dropped.overflow[topic] += 1
+            self._cache.add(message, time.monotonic())
+        elif not self._queue.put(message):
+            self.dropped.overflow[message.topic] += 1
             return
-        self.counts[topic] += 1
+        self._kept += 1
 
     def _hand_on_missed(self) -> None:
         missed, self._missed = self._missed, LatchedValues()
-        for value in missed.values():
-            self._hand_on(value.topic, value.type_name, bytes(value.payload), value.publish_ns, "")
+        for message in missed.values():
+            self._hand_on(message)
 
     def _stamp_ns(self, publish_ns: int) -> int:
         if self._sim_now_ns is None:
@@ -436,7 +455,7 @@ class Recorder:
             if item is None and self._ending.is_set():
                 break
             try:
-                if isinstance(item, Entry):
+                if isinstance(item, BagMessage):
                     self._write(item)
                 elif item is not None:
                     item()
@@ -462,7 +481,7 @@ class Recorder:
                 self._stop(FAILED, f"{type(error).__name__}: {error}")
         self._finish()
 
-    def _write(self, entry: Entry) -> None:
+    def _write(self, entry: BagMessage) -> None:
         try:
             if self._writer is None or self._state != RECORDING:
                 self._count(self.dropped.disk_full, entry.topic)
@@ -504,7 +523,7 @@ class Recorder:
         self._state, self.error, self.failed = state, words, True
         log.debug("%s", words)  # reported by the node's diagnostics and by close()
 
-    def _save(self, snapshot: Snapshot, content: list[Entry]) -> None:
+    def _save(self, snapshot: Snapshot, content: list[BagMessage]) -> None:
         """Write a snapshot. An error concerns this snapshot only; the next may succeed."""
         try:
             if not content:

@@ -22,7 +22,6 @@ class Recovered:
     """Result of a recovery.
 
     Attributes:
-        count: messages written.
         stopped_by: reason why reading stopped early; empty when every file was complete.
         damaged: descriptions of skipped chunks.
         skipped: topic → why its messages were skipped: they are not CDR.

@@ -16,7 +16,8 @@ import yaml
 
 from instant_ic import paths
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.files import BagMessage, BagReader
+from instant_ic.bag.files import BagReader
+from instant_ic.bag.message import BagMessage
 from instant_ic.bag.player import NEVER_PLAYED
 from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
@@ -48,11 +49,7 @@ class ReplayError(RuntimeError):
 
 @dataclass(frozen=True)
 class ReplayNode:
-    """A node to replay.
-
-    Attributes:
-        name: name of a shipped node.
-    """
+    """A node to replay."""
 
     name: str
     node_class: type[Node[Any]]
@@ -110,7 +107,6 @@ def make_node(name: str, params_files: Sequence[Path] | None, overrides: Sequenc
     """Create a node with its parameters.
 
     Args:
-        name: name of a shipped node.
         params_files: parameter files; None takes those of ``config/`` for the node.
         overrides: ``node.key:=value`` arguments; those of other nodes are skipped.
 
@@ -139,12 +135,9 @@ def replay(
     Topics that a replayed node publishes are not fed, nor are transforms whose child frame a replayed node broadcasts.
 
     Args:
-        bag: bag to feed.
-        nodes: nodes to run.
         output: folder of the new bag, which must not exist.
         drop_transforms: further child frames to drop.
         on_progress: called with the completed share of the bag, 0 to 1.
-        compressed: compress the new bag.
 
     Raises:
         BagError: a bag cannot be read or written.

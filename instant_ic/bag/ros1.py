@@ -22,9 +22,6 @@ class Ros1Source:
 
     Types that ROS 2 or this project has are converted, field by field where they changed (``Header.seq`` is dropped,
     ``tfMessage`` becomes ``TFMessage``). All others use the definitions in the bag.
-
-    Args:
-        path: the ``.bag`` file.
     """
 
     compression_mode = None

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING
 
+from instant_ic.bag.message import BagMessage
 from instant_ic.msg import deserialize, message_type, serialize
-
-if TYPE_CHECKING:
-    from instant_ic.bag.files import BagMessage
 
 TRANSFORM_TOPICS = ("/tf", "/tf_static")
 

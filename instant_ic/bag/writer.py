@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from instant_ic.bag.errors import BagError, DiskFullError
-from instant_ic.bag.latched import LatchedValue, LatchedValues
+from instant_ic.bag.latched import LatchedValues
 from instant_ic.bag.mcap_writer import Buffer, McapWriter, Schema
+from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import PartInfo, Topic, channel_metadata, schema_or_unknown, write_metadata
 from instant_ic.bus.qos import SENSOR, QoS
 from instant_ic.closing import Closing
@@ -128,19 +129,20 @@ class BagWriter(Closing):
             self.end_part()
         if (topic, type_name) not in self._topics:
             self.add_topic(topic, type_name, qos, schema)
-        value = LatchedValue(topic, type_name, payload, stamp) if self._topics[topic, type_name][0].latched else None
+        qos = self._topics[topic, type_name][0]
+        value = BagMessage(topic, type_name, bytes(payload), stamp, qos, publisher) if qos.latched else None
         if self._part is None:
             self._open_part()
         assert self._part is not None
         try:
             if self._part.first_ns is None:
                 self._part.first_ns = stamp
-                self._repeat(stamp, value, publisher)
+                self._repeat(stamp, value)
             self._put(topic, type_name, payload, stamp, stamp)
         except OSError as error:
             raise self._failed(error, topic) from error
         if value is not None:
-            self._latched.put(value, publisher)
+            self._latched.put(value)
         self.bytes += len(payload)
 
     def add_topic(self, topic: str, type_name: str, qos: QoS, schema: Schema | None = None) -> None:
@@ -237,15 +239,15 @@ class BagWriter(Closing):
             raise BagError(f"bag {self.path} cannot be created: {error.strerror or error}") from None
         self._part = _Part(file, PartInfo(name))
 
-    def _repeat(self, stamp_ns: int, but: LatchedValue | None, publisher: str) -> None:
+    def _repeat(self, stamp_ns: int, but: BagMessage | None) -> None:
         if not self._done:
             return
         assert self._part is not None
-        for value in self._latched.values(but, publisher):
+        for value in self._latched.values(but):
             if self._unsure:  # a full disk may have dropped it: better twice than never
                 self._put(value.topic, value.type_name, value.payload, stamp_ns, stamp_ns)
                 continue
-            self._put(value.topic, value.type_name, value.payload, stamp_ns, value.publish_ns)
+            self._put(value.topic, value.type_name, value.payload, stamp_ns, value.stamp_ns)
             repeated, self._part.info.repeated_ns = self._part.info.repeated, stamp_ns
             repeated[value.topic] = repeated.get(value.topic, 0) + 1
             self._part.repeats += 1

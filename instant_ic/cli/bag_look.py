@@ -6,7 +6,6 @@ import argparse
 import json
 import math
 import sys
-from collections import Counter
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -194,7 +193,8 @@ def convert(args: argparse.Namespace) -> int:
     with progress(f"converting {', '.join(args.bags)}") as step:
         result = convert_bags([Path(bag) for bag in args.bags], Path(args.output), options, step)
     print(f"{args.output}: {result.counts.total()} messages in {result.files} files")
-    _print_counts(result.counts)
+    for topic, count in sorted(result.counts.items()):
+        print(f"  {topic}: {count}")
     for type_name, topics in sorted(result.skipped.items()):
         print(f"left out: unknown type {type_name} ({', '.join(topics)})")
     return 0
@@ -218,8 +218,3 @@ def reindex(args: argparse.Namespace) -> int:
     files, messages = reindex_bag(Path(args.bag))
     print(f"{args.bag}/metadata.yaml: {messages} messages in {files} files")
     return 0
-
-
-def _print_counts(counts: Counter[str]) -> None:
-    for topic, count in sorted(counts.items()):
-        print(f"  {topic}: {count}")

@@ -11,8 +11,7 @@ import shutil
 import socket
 import stat
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,42 +24,34 @@ MIN_SHM_MB = 64.0
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 
 
-@dataclass(frozen=True)
-class Expectation:
-    """Devices and ports that the nodes of this machine would use.
+TCP_PORTS = {8080: "operator's page", 8089: "simulated Theta"}
+UDP_PORTS = {2368: "VLP-16 data", 8308: "VLP-16 position"}
 
-    Attributes:
-        real_devices: missing devices are failures, not warnings.
+
+def run_checks(
+    run_dir: Path, serial_port: Path, camera_url: str, lidar_port: int, listen_s: float, missing: str
+) -> Iterator[Finding]:
+    """Run every check, the slow ones last.
+
+    Args:
+        run_dir: run directory of the stack.
         serial_port: port of the RoboClaw.
         camera_url: URL of the Theta.
         lidar_port: UDP port of the VLP-16's data.
-        listen_seconds: how long to wait for LiDAR packets.
-        tcp_ports: port → what needs it.
-        udp_ports: port → what needs it.
+        listen_s: how long to wait for LiDAR packets.
+        missing: level of a missing device: FAIL or WARN.
     """
-
-    real_devices: bool = False
-    serial_port: str = "/dev/ttyACM0"
-    camera_url: str = "http://192.168.1.1"
-    lidar_port: int = 2368
-    listen_seconds: float = 1.0
-    tcp_ports: tuple[tuple[int, str], ...] = ((8080, "operator's page"), (8089, "simulated Theta"))
-    udp_ports: tuple[tuple[int, str], ...] = ((2368, "VLP-16 data"), (8308, "VLP-16 position"))
-
-
-def run_checks(expectation: Expectation, run_dir: Path) -> Iterator[Finding]:
-    """Run every check, the slow ones last."""
     yield from check_machine(run_dir)
     yield from check_packages()
     yield from check_configuration()
     yield from check_models()
-    yield from check_ports(expectation)
+    yield from check_ports(TCP_PORTS, UDP_PORTS)
     yield from check_gpu()
     yield from check_browser()
     yield from check_network_filter()
-    yield from check_serial(expectation)
-    yield from check_camera(expectation)
-    yield from check_lidar(expectation)
+    yield from check_serial(serial_port, missing)
+    yield from check_camera(camera_url, missing)
+    yield from check_lidar(lidar_port, listen_s, missing)
     from instant_ic.cli.doctor_running import check_running  # its packages may be missing
 
     yield from check_running(run_dir)
@@ -185,11 +176,10 @@ def check_models() -> Iterator[Finding]:
         yield Finding(OK, f"models/{model.name}", f"{size}, input {shape}")
 
 
-def check_ports(expectation: Expectation) -> Iterator[Finding]:
-    """Check that the ports of the stack are free."""
-    kinds = ((socket.SOCK_STREAM, "tcp", expectation.tcp_ports), (socket.SOCK_DGRAM, "udp", expectation.udp_ports))
-    for kind, word, ports in kinds:
-        for port, need in ports:
+def check_ports(tcp: Mapping[int, str], udp: Mapping[int, str]) -> Iterator[Finding]:
+    """Check that ports are free; each is given with what needs it."""
+    for kind, word, ports in ((socket.SOCK_STREAM, "tcp", tcp), (socket.SOCK_DGRAM, "udp", udp)):
+        for port, need in ports.items():
             try:
                 with socket.socket(socket.AF_INET, kind) as probe:
                     if kind == socket.SOCK_STREAM:
@@ -243,13 +233,11 @@ def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterat
         yield Finding(OK, "rp_filter", "not strict")
 
 
-def check_serial(expectation: Expectation, devices: Callable[[], list[Any]] | None = None) -> Iterator[Finding]:
+def check_serial(port: Path, missing: str, devices: Callable[[], list[Any]] | None = None) -> Iterator[Finding]:
     """Check that the RoboClaw's serial port exists and may be opened."""
     if devices is None:
         from serial.tools.list_ports import comports as devices
     assert devices is not None
-    port = Path(expectation.serial_port)
-    missing = FAIL if expectation.real_devices else WARN
     if not port.exists():
         others = ", ".join(device.device for device in devices()) or "none"
         advice = "connect the RoboClaw, or set serial_port:=... (not needed for sim.yaml)"
@@ -268,12 +256,11 @@ def check_serial(expectation: Expectation, devices: Callable[[], list[Any]] | No
     yield Finding(missing, f"serial {port}", f"no permission ({stat.filemode(info.st_mode)} {group})", advice)
 
 
-def check_camera(expectation: Expectation) -> Iterator[Finding]:
+def check_camera(url: str, missing: str) -> Iterator[Finding]:
     """Check that the Theta answers on its Web API."""
     import requests
 
-    url = expectation.camera_url.rstrip("/")
-    missing = FAIL if expectation.real_devices else WARN
+    url = url.rstrip("/")
     try:
         with requests.Session() as session:
             session.trust_env = False  # a proxy cannot reach a camera in the local network
@@ -293,18 +280,17 @@ def check_camera(expectation: Expectation) -> Iterator[Finding]:
     yield Finding(OK, f"camera {url}", f"{model}, firmware {firmware}")
 
 
-def check_lidar(expectation: Expectation) -> Iterator[Finding]:
+def check_lidar(port: int, listen_s: float, missing: str) -> Iterator[Finding]:
     """Check that packets of a VLP-16 arrive."""
-    subject = f"lidar udp {expectation.lidar_port}"
-    missing = FAIL if expectation.real_devices else WARN
+    subject = f"lidar udp {port}"
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-            receiver.bind(("", expectation.lidar_port))
-            receiver.settimeout(expectation.listen_seconds)
+            receiver.bind(("", port))
+            receiver.settimeout(listen_s)
             packet, sender = receiver.recvfrom(2048)
     except TimeoutError:
         advice = "check the sensor's cable and address (default 192.168.1.201; not needed for sim.yaml)"
-        yield Finding(missing, subject, f"no packet in {expectation.listen_seconds:g} s", advice)
+        yield Finding(missing, subject, f"no packet in {listen_s:g} s", advice)
     except OSError as error:
         advice = "another driver already uses the port; stop it"
         yield Finding(missing, subject, f"cannot listen: {error.strerror}", advice)

@@ -12,29 +12,17 @@ from instant_ic.cli.observer import Observer
 from instant_ic.msg import deserialize
 
 
-class Heartbeats:
-    """Context manager that listens to the heartbeats of every node in a run directory, in every namespace."""
+class Heartbeats(Observer):
+    """Listens to the heartbeats of every node in a run directory, in every namespace."""
 
     def __init__(self, run_dir: Path) -> None:
-        self.run_dir = run_dir
+        topics = {info.topic for info in registry.list_topics(run_dir) if info.type_name == TYPE}
+        super().__init__(sorted(topics | {"/heartbeat"}), run_dir=run_dir)
         self.newest: dict[str, Heartbeat] = {}
-        self._observer: Observer | None = None
-
-    def __enter__(self) -> Heartbeats:
-        """Start listening."""
-        topics = {info.topic for info in registry.list_topics(self.run_dir) if info.type_name == TYPE}
-        self._observer = Observer(sorted(topics | {"/heartbeat"}), run_dir=self.run_dir)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Disconnect from the bus."""
-        if self._observer is not None:
-            self._observer.__exit__(None, None, None)
 
     def listen(self, seconds: float, until: Collection[str] = ()) -> dict[str, Heartbeat]:
         """Listen for some time, or until all the named nodes were heard; return the newest heartbeat of each node."""
-        assert self._observer is not None
-        for batch in self._observer.batches(seconds, 0.1):
+        for batch in self.batches(seconds, 0.1):
             for received in batch:
                 if received.type_name == TYPE:
                     with suppress(ValueError):  # it cannot be read: the node counts as silent

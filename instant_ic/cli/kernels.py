@@ -11,8 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -56,7 +55,8 @@ def compile_all(report: Callable[[float], None]) -> list[str]:
     Returns:
         A text for each part that cannot be compiled. The nodes that need it try again at their start.
     """
-    with _lock():
+    with (_folder() / "kernels.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
         if are_compiled():
             return []
         key = _key()
@@ -119,13 +119,6 @@ def _folder() -> Path:
     return folder
 
 
-@contextmanager
-def _lock() -> Iterator[None]:
-    with (_folder() / "kernels.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
 def _key() -> str:
     """Text that changes with whatever makes numba compile again: a kernel's source file, numba, Python, the CPU."""
     digest = hashlib.sha256(f"{_PACKAGE} {version('numba')} {sys.version} {platform.machine()}".encode())
@@ -138,12 +131,6 @@ def _key() -> str:
         if line.startswith(("model name", "flags")):
             digest.update(line.encode())
     return digest.hexdigest()
-
-
-def _compile(part: str) -> None:
-    """Run every kernel of a part once, as its node does before its first message."""
-    for module in PARTS[part]:
-        import_module(f"instant_ic.{part}.{module}").warm_up()
 
 
 def main() -> None:
@@ -168,7 +155,9 @@ def main() -> None:
             print(min(1.0, finished / len(kernels)), flush=True)
 
     with event.install_listener("numba:compile", Counter()):
-        _compile(sys.argv[1])
+        part = sys.argv[1]
+        for module in PARTS[part]:
+            import_module(f"instant_ic.{part}.{module}").warm_up()
 
 
 if __name__ == "__main__":

@@ -51,7 +51,6 @@ def parse(text: str, node: str, end_s: float) -> list[LogLine]:
     later time of day than the next one, midnight lies between them.
 
     Args:
-        text: content of the file.
         node: owner of the file; a line in another format (output of a library) is attributed to it.
         end_s: when the file was last written, seconds since the epoch.
     """
@@ -153,10 +152,10 @@ def chosen(lines: Iterable[LogLine], level: int, since_s: float = 0.0) -> Iterat
     return (line for line in lines if LEVELS.index(line.level) >= level and line.stamp_s >= since_s)
 
 
-def from_rosout(message: object, now_s: float | None = None) -> LogLine:
+def from_rosout(message: object) -> LogLine:
     """Log line from a ``/rosout`` message (rcl_interfaces/Log)."""
     from instant_ic.msg import stamp_ns
 
     level = min(max(int(message.level) // 10 - 1, 0), len(LEVELS) - 1)  # type: ignore[attr-defined]
-    stamp_s = stamp_ns(message) / 1e9 or (time.time() if now_s is None else now_s)
+    stamp_s = stamp_ns(message) / 1e9 or time.time()
     return LogLine(stamp_s, LEVELS[level], message.name.strip("/"), message.msg)  # type: ignore[attr-defined]

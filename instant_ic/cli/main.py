@@ -14,7 +14,6 @@ import pkgutil
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from types import FrameType
 
 from instant_ic.cli import commands
@@ -57,23 +56,19 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; return the exit status."""
     words = sys.argv[1:] if argv is None else argv
-    with _clean_end(words[:1] == ["launch"]):
+    launches = words[:1] == ["launch"]
+
+    def end(signum: int, frame: FrameType | None) -> None:
+        if launches:  # before the stack is up
+            raise SystemExit(0)
+        raise KeyboardInterrupt if signum == signal.SIGINT else _Terminated
+
+    with on_end_signal(end):
         return _main(argv)
 
 
 class _Terminated(KeyboardInterrupt):
     """SIGTERM or SIGHUP, which end a command as Ctrl-C does: it stops what it started and removes its scratch files."""
-
-
-def _clean_end(launches: bool) -> AbstractContextManager[None]:
-    """End a command cleanly on a signal; ``ic launch`` with status 0 on one that arrives before the stack is up."""
-
-    def end(signum: int, frame: FrameType | None) -> None:
-        if launches:
-            raise SystemExit(0)
-        raise KeyboardInterrupt if signum == signal.SIGINT else _Terminated
-
-    return on_end_signal(end)
 
 
 def _main(argv: Sequence[str] | None) -> int:

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 
 from instant_ic import pace, paths
 from instant_ic.bus import RELIABLE, registry
@@ -17,18 +16,18 @@ from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.transport import RawSubscription, Received
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.names import absolute, unknown_topic
+from instant_ic.closing import Closing
 from instant_ic.msg import deserialize, stamp_ns
 
 _CLOCK = "/clock"
 
 
-class Observer:
-    """Context manager that subscribes to topics.
+class Observer(Closing):
+    """Subscribes to topics until the end of its ``with`` block.
 
     Args:
         topics: one or several names, with or without the leading slash.
         use_sim_time: take arrival times and :attr:`clock` from ``/clock``.
-        run_dir: run directory of the stack.
 
     Raises:
         RegistryError: the run directory cannot be used, or a name is invalid.
@@ -58,13 +57,7 @@ class Observer:
     def _subscribe(self, topic: str) -> RawSubscription:
         return self.transport.subscribe(topic, None, RELIABLE, self._ready.set)
 
-    def __enter__(self) -> Observer:
-        """Return the observer itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         """Disconnect from the bus."""
         self.transport.close()
 

@@ -16,6 +16,7 @@ from typing import Any, TextIO
 ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[C": "right", "\x1b[D": "left"}
 _KEY = re.compile(r"\x1b\[[0-9;]*[A-Za-z~]|.", re.DOTALL)
 _CLEAR_LINE = "\r\x1b[K"
+_PERIOD_S = 0.2
 
 
 class Terminal:
@@ -24,13 +25,11 @@ class Terminal:
     Args:
         keys: key (a character, or ``up``, ``down``, ``left``, ``right``) → its action.
         line: returns the text of the status line.
-        period_s: update period of the status line.
     """
 
-    def __init__(self, keys: Mapping[str, Callable[[], Any]], line: Callable[[], str], period_s: float = 0.2) -> None:
+    def __init__(self, keys: Mapping[str, Callable[[], Any]], line: Callable[[], str]) -> None:
         self._keys = keys
         self._line = line
-        self._period_s = period_s
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._before: list[Any] | None = None
@@ -76,9 +75,9 @@ class Terminal:
                 sys.stderr.flush()
             # Reading would stop a process in the background.
             if not self._in_front():
-                self._stop.wait(self._period_s)
+                self._stop.wait(_PERIOD_S)
                 continue
-            ready, _, _ = select.select([sys.stdin], [], [], self._period_s)
+            ready, _, _ = select.select([sys.stdin], [], [], _PERIOD_S)
             if ready:
                 self._on_keys(os.read(sys.stdin.fileno(), 64).decode(errors="replace"))
 

@@ -112,7 +112,6 @@ def make_rows(
 
     Args:
         infos: nodes listed in the registry.
-        beats: node → its newest heartbeat.
         look: returns CPU, memory and threads of a process.
         nominal: returns the expected rate of a topic.
         now_ns: system time.
@@ -170,15 +169,14 @@ def expected_rate(topic: str) -> TopicRate | None:
 HEADINGS = ("NODE", "PID", "STATE", "CPU%", "BUDGET", "MEM MB", "THR", "LOST", "OUT Hz", "IN Hz", "MESSAGE")
 
 
-def cells(row: NodeRow, topics: bool = True) -> list[str]:
+def cells(row: NodeRow) -> list[str]:
     """A row as text, in the order of ``HEADINGS``."""
 
     def number(value: float) -> str:
         return "-" if math.isnan(value) else f"{value:.0f}"
 
     def flows(rows: Sequence[TopicRow]) -> str:
-        flowing = [one for one in rows if one.rate_hz > 0 or one.fault]
-        return " ".join(f"{one.topic} {rate_words(one)}" for one in flowing) if topics else str(len(flowing))
+        return " ".join(f"{one.topic} {rate_words(one)}" for one in rows if one.rate_hz > 0 or one.fault)
 
     return [
         row.node,
@@ -190,7 +188,7 @@ def cells(row: NodeRow, topics: bool = True) -> list[str]:
         str(row.threads or "-"),
         str(row.lost),
         flows(row.outputs),
-        flows(row.inputs) if topics else str(sum(one.rate_hz > 0 for one in row.inputs)),
+        flows(row.inputs),
         row.message,
     ]
 

@@ -26,9 +26,7 @@ def table(rows: Sequence[NodeRow], sort: str, inputs: bool = False) -> Group:
     """Table of the nodes, with a summary above and the keys below.
 
     Args:
-        rows: one per node.
         sort: a key of ``SORT_KEYS``.
-        inputs: show the rates of inputs as well as outputs.
     """
     shown = Table(box=None, pad_edge=False, header_style="bold reverse", expand=True)
     for heading in HEADINGS:
@@ -83,7 +81,6 @@ def run(rows: Callable[[float], list[NodeRow]], period_s: float, sort: str) -> i
 
     Args:
         rows: returns the newest rows; its argument is the listening time in seconds.
-        period_s: update period.
         sort: a key of ``SORT_KEYS``.
     """
     inputs = False

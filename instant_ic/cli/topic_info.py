@@ -12,11 +12,6 @@ from instant_ic.cli.names import absolute, near, topic_types
 
 
 def info(args: argparse.Namespace) -> int:
-    """Print one topic.
-
-    Raises:
-        UserError: the topic has neither publisher nor subscriber.
-    """
     run_dir = paths.run_dir()
     topic = absolute(args.topic)
     found = next((entry for entry in registry.list_topics(run_dir) if entry.topic == topic), None)

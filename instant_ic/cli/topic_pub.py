@@ -21,12 +21,7 @@ _KEEP_S = 0.2  # time for the last message to arrive before the publisher closes
 
 
 def publish(args: argparse.Namespace) -> int:
-    """Publish messages until Ctrl-C, or the given number of them.
-
-    Raises:
-        UserError: the type, a value or the topic does not fit; a node already commands the robot on this topic; no
-            subscriber appeared.
-    """
+    """Publish messages until Ctrl-C, or the given number of them."""
     topic = registry.check_topic(absolute(args.topic))
     fields(args.type)  # raises for an unknown type
     full = type_name(message_type(args.type))

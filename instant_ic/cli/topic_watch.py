@@ -16,11 +16,6 @@ from instant_ic.msg import MessageError, deserialize, stamp_ns
 
 
 def echo(args: argparse.Namespace) -> int:
-    """Print messages.
-
-    Raises:
-        UserError: the field does not exist, or fewer messages than requested arrived in time.
-    """
     wanted = 1 if args.once else args.n
     style = Style(args.full_length, args.truncate_length, not args.no_arr, not args.no_str)
     count = 0
@@ -98,11 +93,6 @@ def bandwidth(args: argparse.Namespace) -> int:
 
 
 def delay(args: argparse.Namespace) -> int:
-    """Print the age of messages on arrival, by their stamp, once a second.
-
-    Raises:
-        UserError: a message has no header with a stamp.
-    """
     with Observer(args.topic, args.use_sim_time) as observer:
         delays = {topic: Window(args.window) for topic in observer.topics}
 

@@ -8,11 +8,7 @@ from statistics import fmean, pstdev
 
 
 class Window:
-    """Sliding window over the newest values.
-
-    Args:
-        size: maximum number of values.
-    """
+    """Sliding window over the newest values."""
 
     def __init__(self, size: int) -> None:
         self.values: deque[float] = deque(maxlen=size)
@@ -30,11 +26,7 @@ class Window:
 
 
 class Rate:
-    """Rate of a topic from the arrival times of its messages.
-
-    Args:
-        size: number of messages in the window.
-    """
+    """Rate of a topic from the arrival times of its messages."""
 
     def __init__(self, size: int) -> None:
         self.gaps = Window(size)
@@ -52,13 +44,12 @@ class Rate:
 
     def line(self, lost_by: Mapping[str, int]) -> str:
         """One line of ``ic topic hz``."""
-        return f"{self._rate()}  lost: {losses(lost_by)}"
-
-    def _rate(self) -> str:
-        if not self.gaps.values:
-            return "no rate yet: only one message" if self.count else "no message yet"
-        mean = fmean(self.gaps.values)
-        return f"average rate: {1 / mean if mean > 0 else float('inf'):.3f}  {self.gaps.spread()}"
+        if self.gaps.values:
+            mean = fmean(self.gaps.values)
+            rate = f"average rate: {1 / mean if mean > 0 else float('inf'):.3f}  {self.gaps.spread()}"
+        else:
+            rate = "no rate yet: only one message" if self.count else "no message yet"
+        return f"{rate}  lost: {losses(lost_by)}"
 
 
 def losses(lost_by: Mapping[str, int]) -> str:

@@ -26,7 +26,6 @@ class ParameterInfo:
         default: default value, as plain JSON.
         range: allowed range as text; empty without a range.
         live: whether it can be changed while the node runs.
-        description: its meaning.
     """
 
     name: str
@@ -47,7 +46,6 @@ def parameter_infos(config_class: type[Any], config: Any = None, live: Iterable[
     """All parameters of a configuration, in the order of its fields.
 
     Args:
-        config_class: dataclass of the configuration.
         config: configuration that gives the present values; None uses the defaults.
         live: keys and groups that can be changed while the node runs.
     """

@@ -39,7 +39,6 @@ class Problem:
     """One mistake in parameters.
 
     Attributes:
-        text: what is wrong.
         where: its place (``config/slam.yaml:12`` or ``-p key:=value``); empty if no given value is at fault.
         key: the parameter at fault; empty if there is none.
     """
@@ -108,8 +107,6 @@ def gather(
     """All values given to a node: the files in their order, then the ``key:=value`` overrides.
 
     Args:
-        node: name of the node.
-        files: ROS 2 parameter files.
         overrides: ``key:=value`` texts.
         places: place of an override, if it has a better one than the command line (a launch file's line).
 
@@ -272,7 +269,6 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
     A shared value that the node does not have is for other nodes, and skipped.
 
     Args:
-        config_class: dataclass of the configuration.
         base: source of all other values; None uses the defaults.
 
     Raises:

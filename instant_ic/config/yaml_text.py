@@ -74,17 +74,19 @@ def construct(node: yaml.Node) -> Any:
 
 
 def dump_yaml(value: object, **style: Any) -> str:
-    """``yaml.safe_dump`` with keys in their order; by the C emitter where there is one.
-
-    Args:
-        style: options of ``yaml.dump``.
-    """
+    """``yaml.safe_dump`` with keys in their order; by the C emitter where there is one."""
     if (fast := getattr(yaml, "CSafeDumper", None)) is not None:
         try:
             return str(yaml.dump(value, Dumper=fast, sort_keys=False, **style))
         except UnicodeEncodeError:  # half a surrogate pair, from a file name that is not UTF-8; Python escapes it
             pass
     return str(yaml.safe_dump(value, sort_keys=False, **style))
+
+
+def one_line(value: object) -> str:
+    """A value as one line of YAML."""
+    text = dump_yaml(value, default_flow_style=True, allow_unicode=True, width=1 << 20)
+    return text.removesuffix("...\n").rstrip("\n")
 
 
 def _most_levels(text: str) -> int:

@@ -17,7 +17,7 @@ from instant_ic.launch.health import HealthMonitor, TopicFault
 from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.pacing import Pacing
 from instant_ic.launch.process import ManagedProcess, State
-from instant_ic.launch.rundir import StackLock
+from instant_ic.launch.rundir import stack_lock
 from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.launch.supervisor import Supervisor
 from instant_ic.launch.topics import nominal_rate
@@ -37,7 +37,6 @@ def run_stack(
     """Start everything, show its state, and stop it at the end.
 
     Args:
-        description: what to start.
         run_dir: run directory; created if missing, with those of the groups inside.
         live: show a table of the nodes below the lines; default: only if standard output is a terminal.
         pace: of the stack's time. Default: what the machine can do, if the devices are simulated; else the machine's.
@@ -56,7 +55,7 @@ def run_stack(
     with ExitStack() as locks:
         for folder in folders:
             registry.prepare(folder)
-            locks.enter_context(StackLock(folder, description.file.name))
+            locks.enter_context(stack_lock(folder, description.file.name))
             registry.sweep(folder)
             locks.enter_context(RunMark(folder))
         output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live, verbose)

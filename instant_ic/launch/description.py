@@ -19,10 +19,8 @@ class LaunchArgument:
     Attributes:
         default: default value; None if a value must be given.
         description: text for ``--show-args``.
-        line: line in the file.
         type: ``str``, ``int``, ``float``, ``bool`` or ``path``.
         choices: allowed values; empty if any value is allowed.
-        file: the launch file that declares it.
     """
 
     name: str
@@ -48,7 +46,6 @@ class NodeSpec:
         respawn_delay_s: wait before the first restart; doubles with each further one within the window.
         required: when it ends, the whole stack ends.
         file: the launch file that contains it.
-        line: line in that file.
         respawn_max_retries: total number of restarts before it is given up; -1: limited by the window only.
         run_dir: its run directory; None: the stack's own.
         group: name of that run directory within the stack's, shown before the node's name; else empty.
@@ -111,10 +108,6 @@ class LaunchDescription:
     """Everything that a launch file starts and does, with its arguments applied.
 
     Attributes:
-        arguments: arguments that it declares.
-        values: values of its variables.
-        nodes: processes to start.
-        announcements: texts to print.
         shutdown: when the stack ends by itself; None: never.
     """
 

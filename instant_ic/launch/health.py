@@ -15,6 +15,7 @@ from instant_ic.bus import RELIABLE, SENSOR, registry
 from instant_ic.bus.heartbeat import EVERY_NODES, TYPE, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import ERROR, OK, WARN
+from instant_ic.bus.qos import QoS
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.topics import nominal_rate
 from instant_ic.msg import MessageError, deserialize, header, message_type, serialize
@@ -68,16 +69,13 @@ class HealthMonitor:
         for transport in self._transports.values():
             transport.patient = True
         self._folders = groups
-        self._beats = list(self._subscribe_beats())
+        spaces = {(spec.group, spec.namespace.strip("/")): spec for spec in self._specs}
+        self._beats = [(spec.group, self._subscribe(spec, "/heartbeat", TYPE, RELIABLE)) for spec in spaces.values()]
+        status = "instant_ic_msgs/msg/VspaceStatus"
         self._vspace = [
-            (
-                _labelled(spec, "virtual space"),
-                self._transports[spec.group].subscribe(
-                    "/vspace/status", "instant_ic_msgs/msg/VspaceStatus", RELIABLE, lambda: None
-                ),
-            )
-            for spec in self._specs
-            if spec.exec == "nerf" and not spec.namespace
+            (_labelled(spec, "virtual space"), self._subscribe(spec, "/vspace/status", status, RELIABLE))
+            for spec in self._of("nerf")
+            if not spec.namespace
         ]
         array = "diagnostic_msgs/msg/DiagnosticArray"
         self._diagnostics = {
@@ -95,15 +93,10 @@ class HealthMonitor:
     def _of(self, program: str) -> list[NodeSpec]:
         return [spec for spec in self._specs if spec.exec == program]
 
-    def _subscribe(self, spec: NodeSpec, topic: str, type_name: str) -> Any:
+    def _subscribe(self, spec: NodeSpec, topic: str, type_name: str, qos: QoS = SENSOR) -> Any:
         namespace = spec.namespace.strip("/")
         name = f"/{namespace}{topic}" if namespace else topic
-        return self._transports[spec.group].subscribe(name, type_name, SENSOR, lambda: None)
-
-    def _subscribe_beats(self) -> Iterable[tuple[str, Any]]:
-        for group, namespace in sorted({(spec.group, spec.namespace.strip("/")) for spec in self._specs}):
-            topic = f"/{namespace}/heartbeat" if namespace else "/heartbeat"
-            yield group, self._transports[group].subscribe(topic, TYPE, RELIABLE, lambda: None)
+        return self._transports[spec.group].subscribe(name, type_name, qos, lambda: None)
 
     def poll(self) -> None:
         """Process the messages that have arrived; never waits."""

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic import paths
+from instant_ic.config.yaml_text import one_line
 from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
 from instant_ic.launch.source import Value, load
 from instant_ic.launch.substitutions import Context
 from instant_ic.launch.values import (
     CONDITION,
-    as_yaml,
     flag_of,
     holds,
     integer_of,
@@ -122,7 +122,6 @@ def read_executable(body: Value, scope: Scope, taken: set[str]) -> NodeSpec | No
     """Read an ``executable`` (any program); None if it is wrong or its conditions do not hold.
 
     Args:
-        scope: scope of the entry.
         taken: names of the processes before it.
     """
     context = scope.context
@@ -219,7 +218,7 @@ def _parameter(entry: Value, context: Context, places: dict[str, str], prefix: s
         entry.problem("a parameter needs name and value, or from: FILE")
         return []
     value = parameter_value(fields["value"], plain_text(fields.get("type")) or "", context)
-    word = f"{prefix}{name}:={as_yaml(value)}"
+    word = f"{prefix}{name}:={one_line(value)}"
     places[word] = entry.place
     return ["-p", word]
 

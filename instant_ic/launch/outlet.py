@@ -28,8 +28,6 @@ class Outlet:
     """
 
     def __init__(self, name: str, limit: int) -> None:
-        self.left_out = 0
-        """Sum of the sizes that were refused."""
         self.broken: OSError | None = None
         """Set once a call fails because its destination is gone; no further call is run."""
         self._limit = limit
@@ -45,12 +43,10 @@ class Outlet:
 
         Args:
             function: runs on the outlet's thread.
-            size: size of the call.
             always: queue it even then; for the few calls that matter.
         """
         with self._condition:
             if self.broken is not None or (self._waiting + size > self._limit and not always):
-                self.left_out += size
                 return False
             self._waiting += size
             self._calls.append((size, function, args))
@@ -89,7 +85,6 @@ class LogFile:
     """A node's log file, mode 0600; the previous run's file is kept. Errors are reported once and never raised.
 
     Args:
-        path: of the file; its folder need not exist yet.
         tell: called with a text when writing fails and when it works again; runs on the writing thread.
         max_bytes: a larger file is renamed to ``.log.1``, and a new one is started.
     """

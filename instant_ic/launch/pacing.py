@@ -46,9 +46,6 @@ class PaceChooser:
 
     After a fall the pace is held. Each fall that follows soon after a rise doubles the next hold, so that a constant
     load leads to a constant pace.
-
-    Args:
-        pace: pace at the start.
     """
 
     STEP = 0.05
@@ -137,7 +134,6 @@ def pace_of(cores: int, loops_per_s: float, load: float) -> float:
     """Pace that a stack could hold beside other processes.
 
     Args:
-        cores: their number.
         loops_per_s: iterations of an empty loop on one of them.
         load: mean number of processes that already run.
     """
@@ -170,12 +166,7 @@ class CoreLoad:
 
 
 class Pacing:
-    """Adapts the pace of a running stack, and reports changes that an operator notices.
-
-    Args:
-        folders: run directories of the stack.
-        report: receives the texts.
-    """
+    """Adapts the pace of a running stack, and reports changes that an operator notices."""
 
     REPORT_STEP = 0.1
     REPORT_S = 10.0

@@ -55,22 +55,16 @@ class RespawnLimit:
 
     Args:
         delay_s: wait before the first restart.
-        max_delay_s: largest wait.
-        window_s: only restarts within this time count.
-        max_starts: the process is given up after more restarts than this within the window.
         max_retries: the process is given up after more restarts than this in total; -1: no limit.
     """
 
-    def __init__(
-        self,
-        delay_s: float,
-        max_delay_s: float = 15.0,
-        window_s: float = 60.0,
-        max_starts: int = 5,
-        max_retries: int = -1,
-    ) -> None:
-        self.delay_s, self.max_delay_s = delay_s, max_delay_s
-        self.window_s, self.max_starts, self.max_retries = window_s, max_starts, max_retries
+    MAX_DELAY_S = 15.0
+    WINDOW_S = 60.0
+    MAX_STARTS = 5
+    """The process is given up after more restarts than this within the window."""
+
+    def __init__(self, delay_s: float, max_retries: int = -1) -> None:
+        self.delay_s, self.max_retries = delay_s, max_retries
         self.retries = 0
         """Total number of restarts."""
         self._starts: deque[float] = deque()
@@ -82,11 +76,11 @@ class RespawnLimit:
 
     def next_delay_s(self, now_s: float) -> float | None:
         """Count one more restart; returns the seconds to wait before it, or None if there were too many."""
-        while self._starts and now_s - self._starts[0] > self.window_s:
+        while self._starts and now_s - self._starts[0] > self.WINDOW_S:
             self._starts.popleft()
-        if len(self._starts) >= self.max_starts or 0 <= self.max_retries <= self.retries:
+        if len(self._starts) >= self.MAX_STARTS or 0 <= self.max_retries <= self.retries:
             return None
-        delay_s = min(self.delay_s * 2 ** len(self._starts), self.max_delay_s)
+        delay_s = min(self.delay_s * 2 ** len(self._starts), self.MAX_DELAY_S)
         self._starts.append(now_s)
         self.retries += 1
         return delay_s
@@ -95,19 +89,15 @@ class RespawnLimit:
         """Text for the limit that was reached."""
         if 0 <= self.max_retries <= self.retries:
             return f"{self.max_retries} restarts"
-        return f"{self.max_starts} restarts within {self.window_s:.0f} s"
+        return f"{self.MAX_STARTS} restarts within {self.WINDOW_S:.0f} s"
 
 
 class ManagedProcess:
     """A process in a session of its own, with its log file.
 
     Args:
-        spec: what to start.
-        run_dir: run directory of the stack.
         mark: text that the process and everything it starts carry in their environment.
-        disk: outlet that writes the log.
         tell: called with texts about the log.
-        limit: on its restarts.
     """
 
     def __init__(
@@ -117,10 +107,9 @@ class ManagedProcess:
         mark: str,
         disk: Outlet,
         tell: Callable[[str], None],
-        limit: RespawnLimit | None = None,
     ) -> None:
         self.spec = spec
-        self.limit = limit or RespawnLimit(spec.respawn_delay_s, max_retries=spec.respawn_max_retries)
+        self.limit = RespawnLimit(spec.respawn_delay_s, spec.respawn_max_retries)
         self.mark = f"{mark}/{spec.label}."  # ends with a dot, so that no mark is a prefix of another
         self.state = State.WAITING
         self.exit_status: int | None = None

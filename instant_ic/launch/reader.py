@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from instant_ic import paths
+from instant_ic.config.yaml_text import one_line
 from instant_ic.launch import nodes
 from instant_ic.launch.description import (
     Announcement,
@@ -24,9 +25,9 @@ from instant_ic.launch.source import LaunchFileError, Problem, Value, load
 from instant_ic.launch.substitutions import Context, truth
 from instant_ic.launch.values import (
     CONDITION,
-    as_yaml,
     flag_of,
     holds,
+    pairs_of,
     parameter_value,
     plain_text,
     seconds_of,
@@ -57,8 +58,6 @@ class Reader:
     """Collects the contents of a launch file and all its includes.
 
     Args:
-        run_dir: run directory of the stack.
-        given: arguments of the command line.
         conditions: if false, read every include and group as if its conditions held, to list all arguments.
     """
 
@@ -91,14 +90,7 @@ class Reader:
         return declared
 
     def include(self, file: Path, scope: Scope, given: dict[str, str], place: Value, depth: int) -> None:
-        """Read an included file.
-
-        Args:
-            scope: scope of the include.
-            given: the arguments that the include sets.
-            place: place of the include.
-            depth: nesting depth of the includes.
-        """
+        """Read an included file."""
         if depth >= _MAX_INCLUDE_DEPTH:
             place.problem(f"files include each other more than {_MAX_INCLUDE_DEPTH} deep")
             return
@@ -279,13 +271,8 @@ class _Actions:
     def _include(self, body: Value) -> None:
         fields = body.fields(known=("file", "arg", "let", *CONDITION), required=("file",))
         name = text_of(fields.get("file"), self.context)
-        given: dict[str, str] = {}
-        for key in ("arg", "let"):
-            for entry in fields[key].items() if key in fields else []:
-                pair = entry.fields(known=("name", "value"), required=("name", "value"))
-                argument, value = plain_text(pair.get("name")), text_of(pair.get("value"), self.context)
-                if argument and value is not None:
-                    given[argument] = value
+        entries = [pairs_of(fields.get(key), "name", "value", self.context) for key in ("arg", "let")]
+        given = dict(pair for pairs in entries for pair in pairs)
         if name is None or (self.conditions and not holds(fields, self.context)):
             return
         file = self._find(name)
@@ -358,7 +345,7 @@ class _Actions:
     def _set_parameter(self, body: Value) -> None:
         if fields := self._fields(body, ("name", "value"), ("name", "value")):
             value = parameter_value(fields["value"], "", self.context)
-            self.scope.options += ["-p", f"{plain_text(fields['name'])}:={as_yaml(value)}"]
+            self.scope.options += ["-p", f"{plain_text(fields['name'])}:={one_line(value)}"]
 
     def _set_parameters_from_file(self, body: Value) -> None:
         if fields := self._fields(body, ("filename",), ("filename",)):
@@ -404,7 +391,6 @@ def read_launch_file(
     """Read and check a launch file with everything that it includes.
 
     Args:
-        arguments: values for its ``arg`` entries.
         run_dir: value of ``$(run-dir)``; default: ``paths.run_dir()``.
 
     Raises:

@@ -114,13 +114,6 @@ class Screen:
         self._shown: set[tuple[str, str]] = set()
         self._held_back: list[tuple[str, str]] = []
 
-    def __enter__(self) -> Screen:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
     def start(self) -> None:
         if self._live is not None:
             self._live.start()

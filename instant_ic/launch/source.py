@@ -39,7 +39,6 @@ class Value:
     """A place in a YAML file (scalar, mapping or list), with accessors that note problems instead of raising.
 
     Attributes:
-        node: PyYAML's node.
         problems: list where mistakes are noted; shared by the whole launch description.
     """
 
@@ -124,11 +123,7 @@ class Value:
 
 
 def load(file: Path, problems: list[Problem]) -> Value | None:
-    """Read a YAML file; None, with the problem noted, if it cannot be read.
-
-    Args:
-        problems: list where mistakes are noted.
-    """
+    """Read a YAML file; None, with the problem noted, if it cannot be read."""
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

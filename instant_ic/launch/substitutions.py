@@ -38,7 +38,7 @@ _NOT_HERE = {
     "exec-in-pkg": "give the program's path, or $(find-exec NAME)",
     "optenv": "use $(env NAME default)",
 }
-_MOST_TEXT = 1 << 17
+MOST_TEXT = 1 << 17
 """Most characters after substitution; Linux takes no longer argument of a program."""
 _anonymous = itertools.count(1)
 
@@ -55,7 +55,6 @@ class Context:
         launch_file: the file that contains the text.
         run_dir: run directory of the stack.
         variables: launch arguments and ``let`` values in scope.
-        environment: environment variables.
     """
 
     launch_file: Path
@@ -87,8 +86,8 @@ def substitute(text: str, context: Context) -> str:
         parts.append(_evaluate(text[start + 2 : end], context))
         position = end + 1
     parts.append(text[position:])
-    if sum(map(len, parts)) > _MOST_TEXT:  # each of 40 variables may hold its predecessor twice
-        raise SubstitutionError(f"the text has more than {_MOST_TEXT} characters after substitution")
+    if sum(map(len, parts)) > MOST_TEXT:  # each of 40 variables may hold its predecessor twice
+        raise SubstitutionError(f"the text has more than {MOST_TEXT} characters after substitution")
     return "".join(parts)
 
 

@@ -10,16 +10,15 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType
 from typing import Protocol
 
 from instant_ic.closing import on_end_signal
 from instant_ic.launch.description import Announcement, NodeSpec, Shutdown
 from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.outlet import Outlet
-from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, RespawnLimit, Schedule, State, describe_exit
+from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, Schedule, State, describe_exit
 from instant_ic.launch.reaper import kill_marked
 
 STOP_SCHEDULE: Schedule = (
@@ -87,14 +86,8 @@ class Supervisor:
     nodes.
 
     Args:
-        nodes: what to start.
-        run_dir: prepared run directory.
-        output: destination of lines and events.
-        make_limit: creates the respawn limit of a node; for tests.
         stop_schedule: signals at shutdown, with the wait after each.
         make_health: called once all processes are started; None: heartbeats are not watched.
-        announcements: texts to print at their time.
-        shutdown: when to end by itself.
     """
 
     def __init__(
@@ -102,7 +95,6 @@ class Supervisor:
         nodes: Sequence[NodeSpec],
         run_dir: Path,
         output: Output,
-        make_limit: Callable[[NodeSpec], RespawnLimit] | None = None,
         stop_schedule: Schedule = STOP_SCHEDULE,
         make_health: Callable[[], HealthMonitor] | None = None,
         announcements: Sequence[Announcement] = (),
@@ -114,12 +106,7 @@ class Supervisor:
         self._disk = Outlet("log files", _LOG_BYTES)
         self._told: deque[str] = deque()
         """Texts from the thread that writes the logs."""
-        self.processes = [
-            ManagedProcess(
-                node, run_dir, self._mark, self._disk, self._told.append, make_limit(node) if make_limit else None
-            )
-            for node in nodes
-        ]
+        self.processes = [ManagedProcess(node, run_dir, self._mark, self._disk, self._told.append) for node in nodes]
         self._make_health = make_health
         self._health: HealthMonitor | None = None
         self._silences = {process: _Silence() for process in self.processes}
@@ -145,7 +132,8 @@ class Supervisor:
             ended and at least one of them failed.
         """
         try:
-            with self._reaper(), self._signals():
+            # A second signal hurries the end.
+            with self._reaper(), on_end_signal(lambda *_: self.request_stop(hurry=self._stop)):
                 self._start_s = self._last_look_s = time.monotonic()
                 for process in self.processes:
                     process.start_s = self._start_s + process.spec.start_delay_s
@@ -193,25 +181,12 @@ class Supervisor:
             for line in left.decode(errors="replace").splitlines():
                 self._output.event(f"killed a process that a node left behind: {line}", bad=True)
 
-    def _signals(self) -> AbstractContextManager[None]:
-        """Let SIGINT, SIGTERM and SIGHUP request the end; a second signal hurries it."""
-
-        def on_signal(signum: int, frame: FrameType | None) -> None:
-            self.request_stop(hurry=self._stop)
-
-        return on_end_signal(on_signal)
-
     # -- one round -------------------------------------------------------------------------------
 
     def _step(self, wait_s: float) -> None:
         """Forward the nodes' output, then move every process towards its wanted state."""
         flooded = False
-        if self._selector.get_map():
-            ready = self._selector.select(wait_s)
-        else:
-            time.sleep(wait_s)
-            ready = []
-        for key, _ in ready:
+        for key, _ in self._selector.select(wait_s):
             flooded |= self._pass_on(key.data)
         if self._health is not None:
             self._health.poll()
@@ -306,9 +281,9 @@ class Supervisor:
         return process.flooding
 
     def _forget_output(self, process: ManagedProcess) -> None:
-        watched = {key.fileobj for key in self._selector.get_map().values()}
-        if process.output is not None and process.output in watched:
-            self._selector.unregister(process.output)
+        if process.output is not None:
+            with suppress(KeyError):  # its output has been closed before
+                self._selector.unregister(process.output)
 
     def _reap(self, process: ManagedProcess) -> None:
         self._forget_output(process)
@@ -337,7 +312,7 @@ class Supervisor:
             delay_s = process.limit.next_delay_s(time.monotonic())
             if delay_s is not None:
                 process.state, process.start_s = State.WAITING, time.monotonic() + delay_s
-                used, most = process.limit.used, process.limit.max_starts
+                used, most = process.limit.used, process.limit.MAX_STARTS
                 self._output.event(f"{what}; restarts in {delay_s:.1f} s ({used} of {most})", bad=True)
                 return
             process.state = State.FAILED

@@ -44,7 +44,6 @@ class TopicRate:
         """Description of the fault, with the numbers; empty if there is none.
 
         Args:
-            rate_hz: measured rate.
             age_s: age of the newest message; inf before the first.
         """
         if not self.alive(age_s):

@@ -10,7 +10,7 @@ import yaml
 
 from instant_ic.config.yaml_text import read_yaml
 from instant_ic.launch.source import Value
-from instant_ic.launch.substitutions import Context, SubstitutionError, has_substitution, substitute, truth
+from instant_ic.launch.substitutions import MOST_TEXT, Context, SubstitutionError, has_substitution, substitute, truth
 
 CONDITION = ("if", "unless")
 """Keys that every action may have."""
@@ -108,7 +108,7 @@ def pairs_of(value: Value | None, first: str, second: str, context: Context) -> 
 def parameter_value(value: Value, kind: str, context: Context) -> object:
     """The value of a parameter, of the given type, or as YAML reads it."""
     if value.is_list or value.is_mapping:
-        return _substituted(value.plain(), value, context)
+        return _texts_replaced(value, context)
     text = text_of(value, context)
     if text is None:
         return None
@@ -132,17 +132,26 @@ def parameter_value(value: Value, kind: str, context: Context) -> object:
         return None
 
 
-def _substituted(plain: object, value: Value, context: Context) -> object:
-    if isinstance(plain, str):
-        return replaced(plain, value, context)
-    if isinstance(plain, list):
-        return [_substituted(entry, value, context) for entry in plain]
-    if isinstance(plain, dict):
-        return {key: _substituted(entry, value, context) for key, entry in plain.items()}
-    return plain
+def _texts_replaced(value: Value, context: Context) -> object:
+    """A list or mapping with its texts after substitution; None, with the problem noted, if they are too long."""
+    length = 0
 
+    def read(plain: object) -> object:
+        nonlocal length
+        if isinstance(plain, str):
+            text = replaced(plain, value, context) or ""
+            length += len(text)
+            if length > MOST_TEXT:  # 300 bytes of aliases can stand for 100 000 uses of a long text
+                raise OverflowError
+            return text
+        if isinstance(plain, list):
+            return [read(entry) for entry in plain]
+        if isinstance(plain, dict):
+            return {key: read(entry) for key, entry in plain.items()}
+        return plain
 
-def as_yaml(value: object) -> str:
-    """A value as one line of YAML."""
-    text = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=1 << 20)
-    return text.removesuffix("...\n").rstrip("\n")
+    try:
+        return read(value.plain())
+    except OverflowError:
+        value.problem(f"its texts have more than {MOST_TEXT} characters, each alias counted where it is used")
+        return None

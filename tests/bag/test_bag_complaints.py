@@ -12,7 +12,7 @@ import pytest
 from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.player import BagPlayer, PlayOptions
-from instant_ic.bag.recorder import Recorder, RecordOptions
+from instant_ic.bag.recorder import BagRecorderConfig, Recorder
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.qos import QoS
@@ -44,7 +44,7 @@ def tf_static(*children: str) -> bytes:
 
 
 def recorder(path: Path, presets: dict[str, QoS], **options: object) -> Recorder:
-    made = Recorder(path, TopicChoice(), lambda topic, take: Losses(), None, RecordOptions(**options))  # type: ignore[arg-type]
+    made = Recorder(path, TopicChoice(), lambda topic, take: Losses(), None, BagRecorderConfig(**options))  # type: ignore[arg-type]
     for topic, qos in presets.items():
         made.discover([TopicInfo(topic, BOOL, [PublisherInfo("n", 1, qos.name, Path("s"), BOOL, "00", 0)])])
     return made

@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 
 from instant_ic.bag import BagError, BagReader, BagWriter
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.compare import compare, digest
+from instant_ic.bag.compare import compare
 from instant_ic.bag.recorder import Recorder
 from instant_ic.bag.recover import recover
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
@@ -212,12 +212,11 @@ def test_a_whole_bag_is_recovered_whole(tmp_path: Path) -> None:
 def test_compare_names_the_first_field(tmp_path: Path) -> None:
     a, b = make_bag(tmp_path / "a"), make_bag(tmp_path / "b", value=1.5)
     c = make_bag(tmp_path / "c", count=19)
-    assert all(topic.same for topic in compare(a, a)) and digest(a) == digest(make_bag(tmp_path / "a2"))
+    assert all(topic.same for topic in compare(a, a))
     found = {topic.topic: topic.first for topic in compare(a, b)}
     assert found["/keyframe"] == ""
     assert found["/scan"].startswith("message 1: ranges[0] is")
     assert found["/scan"].endswith("(8 of 8 entries differ)")
-    assert digest(a) != digest(b)
     assert {t.topic: t.first for t in compare(a, c)}["/scan"] == "20 and 19 messages"
     assert [t.topic for t in compare(a, b, ignore=("/scan",))] == ["/keyframe", "/operator/estop"]
 

@@ -9,7 +9,7 @@ import pytest
 from instant_ic.bag import BagError, BagReader
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.on_demand import OnDemand
-from instant_ic.bag.recorder import DISK_FULL, Recorder, RecordOptions, TakeMessage
+from instant_ic.bag.recorder import DISK_FULL, BagRecorderConfig, Recorder, TakeMessage
 from instant_ic.bus import SENSOR
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
 from instant_ic.msg import Bool, serialize
@@ -43,7 +43,7 @@ class Source:
             self.takes.clear()
             self.dropped += 1
 
-        return Recorder(path, TopicChoice(), listen, None, RecordOptions(), lambda _: self.free_bytes), drop
+        return Recorder(path, TopicChoice(), listen, None, BagRecorderConfig(), lambda _: self.free_bytes), drop
 
     def say(self, stamp_ns: int) -> None:
         for take in self.takes:

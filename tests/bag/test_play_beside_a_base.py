@@ -71,7 +71,7 @@ def player(run_dir):
     def start(bag, namespace="", remaps=None, **parameters):
         clock = ManualClock()
         transport = LocalTransport(run_dir, f"bag_player{len(nodes)}", clock.now_ns)
-        config = BagPlayerConfig(bag=bag, start_paused=True, delay_s=0.0, linger_s=0.0, **parameters)
+        config = BagPlayerConfig(bag=bag, start_paused=True, delay_s=0.0, **parameters)
         node = BagPlayerNode(
             config, transport, clock, f"bag_player{len(nodes)}", use_sim_time=True, namespace=namespace, remaps=remaps
         )

@@ -5,13 +5,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from instant_ic.bag import BagError, BagMessage, BagWriter, Schema
+from instant_ic.bag import BagError, BagMessage, BagWriter, Schema, player
 from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.player import BagPlayer, PlayOptions
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.bus.clock import ManualClock
+from instant_ic.msg import message_type, serialize, transform_message
 from nodes.bag_player import BagPlayerConfig, BagPlayerNode
 
 BOOL, TF = "std_msgs/msg/Bool", "tf2_msgs/msg/TFMessage"
@@ -32,17 +34,27 @@ class FakeTime:
         return self.now_s >= self.stop_at_s
 
 
+def mount(frame: str) -> bytes:
+    transform = transform_message(np.eye(4), "base_link", frame, 1_000_000_000)
+    return bytes(serialize(message_type("TFMessage")(transforms=[transform])))
+
+
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
     with BagWriter(tmp_path / "bag") as writer:
-        writer.write("/tf_static", TF, b"camera", 1_000_000_000, LATCHED)
-        writer.write("/tf_static", TF, b"lidar", 1_000_000_000, LATCHED)
+        writer.write("/tf_static", TF, mount("camera"), 1_000_000_000, LATCHED)
+        writer.write("/tf_static", TF, mount("lidar"), 1_000_000_000, LATCHED)
         writer.write("/map", BOOL, b"old map", 1_000_000_000, LATCHED)
         writer.write("/map", BOOL, b"new map", 1_200_000_000, LATCHED)
         writer.write("/clock", BOOL, b"", 1_000_000_000, RELIABLE)
         for index in range(5):
             writer.write("/scan", BOOL, bytes([index]), 1_000_000_000 + index * 500_000_000, SENSOR)
     return tmp_path / "bag"
+
+
+@pytest.fixture(autouse=True)
+def clock_at_20_hz(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(player, "CLOCK_HZ", 20.0)
 
 
 def played(bag: Path, options: PlayOptions, time: FakeTime | None = None) -> list[tuple[float, str, bytes]]:
@@ -72,7 +84,8 @@ def test_pace_of_the_bag_and_twice_as_fast(bag: Path) -> None:
 
 def test_start_offset_sends_the_state_that_was_skipped(bag: Path) -> None:
     sent = played(bag, PlayOptions(start_offset_s=1.0, duration_s=0.5))
-    assert sent[:3] == [(0.0, "/tf_static", b"camera"), (0.0, "/tf_static", b"lidar"), (0.0, "/map", b"new map")]
+    mounts = [(0.0, "/tf_static", mount("camera")), (0.0, "/tf_static", mount("lidar"))]
+    assert sent[:3] == [*mounts, (0.0, "/map", b"new map")]
     assert sent[3:] == [(0.0, "/scan", b"\x02"), (0.5, "/scan", b"\x03")]
 
 
@@ -152,7 +165,7 @@ SCANS = ("/scan",)  # at 0, 0.5, 1, 1.5, 2 s
 
 
 def steered(bag: Path, at: dict[float, Callable[[BagPlayer], None]], **options: Any) -> Steered:
-    return Steered(bag, PlayOptions(topics=SCANS, clock_hz=20.0, **options), at)
+    return Steered(bag, PlayOptions(topics=SCANS, **options), at)
 
 
 def near(sent: list[tuple[float, int]]) -> list[tuple[float, int]]:

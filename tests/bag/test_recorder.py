@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag import BagError, BagMessage, BagReader, BagWriter
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, RECORDING, Recorder, RecordOptions
-from instant_ic.bag.snapshot import Entry, SnapshotCache
+from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, RECORDING, BagRecorderConfig, Recorder
+from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
@@ -42,7 +42,7 @@ def make(path: Path, free: Callable[[Path], int] = lambda path: 10**12, **option
         TopicChoice(),
         lambda topic, take: Losses(),
         None,
-        RecordOptions(**options),
+        BagRecorderConfig(**options),
         free,  # type: ignore[arg-type]
     )
     recorder.discover([topic_info("/scan", SENSOR), topic_info("/estop", LATCHED)])
@@ -248,9 +248,9 @@ def test_clock_set_back_while_recording(tmp_path: Path) -> None:
     assert [m[2][0] for m in read(tmp_path / "bag")] == [40, 41, 100, 101]
 
 
-def entry(value: int, size: int = 10, latched: bool = False, publisher: str = "") -> Entry:
+def entry(value: int, size: int = 10, latched: bool = False, publisher: str = "") -> BagMessage:
     qos = LATCHED if latched else SENSOR
-    return Entry("/estop" if latched else "/scan", BOOL, bytes([value]) * size, value * S, qos, publisher)
+    return BagMessage("/estop" if latched else "/scan", BOOL, bytes([value]) * size, value * S, qos, publisher)
 
 
 def test_snapshot_cache_keeps_the_last_seconds_and_what_was_latched_before() -> None:
@@ -340,7 +340,7 @@ def test_recorder_that_writes_at_once_keeps_no_snapshots(tmp_path: Path) -> None
 )
 def test_bad_options_name_the_key(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(bad))} must be"):
-        RecordOptions(**bad)  # type: ignore[arg-type]
+        BagRecorderConfig(**bad)  # type: ignore[arg-type]
 
 
 def test_bag_that_exists_is_not_overwritten(tmp_path: Path) -> None:

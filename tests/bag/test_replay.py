@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from instant_ic.bag import BagError, BagReader, BagWriter, Schema
-from instant_ic.bag.compare import compare, digest
+from instant_ic.bag.compare import compare
 from instant_ic.bag.convert import ConvertOptions, convert
 from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.replay import ReplayError, ReplayNode, make_node, replay
@@ -126,7 +126,7 @@ def test_replay_makes_the_nodes_output_at_the_bags_time(bag: Path, tmp_path: Pat
 def test_twice_the_same_bytes(bag: Path, tmp_path: Path) -> None:
     for folder in ("one", "two"):
         replay(bag, [mean_node()], tmp_path / folder / "out")
-    assert digest(tmp_path / "one" / "out") == digest(tmp_path / "two" / "out")
+    assert all(topic.same for topic in compare(tmp_path / "one" / "out", tmp_path / "two" / "out"))
     assert all(topic.same for topic in compare(tmp_path / "one" / "out", tmp_path / "two" / "out"))
     first, second = (tmp_path / folder / "out" / "out.mcap" for folder in ("one", "two"))
     assert first.read_bytes() == second.read_bytes()
@@ -204,9 +204,7 @@ def test_type_of_another_definition_is_refused(tmp_path: Path) -> None:
 
 def test_bare_file_split_bag_and_compressed_bag_replay_alike(bag: Path, tmp_path: Path) -> None:
     convert([bag], tmp_path / "split", ConvertOptions(max_duration_s=0.3, compressed=True))
-    digests = set()
     for number, source in enumerate((bag, bag / "bag.mcap", tmp_path / "split")):
         result = replay(source, [mean_node()], tmp_path / f"{number}" / "out", compressed=number == 2)
-        digests.add(digest(tmp_path / f"{number}" / "out"))
+        assert all(topic.same for topic in compare(tmp_path / "0" / "out", tmp_path / f"{number}" / "out"))
         assert result.bag_s == pytest.approx(0.9) and result.wall_s > 0
-    assert len(digests) == 1

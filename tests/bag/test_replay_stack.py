@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from instant_ic.bag import BagReader, BagWriter
-from instant_ic.bag.compare import compare, digest
-from instant_ic.bag.files import BagMessage
+from instant_ic.bag import BagMessage, BagReader, BagWriter
+from instant_ic.bag.compare import compare
 from instant_ic.bag.replay import ReplayResult, make_node, replay
 from instant_ic.bus import SENSOR
 from instant_ic.geometry.poses import pose_matrix
@@ -82,7 +81,7 @@ def test_the_whole_stack_replays_bit_for_bit(replayed: tuple[Path, Path, ReplayR
     assert states[-1].mode == ControlState.REAL and twist_values(states[-1].applied_command)[0] > 0.1
     run(bag, tmp_path / "second")
     assert [topic.topic for topic in compare(first, tmp_path / "second") if not topic.same] == []
-    assert digest(first) == digest(tmp_path / "second")
+    assert all(topic.same for topic in compare(first, tmp_path / "second"))
 
 
 def test_other_images_change_keyframes_and_views_and_nothing_before_them(

@@ -8,13 +8,13 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from cli_helpers import talking
 
 from instant_ic import paths
 from instant_ic.cli import doctor
-from instant_ic.cli.doctor import Expectation
 from instant_ic.cli.finding import FAIL, OK, WARN, Finding
 from instant_ic.cli.main import main
 
@@ -55,32 +55,24 @@ def free_port(kind: socket.SocketKind) -> int:
 
 
 def test_camera_that_answers(theta: str) -> None:
-    found = one(doctor.check_camera(Expectation(camera_url=theta)))
+    found = one(doctor.check_camera(theta, WARN))
     assert (found.level, found.words) == (OK, "RICOH THETA Z1, firmware 2.21.1")
 
 
 @pytest.mark.parametrize(("status", "advice"), [(404, "something else answers"), (401, "user and password")])
 def test_camera_that_refuses(status: int, advice: str, theta: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Theta, "status", status)
-    found = one(doctor.check_camera(Expectation(camera_url=theta)))
+    found = one(doctor.check_camera(theta, WARN))
     assert found.words == f"HTTP status {status}" and advice in found.advice
 
 
-@pytest.mark.parametrize(("real", "level"), [(False, WARN), (True, FAIL)])
-def test_devices_that_are_missing(real: bool, level: str, tmp_path: Path) -> None:
-    """A missing device is a failure only where the real ones are asked for."""
-    expected = Expectation(
-        real_devices=real,
-        serial_port=str(tmp_path / "ttyACM7"),
-        camera_url=f"http://127.0.0.1:{free_port(socket.SOCK_STREAM)}",
-        lidar_port=free_port(socket.SOCK_DGRAM),
-        listen_seconds=0.05,
-    )
-    for check in (doctor.check_camera, doctor.check_lidar):
-        found = one(check(expected))
-        assert found.level == level and found.advice
-    assert "is unreachable" in one(doctor.check_camera(expected)).words
-    serial = one(doctor.check_serial(expected, list))
+@pytest.mark.parametrize("level", [WARN, FAIL])
+def test_devices_that_are_missing(level: str, tmp_path: Path) -> None:
+    camera = one(doctor.check_camera(f"http://127.0.0.1:{free_port(socket.SOCK_STREAM)}", level))
+    lidar = one(doctor.check_lidar(free_port(socket.SOCK_DGRAM), 0.05, level))
+    assert camera.level == lidar.level == level and camera.advice and lidar.advice
+    assert "is unreachable" in camera.words
+    serial = one(doctor.check_serial(tmp_path / "ttyACM7", level, list))
     assert serial.level == level and "does not exist (available: none)" in serial.words
 
 
@@ -96,7 +88,7 @@ def test_lidar_packets(size: int, level: str) -> None:
 
     thread = threading.Thread(target=send, daemon=True)
     thread.start()
-    found = one(doctor.check_lidar(Expectation(lidar_port=port, listen_seconds=20.0)))
+    found = one(doctor.check_lidar(port, 20.0, WARN))
     stop.set()
     thread.join()
     assert found.level == level and "127.0.0.1" in found.words
@@ -105,9 +97,9 @@ def test_lidar_packets(size: int, level: str) -> None:
 def test_serial_port_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = tmp_path / "ttyACM0"
     port.touch()
-    assert one(doctor.check_serial(Expectation(serial_port=str(port)), list)).level == OK
+    assert one(doctor.check_serial(port, WARN, list)).level == OK
     monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
-    found = one(doctor.check_serial(Expectation(serial_port=str(port), real_devices=True), list))
+    found = one(doctor.check_serial(port, FAIL, list))
     assert found.level == FAIL and "usermod -aG" in found.advice
 
 
@@ -116,9 +108,9 @@ def test_port_in_use() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        found = one(doctor.check_ports(Expectation(tcp_ports=((port, "operator's page"),), udp_ports=())))
+        found = one(doctor.check_ports({port: "operator's page"}, {}))
     assert found.level == WARN and found.words == "operator's page: Address already in use"
-    assert one(doctor.check_ports(Expectation(tcp_ports=((port, "page"),), udp_ports=()))).level == OK
+    assert one(doctor.check_ports({port: "page"}, {})).level == OK
 
 
 def test_strict_reverse_path_filter(tmp_path: Path) -> None:
@@ -159,7 +151,7 @@ def test_exit_status_follows_the_worst(
 ) -> None:
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path))
     findings = [Finding(OK, "a", "good"), Finding(WARN, "b", "not so good", "do this")]
-    monkeypatch.setattr(doctor, "run_checks", lambda expectation, run_dir: iter(findings))
+    monkeypatch.setattr(doctor, "run_checks", lambda *args: iter(findings))
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert out == "ok    a: good\nwarn  b: not so good\n      → do this\n1 ok, 1 warnings, 0 failures\n"
@@ -167,14 +159,15 @@ def test_exit_status_follows_the_worst(
     assert main(["doctor"]) == 1
 
 
-def test_addresses_come_from_the_shipped_configuration() -> None:
-    from instant_ic.cli.commands.doctor import _expectation
-    from instant_ic.cli.main import build_parser
-
-    args = build_parser().parse_args(["doctor", "--robot", "--lidar-port", "9"])
-    expected = _expectation(args)
-    assert (expected.real_devices, expected.lidar_port) == (True, 9)
-    assert expected.camera_url.startswith("http://") and expected.serial_port.startswith("/dev/")
+def test_addresses_come_from_the_shipped_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(doctor, "run_checks", lambda *args: given.append(args) or iter([]))
+    assert main(["doctor", "--robot", "--lidar-port", "9"]) == 0
+    assert main(["doctor"]) == 0
+    _, serial_port, camera_url, lidar_port, _, missing = given[0]
+    assert camera_url.startswith("http://") and str(serial_port).startswith("/dev/")
+    assert (lidar_port, missing) == (9, FAIL)
+    assert given[1][3:] == (2368, 1.0, WARN)  # a missing device is a failure only where the real ones are asked for
 
 
 def test_faults_of_a_running_stack_are_told_with_what_to_do() -> None:

@@ -18,7 +18,7 @@ from instant_ic.launch import NodeSpec, outlet, process
 from instant_ic.launch import supervisor as supervision
 from instant_ic.launch.outlet import LogFile, Outlet
 from instant_ic.launch.process import ManagedProcess, RespawnLimit, State
-from instant_ic.launch.rundir import StackLock
+from instant_ic.launch.rundir import stack_lock
 from instant_ic.launch.supervisor import STOP_SCHEDULE, Supervisor
 
 SLEEPER = "import time; print('ready', flush=True); time.sleep(600)"
@@ -280,7 +280,7 @@ def test_a_launcher_that_was_held_up_itself_does_not_blame_the_nodes() -> None:
 
 
 def test_respawn_max_retries_counts_in_all() -> None:
-    limit = RespawnLimit(0.0, window_s=1.0, max_starts=5, max_retries=2)
+    limit = RespawnLimit(0.0, max_retries=2)
     assert [limit.next_delay_s(now) for now in (0.0, 100.0, 200.0)] == [0.0, 0.0, None]
     assert str(limit) == "2 restarts"
 
@@ -312,7 +312,7 @@ def test_a_terminal_that_takes_nothing_does_not_hold_up_the_launcher() -> None:
     outlet.put(lambda: (held.wait(240), None)[1])
     taken = [outlet.put(lambda: None) for _ in range(1000)]
     assert not held.is_set()  # nobody waited for the terminal
-    assert 9 <= sum(taken) <= 10 and outlet.left_out == 1000 - sum(taken)
+    assert 9 <= sum(taken) <= 10
     assert outlet.put(done.set, always=True)  # the few words that matter
     assert not outlet.close(timeout_s=0.05)
     held.set()
@@ -443,7 +443,7 @@ def test_two_stacks_in_one_run_directory_also_where_it_is_a_groups(
     file = launch_file(tmp_path, group)
     (tmp_path / "r" / "left").mkdir(parents=True)
     for held in (tmp_path / "r", tmp_path / "r" / "left"):
-        with StackLock(held, "sim.yaml"):
+        with stack_lock(held, "sim.yaml"):
             assert main(["launch", file, "--run-dir", str(tmp_path / "r")]) == 1
         assert f"a stack already runs in {held} (pid {os.getpid()}, sim.yaml)" in capsys.readouterr().err
 

@@ -6,9 +6,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from instant_ic.config.params import parse_override
+from instant_ic.config.yaml_text import one_line
 from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
 from instant_ic.launch.substitutions import Context, SubstitutionError, substitute, truth
-from instant_ic.launch.values import as_yaml
 
 
 @pytest.fixture
@@ -269,9 +269,18 @@ def test_mistake(tmp_path: Path, program: Path, text: str, expected: str) -> Non
     )
 )
 def test_a_parameter_arrives_as_it_was_written(value: object) -> None:
-    word = f"key:={as_yaml(value)}"
+    word = f"key:={one_line(value)}"
     assert "\n" not in word
     assert parse_override(word)[1].value == value
+
+
+def test_a_list_of_aliases_to_a_long_text_is_refused_before_it_is_expanded(tmp_path: Path) -> None:
+    """11 110 uses of a variable of 100 kB would be 1 GB."""
+    lines = [f"      - &a{i} [{', '.join(['$(var long)' if i == 0 else f'*a{i - 1}'] * 10)}]\n" for i in range(4)]
+    text = "launch:\n- arg: {name: long, default: " + "x" * 100_000 + "}\n"
+    text += "- set_parameter:\n    name: p\n    value:\n" + "".join(lines)
+    [problem] = problems_of(write(tmp_path, text))
+    assert "6: its texts have more than 131072 characters" in problem
 
 
 def test_problem_is_told_as_file_and_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,7 @@
 import io
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,9 +27,15 @@ def out() -> io.StringIO:
     return io.StringIO()
 
 
-def screen_on(out: io.StringIO, live: bool, period_s: float = 0.0, verbose: bool = False) -> Screen:
+@contextmanager
+def screen_on(out: io.StringIO, live: bool, period_s: float = 0.0, verbose: bool = False) -> Iterator[Screen]:
     console = Console(file=out, width=120, force_terminal=live, color_system=None)
-    return Screen(["slam", "page"], live, period_s, console, verbose)
+    screen = Screen(["slam", "page"], live, period_s, console, verbose)
+    screen.start()
+    try:
+        yield screen
+    finally:
+        screen.stop()
 
 
 def test_plain_lines_tell_what_is_waited_for(out: io.StringIO) -> None:

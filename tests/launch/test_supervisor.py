@@ -14,7 +14,7 @@ import pytest
 
 from instant_ic.launch import NodeSpec
 from instant_ic.launch.process import ManagedProcess, RespawnLimit
-from instant_ic.launch.rundir import StackLock, StackRunningError
+from instant_ic.launch.rundir import StackRunningError, stack_lock
 from instant_ic.launch.supervisor import STOP_SCHEDULE, Supervisor
 
 IGNORES = """
@@ -67,12 +67,11 @@ def supervise(
     run_dir: Path,
     nodes: list[NodeSpec],
     output: Lines,
-    limit: RespawnLimit | None = None,
     ignored: Sequence[signal.Signals] = (),
 ) -> int:
     """Runs nodes; signals that are known to be ignored are waited for shortly, the others as long as it takes."""
     schedule = [(signum, 0.3 if signum in ignored else 20.0) for signum, _ in STOP_SCHEDULE]
-    supervisor = Supervisor(nodes, run_dir, output, lambda spec: limit or RespawnLimit(spec.respawn_delay_s), schedule)
+    supervisor = Supervisor(nodes, run_dir, output, schedule)
     output.supervisor = supervisor
     return supervisor.run()
 
@@ -97,26 +96,25 @@ def test_output_goes_to_the_log_and_the_terminal(run_dir: Path) -> None:
 
 def test_respawn_with_growing_wait_until_given_up(run_dir: Path) -> None:
     output = Lines()
-    limit = RespawnLimit(0.01, window_s=60, max_starts=3)
-    node = program("crasher", "print('here'); raise SystemExit(3)", respawn=True)
-    assert supervise(run_dir, [node], output, limit) == 1
-    assert output.of("crasher") == ["here"] * 4  # the first start and three more
-    assert [event.split(";")[0] for event in output.events[:3]] == ["crasher ended (exit status 3)"] * 3
-    assert "given up" in output.events[3]
+    node = program("crasher", "print('here'); raise SystemExit(3)", respawn=True, respawn_delay_s=0.01)
+    assert supervise(run_dir, [node], output) == 1
+    assert output.of("crasher") == ["here"] * 6  # the first start and five more
+    assert [event.split(";")[0] for event in output.events[:5]] == ["crasher ended (exit status 3)"] * 5
+    assert "given up" in output.events[5]
 
 
 def test_wrong_parameters_end_the_stack_at_once(run_dir: Path) -> None:
     output = Lines()
     node = program("misfit", "raise SystemExit(2)", respawn=True)
-    assert supervise(run_dir, [node], output, RespawnLimit(0.01)) == 1
+    assert supervise(run_dir, [node], output) == 1
     assert "its parameters are wrong, so the stack ends" in output.events[0]
 
 
 def test_respawn_limit_doubles_and_forgets() -> None:
-    limit = RespawnLimit(delay_s=1.0, max_delay_s=3.0, window_s=10.0, max_starts=3)
-    # 1, 2, then 4 cut to 3; the fourth within the window is refused; 11 s later all but the last two are forgotten.
-    assert [limit.next_delay_s(now) for now in (0.0, 1.0, 2.0, 3.0)] == [1.0, 2.0, 3.0, None]
-    assert limit.next_delay_s(11.5) == 2.0
+    limit = RespawnLimit(delay_s=1.0)
+    # 1, 2, 4, 8, then 16 cut to 15; the sixth within the window is refused; at 61.5 s the first two are forgotten.
+    assert [limit.next_delay_s(now) for now in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)] == [1.0, 2.0, 4.0, 8.0, 15.0, None]
+    assert limit.next_delay_s(61.5) == 8.0
 
 
 def test_required_node_that_fails_ends_the_stack(run_dir: Path) -> None:
@@ -216,11 +214,11 @@ Supervisor(nodes, pathlib.Path({str(run_dir)!r}), Output()).run()
 
 
 def test_second_stack_in_the_run_directory_is_refused(run_dir: Path) -> None:
-    with StackLock(run_dir, "sim.yaml"):
+    with stack_lock(run_dir, "sim.yaml"):
         with pytest.raises(StackRunningError, match=rf"pid {os.getpid()}, sim\.yaml"):
-            with StackLock(run_dir, "other.yaml"):
+            with stack_lock(run_dir, "other.yaml"):
                 pass
-    with StackLock(run_dir, "other.yaml"):
+    with stack_lock(run_dir, "other.yaml"):
         pass
 
 

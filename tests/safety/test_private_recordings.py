@@ -12,7 +12,7 @@ from instant_ic import private
 from instant_ic.bag.choice import EVERYTHING
 from instant_ic.bag.convert import convert
 from instant_ic.bag.on_demand import OnDemand
-from instant_ic.bag.recorder import Recorder, RecordOptions
+from instant_ic.bag.recorder import BagRecorderConfig, Recorder
 from instant_ic.bag.recover import recover, reindex
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bridge.host_keys import KeyStore
@@ -44,7 +44,7 @@ def write(path: Path, **options: int) -> Path:
     return path
 
 
-def recorder(path: Path, options: RecordOptions | None = None) -> Recorder:
+def recorder(path: Path, options: BagRecorderConfig | None = None) -> Recorder:
     return Recorder(path, EVERYTHING, lambda topic, take: pytest.fail("nothing to subscribe to"), None, options)
 
 
@@ -74,7 +74,7 @@ def test_what_the_record_button_writes_is_private(tmp_path):
 
 
 def test_snapshots_are_private(tmp_path):
-    kept = recorder(tmp_path / "snapshots", RecordOptions(snapshot=True, snapshot_seconds=60.0))
+    kept = recorder(tmp_path / "snapshots", BagRecorderConfig(snapshot=True, snapshot_seconds=60.0))
     kept.take("/robot/estop", "std_msgs/msg/Bool", PAYLOAD, 1_000_000_000)
     deadline = time.monotonic() + 60.0
     while not kept.status()["cached_bytes"] and time.monotonic() < deadline:
@@ -98,7 +98,7 @@ def test_an_existing_folder_keeps_its_mode_and_the_files_in_it_are_private(tmp_p
     folder = tmp_path / "shared"
     folder.mkdir()
     folder.chmod(0o755)
-    recorder(folder, RecordOptions(snapshot=True, snapshot_seconds=60.0)).close()
+    recorder(folder, BagRecorderConfig(snapshot=True, snapshot_seconds=60.0)).close()
     write(folder / "drive")
     assert stat.S_IMODE(folder.stat().st_mode) == 0o755
     assert_private(folder / "drive")

@@ -14,7 +14,7 @@ from instant_ic.bus import registry
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.qos import SENSOR
 from instant_ic.bus.registry import RegistryError
-from instant_ic.launch.rundir import StackLock
+from instant_ic.launch.rundir import stack_lock
 
 STRANGER = 65533
 as_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file to another user")
@@ -133,7 +133,7 @@ def test_a_symbolic_link_as_lock_file_is_refused_and_its_target_untouched(tmp_pa
     target.write_text("precious")
     (run_dir / "launch.lock").symlink_to(target)
     (run_dir / "nodes" / "talker.lock").symlink_to(target)
-    with pytest.raises(RegistryError, match=r"launch\.lock is a symbolic link"), StackLock(run_dir, "sim.yaml"):
+    with pytest.raises(RegistryError, match=r"launch\.lock is a symbolic link"), stack_lock(run_dir, "sim.yaml"):
         pass
     with pytest.raises(RegistryError, match=r"talker\.lock is a symbolic link"):
         registry.Claim(run_dir / "nodes" / "talker", "node talker")

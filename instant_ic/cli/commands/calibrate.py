@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
-from instant_ic.cli.arguments import check_files, group, numbers, verb
+from instant_ic.cli.arguments import check_files, group, numbers, positive_int, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
     add("--json", type=Path, metavar="FILE", help="write the figures here")
     add("--images", default="", metavar="TOPIC", help="images (default: /camera/image/compressed)")
     add("--points", default="", metavar="TOPIC", help="LiDAR points (default: /lidar/points, else /lidar/packets)")
-    add("--frames", type=int, default=24, metavar="N", help="maximum number of images (%(default)s)")
+    add("--frames", type=positive_int, default=24, metavar="N", help="maximum number of images (%(default)s)")
     text = "initial camera pose in the LiDAR frame (m, degrees) if /tf_static lacks it"
     form = "X,Y,Z,ROLL,PITCH,YAW"
     add("--guess", type=numbers(form), metavar=form, help=text)
@@ -47,8 +47,6 @@ def camera_lidar(args: argparse.Namespace) -> int:
     from instant_ic.calibration.bag import read_recording
     from instant_ic.calibration.mount import calibrate
 
-    if args.frames < 1:
-        raise UserError(f"--frames must be at least 1 (got {args.frames})", 2)
     guess = _guess(args.guess) if args.guess else None
     check_files(args.out, args.plot, args.json)
     print(f"reading {args.bag}", flush=True)

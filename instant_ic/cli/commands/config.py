@@ -88,9 +88,9 @@ def _is_launch_file(file: Path) -> bool:
 
 
 def show_node(args: argparse.Namespace) -> int:
-    from instant_ic.cli.commands.param import show_value
     from instant_ic.config.parameter_info import parameter_infos
     from instant_ic.config.params import configure
+    from instant_ic.config.yaml_text import one_line
     from instant_ic.launch.parameters import given_values
 
     spec = _node(args.node, args.launch[:1], launch_values(args.launch[1:]))
@@ -101,7 +101,7 @@ def show_node(args: argparse.Namespace) -> int:
         for info in parameter_infos(type(config), config)
         if not args.changed or info.value != info.default
     ]
-    rows = [(i.name, show_value(i.value), values[i.name].where if i.name in values else "default") for i in infos]
+    rows = [(i.name, one_line(i.value), values[i.name].where if i.name in values else "default") for i in infos]
     key_width = max((len(key) for key, _, _ in rows), default=0)
     value_width = min(max((len(value) for _, value, _ in rows), default=0), 40)
     print(f"{spec.label} ({spec.file.name}):")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import Any
 
 from instant_ic.cli.arguments import verb
@@ -30,7 +31,11 @@ def run(args: argparse.Namespace) -> int:
 
     colours = {OK: "32", WARN: "33", FAIL: "31"} if sys.stdout.isatty() else {}
     counts = {OK: 0, WARN: 0, FAIL: 0}
-    for finding in run_checks(_expectation(args), paths.run_dir()):
+    serial_port = Path(args.serial_port or _shipped("crawler_base", "roboclaw.port", "/dev/ttyACM0"))
+    camera_url = args.camera_url or _shipped("theta_camera", "url", "http://192.168.1.1")
+    lidar_port = args.lidar_port or _shipped("vlp16_driver", "port", 2368)
+    missing = FAIL if args.robot else WARN
+    for finding in run_checks(paths.run_dir(), serial_port, camera_url, lidar_port, args.listen, missing):
         counts[finding.level] += 1
         level = f"{finding.level:<4}"
         if finding.level in colours:
@@ -42,23 +47,13 @@ def run(args: argparse.Namespace) -> int:
     return 1 if counts[FAIL] else 0
 
 
-def _expectation(args: argparse.Namespace) -> Any:
+def _shipped(node: str, key: str, default: Any) -> Any:
+    """Value of a parameter in the shipped config/robot.yaml."""
     from instant_ic import paths
-    from instant_ic.cli.doctor import Expectation
     from instant_ic.config.params import ParameterError, load_file
 
-    def shipped(node: str, key: str, default: Any) -> Any:
-        try:
-            found = load_file(paths.shipped_file("config", "robot.yaml"), node).get(key)
-        except (ParameterError, FileNotFoundError):
-            return default  # check_configuration reports the fault in the file
-        return default if found is None else found.value
-
-    plain = Expectation()
-    return Expectation(
-        real_devices=args.robot,
-        serial_port=args.serial_port or shipped("crawler_base", "roboclaw.port", plain.serial_port),
-        camera_url=args.camera_url or shipped("theta_camera", "url", plain.camera_url),
-        lidar_port=args.lidar_port or shipped("vlp16_driver", "port", plain.lidar_port),
-        listen_seconds=args.listen,
-    )
+    try:
+        found = load_file(paths.shipped_file("config", "robot.yaml"), node).get(key)
+    except (ParameterError, FileNotFoundError):
+        return default  # check_configuration reports the fault in the file
+    return default if found is None else found.value

@@ -83,7 +83,8 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     overrides = [f"grid_slam.{override}" for override in args.param]
     config = make_node("grid_slam", args.params_file or [], overrides).config
     particles = ParticleConfig(particles=args.particles) if args.backend == "rbpf" else None
-    folder = args.output or Path(f"runs/slam_{_stem(args.log)}_{time.strftime('%Y%m%d_%H%M%S')}")
+    stem = args.log.resolve().name.removesuffix(".gz").rsplit(".", 1)[0]
+    folder = args.output or Path(f"runs/slam_{stem}_{time.strftime('%Y%m%d_%H%M%S')}")
     check_files(args.json, args.plot)
     bad = None if args.strict else BadLines()
     with errors_for_the_user():
@@ -125,10 +126,6 @@ def evaluate_slam(args: argparse.Namespace) -> int:
             _plot(file, run)
     print_figures(report, folder / "figures.json", args.json)
     return 0
-
-
-def _stem(log: Path) -> str:
-    return log.resolve().name.removesuffix(".gz").rsplit(".", 1)[0]
 
 
 def _plot(path: Path, run: LogResult) -> None:

@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from instant_ic.cli.arguments import check_files, positive, positive_int, size
+from instant_ic.cli.arguments import check_files, positive, positive_int, size, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user, use_one_thread_for_matrices
 from instant_ic.cli.progress import progress
@@ -22,35 +22,21 @@ _MESHES = (".glb", ".gltf", ".obj", ".ply")
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``experiment`` to the ``ic`` command."""
-    parser = subparsers.add_parser(
-        "experiment",
-        help="repeat the paper's experiments and write a report",
-        description=(
-            "Repeat the experiments of the paper's section V in simulated worlds. Writes report.html, which needs no "
-            "other file, and report.json to the output folder. Results of finished units are kept there: the same "
-            "command resumes an interrupted run."
-        ),
-        epilog="example: ic experiment all --quick -o runs/experiments",
-    )
-    add = parser.add_argument
+    add = verb(
+        subparsers, "experiment", "repeat the paper's experiments and write a report", run,
+        "ic experiment all --quick -o runs/experiments",
+        "Repeat the experiments of the paper's section V in simulated worlds. Writes report.html, which needs no "
+        "other file, and report.json to the output folder. Results of finished units are kept there: the same "
+        "command resumes an interrupted run.",
+    ).add_argument  # fmt: skip
     add("name", choices=_NAMES, metavar="NAME", help=", ".join(_NAMES))
     add("-o", "--out", type=Path, required=True, metavar="REPORT", help="output folder")
     add("--seeds", type=positive_int, default=5, metavar="N", help="number of seeds (default: %(default)s)")
-    add(
-        "--world",
-        action="append",
-        default=[],
-        metavar="W",
-        help=(
-            "corridor, random, long, hall, furnished, crossing, windows, people, one of them with its seed (random:7), "
-            "or a mesh file (.glb, ...); repeatable"
-        ),
-    )
+    text = "corridor, random, long, hall, furnished, crossing, windows, people, one of them with its seed (random:7), "
+    add("--world", action="append", default=[], metavar="W", help=text + "or a mesh file (.glb, ...); repeatable")
     add("--method", choices=("ours", "paper"), default="ours", help="virtual space (default: %(default)s)")
-    add(
-        "--bag", type=Path, help="recording to use instead of worlds (not for operators): later panoramas are the truth"
-    )
+    text = "recording to use instead of worlds (not for operators): later panoramas are the truth"
+    add("--bag", type=Path, help=text)
     add("--meshes", type=Path, metavar="DIR", help="environments: also the meshes of this folder")
     add("--quick", action="store_true", help="two seeds, small images, short training: does everything work?")
     add("--size", type=_size, metavar="WxH", help="size of the views (default: 320x180)")
@@ -60,11 +46,9 @@ def add_parser(subparsers: Any) -> None:
     text = "limit for one unit, which is then ended (default: %(default)g s)"
     add("--unit-timeout", type=_limit, default=1800.0, metavar="S", help=text)
     add("--ship", type=Path, metavar="FILE.html", help="also write the report with reduced images, at most 2 MB")
-    parser.set_defaults(func=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run ``ic experiment``; return the exit status."""
     use_one_thread_for_matrices()
     check_files(args.ship, suffix=".html")
     with errors_for_the_user():

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli.arguments import check_files, group, verb
+from instant_ic.cli.arguments import check_files, group, positive, verb
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def add_parser(subparsers: Any) -> None:
         "mapping can continue (grid_slam's map_file).",
     ).add_argument  # fmt: skip
     add("name", type=Path, metavar="NAME", help="path without suffix; missing folders are created")
-    add("--timeout", type=float, default=20.0, metavar="S", help=text)
+    add("--timeout", type=positive, default=20.0, metavar="S", help=text)
     add = verb(
         verbs, "local", "save the local 3D model as a point cloud", save_local,
         "ic map local -o cloud.ply; ic map local runs/drive -o cloud.ply",
@@ -36,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
     ).add_argument  # fmt: skip
     add("bag", type=Path, nargs="?", metavar="BAG", help="a recording (default: the running stack)")
     add("-o", "--out", type=Path, required=True, metavar="FILE.ply", help="point cloud to write")
-    add("--timeout", type=float, default=10.0, metavar="S", help=text)
+    add("--timeout", type=positive, default=10.0, metavar="S", help=text)
     text = "LiDAR points in the bag (default: /lidar/points, else /lidar/packets)"
     add("--points", default="", metavar="TOPIC", help=text)
 
@@ -47,8 +47,6 @@ def save_map(args: argparse.Namespace) -> int:
     from instant_ic.cli.observer import Observer
     from instant_ic.msg import deserialize, message_type, type_name
 
-    if not args.timeout > 0:
-        raise UserError(f"--timeout must be > 0 (got {args.timeout:g})", 2)
     name = args.name.expanduser().absolute()
     if name.suffix in (".yaml", ".pgm"):
         raise UserError(f"NAME must have no suffix: {name.with_suffix('')}", 2)
@@ -78,8 +76,6 @@ def save_local(args: argparse.Namespace) -> int:
 
     out = args.out.expanduser()
     check_files(out)
-    if not args.timeout > 0:
-        raise UserError(f"--timeout must be > 0 (got {args.timeout:g})", 2)
     points = _local_of_bag(args.bag, args.points) if args.bag else _local_of_stack(args.timeout)
     write_ply(out, points)
     print(f"wrote {out}: {len(points)} points")

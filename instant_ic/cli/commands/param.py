@@ -67,7 +67,7 @@ def list_parameters(args: argparse.Namespace) -> int:
     for node in nodes:
         print(f"{node.name}:")
         for key, value in sorted(params.flatten(node.params).items()):
-            print(f"  {key}: {show_value(value)}" if args.values else f"  {key}")
+            print(f"  {key}: {_show(value)}" if args.values else f"  {key}")
     return 0
 
 
@@ -77,7 +77,7 @@ def _list_changed(nodes: Sequence[str]) -> int:
         print(f"{name}:")
         for info in _control(name).describe():
             if info.value != info.default:
-                print(f"  {info.name}: {show_value(info.value)} (default {show_value(info.default)})")
+                print(f"  {info.name}: {_show(info.value)} (default {_show(info.default)})")
     return 0
 
 
@@ -90,9 +90,9 @@ def get_parameter(args: argparse.Namespace) -> int:
     if args.key not in values and not group:
         raise _no_parameter(args.node, args.key, values)
     if args.key in values:
-        print(show_value(values[args.key]))
+        print(_show(values[args.key]))
     for key, value in group.items():
-        print(f"{key}: {show_value(value)}")
+        print(f"{key}: {_show(value)}")
     return 0
 
 
@@ -115,7 +115,7 @@ def set_parameters(args: argparse.Namespace) -> int:
 def _change(node: str, values: dict[str, Any]) -> int:
     changed = _control(node).set(values)
     for key, value in changed.items():
-        print(f"{key}: {show_value(value)}")
+        print(f"{key}: {_show(value)}")
     if not changed:
         print("nothing to change: the parameters already have these values")
     return 0
@@ -132,8 +132,8 @@ def describe(args: argparse.Namespace) -> int:
     for info in chosen:
         print(f"Parameter name: {info.name}")
         print(f"  Type: {info.type}{f', {info.range}' if info.range else ''}")
-        default = "" if info.value == info.default else f" (default {show_value(info.default)})"
-        print(f"  Value: {show_value(info.value)}{default}")
+        default = "" if info.value == info.default else f" (default {_show(info.default)})"
+        print(f"  Value: {_show(info.value)}{default}")
         print(f"  Live: {'yes' if info.live else 'no, takes effect at start'}")
         if info.description:
             print(f"  Description: {info.description}")
@@ -141,9 +141,8 @@ def describe(args: argparse.Namespace) -> int:
 
 
 def dump(args: argparse.Namespace) -> int:
-    import yaml
-
     from instant_ic.cli.names import find_node
+    from instant_ic.config.yaml_text import dump_yaml
 
     node = find_node(args.node)
     nested: dict[str, Any] = {}
@@ -153,7 +152,7 @@ def dump(args: argparse.Namespace) -> int:
         for key_group in groups:
             place = place.setdefault(key_group, {})
         place[last] = value
-    text = yaml.safe_dump({node.name: {"ros__parameters": nested}}, sort_keys=False, default_flow_style=None, width=100)
+    text = dump_yaml({node.name: {"ros__parameters": nested}}, default_flow_style=None, width=100)
     if args.output is None:
         print(text, end="")
         return 0
@@ -174,8 +173,7 @@ def load(args: argparse.Namespace) -> int:
     return _change(name, {key: value.value for key, value in values.items()})
 
 
-def show_value(value: Any) -> str:
-    """A value as one line of YAML."""
-    import yaml
+def _show(value: Any) -> str:
+    from instant_ic.config.yaml_text import one_line
 
-    return str(yaml.safe_dump(value, default_flow_style=True, width=1 << 20)).removesuffix("...\n").strip()
+    return one_line(value)

@@ -1,0 +1,27 @@
+"""One message, as every part of the package handles it: bytes with topic, type, stamp and QoS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from instant_ic.bus.qos import QoS
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """A message in a bag, or on its way into one.
+
+    Attributes:
+        type_name: message type, for example ``sensor_msgs/msg/Image``.
+        payload: CDR bytes.
+        stamp_ns: time of publication, nanoseconds since the epoch.
+        qos: QoS of its publisher; from a bag, the preset closest to it.
+        publisher: name of its publisher, where it is known.
+    """
+
+    topic: str
+    type_name: str
+    payload: bytes
+    stamp_ns: int
+    qos: QoS
+    publisher: str = ""
