@@ -13,7 +13,7 @@ from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, extrapolate
-from instant_ic.control.navigator import Navigator, RecoveryConfig, moving_subgoal
+from instant_ic.control.navigator import Navigator, moving_subgoal
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
@@ -50,7 +50,6 @@ class NavigatorConfig:
     subgoal_timeout_s: Positive = 0.5
     costmap_timeout_s: Positive = 1.0
     state_timeout_s: Positive = 0.3
-    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
@@ -65,7 +64,7 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     name = "navigator"
 
-    live_parameters = ("replan_period_s", "recovery", "limits", "planner", "follower")
+    live_parameters = ("replan_period_s", "limits", "planner", "follower")
 
     def setup(self) -> None:
         if not self.lockstep:
@@ -84,7 +83,7 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     def made(self, c: NavigatorConfig) -> Navigator:
         follower = PathFollower(c.follower, c.limits, c.footprint)
-        return Navigator(HybridPlanner(c.planner, c.footprint), follower, c.replan_period_s, c.recovery)
+        return Navigator(HybridPlanner(c.planner, c.footprint), follower, c.replan_period_s)
 
     def reconfigure(self, config: NavigatorConfig) -> None:
         super().reconfigure(config)

@@ -11,7 +11,7 @@ from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.states import VbotAction
 from instant_ic.control.step_times import StepTimes
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
-from instant_ic.control.walls import WallFinder, WallSearch
+from instant_ic.control.walls import WALL_PERIOD_S, WallSearch
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import (
     ControlState,
@@ -35,16 +35,12 @@ class VirtualRobotConfig:
         command_timeout_s: s; with an older operator's command the v-bot stops.
         state_timeout_s: s without /ic/state after which the v-bot stands still.
         wall_min_length_m: m; as for the arbiter.
-        wall_period_s: s; as for the arbiter.
-        walls_block: false: the v-bot passes walls too.
     """
 
     rate_hz: Positive = 20.0
     command_timeout_s: Positive = 0.3
     state_timeout_s: Positive = 0.5
     wall_min_length_m: Positive = 1.5
-    wall_period_s: Positive = 2.0
-    walls_block: bool = True
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     vbot: VbotConfig = field(default_factory=VbotConfig)
@@ -61,7 +57,8 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
 
     def setup(self) -> None:
         self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
-        self.walls = WallSearch()
+        self.walls = WallSearch(self.config.wall_min_length_m)
+        self.walls.submit = self.background(self.walls.find, self.walls.on_found).submit
         self.action: VbotAction | None = None
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
@@ -69,11 +66,8 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         timeout_s = self.config.command_timeout_s
         self.command = self.latest("/operator/cmd_vel", TwistStamped, timeout_s, callback=self.on_command)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
-        if self.config.walls_block:
-            finder = WallFinder(self.config.wall_min_length_m)
-            self.walls.submit = self.background(finder.find, self.walls.on_found).submit
-            self.subscribe("/map", OccupancyGrid, lambda m: self.walls.on_map(*grid_array(m)), qos=LATCHED)
-            self.timer(self.config.wall_period_s, self.walls.update)
+        self.subscribe("/map", OccupancyGrid, lambda m: self.walls.on_map(*grid_array(m)), qos=LATCHED)
+        self.timer(WALL_PERIOD_S, self.walls.update)
         self.timer(1.0 / self.config.rate_hz, self.on_timer)
 
     def reconfigure(self, config: VirtualRobotConfig) -> None:
