@@ -12,7 +12,7 @@ from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import GridLayers
-from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
+from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import MOST_LAYERS, PageLayers
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.scene import Newest, Scene
@@ -132,7 +132,7 @@ class PageFeed:
         """What pages render of a version of the virtual space, or what is wrong with it. For a worker thread."""
         try:
             layers = layers_of(message)
-            made = PageLayers(layers.version, self._mount, self._meshes.layers(layer_sources(layers))[:MOST_LAYERS])
+            made = PageLayers(layers.version, self._mount, self._meshes.layers(layers)[:MOST_LAYERS])
             made.check()
             return made
         except ValueError as error:
