@@ -12,7 +12,7 @@ from instant_ic.bus.node import Subscription, Timer
 from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.access import AccessError, offer_sign_in
 from instant_ic.console.config import ConsoleConfig
-from instant_ic.console.feed import Inputs, PageFeed
+from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.paths import sign_in_file
 
@@ -87,8 +87,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         for timer in self.page_timers:
             timer.cancel()
         rates = (
-            (1.0 / self.config.state_rate_hz, self.feed.send_state_if_due),
-            (0.2, self.feed.send_plan),
+            (STATE_PERIOD_S, self.feed.send_state_if_due),
+            (PLAN_PERIOD_S, self.feed.send_plan),
             (1.0 / self.config.map_rate_hz, self.feed.send_grids),
         )
         self.page_timers = [self.timer(*rate) for rate in rates] if watched else []

@@ -36,6 +36,8 @@ from instant_ic.pace import current
 from instant_ic.vspace_messages import layers_of
 
 IMAGE_TIMEOUT_S = 2.0
+STATE_PERIOD_S, PLAN_PERIOD_S = 0.05, 0.2
+"""Periods at which mode, poses and commands, and the plan, are sent to the page."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,6 @@ class PageFeed:
         self.display = Display(self.scene)
         self.requests = ViewRequests(config.view, self.scene, self.display)
         self.grids, self.faults = GridLayers(), FaultList()
-        self._state_period_ns = 1e9 / config.state_rate_hz
         self._state_sent_ns = 0
         self._inputs, self._clock, self._diagnose = inputs, clock, diagnose
         self._send_request, self._send_shown = send_request, send_shown
@@ -173,7 +174,7 @@ class PageFeed:
 
     def send_state_if_due(self) -> None:
         """Send the state, unless a step of the v-bot has just triggered it."""
-        if self._clock.steady_ns() - self._state_sent_ns > 0.6 * self._state_period_ns:
+        if self._clock.steady_ns() - self._state_sent_ns > 0.6e9 * STATE_PERIOD_S:
             self.send_state()
 
     def send_state(self) -> None:

@@ -17,6 +17,11 @@ MOST_LAYERS = 8
 """The page marks each layer by a bit of its stencil buffer."""
 
 
+def pose_fields(map_from_camera: Matrix) -> dict[str, list[float]]:
+    """Return a pose as the page reads it: the rotation ``q`` (x, y, z, w) and the position ``p`` in m."""
+    return {"q": quaternion_from_matrix(map_from_camera).tolist(), "p": map_from_camera[:3, 3].tolist()}
+
+
 @dataclass(frozen=True)
 class PageLayer:
     """Surface round a keyframe, as triangles with an equirectangular image (``vspace.layer_mesh``).
@@ -116,9 +121,8 @@ class PageLayers:
                     "id": layer.digest,
                     "size": list(layer.size),
                     "gain": list(layer.gain),
-                    "q": quaternion_from_matrix(layer.map_from_camera).tolist(),
-                    "p": layer.map_from_camera[:3, 3].tolist(),
                     "parts": ranges,
                 }
+                | pose_fields(layer.map_from_camera)
             )
         return {"version": self.version, "mount": list(self.mount), "layers": layers}, bytes(payload)

@@ -186,8 +186,6 @@ class PathFollower:
         return FollowerCommand((0.0, self._turn_rate(bearing)), "rotate")
 
     def _turn_is_free(self, pose: NDArray[np.float64], turn: float, costmap: Costmap | None) -> bool:
-        if costmap is None:
-            return True
         count = max(2, math.ceil(abs(turn) / 0.12))
         poses = np.tile(np.asarray(pose, dtype=np.float64), (count + 1, 1))
         poses[:, 2] += turn * np.arange(count + 1) / count
@@ -196,8 +194,6 @@ class PathFollower:
     def _arc_is_free(
         self, pose: NDArray[np.float64], curvature: float, length_m: float, costmap: Costmap | None
     ) -> bool:
-        if costmap is None:
-            return True
         count = max(2, math.ceil(abs(length_m) / 0.05))
         along = length_m * np.arange(count + 1) / count
         turn = curvature * along
@@ -206,14 +202,14 @@ class PathFollower:
         return self._is_free(np.stack([x, y, pose[2] + turn], axis=1), costmap)
 
     def _straight_is_free(self, pose: NDArray[np.float64], goal: NDArray[np.float64], costmap: Costmap | None) -> bool:
-        if costmap is None:
-            return True
         turn = wrap_angle(float(goal[2] - pose[2]))
         share = np.linspace(0.0, 1.0, 6)[:, None]
         return self._is_free(pose + share * np.array([*(goal[:2] - pose[:2]), turn]), costmap)
 
-    def _is_free(self, poses: NDArray[np.float64], costmap: Costmap) -> bool:
+    def _is_free(self, poses: NDArray[np.float64], costmap: Costmap | None) -> bool:
         """Whether no pose overlaps more obstacle points than the first one, where the robot stands."""
+        if costmap is None:
+            return True
         overlap = costmap.lethal_overlap(poses, self._body)
         return bool((overlap <= overlap[0]).all())
 
