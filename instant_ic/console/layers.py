@@ -108,7 +108,7 @@ class PageLayers:
     def frame(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
         """Return header and payload of the frame, without the layers that the page holds already (``held``)."""
         payload = bytearray()
-        layers = []
+        layers: list[dict[str, Any]] = []
         for layer in self.layers:
             ranges: dict[str, list[int]] | None = None
             if layer.digest not in held:
@@ -121,8 +121,8 @@ class PageLayers:
                     "id": layer.digest,
                     "size": list(layer.size),
                     "gain": list(layer.gain),
+                    **pose_fields(layer.map_from_camera),
                     "parts": ranges,
                 }
-                | pose_fields(layer.map_from_camera)
             )
         return {"version": self.version, "mount": list(self.mount), "layers": layers}, bytes(payload)
