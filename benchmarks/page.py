@@ -27,7 +27,7 @@ from playwright.sync_api import sync_playwright
 from reporting import CHROMIUM_FLAGS, parser_of, report
 
 from instant_ic import paths
-from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
+from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayers
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.experiments.page_renderer import PageRenderer
@@ -84,7 +84,7 @@ def measure(
         space.set_keyframe(rgb, shot.result.depth_m, shot.pose, shot.result.sigma)
         images.insert(0, jpeg.tobytes())
     encoded = LayerEncoder().encode(space._shown, list(range(len(images), 0, -1)), images)
-    layers = PageLayers(1, (0.0, 0.0, 0.0), LayerMeshes().layers(layer_sources(encoded)))
+    layers = PageLayers(1, (0.0, 0.0, 0.0), LayerMeshes().layers(encoded))
     for page in pages.values():
         page.load(layers)
     result: dict[str, Any] = {

@@ -22,10 +22,12 @@ from instant_ic.control.static_map import StaticMap
 from instant_ic.control.surroundings import Cloud, Scan, Surroundings
 from instant_ic.control.walls import WallMap
 from instant_ic.msg import (
+    HARD_STOP,
     ControlState,
     MessageError,
     Odometry,
     ShownPictures,
+    TwistStamped,
     VspaceStatus,
     cloud_array,
     grid_message,
@@ -35,6 +37,7 @@ from instant_ic.msg import (
     pose2_message,
     stamp_ns,
     twist_message,
+    twist_stamped,
     twist_values,
 )
 
@@ -180,6 +183,11 @@ def page_report(shown: ShownPictures | None) -> PageReport | None:
         view_delay_s=float(shown.view_delay_s),
         view_position=matrix_from_pose(shown.view_pose)[:2, 3],
     )
+
+
+def command_message(decision: Decision, now_ns: int) -> TwistStamped:
+    """Message for ``/cmd_vel``; its frame demands a hard stop where the operator did not command the zero."""
+    return twist_stamped(*decision.command, now_ns, HARD_STOP if decision.hard else "base_link")
 
 
 def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> ControlState:

@@ -13,11 +13,10 @@ from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.sources import STEP_AFTER_S
 from instant_ic.control.step_times import REST_COSTMAP_S, REST_STEP_S, StepTimes
 from instant_ic.control.surroundings import Surroundings
-from instant_ic.control.walls import WallFinder, WallSearch
+from instant_ic.control.walls import WALL_PERIOD_S, WallSearch
 from instant_ic.control.warmup import warm_up
-from instant_ic.control_messages import ArbiterInbox, control_state
+from instant_ic.control_messages import ArbiterInbox, command_message, control_state
 from instant_ic.geometry.poses import matrix_from_pose2
-from instant_ic.msg import ControlState, twist_values
 
 
 class ArbiterNode(Node[ArbiterConfig]):
@@ -26,7 +25,6 @@ class ArbiterNode(Node[ArbiterConfig]):
     name = "arbiter"
     live_parameters = (
         *("limits", "prediction", "collision_monitor", "passage", "planner", "subgoal", "switch", "timeouts"),
-        *("map_jump_m", "map_jump_deg"),
     )
 
     def setup(self) -> None:
@@ -34,17 +32,16 @@ class ArbiterNode(Node[ArbiterConfig]):
         if not self.lockstep:
             warm_up()
         self.arbiter = Arbiter(c)
-        self.surroundings = Surroundings(c.costmap, c.footprint, self.tf, c.map_jump_m, c.map_jump_deg)
+        self.surroundings = Surroundings(c.costmap, c.footprint, self.tf)
         self.view = OperatorView(self.tf)
-        self.walls = WallSearch()
-        finder = WallFinder(c.wall_min_length_m, c.costmap.lethal_cost_threshold)
-        self.walls.submit = self.background(finder.find, self.walls.on_found).submit
+        self.walls = WallSearch(c.wall_min_length_m, c.costmap.lethal_cost_threshold)
+        self.walls.submit = self.background(self.walls.find, self.walls.on_found).submit
         self.latch = KeptEstop(self.run_dir, self.clock.now_ns())
         if self.latch.pressed:
             self.log.warning("emergency stop: %s", self.latch.why or "still pressed from before this start")
         self.times = StepTimes()
         self.cmd_vel = self.publisher("/cmd_vel", msg.TwistStamped, qos=SENSOR)
-        self.state = self.publisher("/ic/state", ControlState, qos=LATCHED)
+        self.state = self.publisher("/ic/state", msg.ControlState, qos=LATCHED)
         self.subgoal = self.publisher("/ic/subgoal", msg.PoseStamped, qos=SENSOR)
         self.trajectory = self.publisher("/ic/trajectory", msg.Path, qos=SENSOR)
         self.costmap_out = self.publisher("/costmap", msg.OccupancyGrid, qos=SENSOR)
@@ -67,7 +64,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=msg.Bool)
         # Only its age matters: the image is never decoded here.
         self.subscribe_received("/camera/image/compressed", lambda r: self.view.camera_image(r.published_ns), SENSOR)
-        self.timer(c.wall_period_s, self.walls.update)
+        self.timer(WALL_PERIOD_S, self.walls.update)
         self.timer(1.0 / c.costmap.update_frequency, self.update_costmap)
         self.cancel_extra = lambda: None  # cancels a step between two timers
         self.timer(1.0 / c.rate_hz, self.on_timer)
@@ -75,7 +72,6 @@ class ArbiterNode(Node[ArbiterConfig]):
     def reconfigure(self, config: ArbiterConfig) -> None:
         super().reconfigure(config)
         self.arbiter.reconfigure(config)
-        self.surroundings.jump_m, self.surroundings.jump_deg = config.map_jump_m, config.map_jump_deg
 
     def teardown(self) -> None:
         if hasattr(self, "cmd_vel"):
@@ -101,7 +97,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.diagnose_all(self.latch.save())
 
     def on_command(self, message: msg.TwistStamped) -> None:
-        if self.times.command_steps(twist_values(message)):
+        if self.times.command_steps(msg.twist_values(message)):
             self.tick()
 
     def on_timer(self) -> None:
@@ -129,10 +125,8 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.times.obeyed = inputs.operator_command
         # Steady time: setting the clock back must not make a stale source look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
-        frame = msg.HARD_STOP if decision.hard else "base_link"
-        self.cmd_vel.publish(msg.twist_stamped(*decision.command, now_ns, frame))
+        self.cmd_vel.publish(command_message(decision, now_ns))
         self.publish_decision(decision, inputs, now_ns)
-        self.diagnose_all(*self.surroundings.findings.values())
         # One more step if the next timer may be later than a time-out: time-outs are exact.
         self.cancel_extra()
         stale_in_s = self.arbiter.stale_in_s(inputs, self.clock.steady_ns())
@@ -143,7 +137,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.state.publish(control_state(decision, inputs, now_ns))
         if decision.changed:
             self.log.info("%s: %s", decision.mode.label, decision.reason)
-        self.diagnose_all(decision.diagnosis)
+        self.diagnose_all(decision.diagnosis, *self.surroundings.findings.values())
         if not (self.times.shown or decision.changed):
             return
         if decision.subgoal is not None:

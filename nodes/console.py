@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from instant_ic.bus.node import Subscription, Timer
 from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.access import AccessError, offer_sign_in
 from instant_ic.console.config import ConsoleConfig
-from instant_ic.console.feed import Inputs, PageFeed
+from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.paths import sign_in_file
 
@@ -32,8 +31,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.command_out = self.publisher("/operator/cmd_vel", msg.TwistStamped, qos=SENSOR)
         self.estop_out = self.publisher("/operator/estop", msg.Bool, qos=LATCHED)
         self.bookmark_out = self.publisher("/operator/bookmark", msg.String, qos=RELIABLE)
-        self.request_view = self.publisher("/view/request", msg.ViewRequest, qos=SENSOR).publish
-        self.report_shown = self.publisher("/view/shown", msg.ShownPictures, qos=SENSOR).publish
+        requests = self.publisher("/view/request", msg.ViewRequest, qos=SENSOR)
+        shown = self.publisher("/view/shown", msg.ShownPictures, qos=SENSOR)
         inputs = Inputs(
             control=self.latest("/ic/state", msg.ControlState, 1.0, LATCHED, lambda m: self.feed.take_control(m)),
             vbot=self.latest("/vbot/odom", msg.Odometry, 0.5, SENSOR, lambda m: self.feed.take_vbot(m)),
@@ -49,13 +48,15 @@ class ConsoleNode(Node[ConsoleConfig]):
             raise NodeError(str(error)) from error
         self.recording = RecordingDesk(self.ask_recorder, lambda status: self.server.publish("recording", status))
         self.on_record, self.on_snapshot = self.recording.record, self.recording.snapshot
-        self.feed = feed = PageFeed(config, self.server, self.tf, inputs, self, self.clock, self.diagnose)
+        outputs = requests.publish, shown.publish
+        self.feed = feed = PageFeed(config, self.server, self.tf, inputs, *outputs, self.clock, self.diagnose)
+        self.export_map = feed.grids.map_files
         self.subscribe("/camera/image/compressed", msg.CompressedImage, feed.take_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", msg.RenderedView, feed.take_view, qos=SENSOR)
         self.mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms: commands must not wait for it
         self.layers: Subscription | None = None
-        self.subscribe("/map", msg.OccupancyGrid, partial(feed.grids.take, FrameKind.MAP), qos=LATCHED)
-        self.subscribe("/costmap", msg.OccupancyGrid, partial(feed.grids.take, FrameKind.COSTMAP), qos=SENSOR)
+        self.subscribe("/map", msg.OccupancyGrid, lambda m: feed.grids.take(FrameKind.MAP, m), qos=LATCHED)
+        self.subscribe("/costmap", msg.OccupancyGrid, lambda m: feed.grids.take(FrameKind.COSTMAP, m), qos=SENSOR)
         self.subscribe("/diagnostics", msg.DiagnosticArray, feed.take_diagnostics, qos=RELIABLE)
         self.subscribe("/heartbeat", msg.NodeStatus, feed.take_heartbeat, qos=RELIABLE)
         self.timer(1.0, feed.send_health)
@@ -86,8 +87,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         for timer in self.page_timers:
             timer.cancel()
         rates = (
-            (1.0 / self.config.state_rate_hz, self.feed.send_state_if_due),
-            (0.2, self.feed.send_plan),
+            (STATE_PERIOD_S, self.feed.send_state_if_due),
+            (PLAN_PERIOD_S, self.feed.send_plan),
             (1.0 / self.config.map_rate_hz, self.feed.send_grids),
         )
         self.page_timers = [self.timer(*rate) for rate in rates] if watched else []
@@ -132,19 +133,15 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.bookmark_out.publish(msg.String(data=name))  # the topic puts it into every recording and snapshot
         self.recording.bookmark(name)
 
-    def export_map(self) -> dict[str, bytes]:
-        return self.feed.grids.map_files()
-
     def ask_recorder(self, command: str, **arguments: Any) -> Any:
         """Call the recorder node, on the desk's thread; raise RecorderError with a message for the operator."""
-        name = self.config.recorder
         if self.run_dir is None:
             raise RecorderError("The recorder is not available: this node has no run directory.")
         try:
-            return NodeControl(self.run_dir, name, RECORDER_TIMEOUT_S).call(command, **arguments)
+            return NodeControl(self.run_dir, self.config.recorder, RECORDER_TIMEOUT_S).call(command, **arguments)
         except NodeMissingError:
-            hint = f"Launch the station with recorder:=true (node {name})."
-            raise RecorderError(f"No recorder is running. {hint}") from None
+            text = f"No recorder is running. Launch the station with recorder:=true (node {self.config.recorder})."
+            raise RecorderError(text) from None
         except ControlError as error:
             raise RecorderError(f"recorder: {error}") from None
 

@@ -7,30 +7,17 @@ from typing import Any
 
 import numpy as np
 
+from instant_ic import msg
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, extrapolate
-from instant_ic.control.navigator import Navigator, RecoveryConfig, moving_subgoal
+from instant_ic.control.navigator import Navigator, moving_subgoal
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
-from instant_ic.msg import (
-    ControlState,
-    OccupancyGrid,
-    Odometry,
-    Path,
-    PoseStamped,
-    TwistStamped,
-    grid_array,
-    path_message,
-    pose2_from_message,
-    stamp_ns,
-    twist_stamped,
-    twist_values,
-)
 
 
 @dataclass(frozen=True)
@@ -50,7 +37,6 @@ class NavigatorConfig:
     subgoal_timeout_s: Positive = 0.5
     costmap_timeout_s: Positive = 1.0
     state_timeout_s: Positive = 0.3
-    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
@@ -65,7 +51,7 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     name = "navigator"
 
-    live_parameters = ("replan_period_s", "recovery", "limits", "planner", "follower")
+    live_parameters = ("replan_period_s", "limits", "planner", "follower")
 
     def setup(self) -> None:
         if not self.lockstep:
@@ -75,22 +61,22 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.speed = 0.0
         self.grid: tuple[Any, Any] = (None, None)  # the newest costmap's message, and the costmap
         self.follow_timer: Any = None  # runs while the operator drives the v-bot
-        self.cmd_vel = self.publisher("/nav/cmd_vel", TwistStamped, qos=SENSOR)
-        self.path = self.publisher("/nav/path", Path, qos=SENSOR)
-        self.subgoal = self.latest("/ic/subgoal", PoseStamped, c.subgoal_timeout_s)
-        self.costmap = self.latest("/costmap", OccupancyGrid, c.costmap_timeout_s)
-        self.vbot = self.latest("/vbot/odom", Odometry, 0.3)
-        self.state = self.latest("/ic/state", ControlState, c.state_timeout_s, qos=LATCHED, callback=self.on_state)
+        self.cmd_vel = self.publisher("/nav/cmd_vel", msg.TwistStamped, qos=SENSOR)
+        self.path = self.publisher("/nav/path", msg.Path, qos=SENSOR)
+        self.subgoal = self.latest("/ic/subgoal", msg.PoseStamped, c.subgoal_timeout_s)
+        self.costmap = self.latest("/costmap", msg.OccupancyGrid, c.costmap_timeout_s)
+        self.vbot = self.latest("/vbot/odom", msg.Odometry, 0.3)
+        self.state = self.latest("/ic/state", msg.ControlState, c.state_timeout_s, qos=LATCHED, callback=self.on_state)
 
     def made(self, c: NavigatorConfig) -> Navigator:
         follower = PathFollower(c.follower, c.limits, c.footprint)
-        return Navigator(HybridPlanner(c.planner, c.footprint), follower, c.replan_period_s, c.recovery)
+        return Navigator(HybridPlanner(c.planner, c.footprint), follower, c.replan_period_s)
 
     def reconfigure(self, config: NavigatorConfig) -> None:
         super().reconfigure(config)
         self.navigator = self.made(config)  # plans again at once
 
-    def on_state(self, state: ControlState) -> None:
+    def on_state(self, state: msg.ControlState) -> None:
         """Follow at the controller's rate while the operator drives the v-bot; otherwise nothing runs."""
         if state.mode != Mode.VIRTUAL:
             self.rest()
@@ -113,27 +99,27 @@ class NavigatorNode(Node[NavigatorConfig]):
             return
         command = self.command(state)
         self.speed = command[0]
-        self.cmd_vel.publish(twist_stamped(*command, self.clock.now_ns()))
+        self.cmd_vel.publish(msg.twist_stamped(*command, self.clock.now_ns()))
 
-    def command(self, state: ControlState) -> tuple[float, float]:
+    def command(self, state: msg.ControlState) -> tuple[float, float]:
         """Twist for the r-bot; zero, with a diagnosis, while an input is missing."""
         grid, goal = self.costmap.fresh, self.subgoal.fresh
         if grid is None or goal is None:
             missing = "costmap" if grid is None else "subgoal"
             self.diagnose("follow", WARN, f"robot stands: no {missing} within its time-out")
             return 0.0, 0.0
-        age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
-        pose = extrapolate(pose2_from_message(state.robot_pose), twist_values(state.robot_twist), age_s)
+        age_s = (self.clock.now_ns() - msg.stamp_ns(state)) / 1e9
+        pose = extrapolate(msg.pose2_from_message(state.robot_pose), msg.twist_values(state.robot_twist), age_s)
         if self.grid[0] is not grid:
-            occupancy, resolution, origin = grid_array(grid)
+            occupancy, resolution, origin = msg.grid_array(grid)
             self.grid = grid, Costmap.from_occupancy(occupancy, resolution, np.array(origin))
-        shown, robot = (pose2_from_message(one) for one in (state.vbot_target, state.robot_pose))
+        shown, robot = (msg.pose2_from_message(one) for one in (state.vbot_target, state.robot_pose))
         vbot = self.vbot.fresh
-        own = None if vbot is None else (pose2_from_message(vbot), twist_values(vbot))
-        subgoal, velocity = moving_subgoal(pose2_from_message(goal), own, shown, robot)
+        own = None if vbot is None else (msg.pose2_from_message(vbot), msg.twist_values(vbot))
+        subgoal, velocity = moving_subgoal(msg.pose2_from_message(goal), own, shown, robot)
         step = self.navigator.step(pose, self.speed, subgoal, self.grid[1], self.clock.steady_ns(), velocity)
         if step.replanned and (self.path.subscriber_count or self.lockstep):
-            self.path.publish(path_message(step.plan.poses, "map", self.clock.now_ns()))
+            self.path.publish(msg.path_message(step.plan.poses, "map", self.clock.now_ns()))
         self.diagnose("follow", OK if step.plan.reached else WARN, step.plan.reason or step.state, state=step.state)
         return step.command
 

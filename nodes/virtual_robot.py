@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from instant_ic import msg
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.control.footprint import Footprint
@@ -11,19 +12,8 @@ from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.states import VbotAction
 from instant_ic.control.step_times import StepTimes
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
-from instant_ic.control.walls import WallFinder, WallSearch
+from instant_ic.control.walls import WALL_PERIOD_S, WallSearch
 from instant_ic.geometry.poses import matrix_from_pose2
-from instant_ic.msg import (
-    ControlState,
-    OccupancyGrid,
-    Odometry,
-    TwistStamped,
-    grid_array,
-    odometry_message,
-    pose2_from_message,
-    stamp_ns,
-    twist_values,
-)
 
 
 @dataclass(frozen=True)
@@ -35,16 +25,12 @@ class VirtualRobotConfig:
         command_timeout_s: s; with an older operator's command the v-bot stops.
         state_timeout_s: s without /ic/state after which the v-bot stands still.
         wall_min_length_m: m; as for the arbiter.
-        wall_period_s: s; as for the arbiter.
-        walls_block: false: the v-bot passes walls too.
     """
 
     rate_hz: Positive = 20.0
     command_timeout_s: Positive = 0.3
     state_timeout_s: Positive = 0.5
     wall_min_length_m: Positive = 1.5
-    wall_period_s: Positive = 2.0
-    walls_block: bool = True
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     vbot: VbotConfig = field(default_factory=VbotConfig)
@@ -61,19 +47,17 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
 
     def setup(self) -> None:
         self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
-        self.walls = WallSearch()
+        self.walls = WallSearch(self.config.wall_min_length_m)
+        self.walls.submit = self.background(self.walls.find, self.walls.on_found).submit
         self.action: VbotAction | None = None
         self.stepped_ns = self.clock.steady_ns()
-        self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
+        self.odom = self.publisher("/vbot/odom", msg.Odometry, qos=SENSOR)
         self.times = StepTimes()
         timeout_s = self.config.command_timeout_s
-        self.command = self.latest("/operator/cmd_vel", TwistStamped, timeout_s, callback=self.on_command)
-        self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
-        if self.config.walls_block:
-            finder = WallFinder(self.config.wall_min_length_m)
-            self.walls.submit = self.background(finder.find, self.walls.on_found).submit
-            self.subscribe("/map", OccupancyGrid, lambda m: self.walls.on_map(*grid_array(m)), qos=LATCHED)
-            self.timer(self.config.wall_period_s, self.walls.update)
+        self.command = self.latest("/operator/cmd_vel", msg.TwistStamped, timeout_s, callback=self.on_command)
+        self.state = self.latest("/ic/state", msg.ControlState, self.config.state_timeout_s, qos=LATCHED)
+        self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
+        self.timer(WALL_PERIOD_S, self.walls.update)
         self.timer(1.0 / self.config.rate_hz, self.on_timer)
 
     def reconfigure(self, config: VirtualRobotConfig) -> None:
@@ -81,8 +65,8 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.robot.config, self.robot.limits = config.vbot, config.limits
         self.command.max_age_s, self.state.max_age_s = config.command_timeout_s, config.state_timeout_s
 
-    def on_command(self, message: TwistStamped) -> None:
-        if self.action == VbotAction.DRIVEN and self.times.command_steps(twist_values(message)):
+    def on_command(self, message: msg.TwistStamped) -> None:
+        if self.action == VbotAction.DRIVEN and self.times.command_steps(msg.twist_values(message)):
             self.tick()
 
     def on_timer(self) -> None:
@@ -102,20 +86,19 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
                 return  # no pose yet
         else:
             self.obey(state, dt_s)
-        self.odom.publish(
-            odometry_message(matrix_from_pose2(self.robot.pose), *self.robot.velocity, "map", "vbot_base_link", now_ns)
-        )
+        pose = matrix_from_pose2(self.robot.pose)
+        self.odom.publish(msg.odometry_message(pose, *self.robot.velocity, "map", "vbot_base_link", now_ns))
 
-    def obey(self, state: ControlState, dt_s: float) -> None:
+    def obey(self, state: msg.ControlState, dt_s: float) -> None:
         """Act as the arbiter's state demands."""
         action, before, self.action = VbotAction(state.vbot_action), self.action, VbotAction(state.vbot_action)
-        robot_pose = pose2_from_message(state.robot_pose)
-        robot_twist = twist_values(state.robot_twist)
-        age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
+        robot_pose = msg.pose2_from_message(state.robot_pose)
+        robot_twist = msg.twist_values(state.robot_twist)
+        age_s = (self.clock.now_ns() - msg.stamp_ns(state)) / 1e9
         # The arbiter's message is up to a period old, and the r-bot moves on.
-        target = extrapolate(pose2_from_message(state.vbot_target), robot_twist, age_s)
+        target = extrapolate(msg.pose2_from_message(state.vbot_target), robot_twist, age_s)
         if before is None and action != VbotAction.WITH_ROBOT:
-            self.robot.place(pose2_from_message(state.vbot_pose), (0.0, 0.0))  # the node was restarted
+            self.robot.place(msg.pose2_from_message(state.vbot_pose), (0.0, 0.0))  # the node was restarted
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
@@ -133,7 +116,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
     def operator(self) -> tuple[float, float]:
         """The operator's command; zero when stale."""
         message = self.command.fresh
-        return (0.0, 0.0) if message is None else twist_values(message)
+        return (0.0, 0.0) if message is None else msg.twist_values(message)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ class ConsoleConfig:
     """Parameters.
 
     Attributes:
-        state_rate_hz: rate at which mode, poses and commands are sent to the page.
         map_rate_hz: highest rate at which a changed map or costmap is sent to the page.
         dissolve_ms: duration of the dissolve between camera and rendered view; 0 = cut.
         ease_ms: time in which the remaining offset between the two robots' poses is eased out of the image; 0 = at
@@ -28,7 +27,6 @@ class ConsoleConfig:
 
     server: ServerConfig = field(default_factory=ServerConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
-    state_rate_hz: Positive = 20.0
     map_rate_hz: Positive = 2.0
     dissolve_ms: Annotated[float, Range(0, 5000)] = 250.0
     ease_ms: Annotated[float, Range(0, 5000)] = 400.0

@@ -8,16 +8,11 @@ import numpy as np
 
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.scene import Scene
+from instant_ic.control.states import Mode
 from instant_ic.msg import ControlState, Pose, ShownPictures, header, pose_message, to_time
 from instant_ic.pace import current
 
-MODES: dict[int, str] = {
-    ControlState.REAL: "real",
-    ControlState.VIRTUAL: "virtual",
-    ControlState.STOPPED: "stopped",
-    ControlState.ENTERING: "entering",
-    ControlState.RETURNING: "returning",
-}
+MODES = {int(mode): mode.label for mode in Mode}
 
 
 class Display:

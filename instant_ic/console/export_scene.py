@@ -8,8 +8,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from instant_ic.console.layers import PageLayer
-from instant_ic.geometry.poses import quaternion_from_matrix
+from instant_ic.console.layers import PageLayer, pose_fields
 
 _STATIC = Path(__file__).parent / "static"
 _IMPORT = re.compile(r'from "\./(\w+)\.js"')
@@ -33,8 +32,7 @@ def scene_html(title: str, layers: Sequence[PageLayer]) -> str:
 
 def _fields(layer: PageLayer) -> dict[str, object]:
     parts = {name: _base64(part) for name, part in layer.parts.items()}
-    q = quaternion_from_matrix(layer.map_from_camera).tolist()
-    return {"gain": layer.gain, "size": layer.size, "q": q, "p": layer.map_from_camera[:3, 3].tolist(), **parts}
+    return {"gain": layer.gain, "size": layer.size, **pose_fields(layer.map_from_camera), **parts}
 
 
 def _modules(name: str) -> dict[str, str]:

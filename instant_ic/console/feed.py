@@ -12,9 +12,9 @@ from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
 from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import GridLayers
-from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
+from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import MOST_LAYERS, PageLayers
-from instant_ic.console.protocol import FrameKind, ProtocolError
+from instant_ic.console.protocol import FrameKind
 from instant_ic.console.scene import Newest, Scene
 from instant_ic.console.server import PLAIN_HTTP, ConsoleServer
 from instant_ic.console.view_requests import ViewRequests
@@ -36,6 +36,8 @@ from instant_ic.pace import current
 from instant_ic.vspace_messages import layers_of
 
 IMAGE_TIMEOUT_S = 2.0
+STATE_PERIOD_S, PLAN_PERIOD_S = 0.05, 0.2
+"""Periods at which mode, poses and commands, and the plan, are sent to the page."""
 
 
 @dataclass(frozen=True)
@@ -61,16 +63,6 @@ class Clock(Protocol):
         """Time that is never set back."""
 
 
-class Outputs(Protocol):
-    """Receiver of what the page needs from the stack."""
-
-    def request_view(self, request: ViewRequest) -> None:
-        """Request a rendered view."""
-
-    def report_shown(self, shown: ShownPictures) -> None:
-        """Report to the arbiter which images are available. Called on any thread."""
-
-
 class PageFeed:
     """Sends to the page's server what comes from the stack.
 
@@ -79,7 +71,8 @@ class PageFeed:
         server: the page's server.
         tf: transform tree.
         inputs: newest messages.
-        outputs: receiver of requests and reports.
+        send_request: requests a rendered view.
+        send_shown: reports to the arbiter which images are available. Called on any thread.
         clock: see :class:`Clock`.
         diagnose: sets a diagnosis: name, level, text, values.
 
@@ -94,7 +87,8 @@ class PageFeed:
         server: ConsoleServer,
         tf: TransformBuffer,
         inputs: Inputs,
-        outputs: Outputs,
+        send_request: Callable[[ViewRequest], None],
+        send_shown: Callable[[ShownPictures], None],
         clock: Clock,
         diagnose: Callable[..., None],
     ) -> None:
@@ -107,9 +101,9 @@ class PageFeed:
         self.display = Display(self.scene)
         self.requests = ViewRequests(config.view, self.scene, self.display)
         self.grids, self.faults = GridLayers(), FaultList()
-        self._state_period_ns = 1e9 / config.state_rate_hz
         self._state_sent_ns = 0
-        self._inputs, self._outputs, self._clock, self._diagnose = inputs, outputs, clock, diagnose
+        self._inputs, self._clock, self._diagnose = inputs, clock, diagnose
+        self._send_request, self._send_shown = send_request, send_shown
 
     # ---- messages ----------------------------------------------------------------------------------
 
@@ -139,7 +133,9 @@ class PageFeed:
         """What pages render of a version of the virtual space, or what is wrong with it. For a worker thread."""
         try:
             layers = layers_of(message)
-            return PageLayers(layers.version, self._mount, self._meshes.layers(layer_sources(layers))[:MOST_LAYERS])
+            made = PageLayers(layers.version, self._mount, self._meshes.layers(layers)[:MOST_LAYERS])
+            made.check()
+            return made
         except ValueError as error:
             return str(error)
 
@@ -148,11 +144,7 @@ class PageFeed:
         if isinstance(layers, str):
             self._diagnose("layers", ERROR, f"virtual space dropped: {layers}")
             return
-        try:
-            self.server.send_layers(layers)
-        except ProtocolError as error:
-            self._diagnose("layers", ERROR, f"virtual space dropped: {error}")
-            return
+        self.server.send_layers(layers)
         self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))
 
     def take_control(self, message: ControlState) -> None:
@@ -182,7 +174,7 @@ class PageFeed:
 
     def send_state_if_due(self) -> None:
         """Send the state, unless a step of the v-bot has just triggered it."""
-        if self._clock.steady_ns() - self._state_sent_ns > 0.6 * self._state_period_ns:
+        if self._clock.steady_ns() - self._state_sent_ns > 0.6e9 * STATE_PERIOD_S:
             self.send_state()
 
     def send_state(self) -> None:
@@ -225,7 +217,7 @@ class PageFeed:
         """Report the available images and the loss of the driver. Any thread may call it."""
         if self.watched or always:
             self.display.take_drawn(self.server.drawn_ms(), self.server.now_ms(), self._clock.steady_ns())
-            self._outputs.report_shown(self.display.report(self._clock.now_ns(), self._clock.steady_ns()))
+            self._send_shown(self.display.report(self._clock.now_ns(), self._clock.steady_ns()))
 
     def _request_view(self) -> None:
         if not self.watched:
@@ -234,7 +226,7 @@ class PageFeed:
         renders = status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
         request = self.requests.next(renders, self.server.needs_views(), self._clock.now_ns(), self._clock.steady_ns())
         if request is not None:
-            self._outputs.request_view(request)
+            self._send_request(request)
 
     def _check(self, name: str, fine: bool, fault: str, **values: Any) -> None:
         self._diagnose(name, OK if fine else WARN, "" if fine else fault, **values)

@@ -17,6 +17,11 @@ MOST_LAYERS = 8
 """The page marks each layer by a bit of its stencil buffer."""
 
 
+def pose_fields(map_from_camera: Matrix) -> dict[str, list[float]]:
+    """Return a pose as the page reads it: the rotation ``q`` (x, y, z, w) and the position ``p`` in m."""
+    return {"q": quaternion_from_matrix(map_from_camera).tolist(), "p": map_from_camera[:3, 3].tolist()}
+
+
 @dataclass(frozen=True)
 class PageLayer:
     """Surface round a keyframe, as triangles with an equirectangular image (``vspace.layer_mesh``).
@@ -103,7 +108,7 @@ class PageLayers:
     def frame(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
         """Return header and payload of the frame, without the layers that the page holds already (``held``)."""
         payload = bytearray()
-        layers = []
+        layers: list[dict[str, Any]] = []
         for layer in self.layers:
             ranges: dict[str, list[int]] | None = None
             if layer.digest not in held:
@@ -116,8 +121,7 @@ class PageLayers:
                     "id": layer.digest,
                     "size": list(layer.size),
                     "gain": list(layer.gain),
-                    "q": quaternion_from_matrix(layer.map_from_camera).tolist(),
-                    "p": layer.map_from_camera[:3, 3].tolist(),
+                    **pose_fields(layer.map_from_camera),
                     "parts": ranges,
                 }
             )

@@ -6,8 +6,9 @@ import math
 from typing import Any
 
 from instant_ic.console.display import Display
+from instant_ic.console.layers import pose_fields
 from instant_ic.console.scene import Scene, planar
-from instant_ic.geometry.poses import Matrix, quaternion_from_matrix
+from instant_ic.geometry.poses import Matrix
 from instant_ic.msg import (
     BatteryState,
     ControlState,
@@ -105,17 +106,14 @@ def panorama_header(captured_ms: float, map_from_camera: Matrix | None) -> dict[
     """Return the header of a panorama's frame."""
     if map_from_camera is None:
         return {"captured_ms": captured_ms, "q": None, "p": None}
-    rotation, position = quaternion_from_matrix(map_from_camera), map_from_camera[:3, 3]
-    return {"captured_ms": captured_ms, "q": rotation.tolist(), "p": position.tolist()}
+    return {"captured_ms": captured_ms, **pose_fields(map_from_camera)}
 
 
 def view_header(captured_ms: float, view: RenderedView) -> dict[str, Any]:
     """Return the header of a rendered view's frame."""
-    camera = matrix_from_pose(view.pose)
     return {
         "captured_ms": captured_ms,
-        "q": quaternion_from_matrix(camera).tolist(),
-        "p": camera[:3, 3].tolist(),
+        **pose_fields(matrix_from_pose(view.pose)),
         "fov": float(view.fov_rad),
         "confidence": finite(view.confidence),
         "render_ms": finite(view.render_ms),

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from pathlib import PurePath
-from typing import Any, Protocol
+from typing import Any
 
 MAX_BOOKMARKS = 50
 MAX_SNAPSHOTS = 5
@@ -22,23 +22,17 @@ class RecorderError(RuntimeError):
     """The recorder refused or did not answer; the text is for the operator."""
 
 
-class Ask(Protocol):
-    """Calls a command of the recorder: ``record``, ``stop``, ``snapshot`` or ``status``."""
-
-    def __call__(self, command: str, **arguments: Any) -> Any:
-        """Return the answer; raise RecorderError if there is none or the recorder refuses."""
-
-
 class RecordingDesk:
     """Calls the recorder in its own thread, because an answer may take seconds and the page must not wait.
 
     Args:
-        ask: see :class:`Ask`.
+        ask: calls a command of the recorder (``record``, ``stop``, ``snapshot`` or ``status``) with named arguments and
+            returns the answer; raises RecorderError if there is none or the recorder refuses.
         report: called with the page's ``recording`` message every ``poll_s`` and after each command.
         poll_s: period of the recorder's status, s.
     """
 
-    def __init__(self, ask: Ask, report: Callable[[dict[str, Any]], None], poll_s: float = 1.0) -> None:
+    def __init__(self, ask: Callable[..., Any], report: Callable[[dict[str, Any]], None], poll_s: float = 1.0) -> None:
         self._ask = ask
         self._report = report
         self._poll_s = poll_s

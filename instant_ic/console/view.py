@@ -13,6 +13,10 @@ from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.geometry.poses import pose_matrix
 
 MAX_FOV_RAD = math.radians(150)
+FOV_MARGIN = 1.15
+"""Requested over shown field of view: room to re-aim; a larger one gives coarser pixels."""
+RESPONSE_TIMEOUT_S = 0.5
+"""An unanswered request counts as lost after this time."""
 PROBE = (64, 36)
 """Pixels of a view that is only judged: its expected PSNR is in VspaceStatus."""
 PROBE_HZ = 1.0
@@ -26,16 +30,12 @@ class ViewConfig:
     Attributes:
         width: width * height is the number of pixels of a rendered view; its shape follows the driver's window.
         height: see width.
-        fov_margin: requested over shown field of view; larger: more room to re-aim, coarser pixels.
         virtual_rate_hz: requests a second while rendered views are shown (one outstanding at a time).
-        response_timeout_s: an unanswered request counts as lost after this time.
     """
 
     width: Annotated[int, Range(16, 4096)] = 320  # times height: pixels of a view; its shape is the window's
     height: Annotated[int, Range(16, 4096)] = 180
-    fov_margin: Annotated[float, Range(1, 2)] = 1.15  # requested over shown field of view: room to re-aim
     virtual_rate_hz: Positive = 10.0  # while views are shown
-    response_timeout_s: Positive = 0.5  # an unanswered request counts as lost after this time
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -74,8 +74,8 @@ def view_shape(look: Look, config: ViewConfig) -> ViewShape:
     The number of pixels follows the configuration for any window shape, because it determines the render time.
     Width and height are multiples of 8.
     """
-    half_width = math.tan(min(look.hfov * config.fov_margin, MAX_FOV_RAD) / 2)
-    half_height = math.tan(min(look.vfov * config.fov_margin, MAX_FOV_RAD) / 2)
+    half_width = math.tan(min(look.hfov * FOV_MARGIN, MAX_FOV_RAD) / 2)
+    half_height = math.tan(min(look.vfov * FOV_MARGIN, MAX_FOV_RAD) / 2)
     aspect = min(max(half_width / half_height, 0.5), 2.5)
     pixels = config.width * config.height
     width = max(16, 8 * round(math.sqrt(pixels * aspect) / 8))

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from instant_ic.console.display import Display
 from instant_ic.console.scene import Scene
-from instant_ic.console.view import PROBE, PROBE_HZ, Look, ViewConfig, view_shape
+from instant_ic.console.view import PROBE, PROBE_HZ, RESPONSE_TIMEOUT_S, Look, ViewConfig, view_shape
 from instant_ic.msg import ViewRequest, header, pose_message
 
 _MOST_PENDING = 8
@@ -62,7 +62,7 @@ class ViewRequests:
 
     def _due(self, since_s: float, rate_hz: float) -> bool:
         """Whether to send a request so long after the last one, if there are to be so many a second."""
-        if self._outstanding and since_s < self.config.response_timeout_s:
+        if self._outstanding and since_s < RESPONSE_TIMEOUT_S:
             return False
         return since_s >= 1.0 / rate_hz - 0.001
 

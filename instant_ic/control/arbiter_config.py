@@ -40,14 +40,11 @@ class SwitchConfig:
         min_virtual_s: shortest stay in the virtual space, in seconds.
         min_real_s: seconds between a return, or an abandoned entry, and the next entry.
         return_margin_m: length in metres that must be free beyond the horizon that triggers an entry.
-        return_side_m: width in metres that must be free beside the footprint, on each side.
         neutral_return_s: seconds of hands off after which the real view returns even before an obstacle.
         lead_back_after_s: seconds of hands off after which the v-bot goes back to an r-bot that cannot come; 0: never.
         stop_margin_m: distance in metres kept to an obstacle when no switch is possible.
-        min_switch_speed_m_s: forward speed in m/s below which the robot counts as turning.
         min_expected_psnr_db: expected quality in dB that a view of the robot's place needs; 0: not checked.
         ready_hold_s: seconds for which a virtual space that learns its next keyframe counts as ready with the last one.
-        require_camera: false: drive without camera images (tests, replays).
         require_view: false: nobody shows the virtual space; views are not waited for and may be missing.
     """
 
@@ -66,14 +63,11 @@ class SwitchConfig:
     min_virtual_s: NotNegative = 1.0
     min_real_s: NotNegative = 1.0
     return_margin_m: Positive = 0.5
-    return_side_m: Positive = 0.12
     neutral_return_s: NotNegative = 3.0
     lead_back_after_s: NotNegative = 6.0
     stop_margin_m: NotNegative = 0.15
-    min_switch_speed_m_s: NotNegative = 0.03
     min_expected_psnr_db: NotNegative = 12.0
     ready_hold_s: NotNegative = 2.0
-    require_camera: bool = True
     require_view: bool = True
 
     def __post_init__(self) -> None:
@@ -116,9 +110,6 @@ class ArbiterConfig:
             if longer.
         rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
         wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
-        wall_period_s: s; walls are searched for in a changed /map at most this often, on a separate thread.
-        map_jump_m: m; a correction of map→odom larger than this makes the costmap forget its marks.
-        map_jump_deg: degrees; as map_jump_m, for the yaw.
     """
 
     limits: MotionLimits = field(default_factory=MotionLimits)
@@ -133,9 +124,6 @@ class ArbiterConfig:
     pose_trust: PoseTrustConfig = field(default_factory=PoseTrustConfig)
     rate_hz: Positive = 20.0
     wall_min_length_m: Positive = 1.5
-    wall_period_s: Positive = 2.0
-    map_jump_m: Positive = 0.3
-    map_jump_deg: Positive = 5.0
     costmap: CostmapConfig = field(default_factory=CostmapConfig)
 
     def __post_init__(self) -> None:

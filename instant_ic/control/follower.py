@@ -19,9 +19,30 @@ from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.planner import Plan
 from instant_ic.geometry.poses import relative2, wrap_angle
 
-_BESIDE_M = 0.3
+LOOKAHEAD_TIME_S = 1.0
+"""The carrot is so far ahead at the present speed."""
+SCALING_MIN_RADIUS_M, SCALING_MIN_SPEED_M_S = 0.60, 0.05
+"""The robot is slower in curves tighter than the radius, but not slower than the speed."""
+ROTATE_MIN_RAD, ROTATE_STOP_RAD = 0.8, 0.15
+"""Bearings of the carrot above which the robot turns on the spot, and below which it drives on."""
+ROTATE_GAIN = 2.0
+"""1/s."""
+APPROACH_DECEL_M_S2 = 0.4
+"""Braking towards the end of the path."""
+CHECKED_S = 1.0
+"""Seconds of the arc to the carrot that are checked for collisions."""
+PADDING_M = 0.01
+"""Round the footprint in this check."""
+GOAL_M, GOAL_RAD = 0.05, 0.05
+"""Tolerance at the goal: well inside ``switch.position_m`` and ``switch.yaw_deg``."""
+TRACK_DISTANCE_M = 0.6
+"""Nearer than this to a moving v-bot, its own speed is followed."""
+BESIDE_M = 0.3
 """A moving goal nearer than this may be tracked off the path, if the straight way to it is free."""
-
+STANDS_BELOW = 0.05
+"""m/s or rad/s; below this speed the v-bot counts as standing."""
+TRACK_GAIN_X, TRACK_GAIN_Y, TRACK_GAIN_YAW = 1.5, 6.0, 3.0
+"""Along the heading (1/s), across (1/m²), of the heading (1/m)."""
 CARROT_SHARES = (1.0, 0.7, 0.45, 0.25)
 """Shares of the lookahead that are tried in turn while the arc to the carrot would touch something."""
 
@@ -32,53 +53,13 @@ class FollowerConfig:
 
     Attributes:
         desired_linear_vel: m/s; above the operator's usual 0.4, so that the r-bot catches up.
-        lookahead_dist: m; used if use_velocity_scaled_lookahead_dist is false.
-        use_velocity_scaled_lookahead_dist: the carrot is lookahead_time ahead.
-        lookahead_time: s.
-        min_lookahead_dist: m.
-        max_lookahead_dist: m.
-        regulated_linear_scaling_min_radius: m; slower in tighter curves.
-        regulated_linear_scaling_min_speed: m/s; lower limit of that slowing.
-        use_rotate_to_heading: turn on the spot if the carrot is far to the side.
-        rotate_to_heading_min_angle: rad; bearing of the carrot above which the robot turns on the spot.
-        rotate_to_heading_stop_angle: rad; bearing below which it drives on.
-        rotate_to_heading_gain: 1/s.
-        approach_decel_m_s2: m/s²; braking towards the end of the path.
-        use_collision_detection: a nearer carrot is used if the arc to it would touch something.
-        max_allowed_time_to_collision_up_to_carrot: s of that arc that are checked.
-        collision_padding_m: m round the footprint in this check.
-        xy_goal_tolerance: m; well inside switch.position_m.
-        yaw_goal_tolerance: rad; well inside switch.yaw_deg.
-        track_distance_m: m; nearer than this to a moving v-bot, its own speed is followed.
-        track_min_speed_m_s: m/s (rad/s); below this speed the v-bot counts as standing.
-        track_gain_x: 1/s; along the heading.
-        track_gain_y: 1/m²; across.
-        track_gain_yaw: 1/m.
+        min_lookahead_dist: m; shortest distance of the carrot.
+        max_lookahead_dist: m; longest distance of the carrot.
     """
 
     desired_linear_vel: Positive = 0.5
-    lookahead_dist: Positive = 0.5
-    use_velocity_scaled_lookahead_dist: bool = True
-    lookahead_time: Positive = 1.0
     min_lookahead_dist: Positive = 0.30
     max_lookahead_dist: Positive = 0.70
-    regulated_linear_scaling_min_radius: Positive = 0.60
-    regulated_linear_scaling_min_speed: Positive = 0.05
-    use_rotate_to_heading: bool = True
-    rotate_to_heading_min_angle: Positive = 0.8
-    rotate_to_heading_stop_angle: Positive = 0.15
-    rotate_to_heading_gain: Positive = 2.0
-    approach_decel_m_s2: Positive = 0.4
-    use_collision_detection: bool = True
-    max_allowed_time_to_collision_up_to_carrot: Positive = 1.0
-    collision_padding_m: Positive = 0.01
-    xy_goal_tolerance: Positive = 0.05
-    yaw_goal_tolerance: Positive = 0.05
-    track_distance_m: Positive = 0.6
-    track_min_speed_m_s: Positive = 0.05
-    track_gain_x: Positive = 1.5
-    track_gain_y: Positive = 6.0
-    track_gain_yaw: Positive = 3.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -104,7 +85,7 @@ class PathFollower:
     def __init__(self, config: FollowerConfig, limits: MotionLimits, footprint: Footprint | None = None) -> None:
         self.config = config
         self.limits = limits
-        self._body = (footprint or Footprint()).points(0.045, config.collision_padding_m)
+        self._body = (footprint or Footprint()).points(0.045, PADDING_M)
         self.reset()
 
     def reset(self) -> None:
@@ -129,14 +110,13 @@ class PathFollower:
             goal_velocity: velocity of the goal (m/s, rad/s) when it is a driving v-bot.
             costmap: checks arcs to the carrot for collisions; None: no check.
         """
-        c = self.config
         if len(plan.poses) == 0:
             return FollowerCommand((0.0, 0.0), "end")
         goal = plan.poses[-1]
         ahead, left, turn = (float(value) for value in relative2(pose, goal))
         distance = math.hypot(ahead, left)
-        moving = plan.reached and max(abs(goal_velocity[0]), abs(goal_velocity[1])) > c.track_min_speed_m_s
-        near = distance < c.track_distance_m and abs(turn) < 1.0
+        moving = plan.reached and max(abs(goal_velocity[0]), abs(goal_velocity[1])) > STANDS_BELOW
+        near = distance < TRACK_DISTANCE_M and abs(turn) < 1.0
         # Tracking drives straight at the goal: only where the path does so too, not round a corner. A path to a goal
         # that is very near but not ahead is a manoeuvre, which is not worth it for a moving goal.
         if (
@@ -144,60 +124,56 @@ class PathFollower:
             and near
             and (
                 _remaining(pose, plan.poses) <= 1.15 * distance + 0.1
-                or (distance < _BESIDE_M and self._straight_is_free(pose, goal, costmap))
+                or (distance < BESIDE_M and self._straight_is_free(pose, goal, costmap))
             )
         ):
             self.reset()
             return FollowerCommand(self._track(ahead, left, turn, goal_velocity), "track")
-        tolerance = c.xy_goal_tolerance * (2.0 if self._at_goal else 1.0)
-        self._at_goal = distance <= tolerance
+        self._at_goal = distance <= GOAL_M * (2.0 if self._at_goal else 1.0)
         if self._at_goal:
             if not plan.reached:
                 return FollowerCommand((0.0, 0.0), "end")
-            if abs(turn) <= c.yaw_goal_tolerance:
+            if abs(turn) <= GOAL_RAD:
                 return FollowerCommand((0.0, 0.0), "arrived")
             return FollowerCommand((0.0, self._turn_rate(turn)), "align")
-        return self._pursue(pose, speed_m_s, plan, costmap if c.use_collision_detection else None)
+        return self._pursue(pose, speed_m_s, plan, costmap)
 
     def _track(self, ahead: float, left: float, turn: float, goal_velocity: tuple[float, float]) -> tuple[float, float]:
         """Tracking law of Kanayama et al. (1990): the goal's own twist plus the error in the robot's frame."""
-        c = self.config
         linear, angular = goal_velocity
-        v = linear * math.cos(turn) + c.track_gain_x * ahead
-        w = angular + linear * (c.track_gain_y * left + c.track_gain_yaw * math.sin(turn))
-        return self.limits.clip(self._cap(v), w)
+        v = linear * math.cos(turn) + TRACK_GAIN_X * ahead
+        w = angular + linear * (TRACK_GAIN_Y * left + TRACK_GAIN_YAW * math.sin(turn))
+        most = self.config.desired_linear_vel
+        return self.limits.clip(min(max(v, -most), most), w)
 
     def _pursue(
         self, pose: NDArray[np.float64], speed_m_s: float, plan: Plan, costmap: Costmap | None
     ) -> FollowerCommand:
         c = self.config
-        path, back = _piece(pose, plan, c.xy_goal_tolerance)
-        lookahead = c.lookahead_dist
-        if c.use_velocity_scaled_lookahead_dist:
-            lookahead = min(max(abs(speed_m_s) * c.lookahead_time, c.min_lookahead_dist), c.max_lookahead_dist)
+        path, back = _piece(pose, plan, GOAL_M)
+        lookahead = min(max(abs(speed_m_s) * LOOKAHEAD_TIME_S, c.min_lookahead_dist), c.max_lookahead_dist)
         remaining = _remaining(pose, path)
-        v = min(c.desired_linear_vel, math.sqrt(2.0 * c.approach_decel_m_s2 * remaining))
+        v = min(c.desired_linear_vel, math.sqrt(2.0 * APPROACH_DECEL_M_S2 * remaining))
         sign = -1.0 if back else 1.0
         for share in CARROT_SHARES:
             x, y, _ = (
                 float(value) for value in relative2(pose, np.array([*_carrot(pose, path, share * lookahead), 0]))
             )
             bearing = math.atan2(sign * y, sign * x)
-            limit = c.rotate_to_heading_stop_angle if self._rotating else c.rotate_to_heading_min_angle
-            if c.use_rotate_to_heading and abs(bearing) > limit:
+            if abs(bearing) > (ROTATE_STOP_RAD if self._rotating else ROTATE_MIN_RAD):
                 if share > CARROT_SHARES[-1] and not self._turn_is_free(pose, bearing, costmap):
                     continue
                 return self._rotate(pose, bearing, costmap)
             curvature = 2.0 * y / max(x * x + y * y, 1e-4)
-            length = min(math.hypot(x, y), c.max_allowed_time_to_collision_up_to_carrot * v)
+            length = min(math.hypot(x, y), CHECKED_S * v)
             if self._arc_is_free(pose, sign * curvature, sign * length, costmap):
                 break
         else:
             return FollowerCommand((0.0, 0.0), "blocked")
         self._rotating = False
         radius = 1.0 / abs(curvature) if curvature != 0.0 else math.inf
-        v *= min(1.0, radius / c.regulated_linear_scaling_min_radius)
-        v = sign * max(v, c.regulated_linear_scaling_min_speed)
+        v *= min(1.0, radius / SCALING_MIN_RADIUS_M)
+        v = sign * max(v, SCALING_MIN_SPEED_M_S)
         return FollowerCommand(self.limits.clip(v, v * curvature), "reverse" if back else "pursue")
 
     def _rotate(self, pose: NDArray[np.float64], bearing: float, costmap: Costmap | None) -> FollowerCommand:
@@ -210,8 +186,6 @@ class PathFollower:
         return FollowerCommand((0.0, self._turn_rate(bearing)), "rotate")
 
     def _turn_is_free(self, pose: NDArray[np.float64], turn: float, costmap: Costmap | None) -> bool:
-        if costmap is None:
-            return True
         count = max(2, math.ceil(abs(turn) / 0.12))
         poses = np.tile(np.asarray(pose, dtype=np.float64), (count + 1, 1))
         poses[:, 2] += turn * np.arange(count + 1) / count
@@ -220,8 +194,6 @@ class PathFollower:
     def _arc_is_free(
         self, pose: NDArray[np.float64], curvature: float, length_m: float, costmap: Costmap | None
     ) -> bool:
-        if costmap is None:
-            return True
         count = max(2, math.ceil(abs(length_m) / 0.05))
         along = length_m * np.arange(count + 1) / count
         turn = curvature * along
@@ -230,25 +202,22 @@ class PathFollower:
         return self._is_free(np.stack([x, y, pose[2] + turn], axis=1), costmap)
 
     def _straight_is_free(self, pose: NDArray[np.float64], goal: NDArray[np.float64], costmap: Costmap | None) -> bool:
-        if costmap is None:
-            return True
         turn = wrap_angle(float(goal[2] - pose[2]))
         share = np.linspace(0.0, 1.0, 6)[:, None]
         return self._is_free(pose + share * np.array([*(goal[:2] - pose[:2]), turn]), costmap)
 
-    def _is_free(self, poses: NDArray[np.float64], costmap: Costmap) -> bool:
+    def _is_free(self, poses: NDArray[np.float64], costmap: Costmap | None) -> bool:
         """Whether no pose overlaps more obstacle points than the first one, where the robot stands."""
+        if costmap is None:
+            return True
         overlap = costmap.lethal_overlap(poses, self._body)
         return bool((overlap <= overlap[0]).all())
 
     def _turn_rate(self, angle: float) -> float:
-        rate = max(self.config.rotate_to_heading_gain * abs(angle), 0.1)
+        rate = max(ROTATE_GAIN * abs(angle), 0.1)
         # Never faster than the robot can stop before the angle is reached.
         rate = min(rate, math.sqrt(self.limits.max_angular_accel_rad_s2 * abs(angle)))
         return math.copysign(min(rate, self.limits.max_angular_rad_s), angle)
-
-    def _cap(self, linear: float) -> float:
-        return min(max(linear, -self.config.desired_linear_vel), self.config.desired_linear_vel)
 
 
 def _piece(pose: NDArray[np.float64], plan: Plan, tolerance_m: float) -> tuple[NDArray[np.float64], bool]:

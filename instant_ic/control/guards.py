@@ -11,7 +11,12 @@ from instant_ic.control.freshness import IMAGES
 from instant_ic.control.reasons import Notice, stale_notice
 from instant_ic.control.snapshot import NO_MOTION, Snapshot
 from instant_ic.control.sources import images_too_rare
-from instant_ic.control.states import Reason
+from instant_ic.control.states import GUARDS, Reason
+
+MIN_SWITCH_SPEED_M_S = 0.03
+"""Forward speed below which the robot counts as turning."""
+RETURN_SIDE_M = 0.12
+"""Width beside the footprint, on each side, that must be free for a return."""
 
 
 def estop_pressed(s: Snapshot) -> bool:
@@ -60,7 +65,7 @@ def way_free(s: Snapshot) -> bool:
             inputs.robot_pose, inputs.robot_velocity, command, inputs.costmap, extra_m=extra_m, side_m=side_m
         ).hit_index
         is None
-        for extra_m, side_m in ((0.0, 0.0), (switch.return_margin_m, switch.return_side_m))
+        for extra_m, side_m in ((0.0, 0.0), (switch.return_margin_m, RETURN_SIDE_M))
     )
 
 
@@ -109,25 +114,8 @@ def may_resume(s: Snapshot) -> bool:
     return s.fresh_s >= s.config.timeouts.recover_s
 
 
-GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {
-    guard.__name__: guard
-    for guard in (
-        estop_pressed,
-        source_lost,
-        pose_lost,
-        vspace_lost,
-        obstacle_and_ready,
-        vspace_not_ready,
-        no_view_in_time,
-        way_free,
-        view_fits,
-        rejoined,
-        unsafe_again,
-        image_fits,
-        may_resume,
-    )
-}
-"""By the names in ``states.GUARDS``, where they are explained."""
+GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {name: globals()[name] for name in GUARDS}
+"""The functions above; ``states.GUARDS`` explains them."""
 
 
 def hold(s: Snapshot) -> Notice | None:
@@ -150,7 +138,7 @@ def images_agree(s: Snapshot, within_m: float, within_deg: float) -> bool:
     inputs, switch = s.inputs, s.config.switch
     if inputs.robot_pose is None or abs(s.yaw_gap_rad) > math.radians(within_deg):
         return False
-    if not (switch.require_view and switch.require_camera):
+    if not switch.require_view:
         return True
     if inputs.age("view") > s.config.timeouts.allowed_s("view", inputs.usual.get("view")):
         return False
@@ -168,7 +156,7 @@ def against_switch(s: Snapshot) -> Notice | None:
     assert inputs.robot_pose is not None
     if s.pose_doubtful:
         return Notice(Reason.POSE_DOUBTFUL, "the robot is not sure of its place")
-    if abs(s.command[0]) < switch.min_switch_speed_m_s:
+    if abs(s.command[0]) < MIN_SWITCH_SPEED_M_S:
         return Notice(Reason.NO_ROOM_TO_TURN, "there is no room to turn")
     if inputs.age("vspace") > s.config.timeouts.vspace:
         return Notice(Reason.VSPACE_NOT_RUNNING, "no virtual space is running")

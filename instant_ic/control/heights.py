@@ -19,10 +19,12 @@ from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 
 Cell = TypeVar("Cell", bound=np.generic)
 
-GROUND, OBSTACLE, OVERHEAD, NEAR = 0, 1, 2, 3
-"""Kinds of points: can be driven over, blocks the way, can be passed under, lies on the robot's own body."""
 AZIMUTHS = 720
 """Number of azimuth bins."""
+ROW_RAD, ROWS = math.radians(2.0), 90
+"""Angle between the sensor's rings; number of elevation bins of this size, from straight down to straight up."""
+CLEAR_MARGIN_M = 0.15
+"""A beam must end this far behind a mark to clear it."""
 FAST = {"contract", "arcp", "afn"}
 """Fast-math flags that keep nan and inf."""
 SCATTER_M = 0.01
@@ -44,8 +46,6 @@ class HeightConfig:
         obstacle_min_range: m from the LiDAR; nearer points are on the robot's own body.
         obstacle_max_range: m; farther points are not marked.
         mark_threshold: points in a cell from which on it is an obstacle.
-        vertical_resolution_deg: degrees between the sensor's rings.
-        clear_margin_m: m; a beam must end this far behind a mark to clear it.
     """
 
     enabled: bool = True
@@ -55,8 +55,6 @@ class HeightConfig:
     obstacle_min_range: NotNegative = 0.45
     obstacle_max_range: Positive = 6.0
     mark_threshold: Annotated[int, Range(1, 250)] = 2
-    vertical_resolution_deg: Positive = 2.0
-    clear_margin_m: Positive = 0.15
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -73,7 +71,7 @@ class SortedPoints:
     nearest: NDArray[np.float64]
     """(M, 2) the nearest obstacle point in each direction that has one, as a flat scan would measure it."""
     ends: NDArray[np.float32]
-    """(E, AZIMUTHS) nearest end of the beams of each elevation (from straight down) and azimuth (from -pi), metres
+    """(ROWS, AZIMUTHS) nearest end of the beams of each elevation (from straight down) and azimuth (from -pi), metres
     over ground; inf where no beam returned."""
     origin: NDArray[np.float64]
     """(3,) position of the sensor at the end of the sweep."""
@@ -99,7 +97,6 @@ def sort_points(
         config: height limits.
     """
     poses = np.ascontiguousarray(level_from_lidar, dtype=np.float64).reshape(-1, 4, 4)
-    rows = math.ceil(180.0 / config.vertical_resolution_deg)
     obstacles, nearest, ends, counts = _sort(
         np.ascontiguousarray(points, dtype=np.float32),
         np.ascontiguousarray(time_s, dtype=np.float32),
@@ -109,8 +106,6 @@ def sort_points(
         config.max_obstacle_height,
         math.tan(math.radians(config.ground_tilt_deg)),
         config.obstacle_min_range,
-        math.radians(config.vertical_resolution_deg),
-        rows,
     )
     names = ("ground", "obstacle", "overhead", "near")
     return SortedPoints(
@@ -158,8 +153,6 @@ class HeightLayer:
             float(origin[1]),
             self.resolution,
             self.config.obstacle_max_range,
-            math.radians(self.config.vertical_resolution_deg),
-            self.config.clear_margin_m,
             self.hits,
             self.low,
             self.high,
@@ -207,8 +200,6 @@ def _sort(
     high: float,
     slope: float,
     range_min: float,
-    per_row: float,
-    rows: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.int64]]:
     last = poses.shape[0] - 1
     sensor = poses[last, :3, 3]
@@ -218,11 +209,11 @@ def _sort(
         k = min(int(at), max(last - 1, 0))
         between[i] = poses[k] + (at - k) * (poses[min(k + 1, last)] - poses[k])
     obstacles = np.empty((points.shape[0], 3), dtype=np.float32)
-    ends = np.full((rows, AZIMUTHS), np.inf, dtype=np.float32)
+    ends = np.full((ROWS, AZIMUTHS), np.inf, dtype=np.float32)
     near_m = np.full(AZIMUTHS, np.inf)
     near_at = np.full(AZIMUTHS, -1, dtype=np.int64)
     counts = np.zeros(4, dtype=np.int64)
-    per_radian, rows_per_radian = AZIMUTHS / (2.0 * math.pi), 1.0 / per_row
+    per_radian, rows_per_radian = AZIMUTHS / (2.0 * math.pi), 1.0 / ROW_RAD
     kept = 0
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -243,7 +234,7 @@ def _sort(
         dx, dy, dz = x - sensor[0], y - sensor[1], z - sensor[2]
         distance = math.sqrt(dx * dx + dy * dy)
         column = min(int((_angle(dy, dx) + math.pi) * per_radian), AZIMUTHS - 1)
-        row = min(int((_angle(dz, distance) + 0.5 * math.pi) * rows_per_radian), rows - 1)
+        row = min(int((_angle(dz, distance) + 0.5 * math.pi) * rows_per_radian), ROWS - 1)
         if distance < ends[row, column]:
             ends[row, column] = distance
         # The robot pitches a little: a tilt raises the ground in proportion to the distance.
@@ -276,14 +267,11 @@ def _clear_and_mark(
     origin_y: float,
     resolution: float,
     range_max: float,
-    per_row: float,
-    margin: float,
     hits: NDArray[np.uint8],
     low: NDArray[np.float32],
     high: NDArray[np.float32],
 ) -> None:
     """Clear the cells that beams pass through, then mark."""
-    rows, azimuths = ends.shape
     size_y, size_x = hits.shape
     cos, sin = math.cos(placed[2]), math.sin(placed[2])
     sensor_x = cos * sensor[0] - sin * sensor[1] + placed[0]
@@ -298,19 +286,19 @@ def _clear_and_mark(
             if distance < resolution:
                 continue
             azimuth = _angle(cos * dy - sin * dx, cos * dx + sin * dy)
-            column = min(int((azimuth + math.pi) * azimuths / (2.0 * math.pi)), azimuths - 1)
+            column = min(int((azimuth + math.pi) * AZIMUTHS / (2.0 * math.pi)), AZIMUTHS - 1)
             # A beam above a low thing or below a hanging one proves nothing, and from near no beam ever sees it again.
             # So a mark ends only with a beam well between its heights; a beam that ends there, or nearly so, keeps it.
-            first = (_angle(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
-            last = (_angle(high[r, c] + 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
-            least = (_angle(low[r, c] + SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / per_row
-            most = (_angle(high[r, c] - SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / per_row
+            first = (_angle(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
+            last = (_angle(high[r, c] + 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
+            least = (_angle(low[r, c] + SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
+            most = (_angle(high[r, c] - SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
             passed, stands = False, False
-            for row in range(max(0, int(first)), min(rows - 1, int(last)) + 1):
+            for row in range(max(0, int(first)), min(ROWS - 1, int(last)) + 1):
                 end = ends[row, column]
                 if not np.isfinite(end):
                     continue
-                if abs(end - distance) <= margin:
+                if abs(end - distance) <= CLEAR_MARGIN_M:
                     stands = True
                 elif end > distance and least <= row + 0.5 <= most:
                     passed = True

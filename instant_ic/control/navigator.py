@@ -8,43 +8,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerCommand, PathFollower
 from instant_ic.control.kinematics import move
-from instant_ic.control.planner import HybridPlanner, Plan, no_plan
+from instant_ic.control.planner import TOLERANCE_M, HybridPlanner, Plan, no_plan
 from instant_ic.control.progress import Progress
 from instant_ic.control.snapshot import Twist2
 from instant_ic.geometry.poses import relative2
 
-
-@dataclass(frozen=True)
-class RecoveryConfig:
-    """When the robot counts as stuck, and how it frees itself.
-
-    Attributes:
-        stuck_after_s: s of commands without motion after which the robot backs off.
-        duration_s: s; duration of backing off.
-        speed_m_s: m/s; backwards, the next time forwards.
-        moved_m: m from which on the robot counts as moving.
-        turned_rad: rad from which on it counts as moving.
-        give_up_after_s: s in which the way to a standing goal has not become shorter, after which the robot stands and
-            says that there is no way.
-        keep_plan_s: s for which a path to the goal that is still free is kept when no new one is found.
-    """
-
-    stuck_after_s: Positive = 1.5
-    duration_s: Positive = 1.5
-    speed_m_s: Positive = 0.15
-    moved_m: Positive = 0.03
-    turned_rad: Positive = 0.05
-    give_up_after_s: Positive = 8.0
-    keep_plan_s: NotNegative = 3.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
-
+_STUCK_AFTER_NS = 1_500_000_000
+"""Time of commands without motion after which the robot backs off."""
+_RECOVERY_NS = 1_500_000_000
+"""Duration of backing off."""
+_RECOVERY_M_S = 0.15
+"""Backwards, the next time forwards."""
+_MOVED_M, _TURNED_RAD = 0.03, 0.05
+"""From one of these on the robot counts as moving."""
+_GIVE_UP_AFTER_S = 8.0
+"""Time without a shorter way to a standing goal, after which the robot stands and says that there is no way."""
+_KEEP_PLAN_NS = 3_000_000_000
+"""Time for which a path to the goal that is still free is kept when no new one is found."""
 _NO_PLAN = no_plan("no plan yet")
 
 
@@ -65,23 +48,16 @@ class Navigator:
     and plans again; the next time it moves forwards. The collision monitor also checks these commands.
 
     In a passage hardly wider than the robot, noise opens and closes the way from one plan to the next. When no new path
-    is found, a path to the goal that is still free is therefore kept for ``recovery.keep_plan_s``.
+    is found, a path to the goal that is still free is therefore kept for ``_KEEP_PLAN_NS``.
 
     A robot that shuttles between ways which turn out to be closed stops, and tries again when a way stays open.
     """
 
-    def __init__(
-        self,
-        planner: HybridPlanner,
-        follower: PathFollower,
-        replan_period_s: float = 0.2,
-        recovery: RecoveryConfig | None = None,
-    ) -> None:
+    def __init__(self, planner: HybridPlanner, follower: PathFollower, replan_period_s: float = 0.2) -> None:
         self.planner = planner
         self.follower = follower
         self.replan_period_s = replan_period_s
-        self.recovery = recovery or RecoveryConfig()
-        self._progress = Progress(self.recovery.give_up_after_s)
+        self._progress = Progress(_GIVE_UP_AFTER_S)
         self._lost = False
         self._body = planner.footprint.points(0.045)
         self.reset()
@@ -119,10 +95,10 @@ class Navigator:
             self._recovering_ns, self._moved_ns = None, now_ns
             self.follower.reset()
             why = self._plan.reason or "a way opens and closes"
-            reason = f"no way found in {self.recovery.give_up_after_s:.0f} s: {why}"
+            reason = f"no way found in {_GIVE_UP_AFTER_S:.0f} s: {why}"
             return NavigatorStep((0.0, 0.0), "no_way", replace(plan, reached=False, reason=reason), due)
         if self._recovering(pose, now_ns):
-            return NavigatorStep((self._direction * self.recovery.speed_m_s, 0.0), "recover", plan, due)
+            return NavigatorStep((self._direction * _RECOVERY_M_S, 0.0), "recover", plan, due)
         step: FollowerCommand = self.follower.step(pose, speed_m_s, plan, subgoal_velocity, costmap)
         if step.command == (0.0, 0.0) and step.state != "blocked":
             self._moved_ns = now_ns
@@ -134,10 +110,10 @@ class Navigator:
         if plan.reached:
             self._found_ns = now_ns
             return plan
-        young = self._found_ns is not None and now_ns - self._found_ns <= self.recovery.keep_plan_s * 1e9
+        young = self._found_ns is not None and now_ns - self._found_ns <= _KEEP_PLAN_NS
         if not before.reached or not young:
             return plan
-        if float(np.linalg.norm(before.poses[-1, :2] - subgoal[:2])) > self.planner.config.tolerance:
+        if float(np.linalg.norm(before.poses[-1, :2] - subgoal[:2])) > TOLERANCE_M:
             return plan
         rest = int(np.argmin(np.linalg.norm(before.poses[:, :2] - pose[:2], axis=1)))
         overlap = costmap.lethal_overlap(np.concatenate([pose[None], before.poses[rest:]]), self._body)
@@ -146,18 +122,17 @@ class Navigator:
         return replace(before, poses=before.poses[rest:], reverse=before.reverse[rest:])
 
     def _recovering(self, pose: NDArray[np.float64], now_ns: int) -> bool:
-        recovery = self.recovery
         if self._recovering_ns is not None:
-            if now_ns - self._recovering_ns < recovery.duration_s * 1e9:
+            if now_ns - self._recovering_ns < _RECOVERY_NS:
                 return True
             self._recovering_ns, self._moved_ns = None, None
             self._direction = -self._direction
             self.follower.reset()
-        moved = float(np.linalg.norm(pose[:2] - self._moved_pose[:2])) > recovery.moved_m
-        turned = abs(math.remainder(float(pose[2] - self._moved_pose[2]), 2 * math.pi)) > recovery.turned_rad
+        moved = float(np.linalg.norm(pose[:2] - self._moved_pose[:2])) > _MOVED_M
+        turned = abs(math.remainder(float(pose[2] - self._moved_pose[2]), 2 * math.pi)) > _TURNED_RAD
         if self._moved_ns is None or moved or turned:
             self._moved_ns, self._moved_pose = now_ns, np.array(pose, dtype=np.float64)
-        if now_ns - self._moved_ns < recovery.stuck_after_s * 1e9:
+        if now_ns - self._moved_ns < _STUCK_AFTER_NS:
             return False
         self._recovering_ns = now_ns
         return True

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, check_ranges
+from instant_ic.config.ranges import NotNegative, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.planner import HybridPlanner, Plan
 from instant_ic.control.prediction import Prediction
 from instant_ic.control.reasons import Notice
 from instant_ic.control.states import Reason
-from instant_ic.control.subgoal import behind_obstacle, extend_ahead
+from instant_ic.control.subgoal import WALL_CLEARANCE_M, behind_obstacle, extend_ahead
 from instant_ic.control.walls import WallMap
 
 
@@ -24,15 +24,10 @@ class PassageConfig:
     Attributes:
         max_pass_m: m; largest distance behind the obstacle at which free space must begin for a switch to the v-bot.
         max_detour_m: m; how much longer than straight on the way round may be.
-        max_cost: 0..252; highest cost at which a place counts as free.
-        wall_clearance_m: m; least distance to a wall on the line behind the obstacle: nearer, the v-bot would have to
-            pass the wall.
     """
 
     max_pass_m: NotNegative = 3.0
     max_detour_m: NotNegative = 4.0
-    max_cost: NotNegativeInt = 150
-    wall_clearance_m: NotNegative = 0.25
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -57,10 +52,10 @@ def find_passage(
     hit = prediction.poses[prediction.hit_index]
     heading = hit if forward else hit + np.array([0.0, 0.0, math.pi])
     ahead = extend_ahead(heading, config.max_pass_m, costmap.resolution)
-    free = behind_obstacle(costmap, ahead, config.max_cost)
+    free = behind_obstacle(costmap, ahead)
     exit_index = int(np.flatnonzero(free)[0]) if free.any() else len(ahead)
     if walls is not None:
-        at_wall = np.flatnonzero(walls.distance(ahead[:exit_index, :2]) < config.wall_clearance_m)
+        at_wall = np.flatnonzero(walls.distance(ahead[:exit_index, :2]) < WALL_CLEARANCE_M)
         if at_wall.size:
             return Notice(Reason.WALL_AHEAD, "a wall is in the way")
     if exit_index == len(ahead):

@@ -11,13 +11,13 @@ import heapq
 import itertools
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import NotNegative, PositiveInt, check_ranges
 from instant_ic.control.costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
 from instant_ic.control.footprint import Footprint
 
@@ -25,8 +25,32 @@ SPACING_M = 0.05
 """Distance between the poses of a path."""
 STEP_CELLS = 3.0
 """Length of a primitive."""
+COST_PENALTY = 3.0
+"""Higher: longer paths, farther from obstacles."""
+TIGHT_COST, TIGHT_PENALTY = 165, 6.0
+"""Above this cost the robot cannot turn on the spot (0.39 m from obstacles), and a metre costs up to so much more."""
+UNKNOWN_PENALTY = 5.0
+"""Extra cost of a metre through unseen cells."""
+UNKNOWN_STANDOFF_M = 0.3
+"""Distance that the path keeps to unseen cells."""
+RETROSPECTIVE_GAIN = 0.15
+"""Discount along the previous path: keeps the chosen side."""
 LEAST_WEIGHT = 0.8
-"""Lower bound of a cell's weight: ``retrospective_gain`` is 0.2 at most."""
+"""Lower bound of a cell's weight."""
+BINS = 32
+"""Headings per full turn in the search."""
+REVERSE_PENALTY = 2.0
+"""Cost factor of a metre driven backwards."""
+CURVE_PENALTY = 1.05
+"""Cost factor of a metre on a curve."""
+CHANGE_PENALTY_M = 0.3
+"""Cost of a change of direction."""
+ROTATION_PENALTY_M = 0.3
+"""Cost of one radian turned on the spot."""
+ESCAPE_RADIUS_M = 0.6
+"""How far a robot that stands on obstacles may drive to get off them."""
+TOLERANCE_M = 0.5
+"""A path that ends this near an occupied goal counts as a way."""
 DEAR = np.float32(8.0)
 """Weight of cells that are closed, except for a robot that stands in them."""
 HURRY = 1.2
@@ -35,44 +59,18 @@ HURRY = 1.2
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """What the planner may cross, and at what cost; names of nav2's Smac planner where it has the parameter.
+    """What the planner may cross; names of nav2's Smac planner.
 
     Attributes:
-        cost_penalty: higher: longer paths, farther from obstacles.
-        tight_cost: 0..251; above this cost the robot cannot turn on the spot (0.39 m from obstacles).
-        tight_penalty: extra cost of a metre above tight_cost.
         allow_unknown: plan through unseen cells; the driven path still ends before them.
-        unknown_penalty: extra cost of a metre through unseen cells.
-        unknown_standoff_m: m; distance kept to unseen cells.
-        angle_quantization_bins: headings per full turn in the search.
         allow_reverse_expansion: allow driving backwards, out of dead ends for example.
-        reverse_penalty: extra cost of a metre driven backwards.
-        change_penalty: m; cost of a change of direction.
-        non_straight_penalty: cost factor of a metre on a curve.
-        rotation_penalty: m; cost of one radian turned on the spot.
-        retrospective_gain: 0..0.2; discount along the previous path: keeps the chosen side.
         footprint_padding: m round the footprint.
-        escape_radius_m: m; how far a robot that stands on obstacles may drive to get off them.
-        tolerance: m; a path that ends this near an occupied goal counts as a way.
         max_iterations: poses after which the search gives up.
     """
 
-    cost_penalty: NotNegative = 3.0
-    tight_cost: Annotated[int, Range(0, 251)] = 165
-    tight_penalty: NotNegative = 6.0
     allow_unknown: bool = True
-    unknown_penalty: NotNegative = 5.0
-    unknown_standoff_m: NotNegative = 0.3
-    angle_quantization_bins: Annotated[int, Range(8, 128)] = 32
     allow_reverse_expansion: bool = True
-    reverse_penalty: Annotated[float, Range(low=1)] = 2.0
-    change_penalty: NotNegative = 0.3
-    non_straight_penalty: Annotated[float, Range(low=1)] = 1.05
-    rotation_penalty: NotNegative = 0.3
-    retrospective_gain: Annotated[float, Range(0, 0.2)] = 0.15
     footprint_padding: NotNegative = 0.02
-    escape_radius_m: NotNegative = 0.6
-    tolerance: NotNegative = 0.5
     max_iterations: PositiveInt = 5000
 
     def __post_init__(self) -> None:
@@ -106,12 +104,12 @@ def no_plan(reason: str) -> Plan:
 class HybridPlanner:
     """Finds paths for the true footprint from any pose of the robot.
 
-    A step costs its length times (1 + cost_penalty·cost/252). Above ``tight_cost``, where the robot cannot turn on the
-    spot, up to ``tight_penalty`` is added. Reversing, changing direction and turning cost more.
+    A step costs its length times (1 + COST_PENALTY·cost/252). Above ``TIGHT_COST``, where the robot cannot turn on the
+    spot, up to ``TIGHT_PENALTY`` is added. Reversing, changing direction and turning cost more.
     No pose puts the footprint (with ``footprint_padding``) on a lethal cell. A robot that stands on lethal cells may
     leave them, but never go deeper. With ``allow_unknown`` a way may cross unknown cells, but the path ends
-    ``unknown_standoff_m`` before the first of them: the robot drives up, sees more, and plans again. Without it,
-    unknown cells are walls. Cells near the previous path are a little cheaper (``retrospective_gain``), so that the
+    ``UNKNOWN_STANDOFF_M`` before the first of them: the robot drives up, sees more, and plans again. Without it,
+    unknown cells are walls. Cells near the previous path are a little cheaper (``RETROSPECTIVE_GAIN``), so that the
     planner does not alternate between two equally good ways.
     """
 
@@ -157,7 +155,7 @@ class HybridPlanner:
         poses, reverse = _resample(nodes, start, target if found else None)
         length = _length(poses)
         exact = reachable and found
-        cut = self._before_unknown(costmap, poses)
+        cut = _before_unknown(costmap, poses)
         if cut is not None:
             reason = "the way leads through space not seen yet"
             return Plan(poses[cut], False, reason, length if found else math.inf, reverse[cut], opened)
@@ -167,7 +165,7 @@ class HybridPlanner:
         whole = math.inf
         if outside:
             reason = f"the goal is outside the costmap, {gap:.1f} m beyond the path"
-        elif taken and gap <= self.config.tolerance:
+        elif taken and gap <= TOLERANCE_M:
             reason, whole = f"the goal is on an obstacle; the path ends {gap:.1f} m from it", length
         elif reachable and opened >= self.config.max_iterations:
             reason = f"no way found within {opened} steps of the search; the path ends {gap:.1f} m before the goal"
@@ -184,18 +182,19 @@ class HybridPlanner:
         back = (goal[:2] - start[:2]) @ np.array([math.cos(start[2]), math.sin(start[2])]) < 0.0
         return Plan(np.stack([start, goal]), True, "", _length(np.stack([start, goal])), np.array([False, back]))
 
-    def _before_unknown(self, costmap: Costmap, poses: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-        """Mask of the poses of a path before the first unknown cell; None when it crosses none."""
-        costs = costmap.cost_at(poses[:, :2])
-        from_start = np.linalg.norm(poses[:, :2] - poses[0, :2], axis=1)
-        # The scan sees nothing close to the robot; the cells under it are free.
-        unknown = np.flatnonzero((costs == UNKNOWN) & (from_start > self.config.unknown_standoff_m))
-        if unknown.size == 0:
-            return None
-        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
-        keep: NDArray[np.bool_] = along <= along[unknown[0]] - self.config.unknown_standoff_m
-        keep[0] = True
-        return keep
+
+def _before_unknown(costmap: Costmap, poses: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+    """Mask of the poses of a path before the first unknown cell; None when it crosses none."""
+    costs = costmap.cost_at(poses[:, :2])
+    from_start = np.linalg.norm(poses[:, :2] - poses[0, :2], axis=1)
+    # The scan sees nothing close to the robot; the cells under it are free.
+    unknown = np.flatnonzero((costs == UNKNOWN) & (from_start > UNKNOWN_STANDOFF_M))
+    if unknown.size == 0:
+        return None
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
+    keep: NDArray[np.bool_] = along <= along[unknown[0]] - UNKNOWN_STANDOFF_M
+    keep[0] = True
+    return keep
 
 
 class _Map(NamedTuple):
@@ -221,12 +220,10 @@ class _Pose(NamedTuple):
 
 
 class _Rules(NamedTuple):
-    """``PlannerConfig`` in cells."""
+    """Rules of the search, in cells."""
 
     may_reverse: bool
-    reverse_penalty: float
-    change_penalty: float
-    curve_penalty: float
+    change_price: float
     turn_price: float
     """Price of one radian."""
     escape: float
@@ -265,32 +262,22 @@ class _Grid:
 
         config = planner.config
         self.planner, self.config, self.costmap = planner, config, costmap
-        self.bins = config.angle_quantization_bins
         free = (costmap.costs != LETHAL).astype(np.uint8)
         if free.all():
             self.clearance = np.full(free.shape, 1e6, dtype=np.float32)
         else:
             self.clearance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         near = np.zeros(free.shape, dtype=np.uint8)
-        if before is not None and len(before.poses) > 1 and config.retrospective_gain > 0:
+        if before is not None and len(before.poses) > 1:
             rows, columns = costmap.cells(before.poses[:, :2])
             line = np.clip(np.stack([columns, rows], axis=-1), -10000, 10000).astype(np.int32)
             cv2.polylines(near, [line], False, 1, thickness=round(0.3 / costmap.resolution))
-        unknown = 1.0 + config.unknown_penalty if config.allow_unknown else 0.0
-        self.weights = _weights(
-            costmap.costs,
-            near,
-            config.cost_penalty,
-            config.tight_cost,
-            config.tight_penalty,
-            unknown,
-            1.0 - config.retrospective_gain,
-        )
+        self.weights = _weights(costmap.costs, near, 1.0 + UNKNOWN_PENALTY if config.allow_unknown else 0.0)
         # The body in cells at each heading, filled: posts inside the outline count too. At a spacing of 0.7 cells
         # every cell whose middle is covered holds a point.
         body = planner.footprint.points(0.7 * costmap.resolution, config.footprint_padding) / costmap.resolution
         body = body[np.argsort(-(body**2).sum(axis=1), kind="stable")]
-        yaw = 2.0 * math.pi * np.arange(self.bins) / self.bins
+        yaw = 2.0 * math.pi * np.arange(BINS) / BINS
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         bodies = np.stack([c * body[:, 0] - s * body[:, 1], s * body[:, 0] + c * body[:, 1]], axis=-1)
         # A pose may lie anywhere in its cell: nothing can touch from 0.71 cells farther on.
@@ -302,16 +289,16 @@ class _Grid:
         """Mask (H, W) of the cells that the robot's centre can reach from one."""
         import cv2
 
-        escape = self.config.escape_radius_m
         open_ = (self.weights > 0).astype(np.uint8)
-        reach = math.ceil(escape / self.costmap.resolution)
+        reach = math.ceil(ESCAPE_RADIUS_M / self.costmap.resolution)
         near = slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
         costs = self.costmap.costs[near]
         rows, columns = np.ogrid[
             near[0].start : near[0].start + costs.shape[0], near[1].start : near[1].start + costs.shape[1]
         ]
         away = np.hypot(rows - row, columns - column) * self.costmap.resolution
-        open_[near] |= ((costs == INSCRIBED) & (away <= escape)) | ((costs == LETHAL) & (away <= 0.25 * escape))
+        inscribed, lethal = costs == INSCRIBED, costs == LETHAL
+        open_[near] |= (inscribed & (away <= ESCAPE_RADIUS_M)) | (lethal & (away <= 0.25 * ESCAPE_RADIUS_M))
         open_[row, column] = 1
         _, labels = cv2.connectedComponents(open_, connectivity=8)
         reached: NDArray[np.bool_] = labels == labels[row, column]
@@ -319,7 +306,7 @@ class _Grid:
 
     def cost_to_go(self, row: int, column: int, start_row: int, start_column: int) -> NDArray[np.float32]:
         """Cost in cells (H, W) of the point robot's way to one cell, from all cells that matter for the start."""
-        escape = self.config.escape_radius_m / self.costmap.resolution
+        escape = ESCAPE_RADIUS_M / self.costmap.resolution
         costs: NDArray[np.float32] = _cost_to_go(
             self.costmap.costs, self.weights, row, column, start_row, start_column, escape
         )
@@ -349,11 +336,9 @@ class _Grid:
         config, resolution = self.config, self.costmap.resolution
         rules = _Rules(
             config.allow_reverse_expansion,
-            config.reverse_penalty,
-            config.change_penalty / resolution,
-            config.non_straight_penalty,
-            config.rotation_penalty / resolution,
-            config.escape_radius_m / resolution,
+            CHANGE_PENALTY_M / resolution,
+            ROTATION_PENALTY_M / resolution,
+            ESCAPE_RADIUS_M / resolution,
             config.max_iterations,
         )
         return _search(self.map, to_go, self._in_cells(start), self._in_cells(goal), rules)
@@ -403,16 +388,11 @@ def _resample(
 
 
 @njit(cache=True)
-def _weights(
-    costs: NDArray[np.uint8],
-    near: NDArray[np.uint8],
-    penalty: float,
-    tight_cost: int,
-    tight_penalty: float,
-    unknown: float,
-    discount: float,
-) -> NDArray[np.float32]:
-    """Cost (H, W) of one cell length in a cell; 0 where the robot's centre may not go."""
+def _weights(costs: NDArray[np.uint8], near: NDArray[np.uint8], unknown: float) -> NDArray[np.float32]:
+    """Cost (H, W) of one cell length in a cell; 0 where the robot's centre may not go.
+
+    ``near``: the previous path. ``unknown``: cost in unseen cells.
+    """
     weights = np.empty(costs.shape, dtype=np.float32)
     for r in range(costs.shape[0]):
         for c in range(costs.shape[1]):
@@ -421,10 +401,10 @@ def _weights(
             if cost == 255:
                 weight = unknown
             elif cost < 253:
-                weight = 1.0 + penalty * cost / 252.0
-                if cost > tight_cost:
-                    weight += tight_penalty * (cost - tight_cost) / (252.0 - tight_cost)
-            weights[r, c] = weight * (discount if near[r, c] else 1.0)
+                weight = 1.0 + COST_PENALTY * cost / 252.0
+                if cost > TIGHT_COST:
+                    weight += TIGHT_PENALTY * (cost - TIGHT_COST) / (252.0 - TIGHT_COST)
+            weights[r, c] = weight * (1.0 - RETROSPECTIVE_GAIN if near[r, c] else 1.0)
     return weights
 
 
@@ -692,11 +672,11 @@ def _step_price(k: int, weight: float, before: int, per_bin: float, rules: _Rule
     drive = _drive_of(k)
     if drive == TURN:
         return rules.turn_price * per_bin * weight
-    price = abs(LENGTHS[k]) * weight * (rules.curve_penalty if TURNS[k] != 0 else 1.0)
+    price = abs(LENGTHS[k]) * weight * (CURVE_PENALTY if TURNS[k] != 0 else 1.0)
     if drive == BACKWARD:
-        price *= rules.reverse_penalty
+        price *= REVERSE_PENALTY
     if before != TURN and before != drive:
-        price += rules.change_penalty
+        price += rules.change_price
     return price
 
 
@@ -741,8 +721,8 @@ def _price_to_goal(
     end_turn = 0.0 if np.isnan(goal.yaw) else _wrapped(goal.yaw - yaw)
     total = nodes.price[node] + rules.turn_price * (abs(turn) + abs(end_turn))
     if backwards and nodes.drive[node] == FORWARD and abs(turn) < 0.1:
-        total += rules.change_penalty
-    share = rules.reverse_penalty if backwards else 1.0
+        total += rules.change_price
+    share = REVERSE_PENALTY if backwards else 1.0
     if total + share * away >= most or not _turn_is_free(grid, x, y, heading, turn):
         return np.inf
     line = _line_cost(grid, x, y, goal.x, goal.y, yaw, np.inf)

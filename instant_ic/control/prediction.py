@@ -9,10 +9,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+from instant_ic.config.ranges import NotNegative, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
+
+_YAW_MARGIN_RAD = 0.4
+"""As ``margin_m``, when turning on the spot."""
+_MAX_HORIZON_S = 8.0
+"""Longest prediction, however slow the robot."""
+_STEP_S = 0.05
+"""Seconds between predicted poses."""
 
 
 @dataclass(frozen=True)
@@ -22,17 +29,11 @@ class PredictionConfig:
     Attributes:
         latency_s: s; delay from a command to the base's response.
         margin_m: m; horizon beyond the stopping distance; higher: earlier switch to the v-bot.
-        yaw_margin_rad: rad; horizon when turning on the spot.
-        max_horizon_s: s; longest prediction, however slow the robot.
-        step_s: s between predicted poses.
         padding_m: m round the footprint.
     """
 
     latency_s: NotNegative = 0.2
     margin_m: NotNegative = 0.6
-    yaw_margin_rad: NotNegative = 0.4
-    max_horizon_s: Positive = 8.0
-    step_s: Positive = 0.05
     padding_m: NotNegative = 0.03
 
     def __post_init__(self) -> None:
@@ -83,7 +84,7 @@ class Predictor:
         if speed == 0.0:
             return 0.0
         share = abs(linear) / speed
-        margin = share * self.config.margin_m + (1.0 - share) * self.reach_m * self.config.yaw_margin_rad
+        margin = share * self.config.margin_m + (1.0 - share) * self.reach_m * _YAW_MARGIN_RAD
         return stopping_distance(speed, self.limits, self.config.latency_s) + margin
 
     def predict(
@@ -100,7 +101,6 @@ class Predictor:
         ``extra_m`` is added to the horizon, ``side_m`` to every side of the footprint. Without a
         costmap the way is free.
         """
-        step = self.config.step_s
         command = self.limits.clip(*command)
         # Delayed encoder readings can give a speed that the base cannot drive: the horizon would be metres too long.
         velocity = self.limits.clip(*velocity)
@@ -112,14 +112,12 @@ class Predictor:
             np.array(pose, dtype=np.float64),
             np.array(velocity, dtype=np.float64),
             np.array(command, dtype=np.float64),
-            rates * step,
-            step,
-            math.ceil(self.config.latency_s / step - 1e-9),
-            math.ceil(self.config.max_horizon_s / step),
+            rates * _STEP_S,
+            math.ceil(self.config.latency_s / _STEP_S - 1e-9),
             length,
             self.reach_m,
         )
-        times: NDArray[np.float64] = step * np.arange(len(path), dtype=np.float64)
+        times: NDArray[np.float64] = _STEP_S * np.arange(len(path), dtype=np.float64)
         hit = None
         if costmap is not None:
             body = self.body
@@ -142,9 +140,7 @@ def _roll_out(
     velocity: NDArray[np.float64],
     command: NDArray[np.float64],
     steepest: NDArray[np.float64],
-    step_s: float,
     late_steps: int,
-    most_steps: int,
     length_m: float,
     reach_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -153,6 +149,7 @@ def _roll_out(
     As ``kinematics.accelerate`` and ``move``, step by step: the command takes effect after ``late_steps``, and changes
     the velocity by at most ``steepest`` (2,) per step.
     """
+    most_steps = math.ceil(_MAX_HORIZON_S / _STEP_S)
     poses, travelled = np.empty((most_steps + 1, 3)), np.zeros(most_steps + 1)
     poses[0] = pose
     v = velocity.copy()
@@ -164,13 +161,13 @@ def _roll_out(
         stands = v[0] == 0.0 and v[1] == 0.0 and command[0] == 0.0 and command[1] == 0.0
         if travelled[k] >= length_m or stands:
             break
-        half = 0.5 * v[1] * step_s
-        chord = v[0] * step_s * (math.sin(half) / half if half != 0.0 else 1.0)
+        half = 0.5 * v[1] * _STEP_S
+        chord = v[0] * _STEP_S * (math.sin(half) / half if half != 0.0 else 1.0)
         heading = poses[k, 2] + half
         yaw = heading + half
         poses[k + 1, 0] = poses[k, 0] + chord * math.cos(heading)
         poses[k + 1, 1] = poses[k, 1] + chord * math.sin(heading)
         poses[k + 1, 2] = yaw - 2.0 * math.pi * math.floor(yaw / (2.0 * math.pi) + 0.5)
-        travelled[k + 1] = travelled[k] + (abs(v[0]) + reach_m * abs(v[1])) * step_s
+        travelled[k + 1] = travelled[k] + (abs(v[0]) + reach_m * abs(v[1])) * _STEP_S
         count += 1
     return poses[: count + 1], travelled[: count + 1]

@@ -22,6 +22,8 @@ from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.moving import MOST_SPEED_M_S, NOTHING_MOVES, MovingPoints
 
+STEP_S = 0.05
+"""Seconds between the simulated poses."""
 ActionType = Literal["stop", "slowdown", "limit", "approach"]
 
 
@@ -42,7 +44,6 @@ class PolygonConfig:
         stop_time_s: approach: seconds to contact at which the command becomes zero.
         moving_stop_time_s: approach: the same for contact with a person or another moving thing: the robot stands by
             then.
-        simulation_time_step: approach, stop: seconds between the simulated poses.
     """
 
     enabled: bool = True
@@ -56,7 +57,6 @@ class PolygonConfig:
     time_before_collision: Positive = 1.2
     stop_time_s: NotNegative = 0.1
     moving_stop_time_s: NotNegative = 0.6
-    simulation_time_step: Positive = 0.05
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -217,7 +217,7 @@ class CollisionMonitor:
         """
         config = polygon.config
         looks_ahead = config.action_type in ("approach", "stop")
-        horizon = config.time_before_collision if config.action_type == "approach" else 3 * config.simulation_time_step
+        horizon = config.time_before_collision if config.action_type == "approach" else 3 * STEP_S
         speed = max(abs(command[0]), abs(start[0])) + (MOST_SPEED_M_S if moving else 0.0)
         reach = polygon.reach + 0.05 + (speed * horizon if looks_ahead else 0.0)
         close = (seen.points**2).sum(axis=1) < reach**2
@@ -243,7 +243,6 @@ class CollisionMonitor:
                 np.array([self.limits.max_linear_accel_m_s2, self.limits.max_angular_accel_rad_s2]),
                 polygon.normals,
                 polygon.offsets,
-                config.simulation_time_step,
                 horizon,
                 config.min_points,
             )
@@ -280,7 +279,6 @@ def _time_to_collision(
     accelerations: NDArray[np.float64],
     normals: NDArray[np.float64],
     offsets: NDArray[np.float64],
-    step: float,
     horizon: float,
     min_points: int,
 ) -> float:
@@ -293,20 +291,21 @@ def _time_to_collision(
         depth[j] = _depth(points[j, 0], points[j, 1], normals, offsets)
     x, y, yaw = 0.0, 0.0, 0.0
     now = twists[0].copy()
-    for k in range(1, math.ceil(horizon / step) + 1):
+    for k in range(1, math.ceil(horizon / STEP_S) + 1):
         for i in range(2):
-            most = accelerations[i] * step
+            most = accelerations[i] * STEP_S
             now[i] += min(max(twists[1, i] - now[i], -most), most)
-        half = 0.5 * now[1] * step
-        chord = now[0] * step * (math.sin(half) / half if half != 0.0 else 1.0)
+        half = 0.5 * now[1] * STEP_S
+        chord = now[0] * STEP_S * (math.sin(half) / half if half != 0.0 else 1.0)
         x, y, yaw = x + chord * math.cos(yaw + half), y + chord * math.sin(yaw + half), yaw + 2.0 * half
         c, s = math.cos(yaw), math.sin(yaw)
         inside = 0
         for j in range(points.shape[0]):
-            dx, dy = points[j, 0] + velocities[j, 0] * step * k - x, points[j, 1] + velocities[j, 1] * step * k - y
+            dx = points[j, 0] + velocities[j, 0] * STEP_S * k - x
+            dy = points[j, 1] + velocities[j, 1] * STEP_S * k - y
             new_depth = _depth(c * dx + s * dy, c * dy - s * dx, normals, offsets)
             if new_depth > 0.0 and new_depth > depth[j] + 1e-3:
                 inside += 1
         if inside >= min_points:
-            return step * (k - 1)
+            return STEP_S * (k - 1)
     return np.inf

@@ -83,9 +83,8 @@ class SourceMonitor:
         return limit if limit >= self.config.limits.max_linear_m_s else _CATCH_UP * limit
 
     def _required(self, mode: Mode) -> list[Source]:
-        switch = self.config.switch
-        unused = {key for key, used in (("camera", switch.require_camera), ("view", switch.require_view)) if not used}
-        return [source for source in SOURCES if mode in source.modes and source.key not in unused]
+        unused = "" if self.config.switch.require_view else "view"
+        return [source for source in SOURCES if mode in source.modes and source.key != unused]
 
     def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
         return self.config.timeouts.allowed_s(source.key, _usual_s(source, inputs)) - STEP_AFTER_S
@@ -98,8 +97,7 @@ class SourceMonitor:
 
 def images_too_rare(inputs: ArbiterInputs, config: ArbiterConfig) -> bool:
     """Whether camera images are too rare to drive by, or their rate is not known yet."""
-    usual_s = inputs.usual.get("camera", 0.0) if config.switch.require_camera else 0.0
-    return usual_s > config.timeouts.slowest_image_s
+    return inputs.usual.get("camera", 0.0) > config.timeouts.slowest_image_s
 
 
 def _usual_s(source: Source, inputs: ArbiterInputs) -> float | None:

@@ -4,34 +4,34 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Range, check_ranges
-from instant_ic.control.costmap import LETHAL, UNKNOWN, Costmap
+from instant_ic.config.ranges import NotNegative, check_ranges
+from instant_ic.control.costmap import UNKNOWN, Costmap
 from instant_ic.control.prediction import Prediction
 from instant_ic.control.walls import WallMap
+
+MAX_COST = 150
+"""Highest cost of a free place (0.42 m from obstacles)."""
+WALL_CLEARANCE_M = 0.25
+"""A search straight on ends where the line comes nearer to a wall than this."""
+_SEARCH_RADIUS_M = 1.5
+"""Round the v-bot; searched when nothing is free straight on."""
 
 
 @dataclass(frozen=True)
 class SubgoalConfig:
-    """What counts as a free place, and how far ahead to look for one.
+    """Where to look for a free place.
 
     Attributes:
-        max_cost: 0..252; highest cost of a subgoal (0.42 m from obstacles).
         extend_m: m; length searched straight on for a free place behind the obstacle.
-        search_radius_m: m round the v-bot; searched when nothing is free straight on.
         anticipate: send the r-bot behind an obstacle as soon as the v-bot is about to pass it.
-        wall_clearance_m: m; the search straight on ends where the line comes nearer to a wall than this.
     """
 
-    max_cost: Annotated[int, Range(0, LETHAL - 2)] = 150
     extend_m: NotNegative = 3.0
-    search_radius_m: NotNegative = 1.5
     anticipate: bool = True
-    wall_clearance_m: NotNegative = 0.25
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -58,14 +58,14 @@ _UNSEEN_DEPTH_M = 0.6
 """Unseen space behind an obstacle's near side counts as the obstacle to this depth."""
 
 
-def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64], max_cost: int) -> NDArray[np.bool_]:
+def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which of the poses (N, 3) straight ahead, one cell apart, lie behind the first obstacle on the line.
 
     Free space before the obstacle does not count. Without an obstacle every free place counts.
     """
     costs = costmap.cost_at(ahead[:, :2])
     unseen = (costs == UNKNOWN) & costmap.contains(ahead[:, :2])
-    taken = (costs > max_cost) & ~unseen
+    taken = (costs > MAX_COST) & ~unseen
     if not taken.any():
         return ~taken
     index = np.arange(len(ahead))
@@ -75,12 +75,12 @@ def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64], max_cost: int)
     return free
 
 
-def _free(costmap: Costmap, points: NDArray[np.float64], config: SubgoalConfig) -> NDArray[np.bool_]:
+def _free(costmap: Costmap, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points (..., 2) may be the subgoal."""
     costs = costmap.cost_at(points)
     # The place behind an obstacle has not been seen yet, so unknown cells may be a goal. The planner does not drive
     # into them; it goes on as the robot sees more.
-    return (costs <= config.max_cost) | ((costs == UNKNOWN) & costmap.contains(points))
+    return (costs <= MAX_COST) | ((costs == UNKNOWN) & costmap.contains(points))
 
 
 def choose_subgoal(
@@ -99,44 +99,40 @@ def choose_subgoal(
     to the obstacle and turn there.
     """
     vbot_pose = np.asarray(vbot_pose, dtype=np.float64)
-    if _free(costmap, vbot_pose[:2], config):
+    if _free(costmap, vbot_pose[:2]):
         if config.anticipate and prediction.hit_index is not None:
-            behind = _straight_on(costmap, prediction.poses[prediction.hit_index], forward, walls, config)
+            behind = _straight_on(costmap, prediction.poses[prediction.hit_index], forward, walls, config.extend_m)
             if behind is not None:
                 return Subgoal(behind, "ahead")
         return Subgoal(vbot_pose, "vbot")
     trajectory = prediction.poses
-    free = np.flatnonzero(_free(costmap, trajectory[:, :2], config))
+    free = np.flatnonzero(_free(costmap, trajectory[:, :2]))
     if free.size:
         return Subgoal(trajectory[free[-1]], "trajectory")
-    beyond = _straight_on(costmap, trajectory[-1], forward, walls, config)
+    beyond = _straight_on(costmap, trajectory[-1], forward, walls, config.extend_m)
     if beyond is not None:
         return Subgoal(beyond, "ahead")
-    rows, columns = np.nonzero(costmap.costs <= config.max_cost)
+    rows, columns = np.nonzero(costmap.costs <= MAX_COST)
     if rows.size == 0:
         return None
     centres = costmap.centres(rows, columns)
     distance = np.linalg.norm(centres - vbot_pose[:2], axis=1)
     nearest = int(np.argmin(distance))
-    if distance[nearest] > config.search_radius_m:
+    if distance[nearest] > _SEARCH_RADIUS_M:
         return None
     return Subgoal(np.array([*centres[nearest], vbot_pose[2]]), "around")
 
 
 def _straight_on(
-    costmap: Costmap,
-    pose: NDArray[np.float64],
-    forward: bool,
-    walls: WallMap | None,
-    config: SubgoalConfig,
+    costmap: Costmap, pose: NDArray[np.float64], forward: bool, walls: WallMap | None, length_m: float
 ) -> NDArray[np.float64] | None:
     """First free pose (3,) behind the obstacle ahead of ``pose``; None when a wall comes first."""
     heading = pose if forward else pose + np.array([0.0, 0.0, math.pi])
-    ahead = extend_ahead(heading, config.extend_m, costmap.resolution)
-    index = np.flatnonzero(behind_obstacle(costmap, ahead, config.max_cost))
+    ahead = extend_ahead(heading, length_m, costmap.resolution)
+    index = np.flatnonzero(behind_obstacle(costmap, ahead))
     if index.size == 0:
         return None
     first = int(index[0])
-    if walls is not None and (walls.distance(ahead[: first + 1, :2]) < config.wall_clearance_m).any():
+    if walls is not None and (walls.distance(ahead[: first + 1, :2]) < WALL_CLEARANCE_M).any():
         return None
     return np.array([*ahead[first, :2], pose[2]])

@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 
 _MOTION_SAMPLES = 9
 """Poses of the sensor over a sweep of points; between them its motion counts as even."""
+_JUMP_M, _JUMP_RAD = 0.3, math.radians(5.0)
+"""Motion of map → odom between two updates above which the map has jumped: the costmap forgets its marks."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +66,8 @@ class Surroundings:
     A scan whose transform has not arrived yet does not count: the previous one and its age stay.
     """
 
-    def __init__(
-        self, config: CostmapConfig, footprint: Footprint, tf: TransformBuffer, jump_m: float, jump_deg: float
-    ) -> None:
+    def __init__(self, config: CostmapConfig, footprint: Footprint, tf: TransformBuffer) -> None:
         self.config = config
-        self.jump_m, self.jump_deg = jump_m, jump_deg
-        """Motion of map → odom between two updates above which the map has jumped."""
         self.costmap: Costmap | None = None
         self.points_seen = False
         self.findings: dict[str, Diagnosis] = {}
@@ -164,7 +162,7 @@ class Surroundings:
         except TransformError as error:
             self._find("costmap", False, f"costmap is not updated: {error}")
             return None
-        if self._map_from_odom is not None and self._jumped(self._map_from_odom, map_from_odom):
+        if self._map_from_odom is not None and _jumped(self._map_from_odom, map_from_odom):
             log.info("the map has jumped: the marks of scans are cleared from the costmap")
             self._rolling.reset()
         self._map_from_odom = map_from_odom
@@ -230,8 +228,8 @@ class Surroundings:
         xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
         return sort_points(xyz, time_s, poses, duration_s, self.config.points)
 
-    def _jumped(self, before: Matrix, after: Matrix) -> bool:
-        # Compared once per costmap period, which is shorter than SLAM's: a correction arrives in one piece.
-        moved = relative2(pose2_from_matrix(before), pose2_from_matrix(after))
-        far = math.hypot(float(moved[0]), float(moved[1])) > self.jump_m
-        return far or abs(float(moved[2])) > math.radians(self.jump_deg)
+
+def _jumped(before: Matrix, after: Matrix) -> bool:
+    # Compared once per costmap period, which is shorter than SLAM's: a correction arrives in one piece.
+    x, y, yaw = relative2(pose2_from_matrix(before), pose2_from_matrix(after))
+    return math.hypot(float(x), float(y)) > _JUMP_M or abs(float(yaw)) > _JUMP_RAD

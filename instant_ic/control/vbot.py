@@ -16,11 +16,17 @@ from instant_ic.control.walls import WallMap
 from instant_ic.geometry.poses import wrap_angle
 
 _TRACK_M = 0.1
+_WALL_CLEARANCE_M = 0.12
+"""Between the v-bot's outline and a wall, so that the r-bot has room at the same place."""
+_EASE_TIME_S = 0.25
+"""Time constant with which the last of an error vanishes."""
+_LEAD_BACK_M_S, _LEAD_BACK_RAD_S = 0.2, math.radians(20.0)
+"""Largest speed at which a v-bot that nobody drives goes back to the r-bot."""
 
 
 @dataclass(frozen=True)
 class VbotConfig:
-    """How far the v-bot may lead, how near its outline may come to walls, how gently it moves by itself.
+    """How far the v-bot may lead, and how gently it is eased onto the r-bot.
 
     Attributes:
         max_lead_m: largest lead over the r-bot, in metres.
@@ -28,24 +34,16 @@ class VbotConfig:
         trail_slow: share of its speed that it loses while the r-bot trails it: too little to be noticed, but the two
             meet metres sooner.
         trail_m: lead in metres at which trail_slow is reached.
-        wall_clearance_m: metres between its outline and a wall, so that the r-bot has room at the same place.
         ease_m_s: largest speed in m/s at which it is eased onto the r-bot at the return, on top of the motion of both.
         ease_deg_s: as ease_m_s, for the heading, in degrees/s.
-        ease_time_s: time constant in seconds with which the last of the error vanishes.
-        lead_back_m_s: largest speed in m/s at which a v-bot that nobody drives goes back to the r-bot.
-        lead_back_deg_s: as lead_back_m_s, for the heading, in degrees/s.
     """
 
     max_lead_m: Positive = 3.0
     slow_lead_m: NotNegative = 1.0
     trail_slow: Annotated[float, Range(0, 0.5)] = 0.1
     trail_m: Positive = 0.15
-    wall_clearance_m: NotNegative = 0.12
     ease_m_s: Positive = 0.035
     ease_deg_s: Positive = 6.0
-    ease_time_s: Positive = 0.25
-    lead_back_m_s: Positive = 0.2
-    lead_back_deg_s: Positive = 20.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -81,8 +79,8 @@ class VirtualRobot:
         dt_s: float,
         walls: WallMap | None = None,
         speed_limit_m_s: float = math.inf,
-    ) -> NDArray[np.float64]:
-        """Move by ``dt_s`` under the operator's command; return the new pose (3,) in the map frame."""
+    ) -> None:
+        """Move by ``dt_s`` under the operator's command."""
         linear, angular = self.limits.clip(*command)
         slower = min(1.0, speed_limit_m_s / max(abs(linear), 1e-9))
         linear, angular = linear * slower, angular * slower
@@ -103,34 +101,27 @@ class VirtualRobot:
         self._led_m_s = 0.0
         if not self._track or _distance(pose, self._track[-1]) > _TRACK_M:
             self._track.append(pose.copy())
-        return pose
 
-    def ease(self, target: NDArray[np.float64], velocity: tuple[float, float], dt_s: float) -> NDArray[np.float64]:
+    def ease(self, target: NDArray[np.float64], velocity: tuple[float, float], dt_s: float) -> None:
         """Move for ``dt_s`` at the r-bot's ``velocity`` (m/s, rad/s), easing the remaining error to ``target`` (3,)."""
         config = self.config
         moved = move(self.pose, *velocity, dt_s)
-        share = min(1.0, dt_s / config.ease_time_s)
+        share = min(1.0, dt_s / _EASE_TIME_S)
         self.pose = _towards(moved, target, share, config.ease_m_s * dt_s, math.radians(config.ease_deg_s) * dt_s)
         self.velocity = self.limits.clip(*velocity)
         self.slowed_by = ""
-        return self.pose
 
-    def lead_back(
-        self, robot_pose: NDArray[np.float64], dt_s: float, walls: WallMap | None = None
-    ) -> NDArray[np.float64]:
+    def lead_back(self, robot_pose: NDArray[np.float64], dt_s: float, walls: WallMap | None = None) -> None:
         """Go back towards the r-bot for ``dt_s``: straight, or along the driven track where a wall lies between."""
-        config = self.config
         while self._track and _distance(self.pose, self._track[-1]) < _TRACK_M:
             self._track.pop()
         straight = not self._track or walls is None or _in_sight(self.pose, robot_pose, walls)
         goal = np.asarray(robot_pose, dtype=np.float64) if straight else self._track[-1]
-        self._led_m_s = min(config.lead_back_m_s, self._led_m_s + 0.25 * self.limits.max_linear_accel_m_s2 * dt_s)
-        share = min(1.0, dt_s / config.ease_time_s)
-        turn = math.radians(config.lead_back_deg_s) * dt_s
-        self.pose = _towards(self.pose, goal, share, self._led_m_s * dt_s, turn)
+        self._led_m_s = min(_LEAD_BACK_M_S, self._led_m_s + 0.25 * self.limits.max_linear_accel_m_s2 * dt_s)
+        share = min(1.0, dt_s / _EASE_TIME_S)
+        self.pose = _towards(self.pose, goal, share, self._led_m_s * dt_s, _LEAD_BACK_RAD_S * dt_s)
         self.velocity = (0.0, 0.0)
         self.slowed_by = ""
-        return self.pose
 
     def lead_factor(self, linear: float, robot_pose: NDArray[np.float64]) -> float:
         """Share of the linear speed that remains: a little less than 1 with a lead, 0 at ``max_lead_m``.
@@ -149,7 +140,7 @@ class VirtualRobot:
     def _into_wall(self, pose: NDArray[np.float64], walls: WallMap) -> bool:
         now = float(walls.distance(_placed(self._body, self.pose)).min())
         then = float(walls.distance(_placed(self._body, pose)).min())
-        return then < self.config.wall_clearance_m and then < now
+        return then < _WALL_CLEARANCE_M and then < now
 
 
 def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from instant_ic.control.static_map import StaticMap
 
+WALL_PERIOD_S = 2.0
+"""Walls are searched for in a changed map at most this often."""
+
 
 class WallMap:
     """Distance to the nearest wall of a map.
@@ -47,40 +50,32 @@ class WallMap:
         return np.where(inside, found, np.inf)
 
 
-class WallFinder:
-    """Walls of a growing map; searched again only where occupied cells have changed.
+class WallSearch:
+    """The newest map, and the walls found in it.
 
-    Finding walls in a large map takes tens of milliseconds, and a map comes each second; most bring nothing new. Not
-    thread-safe: one caller at a time, on any thread.
+    Finding walls in a large map takes tens of milliseconds, and a map comes each second; most bring nothing new.
     """
 
     def __init__(self, min_length_m: float = 1.5, occupied_threshold: int = 65) -> None:
         self.min_length_m = min_length_m
         self.occupied_threshold = occupied_threshold
-        self._found: WallMap | None = None
+        self.map: StaticMap | None = None
+        self.found: WallMap | None = None
+        self.submit: Callable[[StaticMap], None] = lambda static: None
+        """Starts :meth:`find` on another thread, whose result arrives at :meth:`on_found`."""
+        self._map_is_new = False
 
     def find(self, static: StaticMap) -> WallMap:
-        """Return the walls of ``static``; the same object as before if nothing has changed."""
-        before = self._found
+        """Return the walls of ``static``; those found before if nothing has changed."""
+        before = self.found
         if (
             before is None
             or before.static.resolution != static.resolution
             or not np.array_equal(before.static.origin, static.origin)
             or not np.array_equal(before.occupied, static.occupancy >= self.occupied_threshold)
         ):
-            self._found = before = WallMap(static, self.min_length_m, self.occupied_threshold)
+            return WallMap(static, self.min_length_m, self.occupied_threshold)
         return before
-
-
-class WallSearch:
-    """The newest map, and the walls found in it by slow work elsewhere."""
-
-    def __init__(self) -> None:
-        self.map: StaticMap | None = None
-        self.found: WallMap | None = None
-        self.submit: Callable[[StaticMap], None] = lambda static: None
-        """Starts a search (``WallFinder.find``), whose result arrives at :meth:`on_found`."""
-        self._map_is_new = False
 
     def on_map(self, grid: NDArray[np.int8], resolution: float, origin: tuple[float, float]) -> None:
         """Take a map; the first one is searched at once, later ones by :meth:`update`."""

@@ -13,12 +13,13 @@ from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import UNKNOWN, Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
+from instant_ic.control.guards import MIN_SWITCH_SPEED_M_S, RETURN_SIDE_M
 from instant_ic.control.navigator import Navigator
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.prediction import Prediction
 from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.states import Mode, Reason
-from instant_ic.control.subgoal import extend_ahead
+from instant_ic.control.subgoal import MAX_COST, extend_ahead
 from instant_ic.geometry.poses import wrap_angle
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -56,10 +57,10 @@ class SharedControl(Arbiter):
             self._speed_m_s = 0.0
             return decision
         if self.goal is None:
-            if not decision.blocked or command[0] < self.config.switch.min_switch_speed_m_s:
+            if not decision.blocked or command[0] < MIN_SWITCH_SPEED_M_S:
                 return decision
             ahead = self.predictor.predict(pose, inputs.robot_velocity, command, costmap)
-            self.goal = _behind(costmap, ahead, self.config.passage.max_pass_m, self.config.passage.max_cost)
+            self.goal = _behind(costmap, ahead, self.config.passage.max_pass_m)
             self.navigator.reset()
             if self.goal is None:
                 return decision
@@ -87,20 +88,18 @@ class SharedControl(Arbiter):
             return False
         if float(np.linalg.norm(pose[:2] - self.goal[:2])) < ARRIVED_M:
             return True
-        switch = self.config.switch
-        ahead = self.predictor.predict(
-            pose, inputs.robot_velocity, command, costmap, switch.return_margin_m, switch.return_side_m
-        )
+        margin_m = self.config.switch.return_margin_m
+        ahead = self.predictor.predict(pose, inputs.robot_velocity, command, costmap, margin_m, RETURN_SIDE_M)
         return ahead.hit_index is None
 
 
-def _behind(costmap: Costmap, ahead: Prediction, reach_m: float, max_cost: int) -> FloatArray | None:
+def _behind(costmap: Costmap, ahead: Prediction, reach_m: float) -> FloatArray | None:
     """Pose (3,) straight behind the predicted obstacle; None if no pose within ``reach_m`` is free."""
     if ahead.hit_index is None:
         return None
     line = extend_ahead(ahead.poses[ahead.hit_index], reach_m, costmap.resolution)
     costs = costmap.cost_at(line[:, :2])
-    free = (costs <= max_cost) | (costs == UNKNOWN)
+    free = (costs <= MAX_COST) | (costs == UNKNOWN)
     taken = np.flatnonzero(~free)
     free[: taken[0] if taken.size else 0] = False
     found = np.flatnonzero(free)

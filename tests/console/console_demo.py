@@ -52,7 +52,7 @@ class DemoRecorder:
         self._began_s = 0.0
 
     def ask(self, command: str, **arguments: Any) -> Any:
-        """See :class:`instant_ic.console.recording.Ask`."""
+        """Answer a command, as the recorder does for ``RecordingDesk``."""
         if self.missing:
             raise RecorderError("No recorder is running. Launch the station with recorder:=true.")
         path = f"recordings/rec_{time.strftime('%Y%m%d_%H%M%S')}"

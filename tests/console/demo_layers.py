@@ -7,7 +7,7 @@ import demo_world
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource, confidence_png
+from instant_ic.console.layer_meshes import page_layer
 from instant_ic.console.layers import PageLayers
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -34,13 +34,9 @@ def demo_layers(version: int, map_from_camera: Matrix, width: int = 1024, depth_
     guessed = np.zeros(behind.inverse.shape, np.bool_)
     for quads in (behind.guessed, behind.sky):
         guessed[quads[:, 0], quads[:, 1]] = True
-    guess = Geometry(behind.inverse, guessed, confidence=confidence_png(behind.sure / 255))
-    seen = Geometry(prior.inverse_depth, prior.content == ROOM)
-    sources = [
-        LayerSource(number, bool(number), _jpeg(colours), (1.0, 1.0, 1.0), map_from_camera, lambda g=geometry: g)  # type: ignore[misc]
-        for number, (colours, geometry) in enumerate([(rgb, seen), (behind.rgb, guess)])
-    ]
-    return PageLayers(version, (0.0, 0.0, z), LayerMeshes().layers(sources))
+    guess = page_layer(_jpeg(behind.rgb), behind.inverse, guessed, behind.sure / 255, map_from_camera)
+    seen = page_layer(_jpeg(rgb), prior.inverse_depth, prior.content == ROOM, None, map_from_camera)
+    return PageLayers(version, (0.0, 0.0, z), (seen, guess))
 
 
 def _jpeg(rgb: NDArray[np.uint8]) -> bytes:

@@ -10,11 +10,12 @@ import pytest
 
 from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ProtocolError, ServerConfig
 from instant_ic.console import server as server_module
-from instant_ic.console.layer_meshes import Geometry, LayerMeshes, LayerSource, confidence_png
+from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayer, PageLayers
 from instant_ic.console.protocol import Parts, decode_frame
 from instant_ic.console.session import PART_BYTES
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.vspace.layers import Content, DecodedLayer, Kind, Layer, Layers
 
 WAIT_S = 20.0
 
@@ -230,26 +231,33 @@ def test_views_are_needed_unless_every_page_renders_the_newest_layers_by_itself(
     asyncio.run(scenario())
 
 
-def source(key, behind, gain=(1.0, 1.0, 1.0), calls=None):
-    """Of a panorama of 8 x 16 pixels, 2 m away everywhere; a guess in one quad."""
-    shown = np.zeros((8, 16), np.bool_)
-    shown[3, 5] = True
-
-    def made():
-        if calls is not None:
-            calls.append(key)
-        confidence = confidence_png(np.zeros((1, 2))) if behind else b""
-        return Geometry(np.full((8, 16), 0.5, np.float32), shown if behind else ~shown, confidence)
-
-    return LayerSource(key, behind, b"JPEG", gain, pose_matrix(), made)
+def encoded(number, kind=Kind.SEEN, gain=(1.0, 1.0, 1.0)):
+    return Layer(kind, number, pose_matrix(), gain, 0.0, b"JPEG", 1.0, b"PNG", 1, 1)
 
 
-def test_meshes_are_made_once_and_what_was_seen_comes_before_all_guesses():
-    meshes, calls = LayerMeshes(), []
-    first = meshes.layers([source("a", False, calls=calls), source("b", True, calls=calls), source("c", False)])
+def version_of(*layers):
+    return Layers(1, layers)
+
+
+def test_meshes_are_made_once_and_what_was_seen_comes_before_all_guesses(monkeypatch):
+    """Panoramas of 8 x 16 pixels, 2 m away everywhere; a guess in one quad."""
+    calls = []
+    content = np.full((8, 16), Content.SURFACE)
+    guess = np.full((8, 16), Content.NOTHING)
+    guess[3, 5] = Content.SURFACE
+
+    def decoded(one):
+        calls.append(one.keyframe_id)
+        marks = guess if one.kind is Kind.BEHIND else content
+        depth, zeros = np.full((8, 16), 0.5, np.float32), np.zeros((8, 16), np.float32)
+        return DecodedLayer(np.zeros((8, 16, 3), np.uint8), depth, marks, zeros, zeros > 0)
+
+    monkeypatch.setattr("instant_ic.console.layer_meshes.decode_layer", decoded)
+    meshes = LayerMeshes()
+    first = meshes.layers(version_of(encoded(1), encoded(2, Kind.BEHIND), encoded(3)))
     assert [bool(one.confidence) for one in first] == [False, False, True]
-    again = meshes.layers([source("a", False, (0.9, 1.0, 1.0), calls), source("b", True, calls=calls)])
-    assert calls == ["a", "b"]
+    again = meshes.layers(version_of(encoded(1, gain=(0.9, 1.0, 1.0)), encoded(2, Kind.BEHIND)))
+    assert calls == [1, 3, 2]
     assert again[0].gain == (0.9, 1.0, 1.0)
     assert again[0].digest == first[0].digest
     assert again[1] is first[2]
@@ -257,6 +265,6 @@ def test_meshes_are_made_once_and_what_was_seen_comes_before_all_guesses():
     # A guess in the quad right of and below (3, 5) has four pixels, each a square of its own at its rim.
     columns, rows = again[1].corners.T
     assert (columns.min(), columns.max(), rows.min(), rows.max()) == (5, 7, 3, 5)
-    meshes.layers([source("d", False)])
-    meshes.layers([source("a", False, calls=calls)])
-    assert calls == ["a", "b", "a"]  # forgotten meanwhile
+    meshes.layers(version_of(encoded(4)))
+    meshes.layers(version_of(encoded(1)))
+    assert calls == [1, 3, 2, 4, 1]  # forgotten meanwhile

@@ -59,12 +59,12 @@ def test_the_file_needs_nothing_else(scene, bag, capsys):
 
 def test_a_title_cannot_leave_its_place(scene, bag):
     from instant_ic.cli.commands.console import newest_of_bag
-    from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
+    from instant_ic.console.layer_meshes import LayerMeshes
     from instant_ic.msg import deserialize
     from instant_ic.vspace_messages import layers_of
 
     received = newest_of_bag(bag)
-    layers = LayerMeshes().layers(layer_sources(layers_of(deserialize(received.payload, received.type_name))))
+    layers = LayerMeshes().layers(layers_of(deserialize(received.payload, received.type_name)))
     plain, hostile = (scene_html(title, layers) for title in ("room", "</script><script>alert(1)</script>"))
     assert hostile.count("</script>") == plain.count("</script>")
     with pytest.raises(ValueError, match="at least one layer"):

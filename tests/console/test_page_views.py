@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from console_pages import BROWSER_TEST
 
-from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
+from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayers
 from instant_ic.experiments import box_room
 from instant_ic.experiments.page_renderer import PageRenderer
@@ -28,7 +28,7 @@ def test_the_page_shows_what_the_cpu_renders(browser, full):
     space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))
     space.set_keyframe(room.rgb, cv2.resize(room.depth_m, (512, 256), interpolation=cv2.INTER_NEAREST), KEYFRAME, 0.02)
     png = cv2.imencode(".png", room.rgb[..., ::-1])[1].tobytes()  # both sides have the same colours
-    layers = LayerMeshes().layers(layer_sources(LayerEncoder().encode(space._shown, [1], [png])))
+    layers = LayerMeshes().layers(LayerEncoder().encode(space._shown, [1], [png]))
     page = PageRenderer(browser, WIDTH, HEIGHT, full)
     page.load(PageLayers(1, (0.0, 0.0, 0.0), layers))
     for ahead, left, turn in STEPS:

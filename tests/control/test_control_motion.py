@@ -220,7 +220,7 @@ class TestVirtualRobot:
     [
         (lambda: MotionLimits(max_linear_m_s=0.0), "max_linear_m_s"),
         (lambda: Footprint(width_m=-1.0), "width_m"),
-        (lambda: PredictionConfig(step_s=0.0), "step_s"),
+        (lambda: PredictionConfig(latency_s=-0.1), "latency_s"),
         (lambda: PolygonConfig(stop_time_s=2.0), "stop_time_s"),
         (lambda: VbotConfig(slow_lead_m=3.0), "slow_lead_m"),
     ],

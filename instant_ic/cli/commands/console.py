@@ -32,7 +32,7 @@ def add_parser(subparsers: Any) -> None:
 
 def export_scene(args: argparse.Namespace) -> int:
     from instant_ic.console.export_scene import scene_html
-    from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
+    from instant_ic.console.layer_meshes import LayerMeshes
     from instant_ic.msg import MessageError, deserialize
     from instant_ic.vspace_messages import layers_of
 
@@ -41,7 +41,7 @@ def export_scene(args: argparse.Namespace) -> int:
     try:
         message = deserialize(received.payload, received.type_name)
         version = layers_of(message)
-        layers = LayerMeshes().layers(layer_sources(version))
+        layers = LayerMeshes().layers(version)
     except (ValueError, MessageError) as error:
         raise UserError(f"{LAYERS}: {error}") from error
     newest = version.layers[0].keyframe_id
