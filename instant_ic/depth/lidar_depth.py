@@ -16,12 +16,17 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
-from instant_ic.depth.visibility import project_points
-from instant_ic.geometry.projections import equirect_directions, equirect_pixels
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.depth.visibility import azimuth_problem, pixels_of
+from instant_ic.geometry.projections import equirect_directions, nearest_pixels
 
 Floats = NDArray[np.floating]
 Indices = NDArray[np.signedinteger]
+_MIN_POINTS = 300
+_MAX_UNDER_FLOOR = 0.1  # a larger share of points there: height or tilt of the camera is wrong, or stairs go down
+_MAX_GAP_DEG = 8.0  # an azimuth without any return is bridged up to this width; a wider one is open: unknown
+_FLOOR_TOLERANCE_M = 0.08
+_SAME_SURFACE = 0.15  # share by which the horizontal ranges of two points of one upright surface differ at most
 
 
 class Origin(IntEnum):
@@ -45,27 +50,13 @@ class LidarDepthConfig:
     Attributes:
         min_range_m: points nearer than this to the camera are left out (the robot itself).
         max_range_m: farther points are left out; what lies farther is unknown.
-        min_points: fewer points give no depth.
-        min_azimuth_deg: points in fewer degrees of azimuth: the depth is not fit.
-        max_under_floor: a larger share of points under the floor: height or tilt of the camera is wrong, or stairs go
-            down; not fit.
-        max_gap_deg: an azimuth without any return is bridged up to this width; a wider one is open: unknown.
         ceiling_height_m: of the ceiling over the floor, where no point was seen on it.
-        floor_tolerance_m: a point this near the floor's plane belongs to the floor.
-        same_surface: two points above each other are of one surface when their horizontal ranges differ by less than
-            this share.
         top_ring_deg: elevation of the LiDAR's uppermost ring.
     """
 
     min_range_m: NotNegative = 0.4
     max_range_m: Positive = 40.0
-    min_points: Annotated[int, Range(20)] = 300
-    min_azimuth_deg: Annotated[float, Range(0, 360)] = 90.0
-    max_under_floor: Share = 0.1
-    max_gap_deg: Annotated[float, Range(0, 90)] = 8.0
     ceiling_height_m: Positive = 2.7
-    floor_tolerance_m: Positive = 0.08
-    same_surface: Annotated[float, Range(above=0, below=1)] = 0.15
     top_ring_deg: Annotated[float, Range(0, 60)] = 15.0
 
     def __post_init__(self) -> None:
@@ -178,9 +169,7 @@ def _confirmed(
     points: Floats, size: tuple[int, int]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Floats]:
     """Of points (N, 3) the nearest in each pixel, without the lonely ones: index, row, column and range, each (M,)."""
-    u, v, range_m = project_points(points, size[1], size[0])
-    rows = np.clip(np.rint(v).astype(np.intp), 0, size[0] - 1)
-    columns = np.rint(u).astype(np.intp) % size[1]
+    rows, columns, range_m = pixels_of(points, size[1], size[0])
     nearest = np.full(size, -1, np.intp)
     far_first = np.argsort(-range_m, kind="stable")
     nearest[rows[far_first], columns[far_first]] = far_first
@@ -228,10 +217,10 @@ class LidarStructure:
             raise ValueError(f"points must be (N, 3) (got {points.shape})")
         turn = level_from_camera(up)
         level = self._usable(points) @ turn.T
-        if len(level) < self.config.min_points:
+        if len(level) < _MIN_POINTS:
             words = (
                 f"{len(level)} LiDAR points between {self.config.min_range_m} and {self.config.max_range_m} m, "
-                f"{self.config.min_points} are needed"
+                f"{_MIN_POINTS} are needed"
             )
             nothing = np.zeros(size, np.float32), np.zeros(size, np.uint8), np.full(size, np.pi, np.float32)
             return LidarDepth(*nothing, len(level), camera_height_m, None, words)
@@ -247,8 +236,7 @@ class LidarStructure:
         building = _Building(self.config, rows, columns, range_m, size, floor, ceiling, ceiling_m)
         depth, origin, gap_rad = building.fill()
         if turn[2, 2] < 1 - 1e-6:
-            u, v = equirect_pixels(rays(*size) @ turn.T.astype(np.float32), size[1], size[0])
-            where = np.clip(np.rint(v).astype(np.intp), 0, size[0] - 1), np.rint(u).astype(np.intp) % size[1]
+            where = nearest_pixels(rays(*size) @ turn.T.astype(np.float32), size[1], size[0])
             depth, origin, gap_rad = depth[where], origin[where], gap_rad[where]
         return LidarDepth(
             depth, origin, gap_rad, len(level), floor, ceiling, self._problem(z, range_m, columns, size[1], floor)
@@ -269,11 +257,10 @@ class LidarStructure:
 
     def _problem(self, z: Floats, range_m: Floats, columns: NDArray[np.intp], width: int, floor: float | None) -> str:
         """Reason for not trusting the structure; empty if it is trusted."""
-        covered, needed = len(np.unique(columns * 120 // width)) * 3.0, self.config.min_azimuth_deg
-        if covered < needed:
-            return f"LiDAR points cover {covered:.0f} deg of azimuth, {needed:.0f} are needed"
+        if problem := azimuth_problem(columns, width):
+            return problem
         under = 0.0 if floor is None else float((z < -floor - 0.15 - 0.02 * range_m).mean())
-        if under > self.config.max_under_floor:
+        if under > _MAX_UNDER_FLOOR:
             return (
                 f"{under:.0%} of the points lie under the floor ({floor:.2f} m under the camera): "
                 "height or tilt of the camera is wrong, or stairs go down"
@@ -306,7 +293,7 @@ class _Building:
         self.cos, self.sin, self.tan = np.cos(elevation), np.sin(elevation), np.tan(elevation)
         z = range_m * self.sin[rows, 0]
         # A row is half a pixel uncertain, which far away is more than the tolerance.
-        slack = config.floor_tolerance_m + range_m * (np.pi / height)
+        slack = _FLOOR_TOLERANCE_M + range_m * (np.pi / height)
         of_plane = np.zeros(len(z), bool)
         if floor is not None:
             of_plane |= z < -floor + slack
@@ -371,7 +358,7 @@ class _Building:
         flat_below = (below < len(index)) & ~wall_below
         r_above, r_below = self.hit[up, column], self.hit[down, column]
         both = wall_above & wall_below
-        same = both & (np.abs(r_above - r_below) < self.config.same_surface * np.minimum(r_above, r_below))
+        same = both & (np.abs(r_above - r_below) < _SAME_SURFACE * np.minimum(r_above, r_below))
         share = ((index - up) / np.maximum(down - up, 1)).astype(np.float32)
         nearer_above = index - above <= below - index
         crown = self._crown()
@@ -427,7 +414,7 @@ class _Building:
         np.minimum(depth, to_top, out=depth)
 
     def _bridged(self, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
-        return _bridge(seen, round(self.config.max_gap_deg / 360 * self.size[1]))
+        return _bridge(seen, round(_MAX_GAP_DEG / 360 * self.size[1]))
 
 
 #: Relative standard deviation at a point and its growth with the angle (1/rad) to it, for each ``Origin``.

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from instant_ic.config.ranges import check_ranges
 from instant_ic.depth.completion import prior_channels
-from instant_ic.depth.fusion import Corrected, FusionConfig, ceiling_height, correct, likely_ceiling
+from instant_ic.depth.fusion import Corrected, ceiling_height, correct, likely_ceiling
 from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, Origin, rays
 from instant_ic.depth.manifest import InferenceError
-from instant_ic.depth.scaler import DepthScaler, ScaleFit, ScalerConfig
+from instant_ic.depth.scaler import AGREEMENT, DepthScaler, ScaleFit, ScalerConfig
 from instant_ic.depth.visibility import nearest_points
 from instant_ic.mapping.mapper import LocalView
 
@@ -34,17 +34,15 @@ class SourceConfig:
     """Source of depth and its parameters.
 
     Attributes:
-        source: ``network``: the network's depth, scaled; ``lidar``: LiDAR and structure, no network; ``fused``: both;
-            ``completed``: ``fused``, for :func:`complete` to correct.
+        source: ``fused``: LiDAR and network; ``lidar``: no network; ``network``: scaled by the LiDAR; ``completed``:
+            ``fused``, corrected by a completion.
         scaler: how the network's depth is scaled.
         lidar: how depth is made from points alone.
-        fusion: how both are brought together.
     """
 
     source: str = "fused"
     scaler: ScalerConfig = field(default_factory=ScalerConfig)
     lidar: LidarDepthConfig = field(default_factory=LidarDepthConfig)
-    fusion: FusionConfig = field(default_factory=FusionConfig)
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
@@ -221,7 +219,7 @@ class DepthSource:
     ) -> tuple[Corrected, float | None]:
         """The network, scaled and corrected by the points, and the height over the camera of the ceiling it shows."""
         size = fit.depth_m.shape
-        network = correct(fit.depth_m, self.structure.ranges(points, size), self.config.fusion)
+        network = correct(fit.depth_m, self.structure.ranges(points, size))
         top = ceiling_height(network.depth_m, rays(*size) @ np.asarray(up, np.float32))
         if top is not None and camera_height_m is not None:
             usual = max(self.config.lidar.ceiling_height_m - camera_height_m, 0.3)
@@ -317,14 +315,14 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
 
 
 def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:
-    """Share of points (N, 3) within ``config.agreement`` of the depth (H, W) at their pixels."""
+    """Share of points (N, 3) within ``AGREEMENT`` of the depth (H, W) at their pixels."""
     points = points[np.isfinite(points).all(axis=1)]
     rows, columns, range_m = nearest_points(points, depth_m.shape[1], depth_m.shape[0])
     inside = (range_m >= config.min_range_m) & (range_m <= config.max_range_m)
     rows, columns, range_m = rows[inside], columns[inside], range_m[inside]
     if len(rows) == 0:
         return 0.0
-    return float((np.abs(depth_m[rows, columns] - range_m) <= config.agreement * range_m).mean())
+    return float((np.abs(depth_m[rows, columns] - range_m) <= AGREEMENT * range_m).mean())
 
 
 def _surfaces(built: _Built) -> str:

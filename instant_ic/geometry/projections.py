@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from instant_ic.geometry.poses import rotation_matrix
 
 Floats = NDArray[np.floating]
+Indices = NDArray[np.intp]
 
 
 def equirect_directions(width: int, height: int) -> NDArray[np.float32]:
@@ -40,6 +41,12 @@ def equirect_pixels(directions: Floats, width: int, height: int) -> tuple[Floats
     u = np.where(u >= width - 0.5, u - width, u)
     v = (math.pi / 2 - elevation) * (height / math.pi) - 0.5
     return u, v
+
+
+def nearest_pixels(directions: Floats, width: int, height: int) -> tuple[Indices, Indices]:
+    """Rows and columns of the pixels nearest to directions (..., 3) of any length."""
+    u, v = equirect_pixels(directions, width, height)
+    return np.clip(np.rint(v).astype(np.intp), 0, height - 1), np.rint(u).astype(np.intp) % width
 
 
 def perspective_directions(width: int, height: int, hfov_rad: float) -> NDArray[np.float32]:

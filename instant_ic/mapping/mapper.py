@@ -13,11 +13,13 @@ from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.depth.deskew import points_at
 from instant_ic.geometry.poses import Matrix, inverse
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.mapping.local_model import LocalDepth, LocalModel, LocalModelConfig
+from instant_ic.mapping.local_model import STRIDE, LocalDepth, LocalModel, LocalModelConfig
 
 _JUMP_M, _JUMP_RAD = 0.2, math.radians(2.0)
 _DRIFT = 0.3
 """Share of the motion since the last look by which odometry may drift; a larger change of the correction is a jump."""
+_KEEP_S = 60.0
+"""Seconds of motion, such as turns in place, that count as ``keep_m`` of the path."""
 _BACK_NS = 1_000_000_000
 _MOST_POINTS = 200_000
 _ENOUGH_POINTS = 16_000
@@ -66,11 +68,6 @@ class LocalMapper:
         self.config = config or MapperConfig()
         self.model = LocalModel(self.config.model)
         self.clear()
-
-    @property
-    def frames(self) -> tuple[str, str]:
-        """The map frame and the odom frame."""
-        return self.map_frame, self.odom_frame
 
     def clear(self) -> None:
         """Forget everything."""
@@ -135,10 +132,10 @@ class LocalMapper:
             raise CloudError("a revolution without a finite point is left out")
         advance_m = 0.0
         if self._taken_ns is not None and (moved_m > _STILL_M or turned_rad > _STILL_RAD):
-            model, since_s = self.config.model, max(stamp_ns - self._taken_ns, 0) / 1e9
-            advance_m = max(moved_m, min(since_s, self.config.every_s) * model.keep_m / model.keep_s)
+            since_s = max(stamp_ns - self._taken_ns, 0) / 1e9
+            advance_m = max(moved_m, min(since_s, self.config.every_s) * self.config.model.keep_m / _KEEP_S)
         # At rest revolutions are few, and what has gone shall not stay for long.
-        stride = 1 if moved_m < self.config.every_m else 0
+        stride = 1 if moved_m < self.config.every_m else STRIDE
         self.model.add(lidar, (model_from_map @ self._map_from(frame, middle_ns))[:3, 3], advance_m, stride)
         self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar
         return True

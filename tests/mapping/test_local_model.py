@@ -5,7 +5,8 @@ import pytest
 
 from instant_ic.depth.inputs import RecentInputs
 from instant_ic.depth.lidar_depth import LidarDepthConfig
-from instant_ic.depth.metric_depth import Frames, MetricDepth, MetricDepthConfig
+from instant_ic.depth.metric_depth import MetricDepth
+from instant_ic.depth.node_config import DepthScalerConfig
 from instant_ic.depth.sources import DepthSource, SourceConfig
 from instant_ic.geometry.poses import Matrix, pose_matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -192,8 +193,8 @@ def test_wrong_use_is_refused() -> None:
         model.add(np.zeros((4, 2)), np.zeros(3))
     with pytest.raises(ValueError, match="position must be finite"):
         model.add(np.zeros((4, 3)), np.array([np.nan, 0, 0]))
-    with pytest.raises(ValueError, match=r"reach_m must be at most 12\.3 with voxels of 0\.05 m"):
-        LocalModelConfig(reach_m=15.0)
+    with pytest.raises(ValueError, match="keep_m must be > 0"):
+        LocalModelConfig(keep_m=0)
 
 
 def buffer(map_from_odom: Matrix | None = None) -> TransformBuffer:
@@ -264,13 +265,7 @@ def test_odometry_that_slips_in_a_turn_does_not_turn_the_model() -> None:
     for k in (31, 32):
         mapper.revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=points - origin: p)
     np.testing.assert_allclose(mapper.model_from_camera("camera", 2 * S), pose, atol=1e-9)
-    depth = MetricDepth(
-        DepthSource(),
-        transforms,
-        RecentInputs(),
-        MetricDepthConfig(Frames("map", "odom", "base_link"), 64, -70.0, 0.3),
-        mapper,
-    )
+    depth = MetricDepth(DepthScalerConfig(), transforms, RecentInputs())
     np.testing.assert_allclose(depth.map_from_camera("camera", 2 * S), pose, atol=1e-9)
     with pytest.raises(TransformError):
         depth.map_from_camera("nowhere", 2 * S)
