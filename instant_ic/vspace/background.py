@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import equirect_directions, equirect_pixels
+from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace.continuation import continued_colours, continued_walls, grown
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import ROOM, SKY, PanoramaPrior, area_average, edge_quads, fill_holes
@@ -121,9 +121,10 @@ class Background:
         rgb, sure = self.rgb.copy(), self.sure.copy()
         colours, sures, nearest = rgb[mask], sure[mask], np.full(len(points), np.inf, np.float32)
         for prior, gain in others:
-            distance, theirs = _as_seen(prior, points)
-            better = distance < nearest
-            colours[better] = np.rint(np.clip(theirs[better] * gain, 0, 255))
+            local = prior.in_camera(points)
+            distance = np.sqrt(np.einsum("ij,ij->i", local, local))
+            better = prior.sees(local, distance, _SEEN) & (distance < nearest)
+            colours[better] = np.rint(np.clip(prior.colours(local[better]) * gain, 0, 255))
             nearest[better], sures[better] = distance[better], 255
         rgb[mask], sure[mask] = colours, sures
         return replace(self, rgb=rgb, sure=sure)
@@ -158,26 +159,6 @@ class Background:
         paint(self.rgb, self.sure, camera_from_map, gain, rays.origin, rays.directions, drawn, depth, colour, share)
         confidence[drawn & (marks.reshape(-1) == 2)] = 1
         return share
-
-
-def _as_seen(prior: PanoramaPrior, points: Floats) -> tuple[Floats, Floats]:
-    """Distances (N,) of points (N, 3) of the map from a keyframe, inf where it has not seen them; colours (N, 3)."""
-    pose = prior.map_from_camera.astype(np.float32)
-    local = np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3])
-    distance = np.sqrt(np.einsum("ij,ij->i", local, local))
-    height, width = prior.inverse_depth.shape
-    u, v = equirect_pixels(local, width, height)
-    row, column = np.clip(np.floor(v), 0, height - 1).astype(np.intp), np.floor(u).astype(np.intp) % width
-    seen = np.abs(prior.inverse_depth[row, column] * distance - 1) < _SEEN
-    seen &= (
-        (prior.known[row, column] == 1) & (prior.depth_edge[row, column] == 0) & (prior.content[row, column] == ROOM)
-    )
-    high, wide = prior.rgb.shape[:2]
-    u, v = equirect_pixels(local, wide, high)
-    row = np.clip(np.rint(v), 0, high - 1).astype(np.intp)
-    return np.where(seen, distance, np.float32(np.inf)), prior.rgb[row, np.rint(u).astype(np.intp) % wide].astype(
-        np.float32
-    )
 
 
 def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list[Floats]:

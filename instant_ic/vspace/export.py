@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.vspace.prior import edge_quads
+from instant_ic.vspace.prior import DEPTH_EDGE_RATIO, edge_quads
 from instant_ic.vspace.space import NotReadyError, VirtualSpace
 
 
@@ -31,13 +31,12 @@ class Surface:
     triangles: NDArray[np.int32]
 
 
-def surface(space: VirtualSpace, width: int = 1024, torn_ratio: float = 0.10) -> Surface:
+def surface(space: VirtualSpace, width: int = 1024) -> Surface:
     """The surfaces that the keyframe has seen, through the trained field, as a mesh cut at depth edges.
 
     Args:
         space: with a keyframe.
         width: of the panorama whose pixels become vertices.
-        torn_ratio: neighbouring depths further apart than this share, off one plane, are an edge.
 
     Raises:
         NotReadyError: no keyframe yet.
@@ -52,7 +51,7 @@ def surface(space: VirtualSpace, width: int = 1024, torn_ratio: float = 0.10) ->
     number = np.cumsum(known.reshape(-1), dtype=np.int32).reshape(known.shape) - 1
     with np.errstate(divide="ignore"):
         inverse = np.where(known, 1 / view.depth_m, 0).astype(np.float32)
-    whole = edge_quads(inverse, torn_ratio)[:-1] == 0
+    whole = edge_quads(inverse, DEPTH_EDGE_RATIO)[:-1] == 0
     for corner in _corners(known):
         whole &= corner
     a, b, c, d = (corner[whole] for corner in _corners(number))

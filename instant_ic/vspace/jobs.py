@@ -46,6 +46,8 @@ class JobKind(enum.Enum):
     TRAIN = "train"
 
 
+_NICE = 5
+"""Of the threads that train, render and prepare: robot control comes first."""
 _SAME_POSE = 2e-3
 """Metres and radians within which poses are the same: a third of a view's pixel. A standing robot's pose jitters."""
 _CHANGES = (JobKind.SHOW, JobKind.LEARN, JobKind.TRAIN)
@@ -141,14 +143,13 @@ class SpaceWorker:
     Args:
         config: the space's parameters.
         robot: the robot's mask, as ``VirtualSpace`` takes it.
-        nice: nice value of the calling threads, 0 to 19.
         warm: whether ``WARM_UP`` compiles the kernels.
     """
 
-    def __init__(self, config: VirtualSpaceConfig, robot: NDArray[np.bool_] | None, nice: int, warm: bool) -> None:
+    def __init__(self, config: VirtualSpaceConfig, robot: NDArray[np.bool_] | None, warm: bool) -> None:
         self.config = config
         self.space: Space | None = None
-        self._robot, self._nice, self._warm = robot, nice, warm
+        self._robot, self._warm = robot, warm
         self._newest: EncodedView | None = None  # view of the space as it is
         self._encoder = LayerEncoder()
         self._sources: dict[int, Incoming] = {}  # of the keyframes by their place in the store
@@ -218,8 +219,8 @@ class SpaceWorker:
 
     def _yield_to_others(self) -> None:
         """Lower this thread's priority (Linux has one per thread)."""
-        if self._nice and sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
+        if sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
 
 
 def _render(space: Space, order: ViewOrder) -> EncodedView:

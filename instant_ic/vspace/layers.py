@@ -17,9 +17,19 @@ from numpy.typing import NDArray
 
 from instant_ic.limits import decode_image
 from instant_ic.vspace.background import Background
-from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.field import Floats
-from instant_ic.vspace.prior import MOST_SIGMA, MOVED, ROBOT, ROOM, SKY, PanoramaPrior, edge_quads, shrunk
+from instant_ic.vspace.prior import (
+    DEPTH_EDGE_RATIO,
+    MOST_SIGMA,
+    MOVED,
+    ROBOT,
+    ROOM,
+    SKY,
+    PanoramaPrior,
+    band_of,
+    edge_quads,
+    shrunk,
+)
 from instant_ic.vspace.store import Keyframe, KeyframeSet
 from instant_ic.vspace.warp import PanoramaWarp
 
@@ -228,32 +238,30 @@ def decode_layer(layer: Layer) -> DecodedLayer:
     return DecodedLayer(rgb, inverse_depth, marks & _CONTENT, confidence, marks & _EDGE > 0)
 
 
-def decode(layers: Layers, panorama_width: int, geometry: GeometryConfig | None = None) -> KeyframeSet:
+def decode(layers: Layers, panorama_width: int) -> KeyframeSet:
     """The keyframes of whole layers, to be rendered as the space's own (``VirtualSpace.show``).
 
     Args:
         layers: a whole version.
         panorama_width: wider panoramas are area-averaged to this.
-        geometry: of the space that they come from.
 
     Raises:
         LayersError: a layer cannot be decoded, or there is none that the camera saw.
     """
-    geometry = geometry or GeometryConfig()
     seen = [layer for layer in layers.layers if layer.kind is Kind.SEEN]
     behind = {layer.keyframe_id: layer for layer in layers.layers if layer.kind is Kind.BEHIND}
     if not seen:
         raise LayersError("the layers hold no keyframe")
     keyframes = []
     for place, layer in enumerate(seen):
-        prior = _prior(layer, panorama_width, geometry)
+        prior = _prior(layer, panorama_width)
         guess = behind.get(layer.keyframe_id)
         background = None if guess is None else _background(guess)
         keyframes.append(Keyframe(place, prior, PanoramaWarp.of_prior(prior), background))
     return KeyframeSet(tuple(keyframes), np.stack([np.asarray(layer.gain, np.float32) for layer in seen]))
 
 
-def _prior(layer: Layer, panorama_width: int, geometry: GeometryConfig) -> PanoramaPrior:
+def _prior(layer: Layer, panorama_width: int) -> PanoramaPrior:
     decoded = decode_layer(layer)
     content = np.full(decoded.content.shape, ROBOT, np.uint8)
     for here, there in _OF_PRIOR.items():
@@ -262,10 +270,10 @@ def _prior(layer: Layer, panorama_width: int, geometry: GeometryConfig) -> Panor
         rgb=np.ascontiguousarray(shrunk(decoded.rgb, panorama_width)),
         inverse_depth=decoded.inverse_depth,
         known=(decoded.confidence == 1).astype(np.uint8),
-        depth_edge=edge_quads(decoded.inverse_depth, geometry.torn_ratio),
+        depth_edge=edge_quads(decoded.inverse_depth, DEPTH_EDGE_RATIO),
         map_from_camera=np.array(layer.map_from_camera, np.float64),
         relative_sigma=layer.relative_sigma,
-        band=float(np.clip(geometry.band_sigmas * layer.relative_sigma, geometry.band_min, geometry.band_max)),
+        band=band_of(layer.relative_sigma),
         sigma=np.full(content.shape, min(layer.relative_sigma, MOST_SIGMA), np.float32),
         usable=(content == ROOM).astype(np.uint8),
         content=content,

@@ -18,12 +18,8 @@ class NerfConfig:
         render_fps: target frame rate of requested views; training gets the remaining time.
         train_ms_per_frame: longest uninterrupted training in ms, and so the longest wait of a requested view. While no
             view is requested, training has all the time.
-        train_nice: nice value, 0 to 19, of the threads that train, render and prepare: robot control comes first.
-        lockstep_iterations: iterations per tick of ``lockstep_period_s`` in tests and replay.
-        lockstep_period_s: period of these ticks, in seconds.
         max_view_pixels: largest view that may be requested; larger requests are refused.
         jpeg_quality: JPEG quality of views, 1 to 100.
-        status_period_s: period of ``/vspace/status``, in seconds.
         robot_mask: image, twice as wide as high, white where the panorama shows the robot itself or its stand (see also
             ``space.geometry.body_below_deg``); empty: no mask.
         space: the virtual space itself.
@@ -31,12 +27,8 @@ class NerfConfig:
 
     render_fps: Annotated[float, Range(0.5, 120)] = 10.0
     train_ms_per_frame: Positive = 50.0
-    train_nice: Annotated[int, Range(0, 19)] = 5
-    lockstep_iterations: PositiveInt = 5
-    lockstep_period_s: Positive = 0.1
     max_view_pixels: PositiveInt = 1280 * 720
     jpeg_quality: Percent = 85
-    status_period_s: Positive = 0.5
     robot_mask: str = ""
     space: VirtualSpaceConfig = dataclasses.field(default_factory=VirtualSpaceConfig)
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
-from instant_ic.geometry.projections import equirect_pixels
+from instant_ic.geometry.projections import nearest_pixels
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import PanoramaPrior, area_average
 
@@ -82,11 +82,8 @@ def error_terms(
 
 def _sigma_at(prior: PanoramaPrior, points: Floats) -> Floats:
     """Relative sigma of a keyframe's depth in the direction of points (N, 3) of the map, (N,)."""
-    pose = prior.map_from_camera.astype(np.float32)
     height, width = prior.sigma.shape
-    u, v = equirect_pixels(np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3]), width, height)
-    row = np.clip(np.rint(v), 0, height - 1).astype(np.intp)
-    return np.asarray(prior.sigma[row, np.rint(u).astype(np.intp) % width], np.float32)
+    return prior.sigma[nearest_pixels(prior.in_camera(points), width, height)]
 
 
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:

@@ -34,6 +34,8 @@ from instant_ic.vspace.view import Drawn, View, checked_pose, perspective_rays
 
 T = TypeVar("T")
 _PROBE = (64, 36)  # pixels of the image that readiness is judged by
+_PARALLAX_RAD = 0.035  # displacement of surfaces by the depth's error that is still fit to show
+_LEAST_DEPTH_SHARE = 0.5  # of the keyframe's depth in where the field's surfaces lie
 
 
 class State(enum.IntEnum):
@@ -343,9 +345,8 @@ class VirtualSpace(Drawn):
 
     def _choose(self) -> None:
         """Show the field or the warp, whichever renders the older keyframes better."""
-        share, train = self.config.picture.least_depth_share, self.config.train
-        drawings = [self._on_device(functools.partial(_field_alone, trial.rays, share)) for trial in self._trials]
-        left = (train.iterations - self._schedule.iteration) / self.config.readiness.plateau_iterations
+        drawings = [self._on_device(functools.partial(_field_alone, trial.rays)) for trial in self._trials]
+        left = (self.config.train.iterations - self._schedule.iteration) / self.config.readiness.plateau_iterations
         self._choice.take(gain_db(self._trials, drawings), left)
 
     def _note(self, colour_error: float) -> None:
@@ -386,10 +387,10 @@ class VirtualSpace(Drawn):
 
     def _ready_radius_m(self) -> float:
         """A surface at depth D, wrong by σ·D, seen from b aside is displaced by about b·σ/D radians."""
-        rule, prior = self.config.readiness, self.keyframe
+        prior = self.keyframe
         assert prior is not None
         sigma = max(prior.relative_sigma, 1e-3)
-        return min(rule.max_radius_m, rule.parallax_rad * prior.median_depth_m / sigma)
+        return min(self.config.readiness.max_radius_m, _PARALLAX_RAD * prior.median_depth_m / sigma)
 
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
         """Expected PSNR of a view, estimated without ground truth (``readiness``); −inf without a keyframe.
@@ -458,7 +459,7 @@ class VirtualSpace(Drawn):
         """Render keyframes: their panoramas warped (``warps``), or the field."""
         share, field = self._panorama_share, None
         if share == 0 or not warps:
-            field = device.draw(rays, share, max(share, self.config.picture.least_depth_share))
+            field = device.draw(rays, share, max(share, _LEAST_DEPTH_SHARE))
         return canvas.draw(rays, shown if warps else None, field, layers)
 
     @property
@@ -554,8 +555,8 @@ def _renewed(keyframe: Keyframe, prior: PanoramaPrior) -> Keyframe:
     return ready(keyframe.place, prior, keyframe.warp.pyramid)
 
 
-def _field_alone(rays: Rays, depth_share: float, device: Device) -> Drawing:
-    return device.draw(rays, 0.0, depth_share)
+def _field_alone(rays: Rays, device: Device) -> Drawing:
+    return device.draw(rays, 0.0, _LEAST_DEPTH_SHARE)
 
 
 def _step(uniform: Floats, rates: tuple[float, float], device: Device) -> tuple[float, float]:

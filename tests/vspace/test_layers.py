@@ -14,7 +14,6 @@ from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import VspaceLayers, deserialize, serialize
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.layers import Content, Kind, LayerEncoder, LayersError, decode, decode_layer
 from instant_ic.vspace_messages import layers_message, layers_of
 from nodes.nerf import NerfConfig, NerfNode
@@ -56,7 +55,7 @@ def space_and_layers(places, **options):
 
 def shown(layers):
     space = VirtualSpace(WARP)
-    space.show(decode(layers, WARP.panorama_width, GeometryConfig()))
+    space.show(decode(layers, WARP.panorama_width))
     return space
 
 

@@ -335,7 +335,7 @@ def test_the_march_by_hand():
     # The network's output is its bias, the same everywhere, with the colour (0.6, 0.7, 0.8). The scene is a sphere of
     # 2 m round the camera, the band 5 %.
     rgb = np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8)
-    prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(band_min=0.05), 2048)
+    prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(), 2048)
     scene = Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy((prior,), GeometryConfig()))
     config = FieldConfig(levels=2, log2_table=10, hidden=4)
     rays = perspective_rays(np.eye(4), 32, 16, 1.0)

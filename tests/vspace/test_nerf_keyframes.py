@@ -10,6 +10,7 @@ import pytest
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.vspace import FieldConfig, ReadinessConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace import compose as composing
 from instant_ic.vspace.compose import Layer, compose, exposure_gain, exposure_gains, moved
@@ -370,7 +371,7 @@ def composed_plainly(layers, rays):
         points = rays.origin + depth[number, at, None] * rays.directions[at]
         local = (points - one.prior.map_from_camera[:3, 3]) @ one.prior.map_from_camera[:3, :3]
         height, width = one.prior.depth_edge.shape
-        u, v = composing.equirect_pixels(local, width, height)
+        u, v = equirect_pixels(local, width, height)
         row, column = np.clip(np.floor(v), 0, height - 1).astype(int), np.floor(u).astype(int) % width
         own, first = (points - prior.map_from_camera[:3, 3] for prior in (one.prior, layers[0].prior))
         near, far = np.linalg.norm(own, axis=1), np.linalg.norm(first, axis=1)
@@ -383,7 +384,7 @@ def composed_plainly(layers, rays):
         for newer, other in enumerate(layers[:number]):
             room = 1 + composing.disagreement(other.prior, one.prior)
             local = (points - other.prior.map_from_camera[:3, 3]) @ other.prior.map_from_camera[:3, :3]
-            u, v = composing.equirect_pixels(local, width, height)
+            u, v = equirect_pixels(local, width, height)
             row, column = np.clip(np.floor(v), 0, height - 1).astype(int), np.floor(u).astype(int) % width
             rows, columns = np.stack([row, np.minimum(row + 1, height - 1)]), np.stack([column, (column + 1) % width])
             corners = rows[:, None], columns[None]

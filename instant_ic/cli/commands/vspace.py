@@ -266,7 +266,7 @@ def _space_of_bag(path: Path) -> VirtualSpace:
     space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))
     try:
         layers = layers_of(deserialize(newest.payload, newest.type_name))
-        space.show(decode(layers, space.config.panorama_width, space.config.geometry))
+        space.show(decode(layers, space.config.panorama_width))
     except (LayersError, MessageError) as error:
         raise UserError(f"{path}, newest message of {_LAYERS}: {error}") from error
     return space

@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf import kernels, march, volume
 from instant_ic.vspace.nerf.field import (
+    BAND_COLOUR_WEIGHT,
     BETA1,
     BETA2,
+    DISTANCE_WEIGHT,
     EPSILON,
+    VOLUME_WEIGHTS,
     FieldParameters,
     Floats,
     Rays,
@@ -52,13 +55,12 @@ class NumbaDevice:
         self.first_stride = FIRST_STRIDE
         self._train = train
         self._density = field.geometry == "density"
-        self._losses = np.array([train.depth_weight, train.opacity_weight, train.distortion_weight], np.float32)
         self._rays = train.ray_columns * train.ray_rows
         self._points = np.zeros((2 * self._rays, 3), np.float32)
         self._target = np.zeros((2 * self._rays, 4), np.float32)
         self._weight = np.zeros((2 * self._rays, 2), np.float32)
         self._colour_weight, self._distance_weight = sample_weights(train)
-        self._level_rates = level_rates(train, field.levels)
+        self._level_rates = level_rates(field.levels)
         self.load(FieldParameters.random(field, train.seed))
 
     def load(self, parameters: FieldParameters) -> None:
@@ -109,14 +111,14 @@ class NumbaDevice:
             colour, distance = volume.volume_gradient(
                 p.table, *p.network(), *place, self._points, self._target, weight,
                 uniform[: len(weight) // 2, 2].copy(), sources, drawn.focus[:, :3].copy(), drawn.priors.band,
-                self._losses, *grads,
+                np.array(VOLUME_WEIGHTS, np.float32), *grads,
             )  # fmt: skip
             return colour, distance
         colour, distance = kernels.gradient(
             p.table, *p.network(), *place, self._points, self._target,
             self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1], *grads,
         )  # fmt: skip
-        return colour / (1 + self._train.band_colour_weight), distance / self._train.distance_weight
+        return colour / (1 + BAND_COLOUR_WEIGHT), distance / DISTANCE_WEIGHT
 
     def _adam(self, table_lr: float, network_lr: float) -> None:
         """One Adam step of table and network; clears the gradients."""

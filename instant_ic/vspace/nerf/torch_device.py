@@ -11,6 +11,7 @@ from torch import Tensor
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf import reference, volume_reference
 from instant_ic.vspace.nerf.field import (
+    VOLUME_WEIGHTS,
     FieldParameters,
     Floats,
     Rays,
@@ -60,7 +61,7 @@ class TorchDevice:
         self.name = torch.cuda.get_device_name() if device == "cuda" else f"{device} (torch)"
         weights = (torch.from_numpy(w).to(device) for w in sample_weights(train))
         self._colour_weight, self._distance_weight = weights
-        self._level_rates = torch.from_numpy(level_rates(train, field.levels)).to(device)[:, None, None]
+        self._level_rates = torch.from_numpy(level_rates(field.levels)).to(device)[:, None, None]
         self._newest_lens: tuple[Floats, Tensor] | None = None
         self.on_gpu = device == "cuda"
         self.load(FieldParameters.random(field, train.seed))
@@ -116,9 +117,9 @@ class TorchDevice:
         samples, offset, span = volume_reference.band_samples(cameras, surface, jitter, band, self._priors[0])
         output = reference.query(self._field, samples.reshape(-1, 3)).reshape(*offset.shape, 4)
         losses = volume_reference.volume_loss(output, offset, span, colours[:, :3], weight)
-        weights = 1.0, self._train.depth_weight, self._train.opacity_weight, self._train.distortion_weight
         share = weight.mean(dim=0).clamp(min=1e-3)
-        error = sum((w * loss for w, loss in zip(weights, losses, strict=True)), torch.zeros((), device=self._device))
+        weighted = (w * loss for w, loss in zip((1.0, *VOLUME_WEIGHTS), losses, strict=True))
+        error = sum(weighted, torch.zeros((), device=self._device))
         return error, losses[0] / share[0], losses[1] / share[1]
 
     @torch.no_grad()
