@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from instant_ic.depth.inputs import HeldImage, Revolution
+from instant_ic.depth.deskew import Revolution
+from instant_ic.depth.inputs import HeldImage
 from instant_ic.depth.keyframes import encode_sigma
 from instant_ic.depth.sources import DepthResult
 from instant_ic.geometry.poses import Matrix

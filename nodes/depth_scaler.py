@@ -109,7 +109,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def on_depth(self, message: Any) -> None:
         if self.config.source != "lidar":
-            self.chain.answered()
+            self.chain.requests.answered()
             self.handle(held_image(message), image_array(message))
 
     def handle(self, image: HeldImage | None, raw: Floats | None = None) -> None:

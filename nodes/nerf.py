@@ -19,9 +19,9 @@ from instant_ic.msg import (
 )
 from instant_ic.nerf_messages import decode_keyframe, status_message, view_message
 from instant_ic.vspace import State
+from instant_ic.vspace.config import NerfConfig
 from instant_ic.vspace.jobs import Incoming, Outcome, SpaceWorker, ViewOrder, load_robot_mask
 from instant_ic.vspace.layers import Layers
-from instant_ic.vspace.node_config import NerfConfig
 from instant_ic.vspace.schedule import JobSchedule, Turns
 from instant_ic.vspace_messages import layers_message
 

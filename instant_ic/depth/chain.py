@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, Revolution, RevolutionTrigger
+from instant_ic.depth.deskew import Revolution
+from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, RevolutionTrigger
 from instant_ic.depth.keyframes import KeyframeSelector
 from instant_ic.depth.metric_depth import MetricDepth
 from instant_ic.depth.node_config import DepthScalerConfig
@@ -33,7 +34,7 @@ class DepthChain:
     def __init__(self, config: DepthScalerConfig, transforms: TransformBuffer, diagnose: Callable[..., None]) -> None:
         self.config, self.inputs, self.selector = config, RecentInputs(), KeyframeSelector(config.keyframes)
         self._diagnose = diagnose
-        self._trigger, self._requests = RevolutionTrigger(), DepthRequests()
+        self._trigger, self.requests = RevolutionTrigger(), DepthRequests()
         self._model: tuple[str, str] | None = None
         self._last_ns: int | None = None  # stamp of the newest depth
         self.image_ns = 0  # stamp of the newest image
@@ -54,7 +55,7 @@ class DepthChain:
             scaler = replace(self.config.scaler, output_kind=output_kind)
         except ValueError as error:
             return self._diagnose("model", Level.WARN, f"{name}: {error}")
-        self.metric.source.config = replace(self.config, scaler=scaler)
+        self.metric.source.configure(replace(self.config, scaler=scaler))
         self._diagnose("model", Level.OK, f"{name}: {output_kind} depth")
 
     def add_image(self, image: HeldImage, message: Any) -> float:
@@ -64,7 +65,7 @@ class DepthChain:
             self.selector.restart()
         self.image_ns = image.stamp_ns
         self.inputs.add_image(image.stamp_ns, message)
-        self.inputs.discard(self._requests.since_ns or image.stamp_ns)
+        self.inputs.discard(self.requests.since_ns or image.stamp_ns)
         return back_s if restarts else 0.0
 
     def due(self, image: HeldImage) -> bool:
@@ -83,17 +84,13 @@ class DepthChain:
 
     def request_due(self, stamp_ns: int) -> bool:
         """Whether to request the network's depth of an image."""
-        if not self._requests.due(stamp_ns):
+        if not self.requests.due(stamp_ns):
             return False
-        silent_s = (stamp_ns - (self._requests.since_ns or stamp_ns)) / 1e9
+        silent_s = (stamp_ns - (self.requests.since_ns or stamp_ns)) / 1e9
         if silent_s > _SILENT_S:
             text = "does depth_estimator run? source lidar needs none"
             self._diagnose("scale", Level.WARN, f"no /depth/raw for {silent_s:.0f} s: {text}")
         return True
-
-    def answered(self) -> None:
-        """The network's depth has arrived."""
-        self._requests.answered()
 
     def add_revolution(self, revolution: Revolution) -> HeldImage | None:
         """Add a revolution to the local model; returns the held image that it completes."""
@@ -102,7 +99,7 @@ class DepthChain:
         if self.config.source != "network":
             mapper = self.metric.mapper
             try:
-                mapper.revolution(revolution.frame, revolution.stamp_ns, revolution.time_s, revolution.xyz)
+                mapper.revolution(revolution)
                 self._diagnose("local model", Level.OK, "growing", revolutions=mapper.model.revolutions)
             except (TransformError, ValueError) as error:
                 self._diagnose("local model", Level.WARN, f"no points added: {error}")

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from instant_ic.depth.deskew import Revolution
 
 KEEP_NS = 4_000_000_000
 """Images and revolutions that differ more from the newest depth are discarded."""
@@ -17,28 +15,6 @@ MAX_CLOUD_AGE_S = 0.3
 _MAX_IMAGES = 150
 _MAX_REVOLUTIONS = 40
 _REPEAT_NS = 2_000_000_000
-
-
-@dataclass(frozen=True)
-class Revolution:
-    """A LiDAR revolution.
-
-    Attributes:
-        frame: of the points.
-        stamp_ns: of the cloud.
-        time_s: (N,) seconds after the stamp.
-        xyz: returns the points, (N, 3) in metres.
-    """
-
-    frame: str
-    stamp_ns: int
-    time_s: NDArray[np.floating]
-    xyz: Callable[[], NDArray[np.floating]]
-
-    @property
-    def middle_ns(self) -> int:
-        """Time of the middle of the revolution; of an empty one, its stamp."""
-        return self.stamp_ns + (round(0.5e9 * float(self.time_s[0] + self.time_s[-1])) if len(self.time_s) else 0)
 
 
 class RecentInputs:

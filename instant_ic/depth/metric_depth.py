@@ -30,7 +30,8 @@ class MetricDepth:
 
     def reconfigure(self, config: DepthScalerConfig) -> None:
         """Apply new parameters; the local model starts again if they change it."""
-        before, self.config, self.source.config = self.config, config, config
+        before, self.config = self.config, config
+        self.source.configure(config)
         keys = ("mapping", "map_frame", "odom_frame")
         if any(getattr(before, key) != getattr(config, key) for key in keys):
             self.mapper = LocalMapper(self.transforms, config.mapping, config.map_frame, config.odom_frame)

@@ -116,29 +116,16 @@ class _Built:
     structure: LidarDepth
     ceiling_m: float | None
 
-    @property
-    def message(self) -> str:
-        return self.structure.message
-
-    @property
-    def points(self) -> int:
-        return self.structure.points
-
 
 class DepthSource:
     """Computes depth from an image's network estimate, simultaneous LiDAR points and the local model."""
 
     def __init__(self, config: SourceConfig | None = None) -> None:
-        self.config = config or SourceConfig()
+        self.configure(config or SourceConfig())
 
-    @property
-    def config(self) -> SourceConfig:
-        """May be replaced at any time."""
-        return self._config
-
-    @config.setter
-    def config(self, config: SourceConfig) -> None:
-        self._config = config
+    def configure(self, config: SourceConfig) -> None:
+        """Apply new parameters."""
+        self.config = config
         self.scaler = DepthScaler(config.scaler)
         self.structure = LidarStructure(config.lidar)
 
@@ -179,7 +166,7 @@ class DepthSource:
         network, top = self.network(fit, points, up, camera_height_m)
         built = self._built(points, up, camera_height_m, fit.depth_m.shape, local, top)
         result = _of_fit(fit)
-        if not fit.ok or built.message:
+        if not fit.ok or built.structure.message:
             # The LiDAR alone is the better estimate, but one of the two is wrong: not fit.
             known = built.depth_m > 0
             return replace(
@@ -187,7 +174,7 @@ class DepthSource:
                 depth_m=np.where(known, built.depth_m, fit.depth_m),
                 sigma=np.where(known, built.sigma, result.sigma),
                 ok=False,
-                message=built.message if fit.ok else fit.message,
+                message=built.structure.message if fit.ok else fit.message,
                 source=config.source,
             )
         known = built.depth_m > 0
@@ -255,17 +242,17 @@ class DepthSource:
     ) -> DepthResult:
         built = self._built(points, up, camera_height_m, size, local, None)
         quality = agreement(built.depth_m, points, self.config.scaler)
-        message = f"LiDAR alone: {quality:.0%} of {built.points} points on its surfaces; {_surfaces(built)}"
+        message = f"LiDAR alone: {quality:.0%} of {built.structure.points} points on its surfaces; {_surfaces(built)}"
         return DepthResult(
             depth_m=built.depth_m,
             sigma=built.sigma,
-            ok=not built.message,
+            ok=not built.structure.message,
             scale=1.0,
             shift=0.0,
             quality=quality,
             relative_sigma=_median(built.sigma),
-            points=built.points,
-            message=built.message or message,
+            points=built.structure.points,
+            message=built.structure.message or message,
             source="lidar",
         )
 

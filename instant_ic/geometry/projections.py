@@ -20,9 +20,13 @@ Indices = NDArray[np.intp]
 def equirect_directions(width: int, height: int) -> NDArray[np.float32]:
     """Unit viewing direction of every pixel of a panorama, (height, width, 3)."""
     azimuth = math.pi - (np.arange(width) + 0.5) * (2 * math.pi / width)
-    elevation = math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height)
+    return directions_at(azimuth, math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height))
+
+
+def directions_at(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Unit directions at all azimuths (W,) of all elevations (H,), radians, (H, W, 3)."""
     horizontal = np.cos(elevation)[:, None]
-    directions = np.empty((height, width, 3), np.float32)
+    directions = np.empty((len(elevation), len(azimuth), 3), np.float32)
     directions[..., 0] = horizontal * np.cos(azimuth)
     directions[..., 1] = horizontal * np.sin(azimuth)
     directions[..., 2] = np.sin(elevation)[:, None]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.config.ranges import Positive, check_ranges
-from instant_ic.depth.deskew import points_at
+from instant_ic.depth.deskew import Revolution, points_at
 from instant_ic.geometry.poses import Matrix, inverse
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.mapping.local_model import STRIDE, LocalDepth, LocalModel, LocalModelConfig
@@ -72,43 +71,35 @@ class LocalMapper:
     def clear(self) -> None:
         """Forget everything."""
         self.model.clear()
-        self._held: tuple[str, int, NDArray[np.floating], Callable[[], NDArray[np.floating]]] | None = None
+        self._held: Revolution | None = None
         self._taken_ns: int | None = None
         self._taken_at: Matrix | None = None
         self._reference: tuple[int, Matrix] | None = None  # stamp and correction of the last look-up
         self._model_from_map = np.eye(4)
 
-    def revolution(
-        self, frame: str, stamp_ns: int, time_s: NDArray[np.floating], xyz: Callable[[], NDArray[np.floating]]
-    ) -> bool:
-        """Hold a revolution; add the one held before if it is due. Returns whether one was added.
-
-        Args:
-            frame: of the points.
-            stamp_ns: of the cloud.
-            time_s: (N,) seconds after the stamp.
-            xyz: returns the points (N, 3); called only for revolutions that are added.
+    def revolution(self, new: Revolution) -> None:
+        """Hold a revolution; add the one held before if it is due. ``xyz`` is called only for those that are added.
 
         Raises:
             CloudError: the revolution is empty or its stamp went back; the model is cleared for the latter.
             TransformError: the pose of the LiDAR is not known.
         """
         held, self._held = self._held, None
-        newest = self._taken_ns if held is None else held[1]
-        if newest is not None and stamp_ns < newest - _BACK_NS:
+        newest = self._taken_ns if held is None else held.stamp_ns
+        if newest is not None and new.stamp_ns < newest - _BACK_NS:
             self.clear()
-            self._held = (frame, stamp_ns, time_s, xyz)
-            raise CloudError(f"time went back by {(newest - stamp_ns) / 1e9:.1f} s: the local model starts again")
-        if not 0 < len(time_s) <= _MOST_POINTS:
-            raise CloudError(f"a revolution of {len(time_s)} points is left out (1 to {_MOST_POINTS} are possible)")
-        self._held = (frame, stamp_ns, time_s, xyz)
-        return held is not None and self._add(*held)
+            self._held = new
+            raise CloudError(f"time went back by {(newest - new.stamp_ns) / 1e9:.1f} s: the local model starts again")
+        count = len(new.time_s)
+        if not 0 < count <= _MOST_POINTS:
+            raise CloudError(f"a revolution of {count} points is left out (1 to {_MOST_POINTS} are possible)")
+        self._held = new
+        if held is not None:
+            self._add(held)
 
-    def _add(
-        self, frame: str, stamp_ns: int, time_s: NDArray[np.floating], xyz: Callable[[], NDArray[np.floating]]
-    ) -> bool:
+    def _add(self, revolution: Revolution) -> None:
         """Add a revolution if the robot has moved or enough time has passed."""
-        middle_ns = stamp_ns + round(0.5e9 * float(time_s[0] + time_s[-1]))
+        frame, stamp_ns, middle_ns = revolution.frame, revolution.stamp_ns, revolution.middle_ns
         odom_from_lidar = self.transforms.lookup(self.odom_frame, frame, middle_ns)
         moved_m, turned_rad = math.inf, math.inf
         if self._taken_at is not None and self._taken_ns is not None:
@@ -116,9 +107,9 @@ class LocalMapper:
             turned_rad = _angle(self._taken_at, odom_from_lidar)
             waited_s = (stamp_ns - self._taken_ns) / 1e9
             if moved_m < self.config.every_m and 0 <= waited_s < self.config.every_s:
-                return False
+                return
         model_from_map = self._model_from_map_at(frame, middle_ns)
-        points = xyz()
+        time_s, points = revolution.time_s, revolution.xyz()
         if len(points) != len(time_s):
             raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is left out")
         step = -(-len(points) // _ENOUGH_POINTS)
@@ -138,7 +129,6 @@ class LocalMapper:
         stride = 1 if moved_m < self.config.every_m else STRIDE
         self.model.add(lidar, (model_from_map @ self._map_from(frame, middle_ns))[:3, 3], advance_m, stride)
         self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar
-        return True
 
     def _map_from(self, frame: str, stamp_ns: int) -> Matrix:
         """Pose of a sensor in the map at a time; by odometry alone where there is no map."""

@@ -1,4 +1,4 @@
-"""Parameters of the virtual space; each class checks its own values."""
+"""Parameters of the virtual space and of the node ``nerf``; each class checks its own values."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import Positive, PositiveInt, Range, Share, check_ranges, require
+from instant_ic.config.ranges import Percent, Positive, PositiveInt, Range, Share, check_ranges, require
 
 Coordinate: TypeAlias = Annotated[float, Range(-100_000, 100_000)]
 
@@ -162,3 +162,29 @@ class VirtualSpaceConfig:
         require(self, "mesh_pose", len(self.mesh_pose) == 4, "x, y, z in metres and yaw in degrees")
         for key in ("ray_columns", "ray_rows") if self.field.geometry == "density" else ():
             require(self.train, key, getattr(self.train, key) % 16 == 0, "a multiple of 16 with density")
+
+
+@dataclass(frozen=True)
+class NerfConfig:
+    """Parameters.
+
+    Attributes:
+        render_fps: target frame rate of requested views; training gets the remaining time.
+        train_ms_per_frame: longest uninterrupted training in ms, and so the longest wait of a requested view. While no
+            view is requested, training has all the time.
+        max_view_pixels: largest view that may be requested; larger requests are refused.
+        jpeg_quality: JPEG quality of views, 1 to 100.
+        robot_mask: image, twice as wide as high, white where the panorama shows the robot itself or its stand (see also
+            ``space.geometry.body_below_deg``); empty: no mask.
+        space: the virtual space itself.
+    """
+
+    render_fps: Annotated[float, Range(0.5, 120)] = 10.0
+    train_ms_per_frame: Positive = 50.0
+    max_view_pixels: PositiveInt = 1280 * 720
+    jpeg_quality: Percent = 85
+    robot_mask: str = ""
+    space: VirtualSpaceConfig = dataclasses.field(default_factory=VirtualSpaceConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)

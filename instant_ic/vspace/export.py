@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,26 +62,6 @@ def _corners(values: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Upper left, upper right, lower left and lower right of each quad; columns wrap, (H − 1, W) each."""
     right = np.roll(values, -1, 1)
     return values[:-1], right[:-1], values[1:], right[1:]
-
-
-def write_ply(path: str | Path, surface: Surface, mesh: bool) -> None:
-    """Writes binary PLY: coloured vertices, and the triangles where ``mesh``.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    vertices = np.empty(len(surface.points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertices["xyz"], vertices["rgb"] = surface.points, surface.rgb
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    content = vertices.tobytes()
-    if mesh:
-        faces = np.empty(len(surface.triangles), [("count", "u1"), ("vertices", "<i4", 3)])
-        faces["count"], faces["vertices"] = 3, surface.triangles
-        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-        content += faces.tobytes()
-    Path(path).write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + content)
 
 
 def default_flight(radius_m: float) -> list[NDArray[np.float64]]:

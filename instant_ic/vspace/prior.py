@@ -22,8 +22,10 @@ DEPTH_EDGE_RATIO = 0.10
 EDGE_RAD = 0.05
 """Distance to each side of an edge within which depth may belong to either surface."""
 
-ROOM, ROBOT, SKY, MOVED = 0, 1, 2, 3
-"""Content of a pixel: a part of the place; the robot itself; the sky; something that has moved away."""
+ROBOT, SKY, MOVED, ROOM = range(4)
+"""Content of a pixel: the robot itself; the sky; something that has moved away; a part of the place. As in
+VspaceLayer.msg.
+"""
 _TOP_RAD, _TOP_STEP, _ASSUMED, _CONTRAST, _THING_SHARE = 0.15, 1.3, 0.05, 30.0, 0.15
 """Of assumed tops, see ``fill_kernels.cut_tops``: their height in the image, the step above them, sigma, grey levels,
 and the share of the thing in a mixed colour."""
@@ -50,7 +52,6 @@ class PanoramaPrior:
         relative_sigma: standard deviation of the depth, relative to it: median over the image.
         band: half width, relative to the depth, of the band in which the signed distance is learnt.
         sigma: as ``relative_sigma``, of each pixel, (h, w) float32; ``MOST_SIGMA`` where the depth was filled in.
-        usable: 1 where training may sample rays, (h, w) uint8: where ``content`` is ``ROOM``.
         content: ``ROOM``, ``ROBOT``, ``SKY`` or ``MOVED``, (h, w) uint8; only ``ROOM`` has surfaces.
     """
 
@@ -62,8 +63,12 @@ class PanoramaPrior:
     relative_sigma: float
     band: float
     sigma: NDArray[np.float32]
-    usable: NDArray[np.uint8]
     content: NDArray[np.uint8]
+
+    @property
+    def usable(self) -> NDArray[np.uint8]:
+        """1 where training may sample rays, (h, w)."""
+        return (self.content == ROOM).astype(np.uint8)
 
     def in_camera(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
         """Points (N, 3) of the map in the camera's frame."""
@@ -89,10 +94,7 @@ class PanoramaPrior:
         """The keyframe with what has ``moved`` (h, w) left out, and nothing else that was left out for that before."""
         content = np.where(self.content == MOVED, ROOM, self.content)
         content[moved & (content == ROOM)] = MOVED
-        return self if np.array_equal(content, self.content) else self._with(content.astype(np.uint8))
-
-    def _with(self, content: NDArray[np.uint8]) -> PanoramaPrior:
-        return replace(self, content=content, usable=(content == ROOM).astype(np.uint8))
+        return self if np.array_equal(content, self.content) else replace(self, content=content.astype(np.uint8))
 
     @functools.cached_property
     def beside_edge(self) -> NDArray[np.uint8]:
@@ -158,7 +160,6 @@ def prepare(
         relative_sigma=sigma,
         band=band_of(sigma),
         sigma=np.where(known, np.minimum(each, np.float32(MOST_SIGMA)), np.float32(MOST_SIGMA)),
-        usable=(content == ROOM).astype(np.uint8),
         content=content,
     )
 

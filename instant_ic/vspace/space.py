@@ -55,8 +55,6 @@ class TrainStats:
 
     iterations: int
     psnr_db: float
-    distance_error: float
-    """Root mean square error of the signed distance, as a share of the truncation distance."""
     elapsed_ms: float
     converged: bool
 
@@ -325,15 +323,14 @@ class VirtualSpace(Drawn):
         if self._scene is None:
             self.learn(self.scene_of(self._shown))
         start = time.perf_counter()
-        done, distance_error = 0, math.nan
+        done = 0
         limit = self.config.train.iterations if iterations is None else iterations
         shape = (self.config.train.ray_columns * self.config.train.ray_rows, 3)
         while not self._done and done < limit:
             uniform = self._rng.random(shape, np.float32)
-            colour, distance = self._on_device(functools.partial(_step, uniform, self._schedule.rates()))
+            colour, _ = self._on_device(functools.partial(_step, uniform, self._schedule.rates()))
             self._schedule.iteration += 1
             done += 1
-            distance_error = math.sqrt(distance)
             if self._schedule.finished or self._schedule.iteration % self.config.readiness.plateau_iterations == 0:
                 self._choose()
             self._note(colour)
@@ -341,7 +338,7 @@ class VirtualSpace(Drawn):
                 break
         elapsed = time.perf_counter() - start
         self._train_seconds += elapsed
-        return TrainStats(done, self._psnr_db, distance_error, elapsed * 1e3, self._done)
+        return TrainStats(done, self._psnr_db, elapsed * 1e3, self._done)
 
     def _choose(self) -> None:
         """Show the field or the warp, whichever renders the older keyframes better."""

@@ -328,14 +328,15 @@ def _warn_of_the_unknown(view: View, space: VirtualSpace, pose: list[float]) -> 
 
 
 def export(args: argparse.Namespace) -> int:
-    from instant_ic.vspace.export import surface, write_ply
+    from instant_ic.geometry.ply import write_ply
+    from instant_ic.vspace.export import surface
 
     space, out = open_space(args), args.points or args.mesh
     try:
         found = surface(space, args.width)
     except ValueError as error:
         raise UserError(f"--width: {error}", 2) from error
-    write_ply(out, found, mesh=args.mesh is not None)
+    write_ply(out, found.points, found.rgb, found.triangles if args.mesh else None)
     triangles = f" and {len(found.triangles)} triangles" if args.mesh else ""
     print(f"wrote {out}: {len(found.points)} points{triangles}")
     return 0

@@ -124,11 +124,9 @@ class TorchDevice:
 
     @torch.no_grad()
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        drawn = self._field, self._priors, self._grid
         origin, directions = torch.from_numpy(rays.origin).to(self._device), self._directions(rays)
-        shares = panorama_share, depth_share
-        draw = self._draw_density if self._density else self._draw
-        parts = [draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
+        draw = self._draw_density if self._density else self._draw_distance
+        parts = [draw(origin, part, panorama_share, depth_share) for part in directions.split(RAYS_AT_ONCE)]
         colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
 
@@ -140,35 +138,23 @@ class TorchDevice:
             self._newest_lens = rays.lens, torch.from_numpy(rays.lens).to(self._device)
         return self._newest_lens[1] @ torch.from_numpy(rays.turn).to(self._device).T
 
-    @staticmethod
-    def _draw(
-        field: TorchField,
-        priors: list[TorchPrior],
-        grid: TorchGrid,
-        origin: Tensor,
-        directions: Tensor,
-        shares: tuple[float, float],
+    def _draw_distance(
+        self, origin: Tensor, directions: Tensor, panorama_share: float, depth_share: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        depth, confidence = reference.trace(field, grid, priors, shares[1], origin, directions)
+        depth, confidence = reference.trace(self._field, self._grid, self._priors, depth_share, origin, directions)
         met = torch.nonzero(depth)[:, 0]
         colour = torch.zeros_like(directions)
         points = origin + depth[met, None] * directions[met]
-        colour[met] = (reference.query(field, points)[:, :3] + 0.5).clamp(0, 1)
-        reference.mix_panorama(priors, origin, directions, depth, confidence, shares[0], colour)
+        colour[met] = (reference.query(self._field, points)[:, :3] + 0.5).clamp(0, 1)
+        reference.mix_panorama(self._priors, origin, directions, depth, confidence, panorama_share, colour)
         return colour, depth, confidence
 
-    @staticmethod
     def _draw_density(
-        field: TorchField,
-        priors: list[TorchPrior],
-        grid: TorchGrid,
-        origin: Tensor,
-        directions: Tensor,
-        shares: tuple[float, float],
+        self, origin: Tensor, directions: Tensor, panorama_share: float, depth_share: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        guide, confidence = reference.trace(field, grid, priors, 1.0, origin, directions)
-        colour, depth = volume_reference.composite(field, priors[0], shares[1], origin, directions, guide)
-        reference.mix_panorama(priors, origin, directions, guide, confidence, shares[0], colour)
+        guide, confidence = reference.trace(self._field, self._grid, self._priors, 1.0, origin, directions)
+        colour, depth = volume_reference.composite(self._field, self._priors[0], depth_share, origin, directions, guide)
+        reference.mix_panorama(self._priors, origin, directions, guide, confidence, panorama_share, colour)
         return colour, depth, confidence
 
     def parameters(self) -> FieldParameters:
