@@ -12,7 +12,7 @@ from instant_ic.depth.chain import DepthChain
 from instant_ic.depth.inference import Floats, Inference
 from instant_ic.depth.inputs import HeldImage
 from instant_ic.depth.manifest import ManifestError
-from instant_ic.depth.node_config import DepthScalerConfig
+from instant_ic.depth.metric_depth import DepthScalerConfig
 from instant_ic.depth.sources import DepthResult, complete
 from instant_ic.depth_messages import held_image, keyframe_message, revolution_of
 from instant_ic.mapping.local_model import warm_up

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, RevolutionTrigger
 from instant_ic.depth.keyframes import KeyframeSelector
-from instant_ic.depth.metric_depth import MetricDepth
-from instant_ic.depth.node_config import DepthScalerConfig
+from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
 from instant_ic.depth.sources import DepthResult
 from instant_ic.diagnosis import Level
 from instant_ic.geometry.poses import Matrix

@@ -161,26 +161,12 @@ class DepthScaler:
         field = self._field(metres, rows, columns, range_m) if config.method == "sector" else None
         if field is not None:
             metres = metres * field
-        line = f"scale {scale:.3f}" + (f", shift {shift:.3f}" if shift else "")
-        return self._judged(metres, rows, columns, range_m, scale, shift, line, field)
-
-    def _judged(
-        self,
-        metres: Floats,
-        rows: NDArray[np.intp],
-        columns: NDArray[np.intp],
-        range_m: Floats,
-        scale: float,
-        shift: float,
-        line: str,
-        field: NDArray[np.float32] | None,
-    ) -> ScaleFit:
-        """The fit with its quality; ``ok`` where nothing speaks against it."""
         scaled = metres[rows, columns]
         error = np.where(np.isfinite(scaled), (scaled - range_m) / range_m, np.inf)
         quality = float((np.abs(error) <= AGREEMENT).mean())
         finite = error[np.isfinite(error)]
         sigma = 1.4826 * float(np.median(np.abs(finite))) if len(finite) else float("inf")
+        line = f"scale {scale:.3f}" + (f", shift {shift:.3f}" if shift else "")
         message = f"{line}: {quality:.0%} of {len(range_m)} points within {AGREEMENT:.0%}"
         behind = float((error < -1 / 3).mean())
         if behind > 0.15:

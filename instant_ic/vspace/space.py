@@ -26,7 +26,7 @@ from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_out_of_memory, make_device
 from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
 from instant_ic.vspace.nerf.occupancy import build_occupancy
-from instant_ic.vspace.prior import KeyframeError, PanoramaPrior, prepare
+from instant_ic.vspace.prior import PanoramaPrior, prepare
 from instant_ic.vspace.readiness import Texture, error_terms, expected_psnr_db
 from instant_ic.vspace.saved import Progress, SavedSpace, read, write
 from instant_ic.vspace.store import RECENT, Keyframe, KeyframeSet, KeyframeStore, ready, recent, spread
@@ -558,6 +558,3 @@ def _field_alone(rays: Rays, device: Device) -> Drawing:
 
 def _step(uniform: Floats, rates: tuple[float, float], device: Device) -> tuple[float, float]:
     return device.step(uniform, *rates)
-
-
-__all__ = ["KeyframeError", "NotReadyError", "State", "Status", "TrainStats", "View", "VirtualSpace"]

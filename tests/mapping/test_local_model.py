@@ -6,8 +6,7 @@ import pytest
 from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.inputs import RecentInputs
 from instant_ic.depth.lidar_depth import LidarDepthConfig
-from instant_ic.depth.metric_depth import MetricDepth
-from instant_ic.depth.node_config import DepthScalerConfig
+from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
 from instant_ic.depth.sources import DepthSource, SourceConfig
 from instant_ic.geometry.ply import write_ply
 from instant_ic.geometry.poses import Matrix, pose_matrix
