@@ -274,6 +274,7 @@ class _Building:
     Attributes:
         hit: (H, W) horizontal range of the point in each pixel, 0 without one.
         flat: (H, W) the point is of the floor or the ceiling.
+        above, below: (H, W) rows of the next points, -1 and H without one; up, down: their indices within the image.
     """
 
     def __init__(
@@ -316,14 +317,14 @@ class _Building:
         height, width = self.size
         column = np.arange(width, dtype=np.int32)
         index = np.arange(height, dtype=np.int32)[:, None]
-        above = np.maximum.accumulate(np.where(self.some, index, np.int32(-1)), axis=0)
-        below = np.minimum.accumulate(np.where(self.some, index, np.int32(height))[::-1], axis=0)[::-1]
-        up, down = np.maximum(above, 0), np.minimum(below, height - 1)
+        self.above = above = np.maximum.accumulate(np.where(self.some, index, np.int32(-1)), axis=0)
+        self.below = below = np.minimum.accumulate(np.where(self.some, index, np.int32(height))[::-1], axis=0)[::-1]
+        self.up, self.down = (np.maximum(above, 0), column), (np.minimum(below, height - 1), column)
         gap = np.minimum(np.where(above < 0, height, index - above), np.where(below == height, height, below - index))
-        wall, origin = self._walls(above, below, up, down, column)
+        wall, origin = self._walls(index)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(wall > 0, wall / self.cos, np.inf)
-            self._plates(depth, origin, above, below, up, down, column)
+            self._plates(depth, origin)
             self._planes(depth, origin, wall)
         np.copyto(depth, self.measured, where=self.some)
         np.copyto(origin, np.uint8(Origin.BEAM), where=self.some)
@@ -344,21 +345,20 @@ class _Building:
         origin[:, used < 0] = np.where(ground > 0, Origin.FLOOR, Origin.UNKNOWN)
         return depth.astype(np.float32), origin, (gap * (np.pi / height)).astype(np.float32)
 
-    def _walls(
-        self, above: Indices, below: Indices, up: Indices, down: Indices, column: Indices
-    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def _walls(self, index: Indices) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Horizontal range (0: none) of the upright surface that each pixel shows, and its origin.
 
-        ``above`` and ``below`` are the rows of the next points, ``up`` and ``down`` the same within the image.
+        ``index``: the image's rows, (H, 1).
         """
-        index = np.arange(self.size[0], dtype=np.int32)[:, None]
-        wall_above = (above >= 0) & ~self.flat[up, column]
-        wall_below = (below < len(index)) & ~self.flat[down, column]
+        above, below = self.above, self.below
+        wall_above = (above >= 0) & ~self.flat[self.up]
+        wall_below = (below < len(index)) & ~self.flat[self.down]
         flat_above = (above >= 0) & ~wall_above
         flat_below = (below < len(index)) & ~wall_below
-        r_above, r_below = self.hit[up, column], self.hit[down, column]
+        r_above, r_below = self.hit[self.up], self.hit[self.down]
         both = wall_above & wall_below
         same = both & (np.abs(r_above - r_below) < _SAME_SURFACE * np.minimum(r_above, r_below))
+        up, down = self.up[0], self.down[0]
         share = ((index - up) / np.maximum(down - up, 1)).astype(np.float32)
         nearer_above = index - above <= below - index
         crown = self._crown()
@@ -390,14 +390,11 @@ class _Building:
         )
         return np.where(donor >= 0, across[donor], 0).astype(np.float32)
 
-    def _plates(
-        self, depth: Floats, origin: NDArray[np.uint8], above: Indices, below: Indices, up: Indices, down: Indices,
-        column: Indices,
-    ) -> None:  # fmt: skip
+    def _plates(self, depth: Floats, origin: NDArray[np.uint8]) -> None:
         """Between two points of one height lies a level surface: a table, a bench."""
-        high, low = self.hit[up, column] * self.tan[up, 0], self.hit[down, column] * self.tan[down, 0]
-        edge = (origin == Origin.EDGE) & (above >= 0) & (below < self.size[0])
-        plate = edge & ~self.flat[up, column] & (high < -0.15) & (np.abs(high - low) < 0.05)
+        high, low = (self.hit[place] * self.tan[place[0], 0] for place in (self.up, self.down))
+        edge = (origin == Origin.EDGE) & (self.above >= 0) & (self.below < self.size[0])
+        plate = edge & ~self.flat[self.up] & (high < -0.15) & (np.abs(high - low) < 0.05)
         np.copyto(depth, 0.5 * (high + low) / self.sin, where=plate)
         np.copyto(origin, np.uint8(Origin.BETWEEN), where=plate)
 

@@ -87,7 +87,6 @@ class ScaleFit:
         relative_sigma: one standard deviation of (depth - range) / range, robust; inf where nothing was compared.
         points: number of points compared.
         message: for people.
-        scale_field: (H, W) factor on top of scale and shift in each direction (``sector``); None: one everywhere.
     """
 
     ok: bool
@@ -98,7 +97,6 @@ class ScaleFit:
     relative_sigma: float
     points: int
     message: str
-    scale_field: NDArray[np.float32] | None = None
 
 
 class DepthScaler:
@@ -158,9 +156,8 @@ class DepthScaler:
         if scale <= 0:
             raise ScaleError(f"depth falls where the range grows (slope {scale:.3g})")
         metres = self._metres(depth, scale, shift)
-        field = self._field(metres, rows, columns, range_m) if config.method == "sector" else None
-        if field is not None:
-            metres = metres * field
+        if config.method == "sector":
+            metres = metres * self._field(metres, rows, columns, range_m)
         scaled = metres[rows, columns]
         error = np.where(np.isfinite(scaled), (scaled - range_m) / range_m, np.inf)
         quality = float((np.abs(error) <= AGREEMENT).mean())
@@ -174,9 +171,7 @@ class DepthScaler:
         problem = self._problem(scale, quality, scaled, range_m)
         if problem:
             message = f"{problem}; {message}"
-        return ScaleFit(
-            not problem, scale, shift, self._clean(metres), quality, sigma, len(range_m), message, field
-        )  # fmt: skip
+        return ScaleFit(not problem, scale, shift, self._clean(metres), quality, sigma, len(range_m), message)
 
     def _visible(self, points: Floats, height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         config = self.config

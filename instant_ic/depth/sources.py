@@ -66,32 +66,20 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class DepthResult:
+class DepthResult(ScaleFit):
     """Depth of one image.
 
+    ``scale`` and ``shift``, of the network, are 1 and 0 for ``lidar``. ``quality`` is the share of points whose range
+    agrees with the scaled network, before it is fused: how well image and LiDAR fit together; for ``lidar``, with
+    ``depth_m``, which has no lonely points in it. ``relative_sigma`` is the median of ``sigma`` over its known pixels.
+
     Attributes:
-        depth_m: (H, W) float32 radial metres, 0 = unknown.
         sigma: (H, W) float32 relative standard deviation, inf where unknown.
-        ok: false: do not trust ``depth_m``; ``message`` says why.
-        scale, shift: of the network's depth, see ``scaler.ScaleFit``; 1 and 0 for ``lidar``.
-        quality: share of points, 0..1, whose range agrees with the scaled network, before it is fused: how well
-            image and LiDAR fit together; for ``lidar``, with ``depth_m``, which has no lonely points in it.
-        relative_sigma: one robust number for the image: median of ``sigma`` over its known pixels.
-        points: number of points compared.
-        message: for people.
         source: what ``depth_m`` was made from.
         prior: for :func:`complete`; None unless the source is ``completed`` and the result ok.
     """
 
-    depth_m: NDArray[np.float32]
     sigma: NDArray[np.float32]
-    ok: bool
-    scale: float
-    shift: float
-    quality: float
-    relative_sigma: float
-    points: int
-    message: str
     source: str
     prior: Prior | None = None
 
@@ -196,10 +184,8 @@ class DepthSource:
         """Unfit result for an image without points: ``raw`` if that is in metres, else all unknown."""
         if raw is not None:
             return replace(_of_fit(self.scaler.refuse(raw, message)), source=self.config.source)
-        unknown = np.full(size, np.inf, np.float32)
-        return DepthResult(
-            np.zeros(size, np.float32), unknown, False, 1.0, 0.0, 0.0, float("inf"), 0, message, self.config.source
-        )  # fmt: skip
+        fit = ScaleFit(False, 1.0, 0.0, np.zeros(size, np.float32), 0.0, float("inf"), 0, message)
+        return DepthResult(**vars(fit), sigma=np.full(size, np.inf, np.float32), source=self.config.source)
 
     def network(
         self, fit: ScaleFit, points: Floats, up: Floats, camera_height_m: float | None
@@ -328,7 +314,4 @@ def _median(sigma: Floats) -> float:
 
 def _of_fit(fit: ScaleFit) -> DepthResult:
     sigma = np.where(fit.depth_m > 0, np.float32(fit.relative_sigma), np.float32(np.inf)).astype(np.float32)
-    return DepthResult(
-        fit.depth_m, sigma, fit.ok, fit.scale, fit.shift, fit.quality, fit.relative_sigma, fit.points, fit.message,
-        "network",
-    )  # fmt: skip
+    return DepthResult(**vars(fit), sigma=sigma, source="network")

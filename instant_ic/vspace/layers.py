@@ -24,7 +24,6 @@ from instant_ic.vspace.prior import (
     ROBOT,
     ROOM,
     PanoramaPrior,
-    band_of,
     edge_quads,
     shrunk,
 )
@@ -231,7 +230,6 @@ def _prior(layer: Layer, panorama_width: int) -> PanoramaPrior:
         depth_edge=edge_quads(decoded.inverse_depth, DEPTH_EDGE_RATIO),
         map_from_camera=np.array(layer.map_from_camera, np.float64),
         relative_sigma=layer.relative_sigma,
-        band=band_of(layer.relative_sigma),
         sigma=np.full(decoded.content.shape, min(layer.relative_sigma, MOST_SIGMA), np.float32),
         content=np.where(decoded.content <= ROOM, decoded.content, np.uint8(ROBOT)),
     )

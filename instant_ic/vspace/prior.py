@@ -50,7 +50,6 @@ class PanoramaPrior:
         depth_edge: 1 where the quad between pixel (v, u) and (v + 1, u + 1) crosses a depth edge, (h, w) uint8.
         map_from_camera: pose, (4, 4).
         relative_sigma: standard deviation of the depth, relative to it: median over the image.
-        band: half width, relative to the depth, of the band in which the signed distance is learnt.
         sigma: as ``relative_sigma``, of each pixel, (h, w) float32; ``MOST_SIGMA`` where the depth was filled in.
         content: ``ROOM``, ``ROBOT``, ``SKY`` or ``MOVED``, (h, w) uint8; only ``ROOM`` has surfaces.
     """
@@ -61,9 +60,13 @@ class PanoramaPrior:
     depth_edge: NDArray[np.uint8]
     map_from_camera: NDArray[np.float64]
     relative_sigma: float
-    band: float
     sigma: NDArray[np.float32]
     content: NDArray[np.uint8]
+
+    @property
+    def band(self) -> float:
+        """Half width, relative to the depth, of the band in which the signed distance is learnt."""
+        return float(np.clip(_BAND_SIGMAS * self.relative_sigma, *_BAND))
 
     @property
     def usable(self) -> NDArray[np.uint8]:
@@ -158,15 +161,9 @@ def prepare(
         depth_edge=edge_quads(inverse, DEPTH_EDGE_RATIO),
         map_from_camera=np.array(map_from_camera, np.float64),
         relative_sigma=sigma,
-        band=band_of(sigma),
         sigma=np.where(known, np.minimum(each, np.float32(MOST_SIGMA)), np.float32(MOST_SIGMA)),
         content=content,
     )
-
-
-def band_of(relative_sigma: float) -> float:
-    """Half width of a keyframe's band (``PanoramaPrior.band``)."""
-    return float(np.clip(_BAND_SIGMAS * relative_sigma, *_BAND))
 
 
 def _cut_tops(
