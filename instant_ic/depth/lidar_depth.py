@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.depth.visibility import azimuth_problem, pixels_of
-from instant_ic.geometry.projections import equirect_directions, nearest_pixels
+from instant_ic.geometry.projections import nearest_pixels, rays_of
 
 Floats = NDArray[np.floating]
 Indices = NDArray[np.signedinteger]
@@ -180,12 +179,6 @@ def _confirmed(
     return kept, rows[kept], columns[kept], range_m[kept]
 
 
-@lru_cache(maxsize=4)
-def rays(height: int, width: int) -> NDArray[np.float32]:
-    """``equirect_directions``, kept."""
-    return equirect_directions(width, height)
-
-
 class LidarStructure:
     """Estimates depth images from points."""
 
@@ -236,7 +229,7 @@ class LidarStructure:
         building = _Building(self.config, rows, columns, range_m, size, floor, ceiling, ceiling_m)
         depth, origin, gap_rad = building.fill()
         if turn[2, 2] < 1 - 1e-6:
-            where = nearest_pixels(rays(*size) @ turn.T.astype(np.float32), size[1], size[0])
+            where = nearest_pixels(rays_of(size) @ turn.T.astype(np.float32), size[1], size[0])
             depth, origin, gap_rad = depth[where], origin[where], gap_rad[where]
         return LidarDepth(
             depth, origin, gap_rad, len(level), floor, ceiling, self._problem(z, range_m, columns, size[1], floor)

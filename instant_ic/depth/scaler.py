@@ -25,6 +25,8 @@ from instant_ic.depth.visibility import azimuth_problem, hidden, nearest_points,
 METHODS = ("max_ratio", "median_ratio", "ransac", "sector", "as_estimated")
 MAXIMA = ("lidar", "image")
 OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
+"""``metric``: metres. ``scale_invariant``: metres up to one factor. ``relative``: metres up to factor and shift.
+``disparity``: inverse metres up to factor and shift."""
 AGREEMENT = 0.15
 """A point agrees with depth within this share of its range."""
 _CONFIDENCE = 0.995  # quantile that stands for the maximum, as in the paper

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import check_ranges
 from instant_ic.depth.completion import prior_channels
 from instant_ic.depth.fusion import Corrected, ceiling_height, correct, likely_ceiling
-from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, Origin, rays
+from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, Origin
 from instant_ic.depth.manifest import InferenceError
 from instant_ic.depth.scaler import AGREEMENT, DepthScaler, ScaleFit, ScalerConfig
 from instant_ic.depth.visibility import nearest_points
+from instant_ic.geometry.projections import rays_of
 from instant_ic.mapping.mapper import LocalView
 
 Floats = NDArray[np.floating]
@@ -193,7 +194,7 @@ class DepthSource:
         """The network, scaled and corrected by the points, and the height over the camera of the ceiling it shows."""
         size = fit.depth_m.shape
         network = correct(fit.depth_m, self.structure.ranges(points, size))
-        top = ceiling_height(network.depth_m, rays(*size) @ np.asarray(up, np.float32))
+        top = ceiling_height(network.depth_m, rays_of(size) @ np.asarray(up, np.float32))
         if top is not None and camera_height_m is not None:
             usual = max(self.config.lidar.ceiling_height_m - camera_height_m, 0.3)
             top = likely_ceiling(top, network, usual)
@@ -276,7 +277,7 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
         camera_height_m: of the camera over the floor; None: what is masked is unknown.
         elevation_deg: below it the image shows the robot; -90 masks nothing.
     """
-    rise = rays(*result.depth_m.shape) @ np.asarray(up, np.float32)
+    rise = rays_of(result.depth_m.shape) @ np.asarray(up, np.float32)
     body = rise < np.sin(np.radians(elevation_deg))
     if elevation_deg <= -90 or not body.any():
         return result

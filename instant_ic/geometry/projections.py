@@ -6,6 +6,7 @@ above, rows run from +90° to −90° elevation. Pixel centres have integer coor
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -21,6 +22,12 @@ def equirect_directions(width: int, height: int) -> NDArray[np.float32]:
     """Unit viewing direction of every pixel of a panorama, (height, width, 3)."""
     azimuth = math.pi - (np.arange(width) + 0.5) * (2 * math.pi / width)
     return directions_at(azimuth, math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height))
+
+
+@functools.lru_cache(maxsize=4)
+def rays_of(size: tuple[int, int]) -> NDArray[np.float32]:
+    """``equirect_directions`` of a panorama of (height, width), kept; not to be changed."""
+    return equirect_directions(size[1], size[0])
 
 
 def directions_at(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> NDArray[np.float32]:

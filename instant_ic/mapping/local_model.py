@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.geometry.poses import Matrix
-from instant_ic.geometry.projections import equirect_directions
+from instant_ic.geometry.projections import rays_of
 from instant_ic.jit import leave_out_blas
 from instant_ic.mapping import kernels
 
@@ -166,7 +165,7 @@ class LocalModel:
             kernels.put_plates(
                 self._key, self._odds, self._index, codes, faces, origin, cell, ground, config.behind_m, highest
             )
-        rays = _rays(*size) @ np.asarray(model_from_camera[:3, :3], np.float32).T
+        rays = rays_of(size) @ np.asarray(model_from_camera[:3, :3], np.float32).T
         kernels.cast_rays(
             self._key, self._index, codes, faces, origin, rays.reshape(-1, 3), cell, _LOW_M, ceiling, measured is None,
             _REACH_M, _UNSEEN_M, depth.reshape(-1), kind.reshape(-1), free.reshape(-1),
@@ -189,11 +188,6 @@ _LEAST_CEILING_COLUMNS = 60
 #: Relative standard deviation of depth for each kind of pixel: 68 % of the errors are smaller in seven generated and
 #: scanned worlds (docs/depth.md).
 _SIGMA = np.array([np.inf, 0.012, 0.012, 0.015, 0.015, 0.1, 0.07, 0.005, 0.027, 0.13], np.float32)
-
-
-@lru_cache(maxsize=2)
-def _rays(height: int, width: int) -> NDArray[np.float32]:
-    return equirect_directions(width, height)
 
 
 def warm_up() -> None:

@@ -212,8 +212,10 @@ class SpaceWorker:
         """The view of an order; the newest one again where it would be the same: a standing robot costs nothing."""
         if self._newest is not None and self._newest.order.same_view(order):
             return self._newest
-        changes = space.dissolving
-        encoded = _render(space, order)
+        changes, start = space.dissolving, time.perf_counter()
+        view = space.render(order.pose(), order.width, order.height, order.fov_rad)
+        _, jpeg = cv2.imencode(".jpg", view.softened()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, order.jpeg_quality])
+        encoded = EncodedView(order, (time.perf_counter() - start) * 1e3, view, jpeg.tobytes())
         self._newest = None if changes else encoded
         return encoded
 
@@ -221,13 +223,6 @@ class SpaceWorker:
         """Lower this thread's priority (Linux has one per thread)."""
         if sys.platform == "linux":
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-
-
-def _render(space: Space, order: ViewOrder) -> EncodedView:
-    start = time.perf_counter()
-    view = space.render(order.pose(), order.width, order.height, order.fov_rad)
-    _, jpeg = cv2.imencode(".jpg", view.softened()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, order.jpeg_quality])
-    return EncodedView(order, (time.perf_counter() - start) * 1e3, view, jpeg.tobytes())
 
 
 def decode_panorama(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
