@@ -76,14 +76,10 @@ def error_terms(
         cosine = -np.einsum("ij,ij->i", back, rays.directions[seen]) / away
         ratio = away / np.maximum(depth[seen], 1e-3)
         sine = np.sqrt(np.clip(1 - cosine * cosine, 0, 1))
-        shift = np.minimum(shift, _sigma_at(prior, points) * ratio * sine)
+        height, width = prior.sigma.shape
+        sigma = prior.sigma[nearest_pixels(prior.in_camera(points), width, height)]
+        shift = np.minimum(shift, sigma * ratio * sine)
     return (1 - unseen) * float(texture.cost(shift).mean()), unseen * texture.variance
-
-
-def _sigma_at(prior: PanoramaPrior, points: Floats) -> Floats:
-    """Relative sigma of a keyframe's depth in the direction of points (N, 3) of the map, (N,)."""
-    height, width = prior.sigma.shape
-    return prior.sigma[nearest_pixels(prior.in_camera(points), width, height)]
 
 
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:

@@ -98,13 +98,6 @@ class TorchDevice:
 
     def _density_step(self, uniform: Tensor, rates: tuple[float, float]) -> tuple[float, float]:
         self._state.steps += 1
-        error, colour, distance = self._density_loss(uniform)
-        grads = torch.autograd.grad(error, self._field.parameters())
-        reference.adam_step(self._field, self._state, grads, rates)
-        return float(colour.detach()), float(distance.detach())
-
-    def _density_loss(self, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What training minimises, and ``step``'s two errors."""
         columns, rows = volume_rays(self._train)
         numbers = ray_sources(len(self._priors), columns * rows // 64, self._state.steps)
         sources = torch.from_numpy(numbers).to(self._device)
@@ -117,10 +110,11 @@ class TorchDevice:
         samples, offset, span = volume_reference.band_samples(cameras, surface, jitter, band, self._priors[0])
         output = reference.query(self._field, samples.reshape(-1, 3)).reshape(*offset.shape, 4)
         losses = volume_reference.volume_loss(output, offset, span, colours[:, :3], weight)
-        share = weight.mean(dim=0).clamp(min=1e-3)
         weighted = (w * loss for w, loss in zip((1.0, *VOLUME_WEIGHTS), losses, strict=True))
         error = sum(weighted, torch.zeros((), device=self._device))
-        return error, losses[0] / share[0], losses[1] / share[1]
+        reference.adam_step(self._field, self._state, torch.autograd.grad(error, self._field.parameters()), rates)
+        share = weight.mean(dim=0).clamp(min=1e-3)
+        return float((losses[0] / share[0]).detach()), float((losses[1] / share[1]).detach())
 
     @torch.no_grad()
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
