@@ -17,7 +17,7 @@ from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.vspace.nerf.reference import TorchField
 from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
-from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.prior import MOVED, prepare
 from instant_ic.vspace.view import perspective_rays
 
 F = np.float32
@@ -146,9 +146,10 @@ def two_keyframes():
         prepare(pictures[0].rgb, pictures[0].depth_m, newest, 0.02, config, 2048),
         prepare((pictures[1].rgb * 0.8).astype(np.uint8), pictures[1].depth_m, older, sigma, config, 2048),
     ]
-    priors[1].usable[:, :64] = 0
+    occupancy = build_occupancy(priors, config)
+    priors[1].content[:, :64] = MOVED
     gains = np.array([[1, 1, 1], [1.25, 1.25, 1.2]], F)
-    return Scene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), build_occupancy(priors, config), gains)
+    return Scene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), occupancy, gains)
 
 
 def sampled(scene, uniform, columns, rows, sources):

@@ -17,7 +17,7 @@ from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.nerf.reference import TorchField, query, sample_rays
 from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
-from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.prior import MOVED, prepare
 from instant_ic.vspace.view import perspective_rays
 
 F = np.float32
@@ -32,8 +32,9 @@ def scene():
     priors = [
         prepare(p.rgb, p.depth_m, pose, 0.02, GeometryConfig(), 2048) for p, pose in zip(pictures, poses, strict=True)
     ]
-    priors[1].usable[:, :64] = 0
-    return Scene(tuple(priors), Lattice.for_prior(priors[0], FIELD), build_occupancy(priors, GeometryConfig()))
+    occupancy = build_occupancy(priors, GeometryConfig())
+    priors[1].content[:, :64] = MOVED
+    return Scene(tuple(priors), Lattice.for_prior(priors[0], FIELD), occupancy)
 
 
 def random_parameters():
