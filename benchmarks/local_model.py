@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from reporting import parser_of, report
 
+from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.depth.sources import DepthSource, SourceConfig
@@ -130,7 +131,7 @@ def mapped(scene: Scene) -> tuple[LocalMapper, np.ndarray, float]:
         # A real revolution has twice as many points; all of one moment, as if the robot stopped for each.
         at_lidar = np.repeat(at_lidar, 2, axis=0)
         begin = time.process_time()
-        mapper.revolution("velodyne", k * S // 10, np.zeros(len(at_lidar)), lambda p=at_lidar: p)
+        mapper.revolution(Revolution("velodyne", k * S // 10, np.zeros(len(at_lidar)), lambda p=at_lidar: p))
         cpu_s += time.process_time() - begin
     return mapper, points, cpu_s / (APPROACH_M / SPEED)
 

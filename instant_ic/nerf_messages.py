@@ -48,7 +48,7 @@ def view_message(order: ViewOrder, encoded: EncodedView, schedule: JobSchedule, 
         width=order.width,
         height=order.height,
         confidence=float(encoded.view.confidence.mean()),
-        render_ms=schedule.figures(now_ns).render_ms,
+        render_ms=schedule.figures(now_ns)["render_ms"],
         image=compressed_image_message(encoded.jpeg, "map", now_ns),
     )
 
@@ -60,5 +60,5 @@ def status_message(schedule: JobSchedule, now_ns: int) -> Any:
         header=header("map", now_ns),
         keyframe_pose=pose_message(np.eye(4)) if keyframe is None else keyframe.message.pose,
         keyframe_stamp=to_time(0) if keyframe is None else keyframe.message.header.stamp,
-        **vars(schedule.figures(now_ns)),
+        **schedule.figures(now_ns),
     )

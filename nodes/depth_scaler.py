@@ -6,18 +6,15 @@ import functools
 from dataclasses import fields
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.control.states import Mode
 from instant_ic.depth.chain import DepthChain
-from instant_ic.depth.inference import Inference
-from instant_ic.depth.inputs import HeldImage, Revolution
+from instant_ic.depth.inference import Floats, Inference
+from instant_ic.depth.inputs import HeldImage
 from instant_ic.depth.manifest import ManifestError
-from instant_ic.depth.node_config import DepthScalerConfig
+from instant_ic.depth.metric_depth import DepthScalerConfig
 from instant_ic.depth.sources import DepthResult, complete
-from instant_ic.keyframe_messages import keyframe_message
+from instant_ic.depth_messages import held_image, keyframe_message, revolution_of
 from instant_ic.mapping.local_model import warm_up
 from instant_ic.msg import (
     CompressedImage,
@@ -26,15 +23,11 @@ from instant_ic.msg import (
     Header,
     Image,
     Keyframe,
-    MessageError,
     PointCloud2,
-    cloud_array,
     cloud_of_points,
-    cloud_xyz,
     header,
     image_array,
     image_message,
-    stamp_ns,
 )
 
 _LOCAL_MAP_S = 2.0
@@ -91,24 +84,22 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def on_image(self, message: Any) -> None:
         """Have the depth of an image computed if a keyframe could be taken of it."""
-        image = HeldImage(message.header.frame_id, stamp_ns(message))
+        image = held_image(message)
         if (back_s := self.chain.add_image(image, message)) > 0:
             self.log.warning("time went back by %.1f s: restarting", back_s)
         state = self.state.message
         self.chain.selector.virtual = state is not None and state.mode in _VIRTUAL
-        if not self.chain.due(image):
-            return
-        if self.config.source == "lidar":
+        due = self.chain.due(image)
+        if due and self.config.source == "lidar":
             self.handle(self.chain.hold(image))
-        elif not self.worker.busy and self.chain.request_due(image.stamp_ns):  # a keyframe may be on its way
+        elif due and not self.worker.busy and self.chain.request_due(image.stamp_ns):  # a keyframe may be on its way
             self.request.publish(header(image.frame, image.stamp_ns))
 
     def on_cloud(self, message: Any) -> None:
         try:
-            time_s, xyz = cloud_array(message)["time"], functools.partial(cloud_xyz, message)
-        except (MessageError, ValueError) as error:  # a cloud of another driver
+            revolution = revolution_of(message)
+        except ValueError as error:  # a cloud of another driver
             return self.diagnose("points", WARN, f"/lidar/points cannot be used: {error}")
-        revolution = Revolution(message.header.frame_id, stamp_ns(message), time_s, xyz)
         self.handle(self.chain.add_revolution(revolution))
 
     def on_local_map(self) -> None:
@@ -118,14 +109,14 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def on_depth(self, message: Any) -> None:
         if self.config.source != "lidar":
-            self.chain.answered()
-            self.handle(HeldImage(message.header.frame_id, stamp_ns(message)), image_array(message))
+            self.chain.requests.answered()
+            self.handle(held_image(message), image_array(message))
 
-    def handle(self, image: HeldImage | None, raw: NDArray[np.float32] | None = None) -> None:
+    def handle(self, image: HeldImage | None, raw: Floats | None = None) -> None:
         """Compute the depth of an image and publish it; before that a completion corrects it in the background."""
         if image is None:
             return
-        result = self.chain.estimate(raw, image.frame, image.stamp_ns)
+        result = self.chain.estimate(raw, image)
         panorama = self.chain.inputs.images.get(image.stamp_ns)
         if result.prior is None or panorama is None:
             self.publish_depth((image, result))
@@ -139,17 +130,14 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def publish_depth(self, done: tuple[HeldImage, DepthResult]) -> None:
         image, result = done
-        camera, stamp = image.frame, image.stamp_ns
         self.chain.report(result)
         if result.ok:
-            self.scaled.publish(image_message(result.depth_m, "32FC1", camera, stamp))
-        pose = self.chain.keyframe_pose(result, camera, stamp)
-        if pose is not None:
-            panorama, count = self.chain.inputs.images[stamp], self.chain.selector.count
-            self.keyframe.publish(keyframe_message(count, self.config.map_frame, pose, panorama, result))
-            self.report_keyframe(result, count)
-
-    def report_keyframe(self, result: DepthResult, count: int) -> None:
+            self.scaled.publish(image_message(result.depth_m, "32FC1", image.frame, image.stamp_ns))
+        pose = self.chain.keyframe_pose(result, image)
+        if pose is None:
+            return
+        panorama, count = self.chain.inputs.images[image.stamp_ns], self.chain.selector.count
+        self.keyframe.publish(keyframe_message(count, self.config.map_frame, pose, panorama, result))
         text, level = f"keyframe {count}: {result.message}", OK if result.ok else WARN
         before = self.diagnoses().get("keyframe", (OK,))[0]
         self.diagnose("keyframe", level, text, id=count)

@@ -19,17 +19,14 @@ from instant_ic.msg import (
 )
 from instant_ic.nerf_messages import decode_keyframe, status_message, view_message
 from instant_ic.vspace import State
-from instant_ic.vspace.jobs import (
-    Incoming,
-    Outcome,
-    SpaceWorker,
-    ViewOrder,
-    load_robot_mask,
-)
+from instant_ic.vspace.config import NerfConfig
+from instant_ic.vspace.jobs import Incoming, Outcome, SpaceWorker, ViewOrder, load_robot_mask
 from instant_ic.vspace.layers import Layers
-from instant_ic.vspace.node_config import NerfConfig
 from instant_ic.vspace.schedule import JobSchedule, Turns
 from instant_ic.vspace_messages import layers_message
+
+_STATUS_S = 0.5
+_LOCKSTEP_S, _LOCKSTEP_ITERATIONS = 0.1, 5  # in tests and replay training runs by iterations, not by time
 
 
 class NerfNode(Node[NerfConfig]):
@@ -37,7 +34,7 @@ class NerfNode(Node[NerfConfig]):
 
     name = "nerf"
     worker_class: type[SpaceWorker] = SpaceWorker
-    live_parameters = ("render_fps", "train_ms_per_frame", "lockstep_iterations", "max_view_pixels", "jpeg_quality")
+    live_parameters = ("render_fps", "train_ms_per_frame", "max_view_pixels", "jpeg_quality")
 
     def setup(self) -> None:
         config = self.config
@@ -49,7 +46,7 @@ class NerfNode(Node[NerfConfig]):
         self.image_out = self.publisher("/vspace/image/compressed", CompressedImage, qos=SENSOR)
         self.status_out = self.publisher("/vspace/status", VspaceStatus, qos=LATCHED)
         self.layers_out = self.publisher("/vspace/layers", VspaceLayers, qos=LATCHED)
-        self.work = self.worker_class(config.space, robot, config.train_nice, warm=not self.lockstep)
+        self.work = self.worker_class(config.space, robot, warm=not self.lockstep)
         renderer = self.background(self.work.run, self.on_rendered)
         preparer = self.background(self.work.run, self.on_prepared)
         turns = Turns(config.render_fps, config.train_ms_per_frame)
@@ -57,9 +54,9 @@ class NerfNode(Node[NerfConfig]):
         self.schedule.start()
         self.subscribe("/keyframe", Keyframe, self.on_keyframe, qos=LATCHED)
         self.subscribe("/view/request", ViewRequest, self.on_request, qos=SENSOR)
-        self.timer(config.status_period_s, self.on_timer)
+        self.timer(_STATUS_S, self.on_timer)
         if self.lockstep:
-            self.timer(config.lockstep_period_s, lambda: self.schedule.train(self.config.lockstep_iterations))
+            self.timer(_LOCKSTEP_S, lambda: self.schedule.train(_LOCKSTEP_ITERATIONS))
         self.publish_status()
 
     def reconfigure(self, config: NerfConfig) -> None:

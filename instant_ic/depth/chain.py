@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, Revolution, RevolutionTrigger
+from instant_ic.depth.deskew import Revolution
+from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, RevolutionTrigger
 from instant_ic.depth.keyframes import KeyframeSelector
-from instant_ic.depth.metric_depth import MetricDepth
-from instant_ic.depth.node_config import DepthScalerConfig
-from instant_ic.depth.sources import DepthResult, DepthSource
+from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
+from instant_ic.depth.sources import DepthResult
 from instant_ic.diagnosis import Level
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.mapping.mapper import LocalMapper
 
 _SILENT_S = 10.0  # without an answer to any request
 
@@ -33,27 +32,20 @@ class DepthChain:
 
     def __init__(self, config: DepthScalerConfig, transforms: TransformBuffer, diagnose: Callable[..., None]) -> None:
         self.config, self.inputs, self.selector = config, RecentInputs(), KeyframeSelector(config.keyframes)
-        self._transforms, self._diagnose = transforms, diagnose
-        self._trigger, self._requests = RevolutionTrigger(), DepthRequests()
+        self._diagnose = diagnose
+        self._trigger, self.requests = RevolutionTrigger(), DepthRequests()
         self._model: tuple[str, str] | None = None
         self._last_ns: int | None = None  # stamp of the newest depth
         self.image_ns = 0  # stamp of the newest image
-        source = DepthSource(config.depth_source)
-        self.metric = MetricDepth(source, transforms, self.inputs, config.metric, self._mapper(config))
+        self.metric = MetricDepth(config, transforms, self.inputs)
 
     def reconfigure(self, config: DepthScalerConfig) -> None:
         """Apply new parameters."""
         self.config, self.selector.config = config, config.keyframes
-        self.metric.source.config, self.metric.config = config.depth_source, config.metric
-        mapper = self.metric.mapper
-        if (mapper.config, *mapper.frames) != (config.mapping, config.map_frame, config.odom_frame):
-            self.metric.mapper = self._mapper(config)
+        self.metric.reconfigure(config)
         self._trigger.clear()
         if self._model is not None:
             self.adopt(*self._model)
-
-    def _mapper(self, config: DepthScalerConfig) -> LocalMapper:
-        return LocalMapper(self._transforms, config.mapping, config.map_frame, config.odom_frame)
 
     def adopt(self, name: str, output_kind: str) -> None:
         """Adopt the kind of values that the network reports, whatever the configuration says."""
@@ -62,7 +54,7 @@ class DepthChain:
             scaler = replace(self.config.scaler, output_kind=output_kind)
         except ValueError as error:
             return self._diagnose("model", Level.WARN, f"{name}: {error}")
-        self.metric.source.config = replace(self.config.depth_source, scaler=scaler)
+        self.metric.source.configure(replace(self.config, scaler=scaler))
         self._diagnose("model", Level.OK, f"{name}: {output_kind} depth")
 
     def add_image(self, image: HeldImage, message: Any) -> float:
@@ -72,7 +64,7 @@ class DepthChain:
             self.selector.restart()
         self.image_ns = image.stamp_ns
         self.inputs.add_image(image.stamp_ns, message)
-        self.inputs.discard(self._requests.since_ns or image.stamp_ns)
+        self.inputs.discard(self.requests.since_ns or image.stamp_ns)
         return back_s if restarts else 0.0
 
     def due(self, image: HeldImage) -> bool:
@@ -87,21 +79,17 @@ class DepthChain:
 
     def hold(self, image: HeldImage) -> HeldImage | None:
         """Hold an image until the revolution around it is complete; returns an earlier one without a revolution."""
-        return self._trigger.image(image, self._last_ns, self.config.max_rate_hz, self.config.max_cloud_age_s)
+        return self._trigger.image(image, self._last_ns, self.config.max_rate_hz)
 
     def request_due(self, stamp_ns: int) -> bool:
         """Whether to request the network's depth of an image."""
-        if not self._requests.due(stamp_ns):
+        if not self.requests.due(stamp_ns):
             return False
-        silent_s = (stamp_ns - (self._requests.since_ns or stamp_ns)) / 1e9
+        silent_s = (stamp_ns - (self.requests.since_ns or stamp_ns)) / 1e9
         if silent_s > _SILENT_S:
             text = "does depth_estimator run? source lidar needs none"
             self._diagnose("scale", Level.WARN, f"no /depth/raw for {silent_s:.0f} s: {text}")
         return True
-
-    def answered(self) -> None:
-        """The network's depth has arrived."""
-        self._requests.answered()
 
     def add_revolution(self, revolution: Revolution) -> HeldImage | None:
         """Add a revolution to the local model; returns the held image that it completes."""
@@ -110,26 +98,26 @@ class DepthChain:
         if self.config.source != "network":
             mapper = self.metric.mapper
             try:
-                mapper.revolution(revolution.frame, revolution.stamp_ns, revolution.time_s, revolution.xyz)
+                mapper.revolution(revolution)
                 self._diagnose("local model", Level.OK, "growing", revolutions=mapper.model.revolutions)
             except (TransformError, ValueError) as error:
                 self._diagnose("local model", Level.WARN, f"no points added: {error}")
         return self._trigger.revolution(revolution.middle_ns)
 
-    def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int) -> DepthResult:
-        """Depth of the image taken at ``stamp_ns``; ``raw``: (H, W) the network's, if the source needs it."""
-        self._last_ns = stamp_ns
-        return self.metric.estimate(raw, camera, stamp_ns)
+    def estimate(self, raw: NDArray[np.float32] | None, image: HeldImage) -> DepthResult:
+        """Depth of an image; ``raw``: (H, W) the network's, if the source needs it."""
+        self._last_ns = image.stamp_ns
+        return self.metric.estimate(raw, image.frame, image.stamp_ns)
 
     def report(self, result: DepthResult) -> None:
         self._diagnose("scale", Level.OK if result.ok else Level.WARN, result.message, **result.figures())
 
-    def keyframe_pose(self, result: DepthResult, camera: str, stamp_ns: int) -> Matrix | None:
+    def keyframe_pose(self, result: DepthResult, image: HeldImage) -> Matrix | None:
         """map_from_camera of a new keyframe; None if the image of this depth becomes none."""
-        if stamp_ns not in self.inputs.images:
+        if image.stamp_ns not in self.inputs.images:
             return self._diagnose("keyframe", Level.WARN, "the image that this depth belongs to did not arrive")
         try:
-            map_from_camera = self.metric.map_from_camera(camera, stamp_ns)
+            map_from_camera = self.metric.map_from_camera(image.frame, image.stamp_ns)
         except TransformError as error:
             return self._diagnose("keyframe", Level.WARN, f"no pose: {error}")
-        return map_from_camera if self.selector.take(map_from_camera, result.ok, stamp_ns) else None
+        return map_from_camera if self.selector.take(map_from_camera, result.ok, image.stamp_ns) else None

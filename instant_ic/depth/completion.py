@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.lidar_depth import rays
+from instant_ic.geometry.projections import rays_of
 
 Floats = NDArray[np.floating]
 PRIOR_CHANNELS = 6
@@ -32,7 +32,7 @@ def prior_channels(
         ``rise``: sine of the pixel's elevation; ``floor``: distance of a level floor, 0 above the horizon; ``network``.
     """
     depth = np.where((depth_m > 0) & (depth_m < _MOST_M), depth_m, 0).astype(np.float32)
-    rise = rays(*depth.shape) @ np.asarray(up, np.float32)
+    rise = rays_of(depth.shape) @ np.asarray(up, np.float32)
     floor = np.zeros_like(depth)
     if camera_height_m is not None:
         below = rise < -camera_height_m / _MOST_M

@@ -3,11 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import transform_points
+
+
+@dataclass(frozen=True)
+class Revolution:
+    """A LiDAR revolution.
+
+    Attributes:
+        frame: of the points.
+        stamp_ns: of the cloud.
+        time_s: (N,) seconds after the stamp.
+        xyz: returns the points, (N, 3) in metres.
+    """
+
+    frame: str
+    stamp_ns: int
+    time_s: NDArray[np.floating]
+    xyz: Callable[[], NDArray[np.floating]]
+
+    @property
+    def middle_ns(self) -> int:
+        """Time of the middle of the revolution; of an empty one, its stamp."""
+        return self.stamp_ns + (round(0.5e9 * float(self.time_s[0] + self.time_s[-1])) if len(self.time_s) else 0)
 
 
 def points_at(

@@ -8,25 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Positive, check_ranges
-
 Floats = NDArray[np.floating]
 
 
-@dataclass(frozen=True)
-class FusionConfig:
-    """Parameters of the correction of the network by points.
-
-    Attributes:
-        across_deg, along_deg: how far around a point, in azimuth and elevation, the network is corrected by it; a
-            network is wrong by the same factor over the height of a wall rather than along it.
-    """
-
-    across_deg: Positive = 6.0
-    along_deg: Positive = 25.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
+_ACROSS_DEG, _ALONG_DEG = 6.0, 25.0
+"""How far around a point, in azimuth and elevation, the network is corrected by it: it is wrong by the same factor over
+the height of a wall rather than along it."""
 
 
 def ceiling_height(depth_m: Floats, rise: Floats, least_m: float = 0.3) -> float | None:
@@ -71,7 +58,7 @@ class Corrected:
     sigma: float
 
 
-def correct(network_m: Floats, measured_m: Floats, config: FusionConfig) -> Corrected:
+def correct(network_m: Floats, measured_m: Floats) -> Corrected:
     """Corrects scaled network depth (H, W) by ranges (H, W) at some pixels, 0 elsewhere: a smooth field of factors.
 
     The field is the weighted mean of the log ratios over a Gaussian around each pixel, 1 far from any point; the
@@ -82,7 +69,7 @@ def correct(network_m: Floats, measured_m: Floats, config: FusionConfig) -> Corr
     ratio = np.zeros((height, width), np.float32)
     ratio[seen] = np.clip(np.log(measured_m[seen]) - np.log(network_m[seen]), -0.7, 0.7)
     small = (width // 4, height // 4)
-    sigma = (config.across_deg * small[0] / 360, config.along_deg * small[1] / 180)
+    sigma = (_ACROSS_DEG * small[0] / 360, _ALONG_DEG * small[1] / 180)
     pad = int(3 * sigma[0]) + 1
 
     def blurred(values: Floats) -> NDArray[np.float32]:

@@ -3,40 +3,18 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from instant_ic.depth.deskew import Revolution
 
 KEEP_NS = 4_000_000_000
 """Images and revolutions that differ more from the newest depth are discarded."""
+MAX_CLOUD_AGE_S = 0.3
+"""Largest difference between an image and the middle of its revolution; so long, by the stamps, an image is held."""
 _MAX_IMAGES = 150
 _MAX_REVOLUTIONS = 40
 _REPEAT_NS = 2_000_000_000
-
-
-@dataclass(frozen=True)
-class Revolution:
-    """A LiDAR revolution.
-
-    Attributes:
-        frame: of the points.
-        stamp_ns: of the cloud.
-        time_s: (N,) seconds after the stamp.
-        xyz: returns the points, (N, 3) in metres.
-    """
-
-    frame: str
-    stamp_ns: int
-    time_s: NDArray[np.floating]
-    xyz: Callable[[], NDArray[np.floating]]
-
-    @property
-    def middle_ns(self) -> int:
-        """Time of the middle of the revolution; of an empty one, its stamp."""
-        return self.stamp_ns + (round(0.5e9 * float(self.time_s[0] + self.time_s[-1])) if len(self.time_s) else 0)
 
 
 class RecentInputs:
@@ -52,14 +30,14 @@ class RecentInputs:
         if len(self.images) > _MAX_IMAGES:
             del self.images[next(iter(self.images))]
 
-    def nearest_revolution(self, stamp_ns: int, max_age_s: float) -> Revolution | None:
-        """The revolution whose middle is nearest in time; None when none is within ``max_age_s``."""
+    def nearest_revolution(self, stamp_ns: int) -> Revolution | None:
+        """The revolution whose middle is nearest in time; None when none is within ``MAX_CLOUD_AGE_S``."""
 
         def gap_ns(revolution: Revolution) -> int:
             return abs(revolution.middle_ns - stamp_ns)
 
         found = min((one for one in self.revolutions if len(one.time_s)), key=gap_ns, default=None)
-        return found if found is not None and gap_ns(found) / 1e9 <= max_age_s else None
+        return found if found is not None and gap_ns(found) / 1e9 <= MAX_CLOUD_AGE_S else None
 
     def discard(self, stamp_ns: int) -> None:
         """Discard what lies more than ``KEEP_NS`` from a time, also ahead of it: the clock may have gone back."""
@@ -83,17 +61,16 @@ class RevolutionTrigger:
     def __init__(self) -> None:
         self._held: HeldImage | None = None
 
-    def image(self, image: HeldImage, last_ns: int | None, max_rate_hz: float, max_age_s: float) -> HeldImage | None:
+    def image(self, image: HeldImage, last_ns: int | None, max_rate_hz: float) -> HeldImage | None:
         """Take a new image; returns a held one for which no revolution arrived.
 
         Args:
             image: the new one.
             last_ns: stamp of the newest depth; None before the first.
             max_rate_hz: rate by the images' stamps, with 1 % tolerance.
-            max_age_s: how long a held image waits, by the images' stamps.
         """
         late = None
-        if self._held is not None and abs(image.stamp_ns - self._held.stamp_ns) > max_age_s * 1e9:
+        if self._held is not None and abs(image.stamp_ns - self._held.stamp_ns) > MAX_CLOUD_AGE_S * 1e9:
             late, self._held = self._held, None
             last_ns = late.stamp_ns
         if self._held is None and (last_ns is None or not 0 <= image.stamp_ns - last_ns < 0.99e9 / max_rate_hz):

@@ -10,18 +10,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
-from instant_ic.depth.visibility import project_points
-from instant_ic.geometry.projections import equirect_directions, equirect_pixels
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.depth.visibility import azimuth_problem, pixels_of
+from instant_ic.geometry.projections import nearest_pixels, rays_of
 
 Floats = NDArray[np.floating]
 Indices = NDArray[np.signedinteger]
+_MIN_POINTS = 300
+_MAX_UNDER_FLOOR = 0.1  # a larger share of points there: height or tilt of the camera is wrong, or stairs go down
+_MAX_GAP_DEG = 8.0  # an azimuth without any return is bridged up to this width; a wider one is open: unknown
+_FLOOR_TOLERANCE_M = 0.08
+_SAME_SURFACE = 0.15  # share by which the horizontal ranges of two points of one upright surface differ at most
 
 
 class Origin(IntEnum):
@@ -45,27 +49,13 @@ class LidarDepthConfig:
     Attributes:
         min_range_m: points nearer than this to the camera are left out (the robot itself).
         max_range_m: farther points are left out; what lies farther is unknown.
-        min_points: fewer points give no depth.
-        min_azimuth_deg: points in fewer degrees of azimuth: the depth is not fit.
-        max_under_floor: a larger share of points under the floor: height or tilt of the camera is wrong, or stairs go
-            down; not fit.
-        max_gap_deg: an azimuth without any return is bridged up to this width; a wider one is open: unknown.
         ceiling_height_m: of the ceiling over the floor, where no point was seen on it.
-        floor_tolerance_m: a point this near the floor's plane belongs to the floor.
-        same_surface: two points above each other are of one surface when their horizontal ranges differ by less than
-            this share.
         top_ring_deg: elevation of the LiDAR's uppermost ring.
     """
 
     min_range_m: NotNegative = 0.4
     max_range_m: Positive = 40.0
-    min_points: Annotated[int, Range(20)] = 300
-    min_azimuth_deg: Annotated[float, Range(0, 360)] = 90.0
-    max_under_floor: Share = 0.1
-    max_gap_deg: Annotated[float, Range(0, 90)] = 8.0
     ceiling_height_m: Positive = 2.7
-    floor_tolerance_m: Positive = 0.08
-    same_surface: Annotated[float, Range(above=0, below=1)] = 0.15
     top_ring_deg: Annotated[float, Range(0, 60)] = 15.0
 
     def __post_init__(self) -> None:
@@ -178,9 +168,7 @@ def _confirmed(
     points: Floats, size: tuple[int, int]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Floats]:
     """Of points (N, 3) the nearest in each pixel, without the lonely ones: index, row, column and range, each (M,)."""
-    u, v, range_m = project_points(points, size[1], size[0])
-    rows = np.clip(np.rint(v).astype(np.intp), 0, size[0] - 1)
-    columns = np.rint(u).astype(np.intp) % size[1]
+    rows, columns, range_m = pixels_of(points, size[1], size[0])
     nearest = np.full(size, -1, np.intp)
     far_first = np.argsort(-range_m, kind="stable")
     nearest[rows[far_first], columns[far_first]] = far_first
@@ -189,12 +177,6 @@ def _confirmed(
     measured[rows[kept], columns[kept]] = range_m[kept]
     kept = kept[~lonely(measured, rows[kept], columns[kept])]
     return kept, rows[kept], columns[kept], range_m[kept]
-
-
-@lru_cache(maxsize=4)
-def rays(height: int, width: int) -> NDArray[np.float32]:
-    """``equirect_directions``, kept."""
-    return equirect_directions(width, height)
 
 
 class LidarStructure:
@@ -228,10 +210,10 @@ class LidarStructure:
             raise ValueError(f"points must be (N, 3) (got {points.shape})")
         turn = level_from_camera(up)
         level = self._usable(points) @ turn.T
-        if len(level) < self.config.min_points:
+        if len(level) < _MIN_POINTS:
             words = (
                 f"{len(level)} LiDAR points between {self.config.min_range_m} and {self.config.max_range_m} m, "
-                f"{self.config.min_points} are needed"
+                f"{_MIN_POINTS} are needed"
             )
             nothing = np.zeros(size, np.float32), np.zeros(size, np.uint8), np.full(size, np.pi, np.float32)
             return LidarDepth(*nothing, len(level), camera_height_m, None, words)
@@ -247,8 +229,7 @@ class LidarStructure:
         building = _Building(self.config, rows, columns, range_m, size, floor, ceiling, ceiling_m)
         depth, origin, gap_rad = building.fill()
         if turn[2, 2] < 1 - 1e-6:
-            u, v = equirect_pixels(rays(*size) @ turn.T.astype(np.float32), size[1], size[0])
-            where = np.clip(np.rint(v).astype(np.intp), 0, size[0] - 1), np.rint(u).astype(np.intp) % size[1]
+            where = nearest_pixels(rays_of(size) @ turn.T.astype(np.float32), size[1], size[0])
             depth, origin, gap_rad = depth[where], origin[where], gap_rad[where]
         return LidarDepth(
             depth, origin, gap_rad, len(level), floor, ceiling, self._problem(z, range_m, columns, size[1], floor)
@@ -269,11 +250,10 @@ class LidarStructure:
 
     def _problem(self, z: Floats, range_m: Floats, columns: NDArray[np.intp], width: int, floor: float | None) -> str:
         """Reason for not trusting the structure; empty if it is trusted."""
-        covered, needed = len(np.unique(columns * 120 // width)) * 3.0, self.config.min_azimuth_deg
-        if covered < needed:
-            return f"LiDAR points cover {covered:.0f} deg of azimuth, {needed:.0f} are needed"
+        if problem := azimuth_problem(columns, width):
+            return problem
         under = 0.0 if floor is None else float((z < -floor - 0.15 - 0.02 * range_m).mean())
-        if under > self.config.max_under_floor:
+        if under > _MAX_UNDER_FLOOR:
             return (
                 f"{under:.0%} of the points lie under the floor ({floor:.2f} m under the camera): "
                 "height or tilt of the camera is wrong, or stairs go down"
@@ -287,6 +267,7 @@ class _Building:
     Attributes:
         hit: (H, W) horizontal range of the point in each pixel, 0 without one.
         flat: (H, W) the point is of the floor or the ceiling.
+        above, below: (H, W) rows of the next points, -1 and H without one; up, down: their indices within the image.
     """
 
     def __init__(
@@ -306,7 +287,7 @@ class _Building:
         self.cos, self.sin, self.tan = np.cos(elevation), np.sin(elevation), np.tan(elevation)
         z = range_m * self.sin[rows, 0]
         # A row is half a pixel uncertain, which far away is more than the tolerance.
-        slack = config.floor_tolerance_m + range_m * (np.pi / height)
+        slack = _FLOOR_TOLERANCE_M + range_m * (np.pi / height)
         of_plane = np.zeros(len(z), bool)
         if floor is not None:
             of_plane |= z < -floor + slack
@@ -329,14 +310,14 @@ class _Building:
         height, width = self.size
         column = np.arange(width, dtype=np.int32)
         index = np.arange(height, dtype=np.int32)[:, None]
-        above = np.maximum.accumulate(np.where(self.some, index, np.int32(-1)), axis=0)
-        below = np.minimum.accumulate(np.where(self.some, index, np.int32(height))[::-1], axis=0)[::-1]
-        up, down = np.maximum(above, 0), np.minimum(below, height - 1)
+        self.above = above = np.maximum.accumulate(np.where(self.some, index, np.int32(-1)), axis=0)
+        self.below = below = np.minimum.accumulate(np.where(self.some, index, np.int32(height))[::-1], axis=0)[::-1]
+        self.up, self.down = (np.maximum(above, 0), column), (np.minimum(below, height - 1), column)
         gap = np.minimum(np.where(above < 0, height, index - above), np.where(below == height, height, below - index))
-        wall, origin = self._walls(above, below, up, down, column)
+        wall, origin = self._walls(index)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(wall > 0, wall / self.cos, np.inf)
-            self._plates(depth, origin, above, below, up, down, column)
+            self._plates(depth, origin)
             self._planes(depth, origin, wall)
         np.copyto(depth, self.measured, where=self.some)
         np.copyto(origin, np.uint8(Origin.BEAM), where=self.some)
@@ -357,21 +338,20 @@ class _Building:
         origin[:, used < 0] = np.where(ground > 0, Origin.FLOOR, Origin.UNKNOWN)
         return depth.astype(np.float32), origin, (gap * (np.pi / height)).astype(np.float32)
 
-    def _walls(
-        self, above: Indices, below: Indices, up: Indices, down: Indices, column: Indices
-    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def _walls(self, index: Indices) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Horizontal range (0: none) of the upright surface that each pixel shows, and its origin.
 
-        ``above`` and ``below`` are the rows of the next points, ``up`` and ``down`` the same within the image.
+        ``index``: the image's rows, (H, 1).
         """
-        index = np.arange(self.size[0], dtype=np.int32)[:, None]
-        wall_above = (above >= 0) & ~self.flat[up, column]
-        wall_below = (below < len(index)) & ~self.flat[down, column]
+        above, below = self.above, self.below
+        wall_above = (above >= 0) & ~self.flat[self.up]
+        wall_below = (below < len(index)) & ~self.flat[self.down]
         flat_above = (above >= 0) & ~wall_above
         flat_below = (below < len(index)) & ~wall_below
-        r_above, r_below = self.hit[up, column], self.hit[down, column]
+        r_above, r_below = self.hit[self.up], self.hit[self.down]
         both = wall_above & wall_below
-        same = both & (np.abs(r_above - r_below) < self.config.same_surface * np.minimum(r_above, r_below))
+        same = both & (np.abs(r_above - r_below) < _SAME_SURFACE * np.minimum(r_above, r_below))
+        up, down = self.up[0], self.down[0]
         share = ((index - up) / np.maximum(down - up, 1)).astype(np.float32)
         nearer_above = index - above <= below - index
         crown = self._crown()
@@ -403,14 +383,11 @@ class _Building:
         )
         return np.where(donor >= 0, across[donor], 0).astype(np.float32)
 
-    def _plates(
-        self, depth: Floats, origin: NDArray[np.uint8], above: Indices, below: Indices, up: Indices, down: Indices,
-        column: Indices,
-    ) -> None:  # fmt: skip
+    def _plates(self, depth: Floats, origin: NDArray[np.uint8]) -> None:
         """Between two points of one height lies a level surface: a table, a bench."""
-        high, low = self.hit[up, column] * self.tan[up, 0], self.hit[down, column] * self.tan[down, 0]
-        edge = (origin == Origin.EDGE) & (above >= 0) & (below < self.size[0])
-        plate = edge & ~self.flat[up, column] & (high < -0.15) & (np.abs(high - low) < 0.05)
+        high, low = (self.hit[place] * self.tan[place[0], 0] for place in (self.up, self.down))
+        edge = (origin == Origin.EDGE) & (self.above >= 0) & (self.below < self.size[0])
+        plate = edge & ~self.flat[self.up] & (high < -0.15) & (np.abs(high - low) < 0.05)
         np.copyto(depth, 0.5 * (high + low) / self.sin, where=plate)
         np.copyto(origin, np.uint8(Origin.BETWEEN), where=plate)
 
@@ -427,7 +404,7 @@ class _Building:
         np.minimum(depth, to_top, out=depth)
 
     def _bridged(self, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
-        return _bridge(seen, round(self.config.max_gap_deg / 360 * self.size[1]))
+        return _bridge(seen, round(_MAX_GAP_DEG / 360 * self.size[1]))
 
 
 #: Relative standard deviation at a point and its growth with the angle (1/rad) to it, for each ``Origin``.

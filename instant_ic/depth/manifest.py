@@ -10,10 +10,7 @@ from typing import Any
 import yaml
 
 from instant_ic.config.yaml_text import compose_yaml, construct
-
-OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
-"""``metric``: metres. ``scale_invariant``: metres up to one factor. ``relative``: metres up to factor and shift.
-``disparity``: inverse metres up to factor and shift."""
+from instant_ic.depth.scaler import OUTPUT_KINDS
 
 MOST_PIXELS = 16384
 """Largest side of a network's input."""
@@ -57,7 +54,7 @@ class ModelManifest:
         depth_output: name of the output that is depth; empty for the first one that is not the mask.
         output_form: ``depth``, ``inverse`` (1 / depth) or ``points`` (three coordinates a pixel, whose length is the
             depth): what the output's numbers are. Inverse and points are turned into depth.
-        output_kind: one of :data:`OUTPUT_KINDS`: what is known of the depth's unit.
+        output_kind: one of ``scaler.OUTPUT_KINDS``: what is known of the depth's unit.
         output_scale: the depth is multiplied by it (100 for a network that gives 0..1 for 0..100 m).
         min_range_m: metric depth between 0 and this is raised to it.
         max_range_m: metric depth above it is cut to it.

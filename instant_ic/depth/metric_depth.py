@@ -2,62 +2,78 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.config.ranges import Positive, PositiveInt, Range
 from instant_ic.depth.deskew import points_at
-from instant_ic.depth.inputs import RecentInputs
-from instant_ic.depth.sources import DepthResult, DepthSource, without_body
+from instant_ic.depth.inputs import MAX_CLOUD_AGE_S, RecentInputs
+from instant_ic.depth.keyframes import KeyframeSelectionConfig
+from instant_ic.depth.sources import DepthResult, DepthSource, SourceConfig, without_body
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.mapping.mapper import LocalMapper, LocalView, correction
+from instant_ic.mapping.mapper import LocalMapper, LocalView, MapperConfig, correction
 
 
 @dataclass(frozen=True)
-class Frames:
-    """Names of the frames: of the keyframes' poses, of motion compensation, and of the robot on the ground."""
-
-    map: str = "map"
-    odom: str = "odom"
-    base: str = "base_link"
-
-
-@dataclass(frozen=True)
-class MetricDepthConfig:
-    """Parameters.
+class DepthScalerConfig(SourceConfig):
+    """Parameters of the node ``depth_scaler``.
 
     Attributes:
-        frames: names of the frames.
-        rows: height of the result without a network's depth, which otherwise sets it.
-        body_elevation_deg: below this elevation the image shows the robot itself; -90: nowhere.
-        max_age_s: largest difference between the middle of a revolution and the image, in seconds.
+        completion: completion model for ``completed``: ONNX file; a bare name is searched for in ``models/``.
+        provider, threads: execution provider and CPU threads of the completion.
+        keyframes: selection of keyframes.
+        mapping: the local 3D model, from which the sources ``fused`` and ``lidar`` take depth first.
+        max_rate_hz: highest rate of the source ``lidar``, by the images' stamps; that of the others is
+            depth_estimator's.
+        rows: height of the depth image of source ``lidar``; the others have the network's.
+        body_elevation_deg: below this elevation the image shows the robot itself, not the room; -90: nowhere.
+        map_frame, odom_frame: frames of the keyframe's pose and of the motion compensation.
+        base_frame: frame on the ground; reference of the camera's height.
     """
 
-    frames: Frames
-    rows: int
-    body_elevation_deg: float
-    max_age_s: float
+    completion: str = ""
+    provider: str = "auto"
+    threads: PositiveInt = 1
+    keyframes: KeyframeSelectionConfig = field(default_factory=KeyframeSelectionConfig)
+    mapping: MapperConfig = field(default_factory=MapperConfig)
+    max_rate_hz: Positive = 2.0
+    rows: Annotated[int, Range(32, 1024)] = 256
+    body_elevation_deg: Annotated[float, Range(-90, 0)] = -70.0
+    map_frame: str = "map"
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.source == "completed" and not self.completion:
+            raise ValueError("source completed needs a model: set completion to a file of ic depth train --export")
 
 
 class MetricDepth:
-    """Joins a ``DepthSource`` with the poses of camera and LiDAR.
+    """Joins a ``DepthSource`` and the local 3D model with the poses of camera and LiDAR.
 
     Args:
-        source: computes depth of points and the network's estimate.
+        config: parameters.
         transforms: poses over time.
         inputs: recent revolutions.
-        config: parameters.
-        mapper: feeds the local 3D model.
     """
 
-    def __init__(
-        self, source: DepthSource, transforms: TransformBuffer, inputs: RecentInputs, config: MetricDepthConfig,
-        mapper: LocalMapper,
-    ) -> None:  # fmt: skip
-        self.source, self.transforms, self.inputs, self.config = source, transforms, inputs, config
-        self.mapper = mapper
+    def __init__(self, config: DepthScalerConfig, transforms: TransformBuffer, inputs: RecentInputs) -> None:
+        self.config, self.transforms, self.inputs = config, transforms, inputs
+        self.source = DepthSource(config)
+        self.mapper = LocalMapper(transforms, config.mapping, config.map_frame, config.odom_frame)
+
+    def reconfigure(self, config: DepthScalerConfig) -> None:
+        """Apply new parameters; the local model starts again if they change it."""
+        before, self.config = self.config, config
+        self.source.configure(config)
+        keys = ("mapping", "map_frame", "odom_frame")
+        if any(getattr(before, key) != getattr(config, key) for key in keys):
+            self.mapper = LocalMapper(self.transforms, config.mapping, config.map_frame, config.odom_frame)
 
     def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int) -> DepthResult:
         """Depth of an image; if something is missing the result is not ok, and its message says what.
@@ -80,7 +96,7 @@ class MetricDepth:
         except TransformError as error:
             return self.source.refuse(raw, str(error), size)
         if points is None:
-            return self.source.refuse(raw, f"no LiDAR revolution within {config.max_age_s} s", size)
+            return self.source.refuse(raw, f"no LiDAR revolution within {MAX_CLOUD_AGE_S} s", size)
         result = self.source.estimate(raw, points, up, height_m, size=size, local=local)
         return without_body(result, up, height_m, config.body_elevation_deg)
 
@@ -90,8 +106,8 @@ class MetricDepth:
         Raises:
             TransformError: the poses are not known.
         """
-        base_from_camera = self.transforms.lookup(self.config.frames.base, camera, stamp_ns)
-        odom_from_camera = self.transforms.lookup(self.config.frames.odom, camera, stamp_ns)
+        base_from_camera = self.transforms.lookup(self.config.base_frame, camera, stamp_ns)
+        odom_from_camera = self.transforms.lookup(self.config.odom_frame, camera, stamp_ns)
         return np.array(odom_from_camera[2, :3]), float(base_from_camera[2, 3])
 
     def points_in_camera(self, camera: str, stamp_ns: int) -> NDArray[np.float64] | None:
@@ -100,10 +116,10 @@ class MetricDepth:
         Raises:
             TransformError: the poses are not known.
         """
-        revolution = self.inputs.nearest_revolution(stamp_ns, self.config.max_age_s)
+        revolution = self.inputs.nearest_revolution(stamp_ns)
         if revolution is None:
             return None
-        odom, lidar = self.config.frames.odom, revolution.frame
+        odom, lidar = self.config.odom_frame, revolution.frame
         camera_from_odom = self.transforms.lookup(camera, odom, stamp_ns)
 
         def camera_from_lidar(at_ns: int) -> Matrix:
@@ -118,5 +134,6 @@ class MetricDepth:
         Raises:
             TransformError: the poses are not known.
         """
-        map_from_odom = correction(self.transforms, self.config.frames.map, self.config.frames.odom, stamp_ns)
-        return map_from_odom @ self.transforms.lookup(self.config.frames.odom, camera, stamp_ns)
+        map_frame, odom_frame = self.config.map_frame, self.config.odom_frame
+        map_from_odom = correction(self.transforms, map_frame, odom_frame, stamp_ns)
+        return map_from_odom @ self.transforms.lookup(odom_frame, camera, stamp_ns)

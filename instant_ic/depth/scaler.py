@@ -20,13 +20,18 @@ from instant_ic.depth.scale_rules import (
     sector_factors,
     solid_angle_quantile,
 )
-from instant_ic.depth.visibility import hidden, nearest_points, on_depth_edge
+from instant_ic.depth.visibility import azimuth_problem, hidden, nearest_points, on_depth_edge
 
 METHODS = ("max_ratio", "median_ratio", "ransac", "sector", "as_estimated")
 MAXIMA = ("lidar", "image")
 OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
-SECTOR_REACH = 0.35
-"""A point farther off than a factor e**0.35 has no say in its sector: glass, a doorway, an outlier."""
+"""``metric``: metres. ``scale_invariant``: metres up to one factor. ``relative``: metres up to factor and shift.
+``disparity``: inverse metres up to factor and shift."""
+AGREEMENT = 0.15
+"""A point agrees with depth within this share of its range."""
+_CONFIDENCE = 0.995  # quantile that stands for the maximum, as in the paper
+_SECTOR_DEG, _SECTOR_POINTS = 15.0, 30.0  # width of a sector; points that give it half of its own correction
+_SECTOR_REACH = 0.35  # a point farther off than a factor e**0.35 has no say: glass, a doorway, an outlier
 
 
 @dataclass(frozen=True)
@@ -36,16 +41,11 @@ class ScalerConfig:
     Attributes:
         method: sector, ransac, median_ratio, max_ratio (the paper's), as_estimated (not for driving).
         maxima: max_ratio's largest depth: over the LiDAR's directions (lidar) or the whole image (image).
-        confidence: quantile that stands for the maximum; lower is more robust, higher nearer the maximum.
         output_kind: of the model, as in its manifest: metric, scale_invariant, relative, disparity.
         min_range_m: metres from the camera; nearer points (the robot itself) are left out.
         max_range_m: metres; farther points are left out, farther depth is cut.
         min_points: points on known depth; fewer give no scale.
-        min_azimuth_deg: degrees of azimuth with points; fewer give no scale.
-        sector_deg: degrees; width of a sector: narrower follows the depth's errors closer, wider is smoother.
-        sector_points: points that give a sector half of its own correction; fewer keep the scale of the whole.
-        agreement: a point agrees within this share of its range; sets what quality counts.
-        min_quality: share of agreeing points; less and the fit is not trusted.
+        min_quality: share of points that agree within 15 %; less and the fit is not trusted.
         max_rival: another scale with more than this share of the scale's points: two fit, none is trusted.
         min_scale, max_scale: a scale outside makes the fit not ok (``metric`` and ``scale_invariant``).
         assumed_sigma: relative standard deviation published for depth that is used as estimated.
@@ -53,15 +53,10 @@ class ScalerConfig:
 
     method: str = "sector"
     maxima: str = "lidar"
-    confidence: Annotated[float, Range(0.5, 1)] = 0.995
     output_kind: str = "metric"
     min_range_m: NotNegative = 0.4
     max_range_m: Positive = 16.0
     min_points: Annotated[int, Range(MIN_VALUES)] = 300
-    min_azimuth_deg: Annotated[float, Range(0, 360)] = 90.0
-    sector_deg: Annotated[float, Range(5, 90)] = 15.0
-    sector_points: Positive = 30.0
-    agreement: Annotated[float, Range(above=0, below=1)] = 0.15
     min_quality: Share = 0.25
     max_rival: Annotated[float, Range(above=0, high=1)] = 0.7
     min_scale: Positive = 0.05
@@ -73,8 +68,6 @@ class ScalerConfig:
             if getattr(self, key) not in allowed:
                 raise ValueError(f"{key} must be one of {', '.join(allowed)} (got {getattr(self, key)!r})")
         check_ranges(self)
-        if abs(360.0 / self.sector_deg - round(360.0 / self.sector_deg)) > 1e-6:
-            raise ValueError(f"360 must be a multiple of sector_deg (got {self.sector_deg})")
         if not self.min_range_m < self.max_range_m:
             raise ValueError(f"min_range_m must be under max_range_m (got {self.min_range_m}, {self.max_range_m})")
         if not self.min_scale < self.max_scale:
@@ -96,7 +89,6 @@ class ScaleFit:
         relative_sigma: one standard deviation of (depth - range) / range, robust; inf where nothing was compared.
         points: number of points compared.
         message: for people.
-        scale_field: (H, W) factor on top of scale and shift in each direction (``sector``); None: one everywhere.
     """
 
     ok: bool
@@ -107,7 +99,6 @@ class ScaleFit:
     relative_sigma: float
     points: int
     message: str
-    scale_field: NDArray[np.float32] | None = None
 
 
 class DepthScaler:
@@ -162,45 +153,27 @@ class DepthScaler:
                 f"{int(usable.sum())} LiDAR points fall off the depth's edges, {config.min_points} are needed"
             )
         rows, columns, range_m = rows[usable], columns[usable], range_m[usable]
-        self._check_azimuth(columns, depth.shape[1])
+        _check_azimuth(columns, depth.shape[1])
         scale, shift = self._line(depth, depth[rows, columns], range_m)
         if scale <= 0:
             raise ScaleError(f"depth falls where the range grows (slope {scale:.3g})")
         metres = self._metres(depth, scale, shift)
-        field = self._field(metres, rows, columns, range_m) if config.method == "sector" else None
-        if field is not None:
-            metres = metres * field
-        line = f"scale {scale:.3f}" + (f", shift {shift:.3f}" if shift else "")
-        return self._judged(metres, rows, columns, range_m, scale, shift, line, field)
-
-    def _judged(
-        self,
-        metres: Floats,
-        rows: NDArray[np.intp],
-        columns: NDArray[np.intp],
-        range_m: Floats,
-        scale: float,
-        shift: float,
-        line: str,
-        field: NDArray[np.float32] | None,
-    ) -> ScaleFit:
-        """The fit with its quality; ``ok`` where nothing speaks against it."""
-        config = self.config
+        if config.method == "sector":
+            metres = metres * self._field(metres, rows, columns, range_m)
         scaled = metres[rows, columns]
         error = np.where(np.isfinite(scaled), (scaled - range_m) / range_m, np.inf)
-        quality = float((np.abs(error) <= config.agreement).mean())
+        quality = float((np.abs(error) <= AGREEMENT).mean())
         finite = error[np.isfinite(error)]
         sigma = 1.4826 * float(np.median(np.abs(finite))) if len(finite) else float("inf")
-        message = f"{line}: {quality:.0%} of {len(range_m)} points within {config.agreement:.0%}"
+        line = f"scale {scale:.3f}" + (f", shift {shift:.3f}" if shift else "")
+        message = f"{line}: {quality:.0%} of {len(range_m)} points within {AGREEMENT:.0%}"
         behind = float((error < -1 / 3).mean())
         if behind > 0.15:
             message += f", {behind:.0%} far behind the depth (glass, a mirror, a doorway?)"
         problem = self._problem(scale, quality, scaled, range_m)
         if problem:
             message = f"{problem}; {message}"
-        return ScaleFit(
-            not problem, scale, shift, self._clean(metres), quality, sigma, len(range_m), message, field
-        )  # fmt: skip
+        return ScaleFit(not problem, scale, shift, self._clean(metres), quality, sigma, len(range_m), message)
 
     def _visible(self, points: Floats, height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         config = self.config
@@ -213,29 +186,23 @@ class DepthScaler:
                 f"{config.min_points} are needed"
             )
         rows, columns, range_m = nearest_points(points[~hidden(points)], width, height)
-        self._check_azimuth(columns, width)
+        _check_azimuth(columns, width)
         return rows, columns, range_m
-
-    def _check_azimuth(self, columns: NDArray[np.intp], width: int) -> None:
-        covered, needed = len(np.unique(columns * 120 // width)) * 3.0, self.config.min_azimuth_deg
-        if covered < needed:
-            raise ScaleError(f"LiDAR points cover {covered:.0f} deg of azimuth, {needed:.0f} are needed")
 
     def _line(self, depth: Floats, at_points: Floats, range_m: Floats) -> tuple[float, float]:
         """Scale and shift between the model's unit and metres (inverse metres for ``disparity``)."""
         config = self.config
         if config.output_kind == "relative":
-            return ransac_line(at_points, range_m, config.agreement * range_m)[:2]
+            return ransac_line(at_points, range_m, AGREEMENT * range_m)[:2]
         if config.output_kind == "disparity":
-            return ransac_line(at_points, 1.0 / range_m, config.agreement / range_m)[:2]
+            return ransac_line(at_points, 1.0 / range_m, AGREEMENT / range_m)[:2]
         if config.method == "median_ratio":
             return median_ratio_scale(at_points, range_m), 0.0
         if config.method in ("ransac", "sector"):
-            return consensus_scale(at_points, range_m, config.agreement).scale, 0.0
+            return consensus_scale(at_points, range_m, AGREEMENT).scale, 0.0
         if config.maxima == "lidar":
-            return max_ratio_scale(at_points, range_m, config.confidence), 0.0
-        largest = float(np.quantile(range_m, config.confidence))
-        return largest / solid_angle_quantile(depth, config.confidence), 0.0
+            return max_ratio_scale(at_points, range_m, _CONFIDENCE), 0.0
+        return float(np.quantile(range_m, _CONFIDENCE)) / solid_angle_quantile(depth, _CONFIDENCE), 0.0
 
     def _metres(self, depth: Floats, scale: float, shift: float) -> NDArray[np.float64]:
         """Depth (H, W) in metres, not finite where it is unknown."""
@@ -251,11 +218,9 @@ class DepthScaler:
         """Factor (H, W) of each direction by the points near the scale; towards the poles it goes to 1."""
         height, width = metres.shape
         ratio = np.log(range_m / metres[rows, columns])
-        near = np.abs(ratio) <= SECTOR_REACH
+        near = np.abs(ratio) <= _SECTOR_REACH
         azimuth = np.pi - (np.arange(width) + 0.5) * (2 * np.pi / width)
-        centres, factors = sector_factors(
-            azimuth[columns[near]], ratio[near], self.config.sector_deg, self.config.sector_points
-        )
+        centres, factors = sector_factors(azimuth[columns[near]], ratio[near], _SECTOR_DEG, _SECTOR_POINTS)
         of_columns = np.interp(azimuth, centres, factors, period=2 * np.pi)
         elevation = np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)
         return np.exp(np.cos(elevation)[:, None] * of_columns[None, :]).astype(np.float32)
@@ -267,7 +232,7 @@ class DepthScaler:
             return f"scale {scale:.3g} is outside {config.min_scale} to {config.max_scale}"
         if quality < config.min_quality:
             return f"only {quality:.0%} of the points agree, {config.min_quality:.0%} are needed"
-        found = consensus_scale(scaled, range_m, config.agreement)
+        found = consensus_scale(scaled, range_m, AGREEMENT)
         if found.rival_share > config.max_rival * found.share:
             return (
                 f"two scales fit: {found.share:.0%} of the points stand for {scale * found.scale:.3g}, "
@@ -278,6 +243,11 @@ class DepthScaler:
     def _clean(self, depth: Floats) -> NDArray[np.float32]:
         known = np.isfinite(depth) & (depth > 0)
         return np.where(known, np.minimum(depth, self.config.max_range_m), 0.0).astype(np.float32)
+
+
+def _check_azimuth(columns: NDArray[np.intp], width: int) -> None:
+    if problem := azimuth_problem(columns, width):
+        raise ScaleError(problem)
 
 
 def _is_known(depth: Floats) -> NDArray[np.bool_]:

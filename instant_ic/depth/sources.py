@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from instant_ic.config.ranges import check_ranges
 from instant_ic.depth.completion import prior_channels
-from instant_ic.depth.fusion import Corrected, FusionConfig, ceiling_height, correct, likely_ceiling
-from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, Origin, rays
+from instant_ic.depth.fusion import Corrected, ceiling_height, correct, likely_ceiling
+from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, Origin
 from instant_ic.depth.manifest import InferenceError
-from instant_ic.depth.scaler import DepthScaler, ScaleFit, ScalerConfig
+from instant_ic.depth.scaler import AGREEMENT, DepthScaler, ScaleFit, ScalerConfig
 from instant_ic.depth.visibility import nearest_points
+from instant_ic.geometry.projections import rays_of
 from instant_ic.mapping.mapper import LocalView
 
 Floats = NDArray[np.floating]
@@ -34,17 +35,15 @@ class SourceConfig:
     """Source of depth and its parameters.
 
     Attributes:
-        source: ``network``: the network's depth, scaled; ``lidar``: LiDAR and structure, no network; ``fused``: both;
-            ``completed``: ``fused``, for :func:`complete` to correct.
+        source: ``fused``: LiDAR and network; ``lidar``: no network; ``network``: scaled by the LiDAR; ``completed``:
+            ``fused``, corrected by a completion.
         scaler: how the network's depth is scaled.
         lidar: how depth is made from points alone.
-        fusion: how both are brought together.
     """
 
     source: str = "fused"
     scaler: ScalerConfig = field(default_factory=ScalerConfig)
     lidar: LidarDepthConfig = field(default_factory=LidarDepthConfig)
-    fusion: FusionConfig = field(default_factory=FusionConfig)
 
     def __post_init__(self) -> None:
         if self.source not in SOURCES:
@@ -68,32 +67,20 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class DepthResult:
+class DepthResult(ScaleFit):
     """Depth of one image.
 
+    ``scale`` and ``shift``, of the network, are 1 and 0 for ``lidar``. ``quality`` is the share of points whose range
+    agrees with the scaled network, before it is fused: how well image and LiDAR fit together; for ``lidar``, with
+    ``depth_m``, which has no lonely points in it. ``relative_sigma`` is the median of ``sigma`` over its known pixels.
+
     Attributes:
-        depth_m: (H, W) float32 radial metres, 0 = unknown.
         sigma: (H, W) float32 relative standard deviation, inf where unknown.
-        ok: false: do not trust ``depth_m``; ``message`` says why.
-        scale, shift: of the network's depth, see ``scaler.ScaleFit``; 1 and 0 for ``lidar``.
-        quality: share of points, 0..1, whose range agrees with the scaled network, before it is fused: how well
-            image and LiDAR fit together; for ``lidar``, with ``depth_m``, which has no lonely points in it.
-        relative_sigma: one robust number for the image: median of ``sigma`` over its known pixels.
-        points: number of points compared.
-        message: for people.
         source: what ``depth_m`` was made from.
         prior: for :func:`complete`; None unless the source is ``completed`` and the result ok.
     """
 
-    depth_m: NDArray[np.float32]
     sigma: NDArray[np.float32]
-    ok: bool
-    scale: float
-    shift: float
-    quality: float
-    relative_sigma: float
-    points: int
-    message: str
     source: str
     prior: Prior | None = None
 
@@ -118,29 +105,16 @@ class _Built:
     structure: LidarDepth
     ceiling_m: float | None
 
-    @property
-    def message(self) -> str:
-        return self.structure.message
-
-    @property
-    def points(self) -> int:
-        return self.structure.points
-
 
 class DepthSource:
     """Computes depth from an image's network estimate, simultaneous LiDAR points and the local model."""
 
     def __init__(self, config: SourceConfig | None = None) -> None:
-        self.config = config or SourceConfig()
+        self.configure(config or SourceConfig())
 
-    @property
-    def config(self) -> SourceConfig:
-        """May be replaced at any time."""
-        return self._config
-
-    @config.setter
-    def config(self, config: SourceConfig) -> None:
-        self._config = config
+    def configure(self, config: SourceConfig) -> None:
+        """Apply new parameters."""
+        self.config = config
         self.scaler = DepthScaler(config.scaler)
         self.structure = LidarStructure(config.lidar)
 
@@ -181,7 +155,7 @@ class DepthSource:
         network, top = self.network(fit, points, up, camera_height_m)
         built = self._built(points, up, camera_height_m, fit.depth_m.shape, local, top)
         result = _of_fit(fit)
-        if not fit.ok or built.message:
+        if not fit.ok or built.structure.message:
             # The LiDAR alone is the better estimate, but one of the two is wrong: not fit.
             known = built.depth_m > 0
             return replace(
@@ -189,7 +163,7 @@ class DepthSource:
                 depth_m=np.where(known, built.depth_m, fit.depth_m),
                 sigma=np.where(known, built.sigma, result.sigma),
                 ok=False,
-                message=built.message if fit.ok else fit.message,
+                message=built.structure.message if fit.ok else fit.message,
                 source=config.source,
             )
         known = built.depth_m > 0
@@ -211,18 +185,16 @@ class DepthSource:
         """Unfit result for an image without points: ``raw`` if that is in metres, else all unknown."""
         if raw is not None:
             return replace(_of_fit(self.scaler.refuse(raw, message)), source=self.config.source)
-        unknown = np.full(size, np.inf, np.float32)
-        return DepthResult(
-            np.zeros(size, np.float32), unknown, False, 1.0, 0.0, 0.0, float("inf"), 0, message, self.config.source
-        )  # fmt: skip
+        fit = ScaleFit(False, 1.0, 0.0, np.zeros(size, np.float32), 0.0, float("inf"), 0, message)
+        return DepthResult(**vars(fit), sigma=np.full(size, np.inf, np.float32), source=self.config.source)
 
     def network(
         self, fit: ScaleFit, points: Floats, up: Floats, camera_height_m: float | None
     ) -> tuple[Corrected, float | None]:
         """The network, scaled and corrected by the points, and the height over the camera of the ceiling it shows."""
         size = fit.depth_m.shape
-        network = correct(fit.depth_m, self.structure.ranges(points, size), self.config.fusion)
-        top = ceiling_height(network.depth_m, rays(*size) @ np.asarray(up, np.float32))
+        network = correct(fit.depth_m, self.structure.ranges(points, size))
+        top = ceiling_height(network.depth_m, rays_of(size) @ np.asarray(up, np.float32))
         if top is not None and camera_height_m is not None:
             usual = max(self.config.lidar.ceiling_height_m - camera_height_m, 0.3)
             top = likely_ceiling(top, network, usual)
@@ -257,17 +229,17 @@ class DepthSource:
     ) -> DepthResult:
         built = self._built(points, up, camera_height_m, size, local, None)
         quality = agreement(built.depth_m, points, self.config.scaler)
-        message = f"LiDAR alone: {quality:.0%} of {built.points} points on its surfaces; {_surfaces(built)}"
+        message = f"LiDAR alone: {quality:.0%} of {built.structure.points} points on its surfaces; {_surfaces(built)}"
         return DepthResult(
             depth_m=built.depth_m,
             sigma=built.sigma,
-            ok=not built.message,
+            ok=not built.structure.message,
             scale=1.0,
             shift=0.0,
             quality=quality,
             relative_sigma=_median(built.sigma),
-            points=built.points,
-            message=built.message or message,
+            points=built.structure.points,
+            message=built.structure.message or message,
             source="lidar",
         )
 
@@ -305,7 +277,7 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
         camera_height_m: of the camera over the floor; None: what is masked is unknown.
         elevation_deg: below it the image shows the robot; -90 masks nothing.
     """
-    rise = rays(*result.depth_m.shape) @ np.asarray(up, np.float32)
+    rise = rays_of(result.depth_m.shape) @ np.asarray(up, np.float32)
     body = rise < np.sin(np.radians(elevation_deg))
     if elevation_deg <= -90 or not body.any():
         return result
@@ -317,14 +289,14 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
 
 
 def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:
-    """Share of points (N, 3) within ``config.agreement`` of the depth (H, W) at their pixels."""
+    """Share of points (N, 3) within ``AGREEMENT`` of the depth (H, W) at their pixels."""
     points = points[np.isfinite(points).all(axis=1)]
     rows, columns, range_m = nearest_points(points, depth_m.shape[1], depth_m.shape[0])
     inside = (range_m >= config.min_range_m) & (range_m <= config.max_range_m)
     rows, columns, range_m = rows[inside], columns[inside], range_m[inside]
     if len(rows) == 0:
         return 0.0
-    return float((np.abs(depth_m[rows, columns] - range_m) <= config.agreement * range_m).mean())
+    return float((np.abs(depth_m[rows, columns] - range_m) <= AGREEMENT * range_m).mean())
 
 
 def _surfaces(built: _Built) -> str:
@@ -343,7 +315,4 @@ def _median(sigma: Floats) -> float:
 
 def _of_fit(fit: ScaleFit) -> DepthResult:
     sigma = np.where(fit.depth_m > 0, np.float32(fit.relative_sigma), np.float32(np.inf)).astype(np.float32)
-    return DepthResult(
-        fit.depth_m, sigma, fit.ok, fit.scale, fit.shift, fit.quality, fit.relative_sigma, fit.points, fit.message,
-        "network",
-    )  # fmt: skip
+    return DepthResult(**vars(fit), sigma=sigma, source="network")

@@ -8,41 +8,23 @@ up to the other.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-
-from instant_ic.config.ranges import Positive, Range, Share, check_ranges
 
 Floats = NDArray[np.float32]
 _PAD = 64  # columns that the image is continued by on both sides, so that its edge is none
 _LEAST_SHARE = 0.15  # of the pixels that look at it have to lie on a floor or ceiling, or there is none
 
-
-@dataclass(frozen=True)
-class TidyConfig:
-    """Parameters of the regularisation.
-
-    Attributes:
-        height: rows of the result: floor and walls meet as sharply as that.
-        smoothing, edge: of the edge-preserving smoother: its strength, and the step of depth that is an edge, in units
-            of 1.8 %.
-        wall_below: what is nearer than this share of the way to floor or ceiling is surely a wall or a thing; beyond
-            goes the wall straight on to the plane.
-        beyond: what is farther than so many times the way to a plane is not under it: another ceiling, a stair.
-        body_below_deg: below this elevation the image shows the robot or its stand, and floor is put there.
-    """
-
-    height: Annotated[int, Range(64, 2048)] = 512
-    smoothing: Positive = 20.0
-    edge: Positive = 3.0
-    wall_below: Share = 0.8
-    beyond: Positive = 1.5
-    body_below_deg: Annotated[float, Range(-90, 0)] = -60.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
+_SMOOTHING, _EDGE = 20.0, 3.0
+"""Of the edge-preserving smoother: its strength, and the step of depth that is an edge, in units of 1.8 %."""
+_WALL_BELOW = 0.8
+"""What is nearer than this share of the way to floor or ceiling is surely a wall or a thing; beyond goes the wall
+straight on to the plane."""
+_BEYOND = 1.5
+"""What is farther than so many times the way to a plane is not under it: another ceiling, a stair."""
+_BODY_BELOW_RAD = np.radians(-60.0)
+"""Below this elevation the image shows the robot or its stand, and floor is put there."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +42,7 @@ class Tidied:
 def tidy(
     depth_m: NDArray[np.floating],
     camera_height_m: float | None = None,
-    config: TidyConfig | None = None,
+    height: int = 512,
 ) -> Tidied:
     """Depth of a level indoor panorama, tidied.
 
@@ -68,14 +50,13 @@ def tidy(
         depth_m: radial depth as estimated, (h, 2 h), 0 = unknown.
         camera_height_m: of the camera above the floor; where given, the whole depth is scaled so that the floor lies
             there. None: the floor lies where the depth says.
+        height: rows of the result: floor and walls meet as sharply as that.
 
     Raises:
         ValueError: shapes or height no good, or a height is given and no floor is found in the depth.
     """
     import cv2
 
-    config = config or TidyConfig()
-    height = config.height
     if depth_m.ndim != 2 or depth_m.shape[1] != 2 * depth_m.shape[0]:
         raise ValueError(f"a panorama's depth is twice as wide as high (got {depth_m.shape})")
     if camera_height_m is not None and not 0.05 <= camera_height_m <= 10:
@@ -90,7 +71,7 @@ def tidy(
     depth = np.where(unknown, 0, weight / np.maximum(inverse, 1e-6)).astype(np.float32)
     elevation = np.pi / 2 - (np.arange(height, dtype=np.float32) + 0.5) * np.float32(np.pi / height)
     rise = np.sin(elevation)[:, None]
-    floor = plane_below(depth, -rise, elevation < -np.radians(20), elevation > np.radians(config.body_below_deg))
+    floor = plane_below(depth, -rise, elevation < -np.radians(20), elevation > _BODY_BELOW_RAD)
     ceiling = plane_below(depth, rise, elevation > np.radians(25), elevation < np.radians(75))
     scale = 1.0
     if camera_height_m is not None:
@@ -104,7 +85,7 @@ def tidy(
 
     def smooth(values: Floats) -> Floats:
         padded = np.ascontiguousarray(_padded(values))
-        filtered = cv2.ximgproc.fastGlobalSmootherFilter(guide, padded, config.smoothing, config.edge)
+        filtered = cv2.ximgproc.fastGlobalSmootherFilter(guide, padded, _SMOOTHING, _EDGE)
         return np.asarray(filtered[:, _PAD:-_PAD], np.float32)
 
     # Walls: of one horizontal range from foot to top, so its inverse varies only with azimuth.
@@ -118,14 +99,14 @@ def tidy(
             continue
         plane = np.maximum(side, 0) / np.float32(at)  # inverse distance
         share_of_plane = depth * plane
-        wall = (share_of_plane < config.wall_below) & ~unknown
-        onto = (share_of_plane < config.beyond) & (side > 0)
+        wall = (share_of_plane < _WALL_BELOW) & ~unknown
+        onto = (share_of_plane < _BEYOND) & (side > 0)
         # From the horizon on, a wall goes straight down (or up) until it meets the plane.
         upright = continued(nearness, wall, upwards=side[0, 0] > 0) * flat
         result = np.where(onto, np.maximum(upright, plane), result).astype(np.float32)
     if floor is not None:  # nothing lies under the floor, and the robot is none of the room
         under = np.maximum(-rise, 0) / np.float32(floor)
-        body = np.broadcast_to((elevation < np.radians(config.body_below_deg))[:, None], depth.shape)
+        body = np.broadcast_to((elevation < _BODY_BELOW_RAD)[:, None], depth.shape)
         result = np.where(body, under, np.maximum(result, under)).astype(np.float32)
         unknown &= ~body
     depth = np.where(unknown, 0, 1 / np.maximum(result, 1e-4)).astype(np.float32)

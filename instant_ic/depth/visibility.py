@@ -5,28 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import equirect_pixels
+from instant_ic.geometry.projections import nearest_pixels
 
 Floats = NDArray[np.floating]
 Indices = NDArray[np.intp]
 CELL_DEG = 1.0
-
-
-def project_points(points: Floats, width: int, height: int) -> tuple[Floats, Floats, Floats]:
-    """Projects points (N, 3) in the camera's frame onto an equirect image.
-
-    Returns:
-        ``u, v`` index coordinates (see ``geometry.projections.equirect_pixels``) and the range in metres, each (N,).
-    """
-    u, v = equirect_pixels(points, width, height)
-    return u, v, np.linalg.norm(points, axis=-1)
+_LEAST_AZIMUTH_DEG = 90.0
 
 
 def pixels_of(points: Floats, width: int, height: int) -> tuple[Indices, Indices, Floats]:
     """Rows, columns and ranges in metres, each (N,), of points (N, 3) in the camera's frame."""
-    u, v, range_m = project_points(points, width, height)
-    rows = np.clip(np.rint(v).astype(np.intp), 0, height - 1)
-    return rows, np.rint(u).astype(np.intp) % width, range_m
+    return *nearest_pixels(points, width, height), np.linalg.norm(points, axis=-1)
 
 
 def nearest_points(points: Floats, width: int, height: int) -> tuple[Indices, Indices, Floats]:
@@ -63,6 +52,14 @@ def hidden(points: Floats, margin: float = 0.25, cell_deg: float = CELL_DEG) -> 
     nearest = np.minimum(np.minimum(nearest[:-2], nearest[1:-1]), nearest[2:])
     nearest = np.minimum(np.minimum(np.roll(nearest, 1, axis=1), nearest), np.roll(nearest, -1, axis=1))
     return np.asarray(nearest[rows, columns] < (1 - margin) * range_m)
+
+
+def azimuth_problem(columns: Indices, width: int) -> str:
+    """Why points in these columns (N,) of an image cover too little azimuth; empty where they cover enough."""
+    covered = len(np.unique(columns * 120 // width)) * 3.0
+    if covered >= _LEAST_AZIMUTH_DEG:
+        return ""
+    return f"LiDAR points cover {covered:.0f} deg of azimuth, {_LEAST_AZIMUTH_DEG:.0f} are needed"
 
 
 def on_depth_edge(depth: Floats, rows: Indices, columns: Indices, ratio: float = 1.25) -> NDArray[np.bool_]:

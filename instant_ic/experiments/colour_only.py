@@ -53,7 +53,7 @@ class ColourOnlyField:
         self._p = FieldParameters.random(config.field, config.train.seed)
         self._rng = np.random.default_rng(config.train.seed)
         self._schedule = Schedule(config.train)
-        self._level_rates = level_rates(config.train, config.field.levels)
+        self._level_rates = level_rates(config.field.levels)
         self._grads = [np.zeros_like(a) for a in (self._p.table, *self._p.network())]
         self._moments = [(np.zeros_like(g), np.zeros_like(g)) for g in self._grads]
         self._touched = kernels.no_marks(self._p.table)

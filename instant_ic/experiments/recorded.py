@@ -123,7 +123,7 @@ def _shot(one: RecordedKeyframe) -> Shot:
 
     known = one.sigma[np.isfinite(one.sigma)]
     middle = float(np.median(known)) if known.size else 1.0
-    depth = DepthResult(one.depth_m, one.sigma, True, 1.0, 0.0, 1.0, middle, 0, "", "recorded")
+    depth = DepthResult(True, 1.0, 0.0, one.depth_m, 1.0, middle, 0, "", one.sigma, "recorded")
     return Shot(one.pose, one.rgb, one.depth_m, one.depth_m, depth, one.depth_m)
 
 

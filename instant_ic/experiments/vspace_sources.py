@@ -246,6 +246,8 @@ def base_of(source: str, method: str) -> str:
 
 def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: Place) -> tuple[Drawer, float]:
     """Prepare a source from keyframes, oldest first; return its renderer and the CPU seconds spent."""
+    from instant_ic.vspace.config import GeometryConfig
+    from instant_ic.vspace.prior import prepare
     from instant_ic.vspace.warp import PanoramaWarp
 
     last, config = shots[-1], place.config
@@ -292,7 +294,8 @@ def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: P
 
         return draw_points, 0.0
     true = name == "true-warp"
-    warp = PanoramaWarp(last.rgb, last.true_depth_m if true else last.result.depth_m, last.pose)
+    depth_m = last.true_depth_m if true else last.result.depth_m
+    warp = PanoramaWarp(prepare(last.rgb, depth_m, last.pose, 0.0, GeometryConfig(), 4096))
     if name != "panorama":
         return of_view(warp), time.process_time() - start
 

@@ -6,6 +6,7 @@ above, rows run from +90° to −90° elevation. Pixel centres have integer coor
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -14,14 +15,25 @@ from numpy.typing import NDArray
 from instant_ic.geometry.poses import rotation_matrix
 
 Floats = NDArray[np.floating]
+Indices = NDArray[np.intp]
 
 
 def equirect_directions(width: int, height: int) -> NDArray[np.float32]:
     """Unit viewing direction of every pixel of a panorama, (height, width, 3)."""
     azimuth = math.pi - (np.arange(width) + 0.5) * (2 * math.pi / width)
-    elevation = math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height)
+    return directions_at(azimuth, math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height))
+
+
+@functools.lru_cache(maxsize=4)
+def rays_of(size: tuple[int, int]) -> NDArray[np.float32]:
+    """``equirect_directions`` of a panorama of (height, width), kept; not to be changed."""
+    return equirect_directions(size[1], size[0])
+
+
+def directions_at(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Unit directions at all azimuths (W,) of all elevations (H,), radians, (H, W, 3)."""
     horizontal = np.cos(elevation)[:, None]
-    directions = np.empty((height, width, 3), np.float32)
+    directions = np.empty((len(elevation), len(azimuth), 3), np.float32)
     directions[..., 0] = horizontal * np.cos(azimuth)
     directions[..., 1] = horizontal * np.sin(azimuth)
     directions[..., 2] = np.sin(elevation)[:, None]
@@ -40,6 +52,12 @@ def equirect_pixels(directions: Floats, width: int, height: int) -> tuple[Floats
     u = np.where(u >= width - 0.5, u - width, u)
     v = (math.pi / 2 - elevation) * (height / math.pi) - 0.5
     return u, v
+
+
+def nearest_pixels(directions: Floats, width: int, height: int) -> tuple[Indices, Indices]:
+    """Rows and columns of the pixels nearest to directions (..., 3) of any length."""
+    u, v = equirect_pixels(directions, width, height)
+    return np.clip(np.rint(v).astype(np.intp), 0, height - 1), np.rint(u).astype(np.intp) % width
 
 
 def perspective_directions(width: int, height: int, hfov_rad: float) -> NDArray[np.float32]:

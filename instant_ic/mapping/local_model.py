@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -18,11 +17,16 @@ from numpy.typing import NDArray
 
 from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.geometry.poses import Matrix
-from instant_ic.geometry.projections import equirect_directions
+from instant_ic.geometry.projections import rays_of
 from instant_ic.jit import leave_out_blas
 from instant_ic.mapping import kernels
 
 Floats = NDArray[np.floating]
+_WINDOW, _CELL_M = 512, 0.05
+_REACH_M = 12.0
+"""Farther points are not kept; the window reaches 12.8 m."""
+STRIDE = 4
+"""Every so many beams of a revolution free space, other ones each time."""
 _LOW_M = -0.2
 _FLOOR_M = 0.1
 """Points below this height belong to the floor."""
@@ -43,32 +47,16 @@ class LocalModelConfig:
 
     Attributes:
         keep_m: what was measured farther back on the path than this is forgotten; odometry drifts.
-        keep_s: the same in seconds of motion, for turns in place.
-        cell_m: edge of a voxel.
-        reach_m: farther points are not kept; at most the half of the window of 512 voxels.
         height_m: height of the window over the floor.
-        stride: every so many beams of a revolution free space, other ones each time.
         behind_m: how far the top of a low thing goes on behind its face, where nothing was measured.
     """
 
     keep_m: Positive = 10.0
-    keep_s: Positive = 60.0
-    cell_m: Annotated[float, Range(0.02, 0.2)] = 0.05
-    reach_m: Positive = 12.0
     height_m: Annotated[float, Range(2, 6)] = 4.0
-    stride: Annotated[int, Range(1, 64)] = 4
     behind_m: NotNegative = 0.5
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if self.reach_m > 0.48 * _WINDOW * self.cell_m:
-            raise ValueError(
-                f"reach_m must be at most {0.48 * _WINDOW * self.cell_m:.1f} with voxels of {self.cell_m} m "
-                f"(got {self.reach_m})"
-            )
-
-
-_WINDOW = 512
 
 
 @dataclass(frozen=True)
@@ -93,7 +81,7 @@ class LocalModel:
 
     def __init__(self, config: LocalModelConfig | None = None) -> None:
         self.config = config or LocalModelConfig()
-        self._levels = math.ceil((self.config.height_m - _LOW_M) / self.config.cell_m)
+        self._levels = math.ceil((self.config.height_m - _LOW_M) / _CELL_M)
         self._key = np.empty((_WINDOW, _WINDOW, 2), np.int32)
         self._odds = np.empty((_WINDOW, _WINDOW, self._levels), np.int8)
         self._sums = np.empty((_WINDOW, _WINDOW, 6), np.float32)
@@ -107,19 +95,18 @@ class LocalModel:
         self._odds[:], self._sums[:], self._last[:] = 0, 0, -np.inf
         self._path_m, self.revolutions = 0.0, 0
 
-    def add(self, points: Floats, origin: Floats, advance_m: float = 0.0, stride: int = 0) -> None:
+    def add(self, points: Floats, origin: Floats, advance_m: float = 0.0, stride: int = STRIDE) -> None:
         """Add a revolution.
 
         Args:
             points: (N, 3) in the model's frame, metres; points that are not finite are left out.
             origin: (3,) of the beams.
             advance_m: how far the robot has come since the last one; ages what is known.
-            stride: every so many beams free space; 0: as configured.
+            stride: every so many beams free space.
 
         Raises:
             ValueError: other shapes, an origin that is not finite, or a negative advance.
         """
-        config = self.config
         points, origin = np.asarray(points, np.float64), np.asarray(origin, np.float64)
         if points.ndim != 2 or points.shape[1] != 3 or origin.shape != (3,):
             raise ValueError(f"points must be (N, 3) and the origin (3,) (got {points.shape}, {origin.shape})")
@@ -129,24 +116,19 @@ class LocalModel:
             raise ValueError(f"advance_m must be >= 0 (got {advance_m})")
         points = points[np.isfinite(points).all(axis=1)]
         self._path_m += advance_m
-        stride = stride or config.stride
         kernels.add_revolution(
-            self._key, self._odds, self._sums, self._last, points, origin, config.cell_m, _LOW_M, _BODY_M,
-            np.float32(self._path_m), np.float32(config.keep_m), self.revolutions % stride, stride,
-            config.reach_m,
+            self._key, self._odds, self._sums, self._last, points, origin, _CELL_M, _LOW_M, _BODY_M,
+            np.float32(self._path_m), np.float32(self.config.keep_m), self.revolutions % stride, stride, _REACH_M,
         )  # fmt: skip
         self.revolutions += 1
 
     def ceiling_m(self, origin: Floats) -> float | None:
         """Height of the level ceiling around a place (3,) over the floor; None where none was seen."""
-        config = self.config
-        first = round((_LEAST_CEILING_M - _LOW_M) / config.cell_m)
-        centre = np.floor(np.asarray(origin)[:2] / config.cell_m).astype(np.int64)
-        within = round(config.reach_m / config.cell_m)
+        first = round((_LEAST_CEILING_M - _LOW_M) / _CELL_M)
+        centre = np.floor(np.asarray(origin)[:2] / _CELL_M).astype(np.int64)
         found = kernels.ceiling_levels(
-            self._key, self._odds, self._last, np.float32(self._path_m),
-            np.float32(config.keep_m), centre, within, first,
-            round(_CEILING_CLEAR_M / config.cell_m),
+            self._key, self._odds, self._last, np.float32(self._path_m), np.float32(self.config.keep_m), centre,
+            round(_REACH_M / _CELL_M), first, round(_CEILING_CLEAR_M / _CELL_M),
         )  # fmt: skip
         # Nothing is seen through a ceiling: the highest level that is as wide as some other counts.
         wide = np.convolve(found, np.ones(3), "same")
@@ -155,7 +137,7 @@ class LocalModel:
             return None
         best = max(range(max(int(enough[-1]) - 2, 0), int(enough[-1]) + 1), key=lambda level: wide[level])
         near = np.arange(max(best - 1, 0), min(best + 2, len(found)))
-        return float(_LOW_M + (np.average(near, weights=found[near]) + 0.5) * config.cell_m)
+        return float(_LOW_M + (np.average(near, weights=found[near]) + 0.5) * _CELL_M)
 
     def render(self, model_from_camera: Matrix, size: tuple[int, int], ceiling_m: float | None = None) -> LocalDepth:
         """Depth of a panorama.
@@ -165,7 +147,7 @@ class LocalModel:
             size: height and width.
             ceiling_m: height over the floor of the ceiling to assume where none was seen; None: unknown.
         """
-        config, cell = self.config, self.config.cell_m
+        config, cell = self.config, _CELL_M
         origin = np.asarray(model_from_camera[:3, 3], np.float64)
         depth, kind, free = np.zeros(size, np.float32), np.zeros(size, np.uint8), np.zeros(size, np.float32)
         if self.revolutions == 0 or not np.isfinite(model_from_camera).all():
@@ -183,22 +165,21 @@ class LocalModel:
             kernels.put_plates(
                 self._key, self._odds, self._index, codes, faces, origin, cell, ground, config.behind_m, highest
             )
-        rays = _rays(*size) @ np.asarray(model_from_camera[:3, :3], np.float32).T
+        rays = rays_of(size) @ np.asarray(model_from_camera[:3, :3], np.float32).T
         kernels.cast_rays(
             self._key, self._index, codes, faces, origin, rays.reshape(-1, 3), cell, _LOW_M, ceiling, measured is None,
-            config.reach_m, _UNSEEN_M, depth.reshape(-1), kind.reshape(-1), free.reshape(-1),
+            _REACH_M, _UNSEEN_M, depth.reshape(-1), kind.reshape(-1), free.reshape(-1),
         )  # fmt: skip
         return LocalDepth(depth, _SIGMA[kind], kind, free)
 
     def points(self) -> NDArray[np.float32]:
         """(N, 3) centres of the solid voxels in the model's frame, on the surface of their column."""
-        config = self.config
-        known = (self._path_m - self._last) <= config.keep_m
+        known = (self._path_m - self._last) <= self.config.keep_m
         a, b, level = np.nonzero((self._odds >= kernels.OCCUPIED) & known[..., None])
         count = self._sums[a, b, 0]
         mean = self._sums[a, b, 1:3] / np.maximum(count, 1)[:, None]
-        across = (self._key[a, b] + 0.5) * config.cell_m + mean
-        z = _LOW_M + (level + 0.5) * config.cell_m
+        across = (self._key[a, b] + 0.5) * _CELL_M + mean
+        z = _LOW_M + (level + 0.5) * _CELL_M
         return np.column_stack([across, z]).astype(np.float32)
 
 
@@ -207,11 +188,6 @@ _LEAST_CEILING_COLUMNS = 60
 #: Relative standard deviation of depth for each kind of pixel: 68 % of the errors are smaller in seven generated and
 #: scanned worlds (docs/depth.md).
 _SIGMA = np.array([np.inf, 0.012, 0.012, 0.015, 0.015, 0.1, 0.07, 0.005, 0.027, 0.13], np.float32)
-
-
-@lru_cache(maxsize=2)
-def _rays(height: int, width: int) -> NDArray[np.float32]:
-    return equirect_directions(width, height)
 
 
 def warm_up() -> None:

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.config.ranges import Positive, check_ranges
-from instant_ic.depth.deskew import points_at
+from instant_ic.depth.deskew import Revolution, points_at
 from instant_ic.geometry.poses import Matrix, inverse
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.mapping.local_model import LocalDepth, LocalModel, LocalModelConfig
+from instant_ic.mapping.local_model import STRIDE, LocalDepth, LocalModel, LocalModelConfig
 
 _JUMP_M, _JUMP_RAD = 0.2, math.radians(2.0)
 _DRIFT = 0.3
 """Share of the motion since the last look by which odometry may drift; a larger change of the correction is a jump."""
+_KEEP_S = 60.0
+"""Seconds of motion, such as turns in place, that count as ``keep_m`` of the path."""
 _BACK_NS = 1_000_000_000
 _MOST_POINTS = 200_000
 _ENOUGH_POINTS = 16_000
@@ -67,51 +68,38 @@ class LocalMapper:
         self.model = LocalModel(self.config.model)
         self.clear()
 
-    @property
-    def frames(self) -> tuple[str, str]:
-        """The map frame and the odom frame."""
-        return self.map_frame, self.odom_frame
-
     def clear(self) -> None:
         """Forget everything."""
         self.model.clear()
-        self._held: tuple[str, int, NDArray[np.floating], Callable[[], NDArray[np.floating]]] | None = None
+        self._held: Revolution | None = None
         self._taken_ns: int | None = None
         self._taken_at: Matrix | None = None
         self._reference: tuple[int, Matrix] | None = None  # stamp and correction of the last look-up
         self._model_from_map = np.eye(4)
 
-    def revolution(
-        self, frame: str, stamp_ns: int, time_s: NDArray[np.floating], xyz: Callable[[], NDArray[np.floating]]
-    ) -> bool:
-        """Hold a revolution; add the one held before if it is due. Returns whether one was added.
-
-        Args:
-            frame: of the points.
-            stamp_ns: of the cloud.
-            time_s: (N,) seconds after the stamp.
-            xyz: returns the points (N, 3); called only for revolutions that are added.
+    def revolution(self, new: Revolution) -> None:
+        """Hold a revolution; add the one held before if it is due. ``xyz`` is called only for those that are added.
 
         Raises:
             CloudError: the revolution is empty or its stamp went back; the model is cleared for the latter.
             TransformError: the pose of the LiDAR is not known.
         """
         held, self._held = self._held, None
-        newest = self._taken_ns if held is None else held[1]
-        if newest is not None and stamp_ns < newest - _BACK_NS:
+        newest = self._taken_ns if held is None else held.stamp_ns
+        if newest is not None and new.stamp_ns < newest - _BACK_NS:
             self.clear()
-            self._held = (frame, stamp_ns, time_s, xyz)
-            raise CloudError(f"time went back by {(newest - stamp_ns) / 1e9:.1f} s: the local model starts again")
-        if not 0 < len(time_s) <= _MOST_POINTS:
-            raise CloudError(f"a revolution of {len(time_s)} points is left out (1 to {_MOST_POINTS} are possible)")
-        self._held = (frame, stamp_ns, time_s, xyz)
-        return held is not None and self._add(*held)
+            self._held = new
+            raise CloudError(f"time went back by {(newest - new.stamp_ns) / 1e9:.1f} s: the local model starts again")
+        count = len(new.time_s)
+        if not 0 < count <= _MOST_POINTS:
+            raise CloudError(f"a revolution of {count} points is left out (1 to {_MOST_POINTS} are possible)")
+        self._held = new
+        if held is not None:
+            self._add(held)
 
-    def _add(
-        self, frame: str, stamp_ns: int, time_s: NDArray[np.floating], xyz: Callable[[], NDArray[np.floating]]
-    ) -> bool:
+    def _add(self, revolution: Revolution) -> None:
         """Add a revolution if the robot has moved or enough time has passed."""
-        middle_ns = stamp_ns + round(0.5e9 * float(time_s[0] + time_s[-1]))
+        frame, stamp_ns, middle_ns = revolution.frame, revolution.stamp_ns, revolution.middle_ns
         odom_from_lidar = self.transforms.lookup(self.odom_frame, frame, middle_ns)
         moved_m, turned_rad = math.inf, math.inf
         if self._taken_at is not None and self._taken_ns is not None:
@@ -119,9 +107,9 @@ class LocalMapper:
             turned_rad = _angle(self._taken_at, odom_from_lidar)
             waited_s = (stamp_ns - self._taken_ns) / 1e9
             if moved_m < self.config.every_m and 0 <= waited_s < self.config.every_s:
-                return False
+                return
         model_from_map = self._model_from_map_at(frame, middle_ns)
-        points = xyz()
+        time_s, points = revolution.time_s, revolution.xyz()
         if len(points) != len(time_s):
             raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is left out")
         step = -(-len(points) // _ENOUGH_POINTS)
@@ -135,13 +123,12 @@ class LocalMapper:
             raise CloudError("a revolution without a finite point is left out")
         advance_m = 0.0
         if self._taken_ns is not None and (moved_m > _STILL_M or turned_rad > _STILL_RAD):
-            model, since_s = self.config.model, max(stamp_ns - self._taken_ns, 0) / 1e9
-            advance_m = max(moved_m, min(since_s, self.config.every_s) * model.keep_m / model.keep_s)
+            since_s = max(stamp_ns - self._taken_ns, 0) / 1e9
+            advance_m = max(moved_m, min(since_s, self.config.every_s) * self.config.model.keep_m / _KEEP_S)
         # At rest revolutions are few, and what has gone shall not stay for long.
-        stride = 1 if moved_m < self.config.every_m else 0
+        stride = 1 if moved_m < self.config.every_m else STRIDE
         self.model.add(lidar, (model_from_map @ self._map_from(frame, middle_ns))[:3, 3], advance_m, stride)
         self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar
-        return True
 
     def _map_from(self, frame: str, stamp_ns: int) -> Matrix:
         """Pose of a sensor in the map at a time; by odometry alone where there is no map."""

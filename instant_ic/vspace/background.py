@@ -7,7 +7,6 @@ under the robot is a continuation of the ground around it. The sky is rendered h
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import equirect_directions, equirect_pixels
+from instant_ic.geometry.projections import rays_of
 from instant_ic.vspace.continuation import continued_colours, continued_walls, grown
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import ROOM, SKY, PanoramaPrior, area_average, edge_quads, fill_holes
@@ -32,7 +31,6 @@ _WALL_RISE = 0.7  # sine of the elevation up to which an upright surface says ho
 _SEEN = 0.08  # depths within this share of a guess's are of its surface
 _SKY_M = 1e4
 _ROWS = 256  # of the images that the background is made in: it is smooth
-_directions = functools.lru_cache(maxsize=2)(equirect_directions)  # a keyframe is as large as the one before
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ class Background:
         height, width = inverse.shape
         sky = content == SKY
         inverse[sky] = 1 / _SKY_M
-        directions = _directions(width, height)
+        directions = rays_of(inverse.shape)
         rise = np.einsum("ijk,k->ij", directions, prior.map_from_camera[2, :3]).astype(np.float32)
         levels = level_planes(inverse, rise, content == ROOM)
         kind = np.zeros(inverse.shape, np.uint8)  # 1 floor, 2 ceiling, 0 all else
@@ -116,14 +114,15 @@ class Background:
             for right in (0, 1):
                 mask[np.minimum(self.guessed[:, 0] + down, height - 1), (self.guessed[:, 1] + right) % width] = True
         pose = self.map_from_camera.astype(np.float32)
-        ways = _directions(width, height)[mask] / self.inverse[mask][:, None]
+        ways = rays_of(self.inverse.shape)[mask] / self.inverse[mask][:, None]
         points = np.einsum("ij,kj->ik", ways, pose[:3, :3]) + pose[:3, 3]
         rgb, sure = self.rgb.copy(), self.sure.copy()
         colours, sures, nearest = rgb[mask], sure[mask], np.full(len(points), np.inf, np.float32)
         for prior, gain in others:
-            distance, theirs = _as_seen(prior, points)
-            better = distance < nearest
-            colours[better] = np.rint(np.clip(theirs[better] * gain, 0, 255))
+            local = prior.in_camera(points)
+            distance = np.sqrt(np.einsum("ij,ij->i", local, local))
+            better = prior.sees(local, distance, _SEEN) & (distance < nearest)
+            colours[better] = np.rint(np.clip(prior.colours(local[better]) * gain, 0, 255))
             nearest[better], sures[better] = distance[better], 255
         rgb[mask], sure[mask] = colours, sures
         return replace(self, rgb=rgb, sure=sure)
@@ -146,8 +145,7 @@ class Background:
         map_from_view, half = pinhole(rays)
         view_from_camera = (np.linalg.inv(map_from_view) @ self.map_from_camera).astype(np.float32)
         nearness, marks = np.zeros(rays.shape, np.float32), np.zeros(rays.shape, np.uint8)
-        height, width = self.inverse.shape
-        directions = _directions(width, height)
+        directions = rays_of(self.inverse.shape)
         for mark, quads in ((1, self.guessed), (2, self.sky)):
             draw_quads(quads, mark, self.inverse, directions, view_from_camera, half, nearness, marks)
         drawn = wanted & (nearness.reshape(-1) > 0)
@@ -158,26 +156,6 @@ class Background:
         paint(self.rgb, self.sure, camera_from_map, gain, rays.origin, rays.directions, drawn, depth, colour, share)
         confidence[drawn & (marks.reshape(-1) == 2)] = 1
         return share
-
-
-def _as_seen(prior: PanoramaPrior, points: Floats) -> tuple[Floats, Floats]:
-    """Distances (N,) of points (N, 3) of the map from a keyframe, inf where it has not seen them; colours (N, 3)."""
-    pose = prior.map_from_camera.astype(np.float32)
-    local = np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3])
-    distance = np.sqrt(np.einsum("ij,ij->i", local, local))
-    height, width = prior.inverse_depth.shape
-    u, v = equirect_pixels(local, width, height)
-    row, column = np.clip(np.floor(v), 0, height - 1).astype(np.intp), np.floor(u).astype(np.intp) % width
-    seen = np.abs(prior.inverse_depth[row, column] * distance - 1) < _SEEN
-    seen &= (
-        (prior.known[row, column] == 1) & (prior.depth_edge[row, column] == 0) & (prior.content[row, column] == ROOM)
-    )
-    high, wide = prior.rgb.shape[:2]
-    u, v = equirect_pixels(local, wide, high)
-    row = np.clip(np.rint(v), 0, high - 1).astype(np.intp)
-    return np.where(seen, distance, np.float32(np.inf)), prior.rgb[row, np.rint(u).astype(np.intp) % wide].astype(
-        np.float32
-    )
 
 
 def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list[Floats]:

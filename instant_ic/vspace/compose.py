@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import equirect_directions, equirect_pixels
+from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import ROOM, PanoramaPrior
 
@@ -117,12 +117,10 @@ def _looks_different(
     """Those of a keyframe's pixels (h, w) whose places no other keyframe shows in the same colour."""
     left = mask.copy()
     directions = equirect_directions(mask.shape[1], mask.shape[0])[mask]
-    own, pose = _colours(prior, directions), prior.map_from_camera.astype(np.float32)
+    own, pose = prior.colours(directions), prior.map_from_camera.astype(np.float32)
     points = np.einsum("ij,kj->ik", directions / prior.inverse_depth[mask][:, None], pose[:3, :3]) + pose[:3, 3]
     for other in others:
-        pose = other.map_from_camera.astype(np.float32)
-        theirs = _colours(other, np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3]))
-        left[mask] &= np.abs(theirs - own).max(axis=1) > SAME_COLOUR
+        left[mask] &= np.abs(other.colours(other.in_camera(points)) - own).max(axis=1) > SAME_COLOUR
     return left
 
 
@@ -177,14 +175,9 @@ def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats | None:
     # Not by matmul: BLAS would start threads for it, which wait for each other longer than they compute.
     points = depth[:, None] * np.einsum("ij,kj->ik", directions, older.map_from_camera[:3, :3].astype(np.float32))
     points += older.map_from_camera[:3, 3].astype(np.float32)
-    local = points - newest.map_from_camera[:3, 3].astype(np.float32)
-    local = np.einsum("ij,jk->ik", local, newest.map_from_camera[:3, :3].astype(np.float32))
-    row, column = _upper_left(newest, local)
-    same = np.abs(newest.inverse_depth[row, column] * np.linalg.norm(local, axis=1) - 1) < SAME_SURFACE
-    same &= (
-        (newest.known[row, column] == 1) & (newest.depth_edge[row, column] == 0) & (newest.content[row, column] == ROOM)
-    )
-    theirs, ours = _colours(older, directions[same]), _colours(newest, local[same])
+    local = newest.in_camera(points)
+    same = newest.sees(local, np.linalg.norm(local, axis=1), SAME_SURFACE)
+    theirs, ours = older.colours(directions[same]), newest.colours(local[same])
     usable = np.all((theirs > 12) & (theirs < 243) & (ours > 12) & (ours < 243), axis=1)
     if np.count_nonzero(usable) < _MIN_SAMPLES:
         return None
@@ -199,18 +192,3 @@ def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats | None:
     if not np.any(np.abs(middle) > width):
         return np.ones(3, np.float32)
     return np.exp(middle).astype(np.float32)
-
-
-def _upper_left(prior: PanoramaPrior, local: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pixels (row, column) of a keyframe's depth up and left of points (N, 3) of its camera's frame."""
-    height, width = prior.inverse_depth.shape
-    u, v = equirect_pixels(local, width, height)
-    return np.clip(np.floor(v), 0, height - 1).astype(np.intp), np.floor(u).astype(np.intp) % width
-
-
-def _colours(prior: PanoramaPrior, directions: Floats) -> Floats:
-    """Nearest pixels of a panorama, (N, 3) in 0..255."""
-    height, width = prior.rgb.shape[:2]
-    u, v = equirect_pixels(directions, width, height)
-    row = np.clip(np.rint(v), 0, height - 1).astype(np.intp)
-    return prior.rgb[row, np.rint(u).astype(np.intp) % width].astype(np.float32)

@@ -1,4 +1,4 @@
-"""Parameters of the virtual space; each class checks its own values."""
+"""Parameters of the virtual space and of the node ``nerf``; each class checks its own values."""
 
 from __future__ import annotations
 
@@ -6,10 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import Positive, PositiveInt, Range, Share, check_ranges, require
-
-_UpToOne: TypeAlias = Annotated[float, Range(above=0, high=1)]
-
+from instant_ic.config.ranges import Percent, Positive, PositiveInt, Range, Share, check_ranges, require
 
 Coordinate: TypeAlias = Annotated[float, Range(-100_000, 100_000)]
 
@@ -22,7 +19,6 @@ class FieldConfig:
         levels: hash-grid levels, coarse to fine.
         features: features of a table entry, 2 or 4.
         log2_table: entries of a level, as a power of two; 18 for more detail and more memory.
-        base_resolution: cells of the coarsest level across the scene.
         hidden: width of the network's hidden layer.
         geometry: distance: a signed one; density: the paper's way, eight samples a pixel.
     """
@@ -30,7 +26,6 @@ class FieldConfig:
     levels: Annotated[int, Range(1, 16)] = 8
     features: Annotated[int, Range(2, 4)] = 4
     log2_table: Annotated[int, Range(10, 22)] = 17
-    base_resolution: Annotated[int, Range(2, 256)] = 16
     hidden: Annotated[int, Range(4, 64)] = 32
     geometry: str = "distance"
 
@@ -52,32 +47,12 @@ class TrainConfig:
         ray_columns: rays of a batch in azimuth; even in solid angle.
         ray_rows: rays of a batch in height; ray_columns x ray_rows in all, both multiples of 8.
         iterations: length of a training run; idle after it.
-        table_lr: learning rate of the hash table at the start.
-        network_lr: learning rate of the network at the start.
-        final_lr_share: both have fallen to this share at the end.
-        fine_lr_share: learning rate of the finest level relative to the coarsest; less reduces grain and slows detail.
-        refresh_lr_share: share of both when a keyframe refreshes a trained field.
-        distance_weight: of the geometry's error against the colour's.
-        band_colour_weight: of the colour error beside the surface against that on it.
-        depth_weight: with density: of the error of a ray's depth, by its uncertainty.
-        opacity_weight: with density: weight of the opacity regulariser.
-        distortion_weight: with density: of how far the density is spread along a ray.
         seed: of the first weights and of the rays.
     """
 
     ray_columns: Annotated[int, Range(8, 1024)] = 128
     ray_rows: Annotated[int, Range(8, 1024)] = 64
     iterations: PositiveInt = 2000
-    table_lr: _UpToOne = 0.04
-    network_lr: _UpToOne = 0.02
-    final_lr_share: _UpToOne = 0.03
-    fine_lr_share: _UpToOne = 0.1
-    refresh_lr_share: _UpToOne = 0.5
-    distance_weight: Positive = 0.1
-    band_colour_weight: Share = 0.3
-    depth_weight: Share = 0.1
-    opacity_weight: Share = 0.1
-    distortion_weight: Share = 0.01
     seed: Annotated[int, Range(low=0)] = 1
 
     def __post_init__(self) -> None:
@@ -91,35 +66,17 @@ class GeometryConfig:
     """How the keyframe's depth shapes the field and the occupancy grid.
 
     Attributes:
-        band_min: share of the depth: narrowest half width in which geometry is learnt.
-        band_max: widest.
-        band_sigmas: half width in standard deviations of the keyframe's depth, between the two.
-        torn_ratio: neighbouring depths that differ by more than this share are an edge, unless they lie on one plane.
-        min_depth_m: m; nearer depths are set to it.
-        max_depth_m: m; farther depths are set to it.
-        min_known_share: keyframes with a smaller share of known depth are refused.
         body_below_deg: degrees; below, the panorama shows the robot itself, which is left out; -90: nowhere.
         sky_share: regions of unknown depth above the horizon, as large a share of the sphere, are sky; 1: none.
         cell_m: m, smallest cell of the occupancy grid.
-        max_cells: cells grow so that the grid has no more than this many (one byte each).
     """
 
-    band_min: Annotated[float, Range(above=0, high=0.5)] = 0.05
-    band_max: Annotated[float, Range(above=0, high=0.5)] = 0.06
-    band_sigmas: Positive = 2.0
-    torn_ratio: Annotated[float, Range(above=0, below=1)] = 0.10
-    min_depth_m: Positive = 0.2
-    max_depth_m: Positive = 30.0
-    min_known_share: _UpToOne = 0.5
     body_below_deg: Annotated[float, Range(-90, 0)] = -90.0
     sky_share: Share = 0.05
-    cell_m: _UpToOne = 0.04
-    max_cells: Annotated[int, Range(10_000, 2**27)] = 6_000_000
+    cell_m: Annotated[float, Range(above=0, high=1)] = 0.04
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        require(self, "band_max", self.band_min <= self.band_max, "at least band_min")
-        require(self, "min_depth_m", self.min_depth_m < self.max_depth_m, "below max_depth_m")
 
 
 @dataclass(frozen=True)
@@ -131,14 +88,12 @@ class ReadinessConfig:
         plateau_iterations: iterations over which that gain is taken.
         plateau_db: dB; less gain than this over plateau_iterations also counts as ready.
         max_radius_m: m from the keyframe, at most, that a view is fit to show.
-        parallax_rad: rad: displacement of surfaces by the depth's error that is still fit to show.
     """
 
     psnr_db: Positive = 24.0
     plateau_iterations: PositiveInt = 100
     plateau_db: Positive = 0.3
     max_radius_m: Positive = 3.0
-    parallax_rad: Positive = 0.035
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -153,13 +108,11 @@ class PictureConfig:
             until it is worse.
         field_alone: the field from its first step on, never the warp, unmeasured: for experiments.
         refresh_pictures: number of views over which a new keyframe is blended in; 1: at once.
-        least_depth_share: of the keyframe's depth in where the field's surfaces lie.
     """
 
     field_gain_db: Annotated[float, Range(0, 20)] = 0.5
     field_alone: bool = False
     refresh_pictures: Annotated[int, Range(1, 60)] = 6
-    least_depth_share: Share = 0.5
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -209,3 +162,29 @@ class VirtualSpaceConfig:
         require(self, "mesh_pose", len(self.mesh_pose) == 4, "x, y, z in metres and yaw in degrees")
         for key in ("ray_columns", "ray_rows") if self.field.geometry == "density" else ():
             require(self.train, key, getattr(self.train, key) % 16 == 0, "a multiple of 16 with density")
+
+
+@dataclass(frozen=True)
+class NerfConfig:
+    """Parameters.
+
+    Attributes:
+        render_fps: target frame rate of requested views; training gets the remaining time.
+        train_ms_per_frame: longest uninterrupted training in ms, and so the longest wait of a requested view. While no
+            view is requested, training has all the time.
+        max_view_pixels: largest view that may be requested; larger requests are refused.
+        jpeg_quality: JPEG quality of views, 1 to 100.
+        robot_mask: image, twice as wide as high, white where the panorama shows the robot itself or its stand (see also
+            ``space.geometry.body_below_deg``); empty: no mask.
+        space: the virtual space itself.
+    """
+
+    render_fps: Annotated[float, Range(0.5, 120)] = 10.0
+    train_ms_per_frame: Positive = 50.0
+    max_view_pixels: PositiveInt = 1280 * 720
+    jpeg_quality: Percent = 85
+    robot_mask: str = ""
+    space: VirtualSpaceConfig = dataclasses.field(default_factory=VirtualSpaceConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.vspace.prior import edge_quads
+from instant_ic.vspace.prior import DEPTH_EDGE_RATIO, edge_quads
 from instant_ic.vspace.space import NotReadyError, VirtualSpace
 
 
@@ -31,13 +30,12 @@ class Surface:
     triangles: NDArray[np.int32]
 
 
-def surface(space: VirtualSpace, width: int = 1024, torn_ratio: float = 0.10) -> Surface:
+def surface(space: VirtualSpace, width: int = 1024) -> Surface:
     """The surfaces that the keyframe has seen, through the trained field, as a mesh cut at depth edges.
 
     Args:
         space: with a keyframe.
         width: of the panorama whose pixels become vertices.
-        torn_ratio: neighbouring depths further apart than this share, off one plane, are an edge.
 
     Raises:
         NotReadyError: no keyframe yet.
@@ -52,7 +50,7 @@ def surface(space: VirtualSpace, width: int = 1024, torn_ratio: float = 0.10) ->
     number = np.cumsum(known.reshape(-1), dtype=np.int32).reshape(known.shape) - 1
     with np.errstate(divide="ignore"):
         inverse = np.where(known, 1 / view.depth_m, 0).astype(np.float32)
-    whole = edge_quads(inverse, torn_ratio)[:-1] == 0
+    whole = edge_quads(inverse, DEPTH_EDGE_RATIO)[:-1] == 0
     for corner in _corners(known):
         whole &= corner
     a, b, c, d = (corner[whole] for corner in _corners(number))
@@ -64,26 +62,6 @@ def _corners(values: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Upper left, upper right, lower left and lower right of each quad; columns wrap, (H − 1, W) each."""
     right = np.roll(values, -1, 1)
     return values[:-1], right[:-1], values[1:], right[1:]
-
-
-def write_ply(path: str | Path, surface: Surface, mesh: bool) -> None:
-    """Writes binary PLY: coloured vertices, and the triangles where ``mesh``.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    vertices = np.empty(len(surface.points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    vertices["xyz"], vertices["rgb"] = surface.points, surface.rgb
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    content = vertices.tobytes()
-    if mesh:
-        faces = np.empty(len(surface.triangles), [("count", "u1"), ("vertices", "<i4", 3)])
-        faces["count"], faces["vertices"] = 3, surface.triangles
-        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-        content += faces.tobytes()
-    Path(path).write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + content)
 
 
 def default_flight(radius_m: float) -> list[NDArray[np.float64]]:

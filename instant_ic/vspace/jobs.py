@@ -46,6 +46,8 @@ class JobKind(enum.Enum):
     TRAIN = "train"
 
 
+_NICE = 5
+"""Of the threads that train, render and prepare: robot control comes first."""
 _SAME_POSE = 2e-3
 """Metres and radians within which poses are the same: a third of a view's pixel. A standing robot's pose jitters."""
 _CHANGES = (JobKind.SHOW, JobKind.LEARN, JobKind.TRAIN)
@@ -141,14 +143,13 @@ class SpaceWorker:
     Args:
         config: the space's parameters.
         robot: the robot's mask, as ``VirtualSpace`` takes it.
-        nice: nice value of the calling threads, 0 to 19.
         warm: whether ``WARM_UP`` compiles the kernels.
     """
 
-    def __init__(self, config: VirtualSpaceConfig, robot: NDArray[np.bool_] | None, nice: int, warm: bool) -> None:
+    def __init__(self, config: VirtualSpaceConfig, robot: NDArray[np.bool_] | None, warm: bool) -> None:
         self.config = config
         self.space: Space | None = None
-        self._robot, self._nice, self._warm = robot, nice, warm
+        self._robot, self._warm = robot, warm
         self._newest: EncodedView | None = None  # view of the space as it is
         self._encoder = LayerEncoder()
         self._sources: dict[int, Incoming] = {}  # of the keyframes by their place in the store
@@ -211,22 +212,17 @@ class SpaceWorker:
         """The view of an order; the newest one again where it would be the same: a standing robot costs nothing."""
         if self._newest is not None and self._newest.order.same_view(order):
             return self._newest
-        changes = space.dissolving
-        encoded = _render(space, order)
+        changes, start = space.dissolving, time.perf_counter()
+        view = space.render(order.pose(), order.width, order.height, order.fov_rad)
+        _, jpeg = cv2.imencode(".jpg", view.softened()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, order.jpeg_quality])
+        encoded = EncodedView(order, (time.perf_counter() - start) * 1e3, view, jpeg.tobytes())
         self._newest = None if changes else encoded
         return encoded
 
     def _yield_to_others(self) -> None:
         """Lower this thread's priority (Linux has one per thread)."""
-        if self._nice and sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
-
-
-def _render(space: Space, order: ViewOrder) -> EncodedView:
-    start = time.perf_counter()
-    view = space.render(order.pose(), order.width, order.height, order.fov_rad)
-    _, jpeg = cv2.imencode(".jpg", view.softened()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, order.jpeg_quality])
-    return EncodedView(order, (time.perf_counter() - start) * 1e3, view, jpeg.tobytes())
+        if sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
 
 
 def decode_panorama(data: NDArray[np.uint8]) -> NDArray[np.uint8]:

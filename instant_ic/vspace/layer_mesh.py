@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.projections import directions_at
+
 TOLERANCE = 0.004
 """Largest error of the inverse depth, in 1/m: it moves a view from 0.5 m aside, 640 pixels wide, by 0.6 pixels."""
 
@@ -87,11 +89,6 @@ def layer_mesh(
 def _directions(height: int, width: int) -> NDArray[np.float32]:
     """Unit vectors at the pixels' corners, (height + 1, width, 3)."""
     azimuth = np.pi - np.arange(width) * (2 * np.pi / width)
-    elevation = np.pi / 2 - np.arange(height + 1) * (np.pi / height)
-    flat = np.cos(elevation)[:, None]
-    flat[[0, -1]] = 0
-    directions = np.empty((height + 1, width, 3), np.float32)
-    directions[..., 0] = flat * np.cos(azimuth)
-    directions[..., 1] = flat * np.sin(azimuth)
-    directions[..., 2] = np.sin(elevation)[:, None]
+    directions = directions_at(azimuth, np.pi / 2 - np.arange(height + 1) * (np.pi / height))
+    directions[[0, -1], :, :2] = 0
     return directions

@@ -17,9 +17,16 @@ from numpy.typing import NDArray
 
 from instant_ic.limits import decode_image
 from instant_ic.vspace.background import Background
-from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.field import Floats
-from instant_ic.vspace.prior import MOST_SIGMA, MOVED, ROBOT, ROOM, SKY, PanoramaPrior, edge_quads, shrunk
+from instant_ic.vspace.prior import (
+    DEPTH_EDGE_RATIO,
+    MOST_SIGMA,
+    ROBOT,
+    ROOM,
+    PanoramaPrior,
+    edge_quads,
+    shrunk,
+)
 from instant_ic.vspace.store import Keyframe, KeyframeSet
 from instant_ic.vspace.warp import PanoramaWarp
 
@@ -47,7 +54,6 @@ class Content(enum.IntEnum):
 _CONTENT, _CONFIDENCE, _EDGE = np.uint8(7), np.uint8(120), np.uint8(128)
 """Bits of the geometry's blue channel."""
 _SURE, _FILLED = 15, 8
-_OF_PRIOR = {ROBOT: Content.NOTHING, SKY: Content.SKY, MOVED: Content.MOVED, ROOM: Content.SURFACE}
 
 
 class LayersError(ValueError):
@@ -76,39 +82,6 @@ class Layers:
 
     version: int
     layers: tuple[Layer, ...]
-
-    def since(self, version: int) -> Layers:
-        """What a receiver of ``version`` does not have: colours and geometries that are older are empty."""
-        return Layers(
-            self.version,
-            tuple(
-                replace(
-                    layer,
-                    colour=layer.colour if layer.colour_version > version else b"",
-                    geometry_png=layer.geometry_png if layer.geometry_version > version else b"",
-                )
-                for layer in self.layers
-            ),
-        )
-
-    def completed(self, before: Layers) -> Layers:
-        """The whole version, from what ``since`` left and the version before.
-
-        Raises:
-            LayersError: a part is missing in both.
-        """
-        known = {(layer.kind, layer.keyframe_id): layer for layer in before.layers}
-        layers = []
-        for layer in self.layers:
-            old = known.get((layer.kind, layer.keyframe_id), layer)
-            colour = old.colour if old.colour_version == layer.colour_version else b""
-            png = old.geometry_png if old.geometry_version == layer.geometry_version else b""
-            whole = replace(layer, colour=layer.colour or colour, geometry_png=layer.geometry_png or png)
-            if not (whole.colour and whole.geometry_png):
-                text = f"layer {layer.kind.name} of keyframe {layer.keyframe_id} refers to a version that is not here"
-                raise LayersError(f"{text}: ask for the whole version")
-            layers.append(whole)
-        return Layers(self.version, tuple(layers))
 
 
 class LayerEncoder:
@@ -162,11 +135,8 @@ class LayerEncoder:
 
 def _marks(keyframe: Keyframe) -> NDArray[np.uint8]:
     prior = keyframe.prior
-    content = np.zeros(prior.content.shape, np.uint8)
-    for here, there in _OF_PRIOR.items():
-        content[prior.content == here] = there
     confidence = np.where(prior.known == 1, _SURE, _FILLED).astype(np.uint8)
-    return content | confidence << 3 | _EDGE * np.minimum(keyframe.warp.depth_edge[1:-1], 1)
+    return prior.content | confidence << 3 | _EDGE * np.minimum(keyframe.warp.depth_edge[1:-1], 1)
 
 
 def _encoded_geometry(inverse_depth: Floats, marks: NDArray[np.uint8]) -> tuple[float, bytes]:
@@ -228,47 +198,40 @@ def decode_layer(layer: Layer) -> DecodedLayer:
     return DecodedLayer(rgb, inverse_depth, marks & _CONTENT, confidence, marks & _EDGE > 0)
 
 
-def decode(layers: Layers, panorama_width: int, geometry: GeometryConfig | None = None) -> KeyframeSet:
+def decode(layers: Layers, panorama_width: int) -> KeyframeSet:
     """The keyframes of whole layers, to be rendered as the space's own (``VirtualSpace.show``).
 
     Args:
         layers: a whole version.
         panorama_width: wider panoramas are area-averaged to this.
-        geometry: of the space that they come from.
 
     Raises:
         LayersError: a layer cannot be decoded, or there is none that the camera saw.
     """
-    geometry = geometry or GeometryConfig()
     seen = [layer for layer in layers.layers if layer.kind is Kind.SEEN]
     behind = {layer.keyframe_id: layer for layer in layers.layers if layer.kind is Kind.BEHIND}
     if not seen:
         raise LayersError("the layers hold no keyframe")
     keyframes = []
     for place, layer in enumerate(seen):
-        prior = _prior(layer, panorama_width, geometry)
+        prior = _prior(layer, panorama_width)
         guess = behind.get(layer.keyframe_id)
         background = None if guess is None else _background(guess)
-        keyframes.append(Keyframe(place, prior, PanoramaWarp.of_prior(prior), background))
+        keyframes.append(Keyframe(place, prior, PanoramaWarp(prior), background))
     return KeyframeSet(tuple(keyframes), np.stack([np.asarray(layer.gain, np.float32) for layer in seen]))
 
 
-def _prior(layer: Layer, panorama_width: int, geometry: GeometryConfig) -> PanoramaPrior:
+def _prior(layer: Layer, panorama_width: int) -> PanoramaPrior:
     decoded = decode_layer(layer)
-    content = np.full(decoded.content.shape, ROBOT, np.uint8)
-    for here, there in _OF_PRIOR.items():
-        content[decoded.content == there] = here
     return PanoramaPrior(
         rgb=np.ascontiguousarray(shrunk(decoded.rgb, panorama_width)),
         inverse_depth=decoded.inverse_depth,
         known=(decoded.confidence == 1).astype(np.uint8),
-        depth_edge=edge_quads(decoded.inverse_depth, geometry.torn_ratio),
+        depth_edge=edge_quads(decoded.inverse_depth, DEPTH_EDGE_RATIO),
         map_from_camera=np.array(layer.map_from_camera, np.float64),
         relative_sigma=layer.relative_sigma,
-        band=float(np.clip(geometry.band_sigmas * layer.relative_sigma, geometry.band_min, geometry.band_max)),
-        sigma=np.full(content.shape, min(layer.relative_sigma, MOST_SIGMA), np.float32),
-        usable=(content == ROOM).astype(np.uint8),
-        content=content,
+        sigma=np.full(decoded.content.shape, min(layer.relative_sigma, MOST_SIGMA), np.float32),
+        content=np.where(decoded.content <= ROOM, decoded.content, np.uint8(ROBOT)),
     )
 
 

@@ -111,58 +111,15 @@ def _check_accessors(path: Path, most: int) -> None:
 
 
 def _read(path: Path, max_triangles: int) -> ScannedMesh:
-    parts = _parts(_scene(path), path, max_triangles)
-    pictures: dict[int, NDArray[np.uint8]] = {}
-    for part in parts:
-        if part["picture"] is not None:
-            pictures.setdefault(id(part["picture"]), _with_factor(part["picture"], part["factor"]))
-    numbers = {key: number for number, key in enumerate(pictures)}
-    texture = [np.full(len(p["triangles"]), numbers.get(id(p["picture"]), -1), np.int32) for p in parts]
-    joined = {
-        key: np.concatenate([part[key] for part in parts]) if parts else np.zeros((0, 3, 3), np.float32)
-        for key in ("triangles", "corner_uv", "corner_rgb")
-    }
-    triangles = joined["triangles"]
-    a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    twice_area = np.linalg.norm(np.cross(a.astype(np.float64), b), axis=1)
-    keep = np.isfinite(twice_area) & (twice_area > 1e-12)
-    if not keep.any():
-        raise MeshError(f"mesh {path}: holds no triangles with an area; is it a point cloud? Mesh it first")
-    texels, start, sizes, levels = _pyramids(list(pictures.values()))
-    index = np.concatenate(texture)[keep]
-    uv = joined["corner_uv"][keep]
-    return ScannedMesh(
-        triangles=np.ascontiguousarray(triangles[keep]),
-        corner_uv=np.ascontiguousarray(uv),
-        corner_rgb=np.ascontiguousarray(joined["corner_rgb"][keep]),
-        texture=index,
-        texel_per_m=_texel_density(uv, twice_area[keep], sizes, index),
-        texels=texels,
-        start=start,
-        sizes=sizes,
-        levels=levels,
-    )
+    """The mesh of a file. Triangles are counted on the way, as one geometry may stand at many nodes."""
+    import trimesh
 
-
-def _scene(path: Path) -> Any:
-    try:
-        import trimesh
-    except ImportError as error:
-        raise MeshError(
-            "a mesh as the virtual space needs the packages trimesh and embreex: pip install them"
-        ) from error
-    return trimesh.load_scene(str(path), process=False)
-
-
-def _parts(scene: Any, path: Path, max_triangles: int) -> list[dict[str, Any]]:
-    """Each geometry's triangles and colours.
-
-    Raises:
-        MeshError: more triangles than are allowed; counted here, as one geometry may stand at many nodes.
-    """
-    parts = []
+    # Corners, their texture coordinates and colours, and the triangles' texture, of each part; of none first.
+    nothing = (np.zeros((0, 3, width), np.float32) for width in (3, 2, 3))
+    parts: list[tuple[NDArray[Any], ...]] = [(*nothing, np.zeros(0, np.int32))]
+    images: dict[int, tuple[Any, NDArray[np.uint8]]] = {}  # by id, with what keeps it
     count = 0
-    for part in mesh_parts(scene, is_y_up(path)):
+    for part in mesh_parts(trimesh.load_scene(str(path), process=False), is_y_up(path)):
         count += len(part.faces)
         if count > max_triangles:
             raise MeshError(
@@ -172,17 +129,32 @@ def _parts(scene: Any, path: Path, max_triangles: int) -> list[dict[str, Any]]:
         factor = None if part.factor is None else part.factor.astype(np.float32)
         if factor is not None:
             factor = 255 * (_to_srgb(factor) if part.factor_is_linear else factor)
-        no_uv = np.zeros((*part.faces.shape, 2), np.float32)
-        parts.append(
-            {
-                "triangles": part.vertices[part.faces].astype(np.float32),
-                "corner_uv": no_uv if part.corner_uv is None else part.corner_uv.astype(np.float32),
-                "corner_rgb": _corner_colours(part.visual, part.faces, factor),
-                "picture": part.image,
-                "factor": factor,
-            }
-        )
-    return parts
+        if part.image is not None and id(part.image) not in images:
+            images[id(part.image)] = part.image, _with_factor(part.image, factor)
+        number = -1 if part.image is None else list(images).index(id(part.image))
+        uv = np.zeros((*part.faces.shape, 2)) if part.corner_uv is None else part.corner_uv
+        corners, colours = part.vertices[part.faces], _corner_colours(part.visual, part.faces, factor)
+        texture = np.full(len(part.faces), number, np.int32)
+        parts.append((corners.astype(np.float32), uv.astype(np.float32), colours, texture))
+    triangles, corner_uv, corner_rgb, texture = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    twice_area = np.linalg.norm(np.cross(a.astype(np.float64), b), axis=1)
+    keep = np.isfinite(twice_area) & (twice_area > 1e-12)
+    if not keep.any():
+        raise MeshError(f"mesh {path}: holds no triangles with an area; is it a point cloud? Mesh it first")
+    texels, start, sizes, levels = _pyramids([rgb for _, rgb in images.values()])
+    index, uv = texture[keep], corner_uv[keep]
+    return ScannedMesh(
+        triangles=np.ascontiguousarray(triangles[keep]),
+        corner_uv=np.ascontiguousarray(uv),
+        corner_rgb=np.ascontiguousarray(corner_rgb[keep]),
+        texture=index,
+        texel_per_m=_texel_density(uv, twice_area[keep], sizes, index),
+        texels=texels,
+        start=start,
+        sizes=sizes,
+        levels=levels,
+    )
 
 
 def _corner_colours(visual: Any, faces: NDArray[np.integer], factor: Floats | None) -> Floats:

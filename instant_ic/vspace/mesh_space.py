@@ -7,7 +7,7 @@ camera image are, and sets the factors of the mesh's colours.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Protocol
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,6 @@ from instant_ic.vspace.readiness import UNSEEN_GAIN, Texture
 from instant_ic.vspace.space import State, Status, TrainStats, VirtualSpace
 from instant_ic.vspace.view import Drawn, View, checked_pose, continue_unseen, equirect_rays, perspective_rays
 
-if TYPE_CHECKING:
-    from instant_ic.vspace.prior import PanoramaPrior
-
 EDGE_RATIO = 0.03
 """Neighbouring depths that differ by more than this share are an edge; its pixels are rendered by four rays."""
 _SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
@@ -38,42 +35,6 @@ _NEAR, _LEAST_NEAR = 0.25, 0.7
 In small_house.glb, with depth 10 % off, 1 m aside or 20° turned gave 0.43 to 0.80, in its place 0.98 and more."""
 _ASIDE = math.sin(math.radians(22.5))
 """Floor and ceiling agree wherever the mesh lies: directions flatter than this count."""
-
-
-class Space(Protocol):
-    """Interface of a source of views; see ``VirtualSpace``."""
-
-    config: VirtualSpaceConfig
-
-    @property
-    def dissolving(self) -> bool: ...
-    @property
-    def keyframe(self) -> PanoramaPrior | None: ...
-    @property
-    def status(self) -> Status: ...
-    def set_keyframe(
-        self,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.floating],
-        map_from_camera: NDArray[np.floating],
-        relative_sigma: float | NDArray[np.floating],
-    ) -> None: ...
-    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats: ...
-    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View: ...
-    def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View: ...
-    def render_cube(self, map_from_camera: NDArray[np.floating], size: int) -> View: ...
-    def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float: ...
-
-
-def make_space(config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> Space:
-    """Create the space for ``config.source``; ``robot``: the robot's mask, as ``VirtualSpace`` takes it.
-
-    Raises:
-        MeshError: ``source`` is ``mesh``, and its file cannot be used.
-        DeviceError: the device that was asked for is not there.
-    """
-    config = config or VirtualSpaceConfig()
-    return MeshSpace(config) if config.source == "mesh" else VirtualSpace(config, robot)
 
 
 class MeshSpace(Drawn):
@@ -176,7 +137,7 @@ class MeshSpace(Drawn):
 
     def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
         """There is nothing to train."""
-        return TrainStats(0, self._psnr_db, math.nan, 0.0, True)
+        return TrainStats(0, self._psnr_db, 0.0, True)
 
     @property
     def _psnr_db(self) -> float:
@@ -271,3 +232,17 @@ class MeshSpace(Drawn):
         density = self._mesh.texel_per_m[face]
         fine |= (self._mesh.texture[face] < 0) & (density * range_m.reshape(-1) * pixel_rad > 1)
         return fine & (face >= 0)
+
+
+Space: TypeAlias = VirtualSpace | MeshSpace
+
+
+def make_space(config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> Space:
+    """Create the space for ``config.source``; ``robot``: the robot's mask, as ``VirtualSpace`` takes it.
+
+    Raises:
+        MeshError: ``source`` is ``mesh``, and its file cannot be used.
+        DeviceError: the device that was asked for is not there.
+    """
+    config = config or VirtualSpaceConfig()
+    return MeshSpace(config) if config.source == "mesh" else VirtualSpace(config, robot)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.projections import equirect_pixels, nearest_pixels
 from instant_ic.vspace.config import GeometryConfig
 
 MOST_SIGMA = 0.5
@@ -16,14 +17,21 @@ MOST_SIGMA = 0.5
 
 MOST_COORDINATE_M = 100_000.0
 """Places farther from the map's origin have no centimetres in float32."""
+DEPTH_EDGE_RATIO = 0.10
+"""Neighbouring depths that differ by more than this share are an edge, unless they lie on one plane."""
 EDGE_RAD = 0.05
 """Distance to each side of an edge within which depth may belong to either surface."""
 
-ROOM, ROBOT, SKY, MOVED = 0, 1, 2, 3
-"""Content of a pixel: a part of the place; the robot itself; the sky; something that has moved away."""
+ROBOT, SKY, MOVED, ROOM = range(4)
+"""Content of a pixel: the robot itself; the sky; something that has moved away; a part of the place. As in
+VspaceLayer.msg.
+"""
 _TOP_RAD, _TOP_STEP, _ASSUMED, _CONTRAST, _THING_SHARE = 0.15, 1.3, 0.05, 30.0, 0.15
 """Of assumed tops, see ``fill_kernels.cut_tops``: their height in the image, the step above them, sigma, grey levels,
 and the share of the thing in a mixed colour."""
+_BAND_SIGMAS, _BAND = 2.0, (0.05, 0.06)  # half width of the band in sigmas of the depth, and its limits
+_DEPTH_M = (0.2, 30.0)  # nearer and farther depths are set to these
+_LEAST_KNOWN = 0.5  # keyframes with a smaller share of known depth are refused
 _SKY_RISE = 0.17  # sine of the elevation that unknown regions must lie above, on the mean, to be the sky
 
 
@@ -42,9 +50,7 @@ class PanoramaPrior:
         depth_edge: 1 where the quad between pixel (v, u) and (v + 1, u + 1) crosses a depth edge, (h, w) uint8.
         map_from_camera: pose, (4, 4).
         relative_sigma: standard deviation of the depth, relative to it: median over the image.
-        band: half width, relative to the depth, of the band in which the signed distance is learnt.
         sigma: as ``relative_sigma``, of each pixel, (h, w) float32; ``MOST_SIGMA`` where the depth was filled in.
-        usable: 1 where training may sample rays, (h, w) uint8: where ``content`` is ``ROOM``.
         content: ``ROOM``, ``ROBOT``, ``SKY`` or ``MOVED``, (h, w) uint8; only ``ROOM`` has surfaces.
     """
 
@@ -54,19 +60,44 @@ class PanoramaPrior:
     depth_edge: NDArray[np.uint8]
     map_from_camera: NDArray[np.float64]
     relative_sigma: float
-    band: float
     sigma: NDArray[np.float32]
-    usable: NDArray[np.uint8]
     content: NDArray[np.uint8]
+
+    @property
+    def band(self) -> float:
+        """Half width, relative to the depth, of the band in which the signed distance is learnt."""
+        return float(np.clip(_BAND_SIGMAS * self.relative_sigma, *_BAND))
+
+    @property
+    def usable(self) -> NDArray[np.uint8]:
+        """1 where training may sample rays, (h, w)."""
+        return (self.content == ROOM).astype(np.uint8)
+
+    def in_camera(self, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Points (N, 3) of the map in the camera's frame."""
+        pose = self.map_from_camera.astype(np.float32)
+        return np.asarray(np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3]))
+
+    def sees(self, local: NDArray[np.float32], distance: NDArray[np.float32], share: float) -> NDArray[np.bool_]:
+        """Whether points (N, 3) of the camera's frame, at ``distance`` (N,) from it, lie within a share of this of a
+        surface that the keyframe knows, beside no depth edge.
+        """
+        height, width = self.inverse_depth.shape
+        u, v = equirect_pixels(local, width, height)
+        at = np.clip(np.floor(v), 0, height - 1).astype(np.intp), np.floor(u).astype(np.intp) % width
+        known = (self.known[at] == 1) & (self.depth_edge[at] == 0) & (self.content[at] == ROOM)
+        return np.asarray(known & (np.abs(self.inverse_depth[at] * distance - 1) < share))
+
+    def colours(self, local: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Nearest pixels of the panorama in the direction of points (N, 3) of the camera's frame, (N, 3) in 0..255."""
+        height, width = self.rgb.shape[:2]
+        return self.rgb[nearest_pixels(local, width, height)].astype(np.float32)
 
     def without(self, moved: NDArray[np.bool_]) -> PanoramaPrior:
         """The keyframe with what has ``moved`` (h, w) left out, and nothing else that was left out for that before."""
         content = np.where(self.content == MOVED, ROOM, self.content)
         content[moved & (content == ROOM)] = MOVED
-        return self if np.array_equal(content, self.content) else self._with(content.astype(np.uint8))
-
-    def _with(self, content: NDArray[np.uint8]) -> PanoramaPrior:
-        return replace(self, content=content, usable=(content == ROOM).astype(np.uint8))
+        return self if np.array_equal(content, self.content) else replace(self, content=content.astype(np.uint8))
 
     @functools.cached_property
     def beside_edge(self) -> NDArray[np.uint8]:
@@ -117,23 +148,20 @@ def prepare(
     sky = content == SKY
     known: NDArray[np.bool_] = depth > 0
     with np.errstate(divide="ignore"):
-        inverse = np.where(known, 1.0 / np.clip(depth, config.min_depth_m, config.max_depth_m), 0.0)
+        inverse = np.where(known, 1.0 / np.clip(depth, *_DEPTH_M), 0.0)
     inverse = np.ascontiguousarray(fill_holes(inverse.astype(np.float32), known & ~sky))
-    inverse[sky] = 1 / config.max_depth_m
+    inverse[sky] = 1 / _DEPTH_M[1]
     if np.ndim(relative_sigma):
         _cut_tops(inverse, each, rgb, content == ROOM)
     known |= sky
-    band = float(np.clip(config.band_sigmas * sigma, config.band_min, config.band_max))
     return PanoramaPrior(
         rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile again
         inverse_depth=inverse,
         known=(known & ((each <= MOST_SIGMA) | sky) & (content != ROBOT)).astype(np.uint8),
-        depth_edge=edge_quads(inverse, config.torn_ratio),
+        depth_edge=edge_quads(inverse, DEPTH_EDGE_RATIO),
         map_from_camera=np.array(map_from_camera, np.float64),
         relative_sigma=sigma,
-        band=band,
         sigma=np.where(known, np.minimum(each, np.float32(MOST_SIGMA)), np.float32(MOST_SIGMA)),
-        usable=(content == ROOM).astype(np.uint8),
         content=content,
     )
 
@@ -187,13 +215,13 @@ def _checked_depth(
     # Geometry does not gain from more than 0.35° a pixel, and tears and occupancy cost by the pixel.
     step = max(1, depth_m.shape[1] // 1024)
     rows = depth_m.shape[0] // step
-    depth = np.minimum(depth_m[::step, ::step][:rows, : 2 * rows], config.max_depth_m).astype(np.float32, order="C")
+    depth = np.minimum(depth_m[::step, ::step][:rows, : 2 * rows], _DEPTH_M[1]).astype(np.float32, order="C")
     content = np.full(depth.shape, ROOM, np.uint8)
     content[sky_region(depth == 0, config.sky_share)] = SKY
     content[robot_region(depth.shape[0], config.body_below_deg, robot)] = ROBOT
     share = float(np.count_nonzero(depth)) / max(1, int(np.count_nonzero(content != SKY)))
-    if share < config.min_known_share:
-        raise KeyframeError(f"depth is known in {share:.0%} of the image, {config.min_known_share:.0%} are needed")
+    if share < _LEAST_KNOWN:
+        raise KeyframeError(f"depth is known in {share:.0%} of the image, {_LEAST_KNOWN:.0%} are needed")
     return depth, content
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
-from instant_ic.geometry.projections import equirect_pixels
+from instant_ic.geometry.projections import nearest_pixels
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import PanoramaPrior, area_average
 
@@ -76,17 +76,10 @@ def error_terms(
         cosine = -np.einsum("ij,ij->i", back, rays.directions[seen]) / away
         ratio = away / np.maximum(depth[seen], 1e-3)
         sine = np.sqrt(np.clip(1 - cosine * cosine, 0, 1))
-        shift = np.minimum(shift, _sigma_at(prior, points) * ratio * sine)
+        height, width = prior.sigma.shape
+        sigma = prior.sigma[nearest_pixels(prior.in_camera(points), width, height)]
+        shift = np.minimum(shift, sigma * ratio * sine)
     return (1 - unseen) * float(texture.cost(shift).mean()), unseen * texture.variance
-
-
-def _sigma_at(prior: PanoramaPrior, points: Floats) -> Floats:
-    """Relative sigma of a keyframe's depth in the direction of points (N, 3) of the map, (N,)."""
-    pose = prior.map_from_camera.astype(np.float32)
-    height, width = prior.sigma.shape
-    u, v = equirect_pixels(np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3]), width, height)
-    row = np.clip(np.rint(v), 0, height - 1).astype(np.intp)
-    return np.asarray(prior.sigma[row, np.rint(u).astype(np.intp) % width], np.float32)
 
 
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:

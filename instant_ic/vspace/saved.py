@@ -19,7 +19,7 @@ from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import FieldParameters, Floats, Lattice
 from instant_ic.vspace.prior import PanoramaPrior
 
-FORMAT, VERSION = "instant_ic virtual space", 3
+FORMAT, VERSION = "instant_ic virtual space", 4
 FILE_NAME = "space.npz"
 """Name of the file in a folder."""
 

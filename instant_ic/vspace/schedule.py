@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.vspace.config import VirtualSpaceConfig
@@ -19,26 +19,6 @@ _LASTING = (JobKind.WARM_UP, JobKind.LEARN, JobKind.TRAIN)
 """Jobs that would fail again at once: after an error nothing is trained until the next keyframe."""
 _NOTHING_SEEN = 0.98
 """A view with a larger share of unseen pixels shows nothing that is known."""
-
-
-@dataclass(frozen=True)
-class Figures:
-    """Fields of VspaceStatus.msg; 0 or empty where unknown."""
-
-    state: State
-    keyframe_id: int
-    ready_radius_m: float
-    psnr_db: float
-    expected_psnr_db: float
-    unseen_share: float
-    train_seconds: float
-    ready_seconds: float
-    iterations: int
-    ms_per_iteration: float
-    render_ms: float
-    render_fps: float
-    device: str
-    message: str
 
 
 class Turns:
@@ -291,24 +271,24 @@ class JobSchedule:
             found.append(Diagnosis("vspace", Level.OK, self.text()))
         return found
 
-    def figures(self, now_ns: int) -> Figures:
-        """The present status."""
+    def figures(self, now_ns: int) -> dict[str, Any]:
+        """The present status: fields of VspaceStatus.msg, 0 or empty where unknown."""
         status, keyframe, state = self.status, self.keyframe, self.state
         shown = status if keyframe is not None or self.config.source == "mesh" else None
         of_keyframe = status if keyframe is not None else None
-        return Figures(
-            state=state,
-            keyframe_id=0 if status is None or keyframe is None else keyframe.id,
-            ready_radius_m=0.0 if shown is None else shown.ready_radius_m,
-            psnr_db=of_keyframe.psnr_db if of_keyframe is not None and of_keyframe.iterations else 0.0,
-            expected_psnr_db=self._expected_psnr_db,
-            unseen_share=self._unseen_share,
-            train_seconds=0.0 if keyframe is None else (now_ns - keyframe.arrival_ns) / 1e9,
-            ready_seconds=self._ready_seconds if keyframe is not None and state == State.READY else 0.0,
-            iterations=0 if of_keyframe is None else of_keyframe.iterations,
-            ms_per_iteration=0.0 if of_keyframe is None or self._lockstep else of_keyframe.ms_per_iteration,
-            render_ms=self._render_ms,
-            render_fps=self._frame_rate.per_second(now_ns),
-            device="" if status is None else status.device,
-            message=self.text(),
-        )
+        return {
+            "state": state,
+            "keyframe_id": 0 if status is None or keyframe is None else keyframe.id,
+            "ready_radius_m": 0.0 if shown is None else shown.ready_radius_m,
+            "psnr_db": of_keyframe.psnr_db if of_keyframe is not None and of_keyframe.iterations else 0.0,
+            "expected_psnr_db": self._expected_psnr_db,
+            "unseen_share": self._unseen_share,
+            "train_seconds": 0.0 if keyframe is None else (now_ns - keyframe.arrival_ns) / 1e9,
+            "ready_seconds": self._ready_seconds if keyframe is not None and state == State.READY else 0.0,
+            "iterations": 0 if of_keyframe is None else of_keyframe.iterations,
+            "ms_per_iteration": 0.0 if of_keyframe is None or self._lockstep else of_keyframe.ms_per_iteration,
+            "render_ms": self._render_ms,
+            "render_fps": self._frame_rate.per_second(now_ns),
+            "device": "" if status is None else status.device,
+            "message": self.text(),
+        }

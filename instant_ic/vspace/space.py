@@ -26,7 +26,7 @@ from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_out_of_memory, make_device
 from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
 from instant_ic.vspace.nerf.occupancy import build_occupancy
-from instant_ic.vspace.prior import KeyframeError, PanoramaPrior, prepare
+from instant_ic.vspace.prior import PanoramaPrior, prepare
 from instant_ic.vspace.readiness import Texture, error_terms, expected_psnr_db
 from instant_ic.vspace.saved import Progress, SavedSpace, read, write
 from instant_ic.vspace.store import RECENT, Keyframe, KeyframeSet, KeyframeStore, ready, recent, spread
@@ -34,6 +34,8 @@ from instant_ic.vspace.view import Drawn, View, checked_pose, perspective_rays
 
 T = TypeVar("T")
 _PROBE = (64, 36)  # pixels of the image that readiness is judged by
+_PARALLAX_RAD = 0.035  # displacement of surfaces by the depth's error that is still fit to show
+_LEAST_DEPTH_SHARE = 0.5  # of the keyframe's depth in where the field's surfaces lie
 
 
 class State(enum.IntEnum):
@@ -53,8 +55,6 @@ class TrainStats:
 
     iterations: int
     psnr_db: float
-    distance_error: float
-    """Root mean square error of the signed distance, as a share of the truncation distance."""
     elapsed_ms: float
     converged: bool
 
@@ -323,15 +323,14 @@ class VirtualSpace(Drawn):
         if self._scene is None:
             self.learn(self.scene_of(self._shown))
         start = time.perf_counter()
-        done, distance_error = 0, math.nan
+        done = 0
         limit = self.config.train.iterations if iterations is None else iterations
         shape = (self.config.train.ray_columns * self.config.train.ray_rows, 3)
         while not self._done and done < limit:
             uniform = self._rng.random(shape, np.float32)
-            colour, distance = self._on_device(functools.partial(_step, uniform, self._schedule.rates()))
+            colour, _ = self._on_device(functools.partial(_step, uniform, self._schedule.rates()))
             self._schedule.iteration += 1
             done += 1
-            distance_error = math.sqrt(distance)
             if self._schedule.finished or self._schedule.iteration % self.config.readiness.plateau_iterations == 0:
                 self._choose()
             self._note(colour)
@@ -339,13 +338,12 @@ class VirtualSpace(Drawn):
                 break
         elapsed = time.perf_counter() - start
         self._train_seconds += elapsed
-        return TrainStats(done, self._psnr_db, distance_error, elapsed * 1e3, self._done)
+        return TrainStats(done, self._psnr_db, elapsed * 1e3, self._done)
 
     def _choose(self) -> None:
         """Show the field or the warp, whichever renders the older keyframes better."""
-        share, train = self.config.picture.least_depth_share, self.config.train
-        drawings = [self._on_device(functools.partial(_field_alone, trial.rays, share)) for trial in self._trials]
-        left = (train.iterations - self._schedule.iteration) / self.config.readiness.plateau_iterations
+        drawings = [self._on_device(functools.partial(_field_alone, trial.rays)) for trial in self._trials]
+        left = (self.config.train.iterations - self._schedule.iteration) / self.config.readiness.plateau_iterations
         self._choice.take(gain_db(self._trials, drawings), left)
 
     def _note(self, colour_error: float) -> None:
@@ -386,10 +384,10 @@ class VirtualSpace(Drawn):
 
     def _ready_radius_m(self) -> float:
         """A surface at depth D, wrong by σ·D, seen from b aside is displaced by about b·σ/D radians."""
-        rule, prior = self.config.readiness, self.keyframe
+        prior = self.keyframe
         assert prior is not None
         sigma = max(prior.relative_sigma, 1e-3)
-        return min(rule.max_radius_m, rule.parallax_rad * prior.median_depth_m / sigma)
+        return min(self.config.readiness.max_radius_m, _PARALLAX_RAD * prior.median_depth_m / sigma)
 
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
         """Expected PSNR of a view, estimated without ground truth (``readiness``); −inf without a keyframe.
@@ -458,7 +456,7 @@ class VirtualSpace(Drawn):
         """Render keyframes: their panoramas warped (``warps``), or the field."""
         share, field = self._panorama_share, None
         if share == 0 or not warps:
-            field = device.draw(rays, share, max(share, self.config.picture.least_depth_share))
+            field = device.draw(rays, share, max(share, _LEAST_DEPTH_SHARE))
         return canvas.draw(rays, shown if warps else None, field, layers)
 
     @property
@@ -554,12 +552,9 @@ def _renewed(keyframe: Keyframe, prior: PanoramaPrior) -> Keyframe:
     return ready(keyframe.place, prior, keyframe.warp.pyramid)
 
 
-def _field_alone(rays: Rays, depth_share: float, device: Device) -> Drawing:
-    return device.draw(rays, 0.0, depth_share)
+def _field_alone(rays: Rays, device: Device) -> Drawing:
+    return device.draw(rays, 0.0, _LEAST_DEPTH_SHARE)
 
 
 def _step(uniform: Floats, rates: tuple[float, float], device: Device) -> tuple[float, float]:
     return device.step(uniform, *rates)
-
-
-__all__ = ["KeyframeError", "NotReadyError", "State", "Status", "TrainStats", "View", "VirtualSpace"]

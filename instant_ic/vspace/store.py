@@ -119,7 +119,7 @@ class KeyframeStore:
 
 def ready(place: int, prior: PanoramaPrior, pyramid: Pyramid) -> Keyframe:
     """Prepare a keyframe for rendering."""
-    return Keyframe(place, prior, PanoramaWarp.of_prior(prior, pyramid), Background.of(prior))
+    return Keyframe(place, prior, PanoramaWarp(prior, pyramid), Background.of(prior))
 
 
 def _arrays_for(like: dict[str, NDArray[Any]], place: int) -> dict[str, NDArray[Any]]:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.vspace.config import GeometryConfig
+from instant_ic.geometry.projections import directions_at
 from instant_ic.vspace.nerf.field import Floats, Rays
-from instant_ic.vspace.prior import ROOM, PanoramaPrior, edge_quads, prepare
+from instant_ic.vspace.prior import ROOM, PanoramaPrior, edge_quads
 from instant_ic.vspace.view import View, check_size, checked_pose, continue_unseen, perspective_rays
 
 EDGE_RATIO = 0.05
@@ -88,34 +88,12 @@ class PanoramaWarp:
         inverse, depth_edge, known: of its mesh, as ``warp_kernels.draw_mesh`` takes them, (h + 2, w).
 
     Example:
-        >>> warp = PanoramaWarp(rgb, depth_m, map_from_camera)               # doctest: +SKIP
+        >>> warp = PanoramaWarp(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), 4096))  # doctest: +SKIP
         >>> warp.render(pose, 320, 180, fov_rad=1.57).rgb
     """
 
-    def __init__(
-        self,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.floating],
-        map_from_camera: NDArray[np.floating],
-        panorama_width: int = 4096,
-    ) -> None:
-        """Checks and takes a keyframe.
-
-        Args: as ``prior.prepare``.
-
-        Raises:
-            KeyframeError: the keyframe is no good.
-        """
-        self._take(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), panorama_width))
-
-    @classmethod
-    def of_prior(cls, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> PanoramaWarp:
-        """Of a keyframe that has been made ready already, and its pyramid where that is there too."""
-        warp = cls.__new__(cls)
-        warp._take(prior, pyramid)
-        return warp
-
-    def _take(self, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> None:
+    def __init__(self, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> None:
+        """Of a keyframe; ``pyramid``: of its panorama, where that is there already."""
         self.prior = prior
         self.pyramid = pyramid or Pyramid.of(prior.rgb)
         self._camera_from_map = np.linalg.inv(prior.map_from_camera).astype(np.float32)
@@ -208,10 +186,4 @@ def _half_step_directions(width: int, height: int) -> NDArray[np.float32]:
     """
     azimuth = math.pi - (np.arange(2 * width) + 1) * (math.pi / width)
     elevation = math.pi / 2 - (np.arange(-2, 2 * height + 1) + 1) * (math.pi / (2 * height))
-    elevation = np.clip(elevation, -math.pi / 2, math.pi / 2)
-    flat = np.cos(elevation)[:, None]
-    directions = np.empty((2 * height + 3, 2 * width, 3), np.float32)
-    directions[..., 0] = flat * np.cos(azimuth)
-    directions[..., 1] = flat * np.sin(azimuth)
-    directions[..., 2] = np.sin(elevation)[:, None]
-    return directions
+    return directions_at(azimuth, np.clip(elevation, -math.pi / 2, math.pi / 2))

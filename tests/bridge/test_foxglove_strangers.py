@@ -199,10 +199,10 @@ HARMLESS = {
     "bag_recorder": ("duration_s", "snapshot_after_s"),
     "depth_estimator": ("max_rate_hz",),
     "depth_scaler": (
-        *("source", "scaler", "lidar", "fusion", "keyframes", "mapping", "max_rate_hz", "rows"),
-        *("body_elevation_deg", "max_cloud_age_s", "map_frame", "odom_frame", "base_frame"),
+        *("source", "scaler", "lidar", "keyframes", "mapping", "max_rate_hz", "rows"),
+        *("body_elevation_deg", "map_frame", "odom_frame", "base_frame"),
     ),
-    "nerf": ("render_fps", "train_ms_per_frame", "lockstep_iterations", "max_view_pixels", "jpeg_quality"),
+    "nerf": ("render_fps", "train_ms_per_frame", "max_view_pixels", "jpeg_quality"),
 }
 """Live parameters that a bridge may set, if it may set any: none of them decides whether or how the robot moves."""
 

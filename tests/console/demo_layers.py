@@ -12,8 +12,8 @@ from instant_ic.console.layers import PageLayers
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace.background import Background
-from instant_ic.vspace.prior import ROOM
-from instant_ic.vspace.warp import PanoramaWarp
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.prior import ROOM, prepare
 
 
 def demo_layers(version: int, map_from_camera: Matrix, width: int = 1024, depth_width: int = 512) -> PageLayers:
@@ -29,7 +29,7 @@ def demo_layers(version: int, map_from_camera: Matrix, width: int = 1024, depth_
     rotation = map_from_camera[:3, :3].astype(np.float32)
     rgb = demo_world.shade((x, y, z), equirect_directions(width, width // 2) @ rotation.T)[..., ::-1]
     depth = demo_world.distances((x, y, z), equirect_directions(depth_width, depth_width // 2) @ rotation.T)
-    prior = PanoramaWarp(np.ascontiguousarray(rgb), depth, map_from_camera).prior
+    prior = prepare(np.ascontiguousarray(rgb), depth, map_from_camera, 0.0, GeometryConfig(), 4096)
     behind = Background.of(prior)
     guessed = np.zeros(behind.inverse.shape, np.bool_)
     for quads in (behind.guessed, behind.sky):

@@ -17,7 +17,7 @@ from instant_ic.depth.scale_rules import (
     solid_angle_quantile,
 )
 from instant_ic.depth.scaler import DepthScaler, ScalerConfig
-from instant_ic.depth.visibility import hidden, nearest_points, on_depth_edge, project_points
+from instant_ic.depth.visibility import hidden, nearest_points, on_depth_edge, pixels_of
 from instant_ic.geometry.poses import pose_matrix, transform_points
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.geometry.transforms import TransformBuffer
@@ -72,9 +72,8 @@ def test_too_few_values_are_refused() -> None:
 def test_projection_by_hand() -> None:
     # 8 x 4 pixels: forward lies between columns 3 and 4, left a quarter turn before, row 1.5 is the horizon.
     points = np.array([[2.0, 0, 0], [0, 3.0, 0], [0, -1.0, 0], [0, 0, 4.0]])
-    u, v, range_m = project_points(points, 8, 4)
-    np.testing.assert_allclose(u[:3], [3.5, 1.5, 5.5])
-    np.testing.assert_allclose(v, [1.5, 1.5, 1.5, -0.5])
+    rows, columns, range_m = pixels_of(points, 8, 4)
+    assert columns[:3].tolist() == [4, 2, 6] and rows.tolist() == [2, 2, 2, 0]
     np.testing.assert_allclose(range_m, [2, 3, 1, 4])
 
 
@@ -163,17 +162,15 @@ def test_sectors_straighten_a_room_whose_left_is_estimated_too_near() -> None:
     near_horizon = slice(50, 78)  # the rows that the LiDAR sees
     one = DepthScaler(ScalerConfig(method="ransac")).fit(bent, room_points(noise=0.003))
     many = DepthScaler(ScalerConfig(method="sector")).fit(bent, room_points(noise=0.003))
-    assert one.scale_field is None
-    assert many.scale_field is not None
-    assert (many.scale_field.shape, many.scale_field.dtype) == (truth.shape, np.float32)
     assert np.abs(one.depth_m / truth - 1)[near_horizon].max() > 0.1
     assert np.abs(many.depth_m / truth - 1)[near_horizon].max() < 0.03
-    np.testing.assert_allclose(many.scale_field[[0, -1]], 1.0, atol=0.005)  # one value at the poles
+    factor = many.depth_m / (many.scale * bent)
+    np.testing.assert_allclose(factor[[0, -1]], 1.0, atol=0.005)  # one value at the poles
     assert many.quality >= one.quality
     # Where the LiDAR sees nothing the scale of the rest stays: no points on the left half.
     right = room_points()[room_points()[:, 1] < 0]
     half = DepthScaler(ScalerConfig(method="sector")).fit(truth, right)
-    np.testing.assert_allclose(half.scale_field, 1.0, atol=0.02)
+    np.testing.assert_allclose(half.depth_m / (half.scale * truth), 1.0, atol=0.02)
 
 
 def spoilt(points: np.ndarray, share: float) -> np.ndarray:
@@ -327,8 +324,8 @@ def test_shapes_and_configuration_are_checked() -> None:
         DepthScaler().fit(room_depth(), np.zeros((5, 4)))
     with pytest.raises(ValueError, match="method"):
         ScalerConfig(method="mean")
-    with pytest.raises(ValueError, match="confidence"):
-        ScalerConfig(confidence=99.5)
+    with pytest.raises(ValueError, match="min_points"):
+        ScalerConfig(min_points=5)
 
 
 def test_deskew_undoes_motion() -> None:

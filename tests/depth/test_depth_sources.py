@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from instant_ic.depth.completion import prior_channels
-from instant_ic.depth.fusion import FusionConfig, ceiling_height, correct
+from instant_ic.depth.fusion import ceiling_height, correct
 from instant_ic.depth.lidar_depth import (
     LidarDepthConfig,
     LidarStructure,
@@ -263,11 +263,11 @@ def test_a_wall_that_the_network_sees_too_near_is_put_right() -> None:
     azimuth = np.pi - (np.arange(SIZE[1]) + 0.5) * (2 * np.pi / SIZE[1])
     factor = np.where(np.abs(azimuth) < 0.6, 0.75, 1.0)
     measured = STRUCTURE.ranges(POINTS, SIZE)
-    found = correct((true * factor).astype(np.float32), measured, FusionConfig())
+    found = correct((true * factor).astype(np.float32), measured)
     middle = slice(SIZE[0] // 3, 2 * SIZE[0] // 3), np.abs(azimuth) < 0.35
     assert np.abs(found.depth_m[middle] / true[middle] - 1).max() < 0.06
     assert found.sigma < 0.05 and found.wrong.max() < 0.3
-    assert (correct(np.zeros(SIZE, np.float32), measured, FusionConfig()).depth_m == 0).all()
+    assert (correct(np.zeros(SIZE, np.float32), measured).depth_m == 0).all()
 
 
 def raw_of(true: np.ndarray) -> np.ndarray:

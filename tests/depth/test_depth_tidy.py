@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.depth.tidy import TidyConfig, continued, plane_below, tidy
+from instant_ic.depth.tidy import continued, plane_below, tidy
 
 H, W = 64, 128
 FLOOR, CEILING, HALF = 1.2, 1.5, 2.5  # metres from the camera to floor and ceiling, and to the walls ahead and aside
-SMALL = TidyConfig(height=H)
 
 
 def _angles():
@@ -39,7 +38,7 @@ def _error(depth: np.ndarray) -> np.ndarray:
 
 
 def test_floor_and_ceiling_become_level():
-    room = tidy(_bent(_room()), config=SMALL)
+    room = tidy(_bent(_room()), height=H)
     assert room.floor_m == pytest.approx(FLOOR, rel=0.03) and room.ceiling_m == pytest.approx(CEILING, rel=0.03)
     assert room.scale == 1
     elevation, _ = _angles()
@@ -51,12 +50,12 @@ def test_floor_and_ceiling_become_level():
 
 
 def test_a_room_that_is_right_stays_so():
-    room = tidy(_room(), config=SMALL)
+    room = tidy(_room(), height=H)
     assert np.median(_error(room.depth_m)) < 0.005 and _error(room.depth_m).mean() < 0.02
 
 
 def test_a_known_camera_height_scales_everything():
-    room = tidy(0.5 * _room(), camera_height_m=FLOOR, config=SMALL)
+    room = tidy(0.5 * _room(), camera_height_m=FLOOR, height=H)
     assert room.floor_m == FLOOR and room.scale == pytest.approx(2, rel=0.03)
     assert room.ceiling_m == pytest.approx(CEILING, rel=0.05)
     assert np.median(_error(room.depth_m)) < 0.04
@@ -66,7 +65,7 @@ def test_a_table_stays_a_table():
     depth, (elevation, azimuth) = _room(), _angles()
     table = (elevation < -math.radians(20)) & (elevation > -math.radians(50)) & (np.abs(azimuth) < 0.5)
     depth[table] = 0.45 / np.sin(-elevation[table])  # its top is 0.45 m under the camera
-    tidied = tidy(depth, config=SMALL).depth_m
+    tidied = tidy(depth, height=H).depth_m
     inside = table & np.roll(table, 4, 0) & np.roll(table, -4, 0) & np.roll(table, 4, 1) & np.roll(table, -4, 1)
     height = tidied[inside] * np.sin(-elevation[inside])
     assert np.median(np.abs(height - 0.45)) < 0.03
@@ -76,29 +75,29 @@ def test_stairs_down_are_not_filled_up_but_nothing_else_lies_under_the_floor():
     depth, (elevation, azimuth) = _room(), _angles()
     spike = (elevation < -math.radians(70)) & (np.abs(azimuth) < 0.4)
     depth[spike] *= 3  # the foot of the stand, as the network sees it
-    tidied = tidy(depth, config=SMALL).depth_m
+    tidied = tidy(depth, height=H).depth_m
     assert (tidied * np.sin(-elevation)).max() < FLOOR * 1.01
 
 
 def test_the_seam_is_no_edge():
     bent = _bent(_room())
-    turned = np.roll(tidy(np.roll(bent, W // 2, 1), config=SMALL).depth_m, -W // 2, 1)
-    assert np.abs(turned / tidy(bent, config=SMALL).depth_m - 1).max() < 0.01
+    turned = np.roll(tidy(np.roll(bent, W // 2, 1), height=H).depth_m, -W // 2, 1)
+    assert np.abs(turned / tidy(bent, height=H).depth_m - 1).max() < 0.01
 
 
 def test_what_is_unknown_stays_so_but_for_the_robot():
     depth = _room()
     depth[20:28, 10:30] = 0
     depth[-4:] = np.nan  # the stand
-    tidied = tidy(depth, config=SMALL).depth_m
+    tidied = tidy(depth, height=H).depth_m
     assert (tidied[21:27, 11:29] == 0).all() and np.isfinite(tidied).all()
     elevation, _ = _angles()
     np.testing.assert_allclose(tidied[-4:], FLOOR / np.sin(-elevation[-4:]), rtol=0.03)
 
 
 def test_other_sizes_come_out_at_the_size_asked_for():
-    assert tidy(_room(), config=TidyConfig(height=128)).depth_m.shape == (128, 256)
-    large = tidy(_bent(_room()), config=TidyConfig(height=128)).depth_m
+    assert tidy(_room(), height=128).depth_m.shape == (128, 256)
+    large = tidy(_bent(_room()), height=128).depth_m
     assert np.median(_error(large[::2, ::2])) < 0.06
 
 
@@ -130,7 +129,7 @@ def test_values_go_on_from_the_last_sure_one_by_hand():
 )
 def test_what_cannot_be_tidied_is_said(depth, height, words):
     with pytest.raises(ValueError, match=words):
-        tidy(depth, height, SMALL)
+        tidy(depth, height, H)
 
 
 @pytest.mark.parametrize("words", [["--camera-height", "1.2"], ["--as-estimated"]])

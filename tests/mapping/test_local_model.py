@@ -3,17 +3,18 @@
 import numpy as np
 import pytest
 
+from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.inputs import RecentInputs
 from instant_ic.depth.lidar_depth import LidarDepthConfig
-from instant_ic.depth.metric_depth import Frames, MetricDepth, MetricDepthConfig
+from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
 from instant_ic.depth.sources import DepthSource, SourceConfig
+from instant_ic.geometry.ply import write_ply
 from instant_ic.geometry.poses import Matrix, pose_matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.mapping import kernels
 from instant_ic.mapping.local_model import LocalModel, LocalModelConfig
 from instant_ic.mapping.mapper import CloudError, LocalMapper, LocalView, MapperConfig
-from instant_ic.mapping.ply import write_ply
 
 S = 1_000_000_000
 SIZE = (128, 256)
@@ -192,8 +193,8 @@ def test_wrong_use_is_refused() -> None:
         model.add(np.zeros((4, 2)), np.zeros(3))
     with pytest.raises(ValueError, match="position must be finite"):
         model.add(np.zeros((4, 3)), np.array([np.nan, 0, 0]))
-    with pytest.raises(ValueError, match=r"reach_m must be at most 12\.3 with voxels of 0\.05 m"):
-        LocalModelConfig(reach_m=15.0)
+    with pytest.raises(ValueError, match="keep_m must be > 0"):
+        LocalModelConfig(keep_m=0)
 
 
 def buffer(map_from_odom: Matrix | None = None) -> TransformBuffer:
@@ -213,7 +214,9 @@ def feed(mapper: LocalMapper, start: int, end: int) -> None:
     for k in range(start, end):
         x = 0.5 * max(k / 10 + 0.05 - 1, 0.0)
         points, origin = measured(x, (), k)
-        mapper.revolution("velodyne", k * S // 10, np.linspace(0, 0.1, len(RAYS)), lambda p=points, o=origin: p - o)
+        mapper.revolution(
+            Revolution("velodyne", k * S // 10, np.linspace(0, 0.1, len(RAYS)), lambda p=points, o=origin: p - o)
+        )
 
 
 def test_revolutions_are_taken_by_distance_and_once_a_second_at_rest() -> None:
@@ -255,22 +258,16 @@ def test_odometry_that_slips_in_a_turn_does_not_turn_the_model() -> None:
         transforms.set("odom", "base_link", k * S // 10, pose_matrix(yaw=seen))
         transforms.set("map", "odom", k * S // 10, pose_matrix(yaw=true - seen))
         turned = (points - origin) @ pose_matrix(yaw=true)[:3, :3]
-        mapper.revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=turned: p)
+        mapper.revolution(Revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=turned: p))
     pose = mapper.model_from_camera("camera", 2 * S)  # an image one second old
     np.testing.assert_allclose(pose, pose_matrix(0, 0, 1.2, yaw=1.6), atol=1e-9)
     # The next revolution is 1.1 s newer than that image: its correction is another by 5 degrees, and nothing jumped.
     transforms.set("odom", "base_link", 31 * S // 10, pose_matrix(yaw=2.232))
     transforms.set("map", "odom", 31 * S // 10, pose_matrix(yaw=0.248))
     for k in (31, 32):
-        mapper.revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=points - origin: p)
+        mapper.revolution(Revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=points - origin: p))
     np.testing.assert_allclose(mapper.model_from_camera("camera", 2 * S), pose, atol=1e-9)
-    depth = MetricDepth(
-        DepthSource(),
-        transforms,
-        RecentInputs(),
-        MetricDepthConfig(Frames("map", "odom", "base_link"), 64, -70.0, 0.3),
-        mapper,
-    )
+    depth = MetricDepth(DepthScalerConfig(), transforms, RecentInputs())
     np.testing.assert_allclose(depth.map_from_camera("camera", 2 * S), pose, atol=1e-9)
     with pytest.raises(TransformError):
         depth.map_from_camera("nowhere", 2 * S)
@@ -281,17 +278,17 @@ def test_bad_revolutions_are_refused_with_the_reason() -> None:
     feed(mapper, 0, 11)
     times = np.linspace(0, 0.1, 100)
     with pytest.raises(CloudError, match="a revolution of 0 points"):
-        mapper.revolution("velodyne", 11 * S // 10, np.empty(0), lambda: np.empty((0, 3)))
-    mapper.revolution("laser2", 15 * S // 10, times, lambda: np.zeros((100, 3)))
+        mapper.revolution(Revolution("velodyne", 11 * S // 10, np.empty(0), lambda: np.empty((0, 3))))
+    mapper.revolution(Revolution("laser2", 15 * S // 10, times, lambda: np.zeros((100, 3))))
     with pytest.raises(TransformError, match="no path from laser2 to odom"):
-        mapper.revolution("velodyne", 25 * S // 10, times, lambda: np.full((100, 3), np.nan))
+        mapper.revolution(Revolution("velodyne", 25 * S // 10, times, lambda: np.full((100, 3), np.nan)))
     with pytest.raises(CloudError, match="without a finite point"):
-        mapper.revolution("velodyne", 35 * S // 10, times, lambda: np.zeros((99, 3)))
+        mapper.revolution(Revolution("velodyne", 35 * S // 10, times, lambda: np.zeros((99, 3))))
     with pytest.raises(CloudError, match="99 points with 100 times"):
-        mapper.revolution("velodyne", 45 * S // 10, times, lambda: np.zeros((100, 3)))
+        mapper.revolution(Revolution("velodyne", 45 * S // 10, times, lambda: np.zeros((100, 3))))
     assert mapper.model.revolutions == 1
     with pytest.raises(CloudError, match="time went back"):
-        mapper.revolution("velodyne", S, times, lambda: np.zeros((100, 3)))
+        mapper.revolution(Revolution("velodyne", S, times, lambda: np.zeros((100, 3))))
     assert mapper.model.revolutions == 0 and len(mapper.cloud()) == 0
 
 

@@ -20,6 +20,7 @@ from instant_ic.vspace import (
 )
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.layers import LayerEncoder, decode
+from instant_ic.vspace.nerf import occupancy
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.vspace.prior import SKY, prepare
 
@@ -30,8 +31,16 @@ CONFIG = VirtualSpaceConfig(
     keyframes=2,  # a third one is kept, and field and warp are compared by it
     field=FieldConfig(levels=2, log2_table=10, hidden=8),
     train=TrainConfig(ray_columns=8, ray_rows=8),
-    geometry=GeometryConfig(cell_m=0.2, max_cells=200_000),
+    geometry=GeometryConfig(cell_m=0.2),
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _small_grids():
+    """Grids of 200 000 cells: thousands of images are tried."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(occupancy, "MAX_CELLS", 200_000)
+        yield
 
 
 @st.composite
@@ -121,7 +130,7 @@ def chain(depths, sigma, step_m, robot=None):
     assert not math.isnan(space.expected_psnr_db(pose))
     count = len(space.keyframes)
     layers = LayerEncoder().encode(space.shown, range(count), [None] * count)
-    space.show(decode(layers, CONFIG.panorama_width, CONFIG.geometry))
+    space.show(decode(layers, CONFIG.panorama_width))
     assert np.isfinite(space.render(pose, 24, 16, 1.5).depth_m).all()
 
 

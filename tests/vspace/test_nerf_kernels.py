@@ -17,7 +17,7 @@ from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.vspace.nerf.reference import TorchField
 from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
-from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.prior import MOVED, prepare
 from instant_ic.vspace.view import perspective_rays
 
 F = np.float32
@@ -146,9 +146,10 @@ def two_keyframes():
         prepare(pictures[0].rgb, pictures[0].depth_m, newest, 0.02, config, 2048),
         prepare((pictures[1].rgb * 0.8).astype(np.uint8), pictures[1].depth_m, older, sigma, config, 2048),
     ]
-    priors[1].usable[:, :64] = 0
+    occupancy = build_occupancy(priors, config)
+    priors[1].content[:, :64] = MOVED
     gains = np.array([[1, 1, 1], [1.25, 1.25, 1.2]], F)
-    return Scene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), build_occupancy(priors, config), gains)
+    return Scene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), occupancy, gains)
 
 
 def sampled(scene, uniform, columns, rows, sources):
@@ -335,7 +336,7 @@ def test_the_march_by_hand():
     # The network's output is its bias, the same everywhere, with the colour (0.6, 0.7, 0.8). The scene is a sphere of
     # 2 m round the camera, the band 5 %.
     rgb = np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8)
-    prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(band_min=0.05), 2048)
+    prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(), 2048)
     scene = Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy((prior,), GeometryConfig()))
     config = FieldConfig(levels=2, log2_table=10, hidden=4)
     rays = perspective_rays(np.eye(4), 32, 16, 1.0)

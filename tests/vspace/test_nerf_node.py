@@ -370,8 +370,6 @@ def test_a_request_that_cannot_be_drawn_is_told(bus, request_):
         {"render_fps": 0},
         {"train_ms_per_frame": -1},
         {"jpeg_quality": 101},
-        {"lockstep_iterations": -1},
-        {"train_nice": 20},
     ],
 )
 def test_parameters_are_checked(values):

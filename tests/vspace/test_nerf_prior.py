@@ -13,7 +13,7 @@ PICTURE = box_room.panorama(CAMERA, 64)
 
 
 def prior(sigma, depth=PICTURE.depth_m):
-    return prepare(PICTURE.rgb, depth, CAMERA, sigma, GeometryConfig(band_min=0.01, band_max=0.5), 2048)
+    return prepare(PICTURE.rgb, depth, CAMERA, sigma, GeometryConfig(), 2048)
 
 
 def test_one_number_and_a_picture_of_it_are_the_same() -> None:
@@ -27,7 +27,7 @@ def test_the_median_of_what_is_known_counts_and_guesses_are_not_known() -> None:
     depth = PICTURE.depth_m.copy()
     sigma[:4], sigma[4:8], depth[4:8] = 0.7, np.inf, 0
     found = prior(sigma, depth)
-    assert found.relative_sigma == pytest.approx(0.02) and found.band == pytest.approx(0.04)
+    assert found.relative_sigma == pytest.approx(0.02) and found.band == pytest.approx(0.05)
     assert (found.known[:8] == 0).all() and (found.known[8:] == 1).all()
     # A guess is kept as it is, what is unknown is filled from around.
     np.testing.assert_allclose(1 / found.inverse_depth[:4], depth[:4], rtol=1e-5)

@@ -145,7 +145,7 @@ WRONG = {
     "foreign": "not a saved virtual space",
     "text": "not a saved virtual space",
     "empty": "not a saved virtual space",
-    "newer": "version 4, this program reads up to 3",
+    "newer": "version 5, this program reads up to 4",
     "key": "colour",
     "value": "levels",
     "array": "parameters.w1",

@@ -261,8 +261,7 @@ def test_a_view_that_cannot_be_drawn(space, width, height, fov):
         (lambda: FieldConfig(features=3), "features"),
         (lambda: FieldConfig(levels=20), "levels"),
         (lambda: TrainConfig(ray_rows=12), "ray_rows"),
-        (lambda: TrainConfig(table_lr=0), "table_lr"),
-        (lambda: GeometryConfig(band_max=0.01), "band_max"),
+        (lambda: GeometryConfig(cell_m=0), "cell_m"),
         (lambda: ReadinessConfig(psnr_db=-1), "psnr_db"),
         (lambda: VirtualSpaceConfig(device="tpu"), "device"),
     ],
@@ -423,4 +422,4 @@ def test_occupancy_holds_every_surface_and_knows_distances():
     # less the margin of two and the cell's own edge).
     cell = tuple(((CAMERA[:3, 3] - grid.origin) / grid.cell_m).astype(int))
     assert 24 <= int(grid.distance[cell]) <= 31
-    assert grid.occupied_share < 0.35
+    assert (grid.distance == 0).mean() < 0.35

@@ -17,7 +17,7 @@ from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.nerf.reference import TorchField, query, sample_rays
 from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
-from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.prior import MOVED, prepare
 from instant_ic.vspace.view import perspective_rays
 
 F = np.float32
@@ -32,8 +32,9 @@ def scene():
     priors = [
         prepare(p.rgb, p.depth_m, pose, 0.02, GeometryConfig(), 2048) for p, pose in zip(pictures, poses, strict=True)
     ]
-    priors[1].usable[:, :64] = 0
-    return Scene(tuple(priors), Lattice.for_prior(priors[0], FIELD), build_occupancy(priors, GeometryConfig()))
+    occupancy = build_occupancy(priors, GeometryConfig())
+    priors[1].content[:, :64] = MOVED
+    return Scene(tuple(priors), Lattice.for_prior(priors[0], FIELD), occupancy)
 
 
 def random_parameters():
@@ -139,7 +140,7 @@ def test_a_dense_wall_is_drawn_where_it_stands():
     # The density is the same everywhere and lets next to nothing through: each ray ends at the front of its band.
     # One that lets nearly everything through: the mean of the band, which is the guiding depth.
     rgb = np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8)
-    prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(band_min=0.05), 2048)
+    prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(), 2048)
     scene = Scene((prior,), Lattice.for_prior(prior, FIELD), build_occupancy([prior], GeometryConfig()))
     rays = perspective_rays(np.eye(4), 32, 16, 1.0)
     for raw, expected in ((6.0, 2 * (1 - 0.05 * 7 / 8)), (-8.0, 2.0)):
@@ -163,4 +164,3 @@ def test_a_field_of_density_needs_tiles_of_rays():
         VirtualSpaceConfig(field=FIELD, train=TrainConfig(ray_columns=32, ray_rows=24))
     with pytest.raises(ValueError, match="geometry must be distance or density"):
         FieldConfig(geometry="points")
-    assert math.isclose(VirtualSpaceConfig(field=FIELD).train.depth_weight, TrainConfig().depth_weight)

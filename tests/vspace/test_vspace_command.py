@@ -9,10 +9,11 @@ from instant_ic.bag import BagWriter
 from instant_ic.cli.main import main
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
+from instant_ic.geometry.ply import write_ply
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import Empty, serialize, type_name
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace.export import flight, surface, write_ply
+from instant_ic.vspace.export import flight, surface
 from instant_ic.vspace.layers import LayerEncoder
 from instant_ic.vspace.space import NotReadyError
 from instant_ic.vspace_messages import layers_message
@@ -252,10 +253,7 @@ def test_a_folder_without_a_space(tmp_path, capsys):
 
 
 def test_ply_without_faces_by_hand(tmp_path):
-    from instant_ic.vspace.export import Surface
-
-    cloud = Surface(np.array([[1, 2, 3]], np.float32), np.array([[255, 0, 7]], np.uint8), np.zeros((0, 3), np.int32))
-    write_ply(tmp_path / "a.ply", cloud, mesh=False)
+    write_ply(tmp_path / "a.ply", np.array([[1, 2, 3]], np.float32), np.array([[255, 0, 7]], np.uint8))
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
     assert b"element vertex 1\n" in head
     assert body == np.array([1, 2, 3], "<f4").tobytes() + bytes([255, 0, 7])

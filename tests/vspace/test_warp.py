@@ -19,10 +19,16 @@ from instant_ic.vspace import (
     fill_kernels,
     warp_kernels,
 )
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.prior import prepare
 from instant_ic.vspace.view import perspective_rays
 from instant_ic.vspace.warp import PanoramaWarp, Pyramid
 
 FOV = math.pi / 2
+
+
+def warp_of(rgb, depth_m, map_from_camera):
+    return PanoramaWarp(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), 4096))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +40,7 @@ def room():
 @pytest.fixture(scope="module")
 def warp(room):
     camera, picture = room
-    return PanoramaWarp(picture.rgb, picture.depth_m, camera)
+    return warp_of(picture.rgb, picture.depth_m, camera)
 
 
 def test_from_the_panoramas_own_place_nothing_is_missing(room, warp):
@@ -79,7 +85,7 @@ def test_a_sphere_by_hand():
     """All at 2 m, seen from 1 m ahead: 1 m in front, 3 m behind, √3 m to the side."""
     rgb = np.zeros((64, 128, 3), np.uint8)
     rgb[:, :64] = 200
-    warp = PanoramaWarp(rgb, np.full((64, 128), 2.0), np.eye(4))
+    warp = warp_of(rgb, np.full((64, 128), 2.0), np.eye(4))
     for yaw, metres in ((0.0, 1.0), (math.pi, 3.0), (math.pi / 2, math.sqrt(3))):
         view = warp.render(pose_matrix(1.0, yaw=yaw), 33, 33, FOV)
         assert view.depth_m[16, 16] == pytest.approx(metres, rel=2e-3)
@@ -92,7 +98,7 @@ def test_a_sphere_by_hand():
 def test_from_outside_backs_are_unknown():
     rgb = np.zeros((64, 128, 3), np.uint8)
     rgb[::2] = 200
-    warp = PanoramaWarp(rgb, np.full((64, 128), 2.0), np.eye(4))
+    warp = warp_of(rgb, np.full((64, 128), 2.0), np.eye(4))
     view = warp.render(pose_matrix(-5.0), 64, 64, 0.5)
     assert view.confidence.max() == 0
     assert (view.depth_m > 0).mean() > 0.9
@@ -103,7 +109,7 @@ def test_a_wall_that_passes_through_the_views_plane_is_drawn_up_to_the_edge():
     """A view 4 cm off a wall: triangles with a corner behind the view are drawn, not dropped."""
     camera = pose_matrix()
     picture = box_room.panorama(camera, 64)
-    warp = PanoramaWarp(picture.rgb, picture.depth_m, camera)
+    warp = warp_of(picture.rgb, picture.depth_m, camera)
     view = warp.render(pose_matrix(0.0, 1.96, 0.0), 64, 36, 2.0)
     assert (view.confidence[:, :8] == 1).mean() > 0.95
 
@@ -112,7 +118,7 @@ def test_fine_stripes_become_grey_in_a_small_picture():
     """Stripes of one panorama pixel under view pixels of many: their mean, 100, and no moiré."""
     rgb = np.zeros((512, 1024, 3), np.uint8)
     rgb[:, ::2] = 200
-    warp = PanoramaWarp(rgb, np.full((32, 64), 3.0), np.eye(4))
+    warp = warp_of(rgb, np.full((32, 64), 3.0), np.eye(4))
     view = warp.render(np.eye(4), 32, 18, FOV)
     assert abs(view.rgb.astype(int) - 100).max() <= 2
 
@@ -130,7 +136,7 @@ def test_unknown_depth_is_filled_and_said(room):
     camera, picture = room
     depth = picture.depth_m.copy()
     depth[:, 120:136] = 0  # ahead
-    view = PanoramaWarp(picture.rgb, depth, camera).render(camera, 96, 54, FOV)
+    view = warp_of(picture.rgb, depth, camera).render(camera, 96, 54, FOV)
     assert np.all(view.confidence[:, 46:50] == 0.5)
     assert np.all(view.confidence[:, :30] == 1)
 
@@ -138,9 +144,9 @@ def test_unknown_depth_is_filled_and_said(room):
 def test_what_is_no_keyframe_or_view_is_refused(room, warp):
     camera, picture = room
     with pytest.raises(KeyframeError, match="not finite"):
-        PanoramaWarp(picture.rgb, np.full((64, 128), np.nan), camera)
+        warp_of(picture.rgb, np.full((64, 128), np.nan), camera)
     with pytest.raises(KeyframeError, match="one colour"):
-        PanoramaWarp(np.zeros_like(picture.rgb), picture.depth_m, camera)
+        warp_of(np.zeros_like(picture.rgb), picture.depth_m, camera)
     with pytest.raises(ValueError, match="pixels a side"):
         warp.render(camera, 8, 8, FOV)
     with pytest.raises(ValueError, match="finite"):

@@ -72,7 +72,7 @@ def save_map(args: argparse.Namespace) -> int:
 
 
 def save_local(args: argparse.Namespace) -> int:
-    from instant_ic.mapping.ply import write_ply
+    from instant_ic.geometry.ply import write_ply
 
     out = args.out.expanduser()
     check_files(out)
@@ -85,6 +85,7 @@ def save_local(args: argparse.Namespace) -> int:
 def _local_of_bag(path: Path, topic: str) -> NDArray[np.float32]:
     from instant_ic.bag.files import BagReader
     from instant_ic.calibration.bag import read_clouds
+    from instant_ic.depth.deskew import Revolution
     from instant_ic.geometry.transforms import TransformError
     from instant_ic.mapping.mapper import LocalMapper
     from instant_ic.msg import cloud_points
@@ -97,7 +98,7 @@ def _local_of_bag(path: Path, topic: str) -> NDArray[np.float32]:
             try:
                 points = cloud.points
                 xyz = functools.partial(cloud_points, points)
-                mapper.revolution(cloud.frame_id, cloud.stamp_ns, points["time"], xyz)
+                mapper.revolution(Revolution(cloud.frame_id, cloud.stamp_ns, points["time"], xyz))
             except (TransformError, ValueError) as error:
                 problem = str(error)
     if mapper.model.revolutions == 0:

@@ -266,7 +266,7 @@ def _space_of_bag(path: Path) -> VirtualSpace:
     space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))
     try:
         layers = layers_of(deserialize(newest.payload, newest.type_name))
-        space.show(decode(layers, space.config.panorama_width, space.config.geometry))
+        space.show(decode(layers, space.config.panorama_width))
     except (LayersError, MessageError) as error:
         raise UserError(f"{path}, newest message of {_LAYERS}: {error}") from error
     return space
@@ -328,14 +328,15 @@ def _warn_of_the_unknown(view: View, space: VirtualSpace, pose: list[float]) -> 
 
 
 def export(args: argparse.Namespace) -> int:
-    from instant_ic.vspace.export import surface, write_ply
+    from instant_ic.geometry.ply import write_ply
+    from instant_ic.vspace.export import surface
 
     space, out = open_space(args), args.points or args.mesh
     try:
         found = surface(space, args.width)
     except ValueError as error:
         raise UserError(f"--width: {error}", 2) from error
-    write_ply(out, found, mesh=args.mesh is not None)
+    write_ply(out, found.points, found.rgb, found.triangles if args.mesh else None)
     triangles = f" and {len(found.triangles)} triangles" if args.mesh else ""
     print(f"wrote {out}: {len(found.points)} points{triangles}")
     return 0

@@ -14,6 +14,20 @@ from instant_ic.vspace.nerf.occupancy import Occupancy
 from instant_ic.vspace.prior import PanoramaPrior
 
 Floats = NDArray[np.float32]
+TABLE_LR, NETWORK_LR = 0.04, 0.02
+"""Learning rates at the start of a run."""
+FINAL_LR_SHARE = 0.03
+"""Both have fallen to this share at the end."""
+REFRESH_LR_SHARE = 0.5
+"""Share of both when a keyframe refreshes a trained field."""
+FINE_LR_SHARE = 0.1
+"""Learning rate of the finest level relative to the coarsest; less reduces grain and slows detail."""
+DISTANCE_WEIGHT = 0.1
+"""Weight of the geometry's error against the colour's."""
+BAND_COLOUR_WEIGHT = 0.3
+"""Weight of the colour error beside the surface against that on it."""
+VOLUME_WEIGHTS = 0.1, 0.1, 0.01
+"""With a density: weights of a ray's depth error, of the opacity regulariser, and of the spread along the ray."""
 BETA1, BETA2, EPSILON = 0.9, 0.99, 3e-7
 """Adam's constants, as in instant-ngp."""
 VOLUME_SAMPLES = 8
@@ -36,9 +50,9 @@ class Lattice:
 
     @classmethod
     def for_prior(cls, prior: PanoramaPrior, config: FieldConfig) -> Lattice:
-        """Coarsest cell: the scene over ``base_resolution``; finest: a panorama pixel at the median depth."""
+        """Coarsest cell: a sixteenth of the scene; finest: a panorama pixel at the median depth."""
         extent = 2 * float(1.0 / np.quantile(prior.inverse_depth, 0.05))
-        coarse = config.base_resolution / extent
+        coarse = 16 / extent
         pixel = 2 * math.pi / prior.rgb.shape[1] * prior.median_depth_m
         fine = max(1 / pixel, 2 * coarse)
         # Half a fine cell aside: a wall in the plane of a lattice face would use one side's entries only by chance.
@@ -264,10 +278,10 @@ class Schedule:
 
     def rates(self) -> tuple[float, float]:
         """Table's and network's rates of the present iteration."""
-        share = self.config.final_lr_share ** min(1.0, self.iteration / self.config.iterations)
+        share = FINAL_LR_SHARE ** min(1.0, self.iteration / self.config.iterations)
         if self.refresh:
-            share *= self.config.refresh_lr_share
-        return self.config.table_lr * share, self.config.network_lr * share
+            share *= REFRESH_LR_SHARE
+        return TABLE_LR * share, NETWORK_LR * share
 
 
 def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
@@ -278,8 +292,8 @@ def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
     """
     rays = config.ray_columns * config.ray_rows
     on_surface = np.repeat(np.tile([True, False], rays // 64), 64)
-    colour = np.where(on_surface, 1.0, config.band_colour_weight) / (3 * rays)
-    distance = np.full(2 * rays, config.distance_weight / (2 * rays))
+    colour = np.where(on_surface, 1.0, BAND_COLOUR_WEIGHT) / (3 * rays)
+    distance = np.full(2 * rays, DISTANCE_WEIGHT / (2 * rays))
     return colour.astype(np.float32), distance.astype(np.float32)
 
 
@@ -288,9 +302,9 @@ def volume_rays(config: TrainConfig) -> tuple[int, int]:
     return config.ray_columns // 2, config.ray_rows // 2
 
 
-def level_rates(config: TrainConfig, levels: int) -> Floats:
+def level_rates(levels: int) -> Floats:
     """Learning rate of each level against the coarsest's, (levels,)."""
-    return np.geomspace(1.0, config.fine_lr_share, levels).astype(np.float32)
+    return np.geomspace(1.0, FINE_LR_SHARE, levels).astype(np.float32)
 
 
 def adam_step_size(lr: float, step: int) -> float:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf import kernels, march, volume
 from instant_ic.vspace.nerf.field import (
+    BAND_COLOUR_WEIGHT,
     BETA1,
     BETA2,
+    DISTANCE_WEIGHT,
     EPSILON,
+    VOLUME_WEIGHTS,
     FieldParameters,
     Floats,
     Rays,
@@ -32,16 +33,6 @@ DEPTH_TOLERANCE = 0.08
 """Neighbours further apart than this share are traced, not interpolated."""
 
 
-@dataclass(frozen=True)
-class DrawnField:
-    """Input of rendering: parameters, scene, and arrays derived from the scene."""
-
-    parameters: FieldParameters
-    scene: Scene
-    focus: Floats
-    priors: StackedPriors
-
-
 class NumbaDevice:
     """See ``field.Device``. Not thread-safe: one thread at a time."""
 
@@ -52,13 +43,12 @@ class NumbaDevice:
         self.first_stride = FIRST_STRIDE
         self._train = train
         self._density = field.geometry == "density"
-        self._losses = np.array([train.depth_weight, train.opacity_weight, train.distortion_weight], np.float32)
         self._rays = train.ray_columns * train.ray_rows
         self._points = np.zeros((2 * self._rays, 3), np.float32)
         self._target = np.zeros((2 * self._rays, 4), np.float32)
         self._weight = np.zeros((2 * self._rays, 2), np.float32)
         self._colour_weight, self._distance_weight = sample_weights(train)
-        self._level_rates = level_rates(train, field.levels)
+        self._level_rates = level_rates(field.levels)
         self.load(FieldParameters.random(field, train.seed))
 
     def load(self, parameters: FieldParameters) -> None:
@@ -72,7 +62,7 @@ class NumbaDevice:
         self._steps = 0
 
     def set_scene(self, scene: Scene) -> None:
-        self._drawn = DrawnField(self._p, scene, scene.focus, StackedPriors.of(scene))
+        self._scene, self._focus, self._priors = scene, scene.focus, StackedPriors.of(scene)
         for moments in (self._table_moments, *self._network_moments):
             for moment in moments:
                 moment[...] = 0
@@ -89,7 +79,7 @@ class NumbaDevice:
 
     def _sample_rays(self, uniform: Floats) -> tuple[Floats, NDArray[np.int32]]:
         """Fill the batch's points and targets; returns weights (2 N, 2) and the keyframe of each tile."""
-        priors = self._drawn.priors
+        priors = self._priors
         columns, rows = volume_rays(self._train) if self._density else (self._train.ray_columns, self._train.ray_rows)
         weight = self._weight[: 2 * columns * rows]
         sources = ray_sources(len(priors.band), columns * rows // 64, self._steps)
@@ -102,21 +92,20 @@ class NumbaDevice:
 
     def _gradient(self, uniform: Floats, weight: Floats, sources: NDArray[np.int32]) -> tuple[float, float]:
         """Add the gradient of the batch to the gradients; returns colour and distance error."""
-        drawn, lattice, p = self._drawn, self._drawn.scene.lattice, self._p
-        place = lattice.cells_per_m, lattice.origin, drawn.focus
+        p, place = self._p, self._place
         grads = self._table_grad, self._touched, *self._network_grads
         if self._density:
             colour, distance = volume.volume_gradient(
                 p.table, *p.network(), *place, self._points, self._target, weight,
-                uniform[: len(weight) // 2, 2].copy(), sources, drawn.focus[:, :3].copy(), drawn.priors.band,
-                self._losses, *grads,
+                uniform[: len(weight) // 2, 2].copy(), sources, self._focus[:, :3].copy(), self._priors.band,
+                np.array(VOLUME_WEIGHTS, np.float32), *grads,
             )  # fmt: skip
             return colour, distance
         colour, distance = kernels.gradient(
             p.table, *p.network(), *place, self._points, self._target,
             self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1], *grads,
         )  # fmt: skip
-        return colour / (1 + self._train.band_colour_weight), distance / self._train.distance_weight
+        return colour / (1 + BAND_COLOUR_WEIGHT), distance / DISTANCE_WEIGHT
 
     def _adam(self, table_lr: float, network_lr: float) -> None:
         """One Adam step of table and network; clears the gradients."""
@@ -132,68 +121,56 @@ class NumbaDevice:
             grad[...] = 0
 
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        height, width = rays.shape
-        drawn = self._drawn
         # A density is composited round the keyframes' own depth.
-        axial_depth, confidence = self._trace(drawn, rays, 1.0 if self._density else depth_share)
+        axial_depth, confidence = self._trace(rays, 1.0 if self._density else depth_share)
         depth = axial_depth / rays.axial
-        guide, colour = depth, np.zeros((height * width, 3), np.float32)
+        guide, colour = depth, np.zeros((len(depth), 3), np.float32)
         if panorama_share < 1 and self._density:
-            p, lattice, depth = drawn.parameters, drawn.scene.lattice, guide.copy()
+            p, depth = self._p, guide.copy()
             volume.composite(
-                p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, drawn.priors.band[0],
-                np.float32(depth_share), rays.origin, rays.directions, depth, colour,
+                p.table, *p.network(), *self._place, self._priors.band[0], np.float32(depth_share),
+                rays.origin, rays.directions, depth, colour,
             )  # fmt: skip
         elif panorama_share < 1:
-            self._query(drawn, rays, depth, colour)
+            met = np.flatnonzero(depth)
+            out = np.empty((met.size, 4), np.float32)
+            points = rays.origin + depth[met, None] * rays.directions[met]
+            kernels.query(self._p.table, *self._p.network(), *self._place, points, out)
+            colour[met] = np.clip(out[:, :3] + np.float32(0.5), 0, 1)
         if panorama_share > 0:
-            priors = drawn.priors
+            priors = self._priors
             march.mix_panorama(
                 priors.rgb, priors.inverse_depth, priors.depth_edge, priors.known, priors.camera_from_map, priors.gains,
                 priors.band, rays.origin, rays.directions, guide, confidence, np.float32(panorama_share), colour,
             )  # fmt: skip
         return colour, depth, confidence
 
-    @staticmethod
-    def _query(drawn: DrawnField, rays: Rays, depth: Floats, colour: Floats) -> None:
-        """The field's colours where the rays meet something."""
-        met = np.flatnonzero(depth)
-        points = rays.origin + depth[met, None] * rays.directions[met]
-        out = np.empty((met.size, 4), np.float32)
-        p, lattice = drawn.parameters, drawn.scene.lattice
-        kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, points, out)
-        colour[met] = np.clip(out[:, :3] + np.float32(0.5), 0, 1)
+    @property
+    def _place(self) -> tuple[Floats, Floats, Floats]:
+        """Cells and origin of the lattice, and the scene's ``focus``, as the kernels take them."""
+        return self._scene.lattice.cells_per_m, self._scene.lattice.origin, self._focus
 
-    def _trace(self, drawn: DrawnField, rays: Rays, depth_share: float) -> tuple[Floats, Floats]:
+    def _trace(self, rays: Rays, depth_share: float) -> tuple[Floats, Floats]:
         """Depth along the view's axis and confidence: every 4th pixel first, then what cannot be interpolated."""
         height, width = rays.shape
         depth = np.zeros(height * width, np.float32)
         confidence = np.zeros(height * width, np.float32)
         index = np.arange(height * width, dtype=np.int32).reshape(height, width)
         stride = min(self.first_stride, rays.stride)
-        self._march(drawn, rays, depth_share, index[::stride, ::stride].reshape(-1).copy(), depth, confidence)
+        self._march(rays, depth_share, index[::stride, ::stride].reshape(-1).copy(), depth, confidence)
         listed = np.empty(height * width, np.int32)
         stride //= 2
         while stride >= 1:
-            count = march.interpolate_depth(
-                depth.reshape(height, width),
-                confidence.reshape(height, width),
-                stride,
-                np.float32(DEPTH_TOLERANCE),
-                listed,
-            )
-            self._march(drawn, rays, depth_share, listed[:count], depth, confidence)
+            images = depth.reshape(height, width), confidence.reshape(height, width)
+            count = march.interpolate_depth(*images, stride, np.float32(DEPTH_TOLERANCE), listed)
+            self._march(rays, depth_share, listed[:count], depth, confidence)
             stride //= 2
         return depth, confidence
 
-    def _march(
-        self, drawn: DrawnField, rays: Rays, depth_share: float, pixels: np.ndarray, depth: Floats, confidence: Floats
-    ) -> None:
-        scene, p = drawn.scene, drawn.parameters
-        priors, grid = drawn.priors, scene.occupancy
+    def _march(self, rays: Rays, depth_share: float, pixels: np.ndarray, depth: Floats, confidence: Floats) -> None:
+        p, priors, grid = self._p, self._priors, self._scene.occupancy
         march.trace(
-            p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin, drawn.focus,
-            grid.distance, grid.origin, np.float32(grid.cell_m),
+            p.table, *p.network(), *self._place, grid.distance, grid.origin, np.float32(grid.cell_m),
             priors.inverse_depth, priors.depth_edge, priors.known, priors.camera_from_map, priors.band,
             np.float32(depth_share), rays.origin, rays.directions, pixels, depth, confidence,
         )  # fmt: skip

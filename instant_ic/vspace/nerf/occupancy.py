@@ -17,6 +17,7 @@ from instant_ic.vspace.prior import ROOM, PanoramaPrior
 MAX_DISTANCE = 100
 MARGIN_CELLS = 2
 _MAX_PARTS = 16
+MAX_CELLS = 6_000_000  # of a grid, one byte each; its cells grow so that it has no more
 
 
 @dataclass(frozen=True)
@@ -32,10 +33,6 @@ class Occupancy:
     distance: NDArray[np.uint8]
     origin: NDArray[np.float32]
     cell_m: float
-
-    @property
-    def occupied_share(self) -> float:
-        return float(np.count_nonzero(self.distance == 0)) / self.distance.size
 
 
 def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
@@ -83,7 +80,7 @@ def build_occupancy(priors: Sequence[PanoramaPrior], config: GeometryConfig) -> 
     corners = np.concatenate([surface_points(prior, math.inf) for prior in priors])
     low, high = corners.min(axis=0), corners.max(axis=0)  # parts of quads lie between their corners
     volume = float(np.prod((high - low).astype(np.float64) + 8 * config.cell_m))
-    cell = max(config.cell_m, (volume / config.max_cells) ** (1 / 3))
+    cell = max(config.cell_m, (volume / MAX_CELLS) ** (1 / 3))
     origin = low - np.float32(4 * cell)
     shape = tuple(int(n) for n in np.ceil((high - origin) / cell).astype(int) + 4)
     distance = np.full(shape, MAX_DISTANCE, np.uint8)

@@ -16,7 +16,15 @@ import torch
 from torch import Tensor
 
 from instant_ic.vspace.config import TrainConfig
-from instant_ic.vspace.nerf.field import BETA1, BETA2, EPSILON, adam_step_size, ray_sources
+from instant_ic.vspace.nerf.field import (
+    BAND_COLOUR_WEIGHT,
+    BETA1,
+    BETA2,
+    DISTANCE_WEIGHT,
+    EPSILON,
+    adam_step_size,
+    ray_sources,
+)
 
 _P1 = 2654435761
 _P2 = 805459861
@@ -116,8 +124,8 @@ def train_step(
     colour, distance = loss(output, target, weights[0] * weight[:, 0], weights[1] * weight[:, 1])
     adam_step(field, state, torch.autograd.grad(colour + distance, field.parameters()), rates)
     share = weight.mean(dim=0).clamp(min=1e-3)  # of the samples that count
-    colour = colour / share[0] / (1 + config.band_colour_weight)
-    return float(colour.detach()), float((distance / share[1] / config.distance_weight).detach())
+    colour = colour / share[0] / (1 + BAND_COLOUR_WEIGHT)
+    return float(colour.detach()), float((distance / share[1] / DISTANCE_WEIGHT).detach())
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ from torch import Tensor
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf import reference, volume_reference
 from instant_ic.vspace.nerf.field import (
+    VOLUME_WEIGHTS,
     FieldParameters,
     Floats,
     Rays,
@@ -60,7 +61,7 @@ class TorchDevice:
         self.name = torch.cuda.get_device_name() if device == "cuda" else f"{device} (torch)"
         weights = (torch.from_numpy(w).to(device) for w in sample_weights(train))
         self._colour_weight, self._distance_weight = weights
-        self._level_rates = torch.from_numpy(level_rates(train, field.levels)).to(device)[:, None, None]
+        self._level_rates = torch.from_numpy(level_rates(field.levels)).to(device)[:, None, None]
         self._newest_lens: tuple[Floats, Tensor] | None = None
         self.on_gpu = device == "cuda"
         self.load(FieldParameters.random(field, train.seed))
@@ -97,13 +98,6 @@ class TorchDevice:
 
     def _density_step(self, uniform: Tensor, rates: tuple[float, float]) -> tuple[float, float]:
         self._state.steps += 1
-        error, colour, distance = self._density_loss(uniform)
-        grads = torch.autograd.grad(error, self._field.parameters())
-        reference.adam_step(self._field, self._state, grads, rates)
-        return float(colour.detach()), float(distance.detach())
-
-    def _density_loss(self, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What training minimises, and ``step``'s two errors."""
         columns, rows = volume_rays(self._train)
         numbers = ray_sources(len(self._priors), columns * rows // 64, self._state.steps)
         sources = torch.from_numpy(numbers).to(self._device)
@@ -116,18 +110,17 @@ class TorchDevice:
         samples, offset, span = volume_reference.band_samples(cameras, surface, jitter, band, self._priors[0])
         output = reference.query(self._field, samples.reshape(-1, 3)).reshape(*offset.shape, 4)
         losses = volume_reference.volume_loss(output, offset, span, colours[:, :3], weight)
-        weights = 1.0, self._train.depth_weight, self._train.opacity_weight, self._train.distortion_weight
+        weighted = (w * loss for w, loss in zip((1.0, *VOLUME_WEIGHTS), losses, strict=True))
+        error = sum(weighted, torch.zeros((), device=self._device))
+        reference.adam_step(self._field, self._state, torch.autograd.grad(error, self._field.parameters()), rates)
         share = weight.mean(dim=0).clamp(min=1e-3)
-        error = sum((w * loss for w, loss in zip(weights, losses, strict=True)), torch.zeros((), device=self._device))
-        return error, losses[0] / share[0], losses[1] / share[1]
+        return float((losses[0] / share[0]).detach()), float((losses[1] / share[1]).detach())
 
     @torch.no_grad()
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
-        drawn = self._field, self._priors, self._grid
         origin, directions = torch.from_numpy(rays.origin).to(self._device), self._directions(rays)
-        shares = panorama_share, depth_share
-        draw = self._draw_density if self._density else self._draw
-        parts = [draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
+        draw = self._draw_density if self._density else self._draw_distance
+        parts = [draw(origin, part, panorama_share, depth_share) for part in directions.split(RAYS_AT_ONCE)]
         colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
 
@@ -139,35 +132,23 @@ class TorchDevice:
             self._newest_lens = rays.lens, torch.from_numpy(rays.lens).to(self._device)
         return self._newest_lens[1] @ torch.from_numpy(rays.turn).to(self._device).T
 
-    @staticmethod
-    def _draw(
-        field: TorchField,
-        priors: list[TorchPrior],
-        grid: TorchGrid,
-        origin: Tensor,
-        directions: Tensor,
-        shares: tuple[float, float],
+    def _draw_distance(
+        self, origin: Tensor, directions: Tensor, panorama_share: float, depth_share: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        depth, confidence = reference.trace(field, grid, priors, shares[1], origin, directions)
+        depth, confidence = reference.trace(self._field, self._grid, self._priors, depth_share, origin, directions)
         met = torch.nonzero(depth)[:, 0]
         colour = torch.zeros_like(directions)
         points = origin + depth[met, None] * directions[met]
-        colour[met] = (reference.query(field, points)[:, :3] + 0.5).clamp(0, 1)
-        reference.mix_panorama(priors, origin, directions, depth, confidence, shares[0], colour)
+        colour[met] = (reference.query(self._field, points)[:, :3] + 0.5).clamp(0, 1)
+        reference.mix_panorama(self._priors, origin, directions, depth, confidence, panorama_share, colour)
         return colour, depth, confidence
 
-    @staticmethod
     def _draw_density(
-        field: TorchField,
-        priors: list[TorchPrior],
-        grid: TorchGrid,
-        origin: Tensor,
-        directions: Tensor,
-        shares: tuple[float, float],
+        self, origin: Tensor, directions: Tensor, panorama_share: float, depth_share: float
     ) -> tuple[Tensor, Tensor, Tensor]:
-        guide, confidence = reference.trace(field, grid, priors, 1.0, origin, directions)
-        colour, depth = volume_reference.composite(field, priors[0], shares[1], origin, directions, guide)
-        reference.mix_panorama(priors, origin, directions, guide, confidence, shares[0], colour)
+        guide, confidence = reference.trace(self._field, self._grid, self._priors, 1.0, origin, directions)
+        colour, depth = volume_reference.composite(self._field, self._priors[0], depth_share, origin, directions, guide)
+        reference.mix_panorama(self._priors, origin, directions, guide, confidence, panorama_share, colour)
         return colour, depth, confidence
 
     def parameters(self) -> FieldParameters:

@@ -14,8 +14,10 @@ from torch import Tensor
 from instant_ic import paths
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf.field import (
+    BAND_COLOUR_WEIGHT,
     BETA1,
     BETA2,
+    DISTANCE_WEIGHT,
     EPSILON,
     FieldParameters,
     Floats,
@@ -110,7 +112,7 @@ class TritonDevice:
         self._table_shape = (field.levels, 1 << field.log2_table, features)
         self._network_shapes = ((field.hidden, inputs), (field.hidden,), (4, field.hidden), (4,))
         self._colour_weight, self._distance_weight = (self._tensor(w) for w in sample_weights(train))
-        self._level_rates = level_rates(train, field.levels)
+        self._level_rates = level_rates(field.levels)
         self._scene: _GpuScene | None = None
         self._newest_lens: tuple[Floats, Tensor] | None = None
         self._p = self._uploaded(FieldParameters.random(field, train.seed))
@@ -146,8 +148,8 @@ class TritonDevice:
             self._launch_step(scene)
         colour, distance, shown, sure = b.sums.tolist()
         count = len(b.points)
-        colour /= max(shown / count, 1e-3) * (1 + self._train.band_colour_weight)
-        return colour, distance / max(sure / count, 1e-3) / self._train.distance_weight
+        colour /= max(shown / count, 1e-3) * (1 + BAND_COLOUR_WEIGHT)
+        return colour, distance / max(sure / count, 1e-3) / DISTANCE_WEIGHT
 
     def _launch_step(self, scene: _GpuScene) -> None:
         self._launch_gradient(scene)

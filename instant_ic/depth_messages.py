@@ -1,13 +1,32 @@
-"""Keyframe messages from depth and its pose."""
+"""Messages of the node ``depth_scaler`` to the plain values of ``instant_ic.depth``, and back."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
+from instant_ic.depth.deskew import Revolution
+from instant_ic.depth.inputs import HeldImage
 from instant_ic.depth.keyframes import encode_sigma
 from instant_ic.depth.sources import DepthResult
 from instant_ic.geometry.poses import Matrix
-from instant_ic.msg import Keyframe, header, image_message, pose_message, stamp_ns
+from instant_ic.msg import Keyframe, cloud_array, cloud_points, header, image_message, pose_message, stamp_ns
+
+
+def held_image(message: Any) -> HeldImage:
+    """Frame and stamp of an Image or CompressedImage."""
+    return HeldImage(message.header.frame_id, stamp_ns(message))
+
+
+def revolution_of(message: Any) -> Revolution:
+    """The revolution of a PointCloud2.
+
+    Raises:
+        ValueError: its points cannot be read, or have no times.
+    """
+    points = cloud_array(message)
+    xyz = functools.partial(cloud_points, points)
+    return Revolution(message.header.frame_id, stamp_ns(message), points["time"], xyz)
 
 
 def keyframe_message(number: int, frame: str, frame_from_camera: Matrix, panorama: Any, depth: DepthResult) -> Any:
