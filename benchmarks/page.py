@@ -16,7 +16,6 @@ where the robot is, as the image was taken and moved by the depth of the layers 
 from __future__ import annotations
 
 import math
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,13 @@ from typing import Any
 import cv2
 import numpy as np
 from playwright.sync_api import sync_playwright
-from reporting import CHROMIUM_FLAGS, parser_of, report
+from reporting import parser_of, report
 
 from instant_ic import paths
 from instant_ic.console.layer_meshes import LayerMeshes, layer_sources
 from instant_ic.console.layers import PageLayers
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-from instant_ic.experiments.page_renderer import PageRenderer
+from instant_ic.experiments.page_renderer import PageRenderer, launch_chromium
 from instant_ic.experiments.vspace import path_poses, start_pose
 from instant_ic.experiments.vspace_sources import VspaceSettings, take_shot
 from instant_ic.geometry.image_quality import psnr_db
@@ -147,7 +146,7 @@ def main() -> int:
     size = width, height
     model = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        browser = launch_chromium(playwright)
         pages = {"page": PageRenderer(browser, *size), "page_plain": PageRenderer(browser, *size, full=False)}
         worlds = {
             Path(name).name: measure(name, size, args.keyframes, model, pages, args.strips) for name in args.worlds

@@ -198,7 +198,7 @@ def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, repor
     folders = [open_folder(name, (network.height, network.width)) for name in args.data]
     if args.batch_size < len(folders):
         raise ValueError(f"a batch of {args.batch_size} is too small for {len(folders)} folders: increase --batch-size")
-    feeds: list[Feed] = []
+    feeds: list[FileFeed] = []
     held_out: list[tuple[Samples, Any]] = []
     for number, folder in enumerate(folders):
         part = (args.batch_size + number) // len(folders)

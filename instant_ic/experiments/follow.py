@@ -38,6 +38,7 @@ from instant_ic.control.walls import WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import follow_worlds as worlds
 from instant_ic.experiments.processes import run_all
+from instant_ic.experiments.results import finite
 from instant_ic.geometry.poses import matrix_from_pose2, relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 
@@ -403,9 +404,9 @@ def report(episodes: list[Episode], seed: int) -> dict[str, Any]:
         row = {key: value for key, value in asdict(episode).items() if key not in left_out}
         row["path_ratio"] = episode.ratio if episode.reached and episode.reachable else None
         row["planner_ms_max"] = max(episode.planner_ms, default=None)
-        rows.append({k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()})
-    figures = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in summary(episodes).items()}
-    return {"seed": seed, **figures, "each": rows}
+        rows.append(row)
+    figures: dict[str, Any] = finite({"seed": seed, **summary(episodes), "each": rows})
+    return figures
 
 
 def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None:

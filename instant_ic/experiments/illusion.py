@@ -179,6 +179,3 @@ def readiness(frames: Sequence[IllusionFrame]) -> dict[str, Any]:
 
 def _row(distance_m: float) -> float:
     return STEP_M * round(distance_m / STEP_M) + 0.0  # no −0
-
-
-__all__ = ["Film", "TeleopSettings", "evaluate", "film_episode", "report"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,10 @@ from instant_ic import console
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
 
+CHROMIUM_FLAGS = [
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
 _STATIC = Path(console.__file__).parent / "static"
 _ORIGIN = "http://page.invalid/"
 _TIMEOUT_MS = 60_000
@@ -47,6 +52,11 @@ _SETUP = """async ([width, height, full]) => {
         return read({tanHalf, mapFromLook, panoramaFromLook, glide, blend: 0, panoramaColour: plain});
     };
 }"""
+
+
+def launch_chromium(playwright: Any) -> Any:
+    """The machine's Chromium, which renders WebGL on the CPU."""
+    return playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
 
 
 class PageRenderer:

@@ -8,6 +8,7 @@ become too unequal (Grisetti, Stachniss, Burgard, 2007). Between two updates the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -99,7 +100,7 @@ class _PathAnchor:
 
 
 class ParticleSlam:
-    """Particle filter with the interface of `instant_ic.experiments.slam.Slam`."""
+    """Particle filter with the interface of `GridSlam`."""
 
     def __init__(self, particles: ParticleConfig | None = None, config: SlamConfig | None = None) -> None:
         self.config = config = config or SlamConfig()
@@ -185,8 +186,9 @@ class ParticleSlam:
         values[visits == 0] = -1
         return OccupancyGrid(values, self.maps.delta, corner)
 
-    def background_job(self) -> None:
+    def background_job(self) -> Callable[[], Any] | None:
         """Return None: this method has no background jobs."""
+        return None
 
     def take_over(self, outcome: Any) -> None:
         """Do nothing: there are no background jobs."""

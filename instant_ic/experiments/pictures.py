@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -65,7 +66,7 @@ def save_depth(path: Path, panorama: NDArray[np.uint8], depth_m: NDArray[np.floa
 
 
 def save_map(
-    path: Path,
+    path: Path | io.BytesIO,
     grid: NDArray[np.int8],
     resolution_m: float,
     origin_xy: tuple[float, float],
@@ -111,9 +112,10 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any,
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, creating its folder if needed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+def save_figure(figure: Any, path: Path | io.BytesIO) -> None:
+    """Write a figure as PNG, creating its folder if needed."""
+    if isinstance(path, Path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
 
@@ -167,8 +169,6 @@ def series_colour(number: int) -> str:
 
 def figure_svg(figure: Any, axis: Any) -> str:
     """A figure with one pair of axes as SVG text that follows the page's light or dark colours."""
-    import io
-
     import matplotlib
 
     axis.yaxis.label.set_color(_INK)

@@ -16,45 +16,15 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from instant_ic.experiments.particle_slam import ParticleConfig, ParticleSlam
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
-from instant_ic.slam import GridSlam, OccupancyGrid, Scan, SlamConfig, SlamResult
+from instant_ic.slam import GridSlam, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import Anchor, warm_up
 from instant_ic.slam.logs import LogEntry, LogError, open_log
 from instant_ic.slam.scan import FloatArray
-
-
-class Slam(Protocol):
-    """What the evaluation uses of a SLAM method: `GridSlam`, or the paper's particle filter."""
-
-    def process(self, scan: Scan, odom_pose: ArrayLike | None, base_from_laser: ArrayLike) -> SlamResult:
-        """Estimate the pose of a scan."""
-        ...
-
-    def background_job(self) -> Callable[[], Any] | None:
-        """Return pending work or None; pass its result to `take_over`."""
-        ...
-
-    def take_over(self, outcome: Any) -> None:
-        """Apply the result of a background job."""
-        ...
-
-    def finish(self) -> None:
-        """Complete all pending work after the last scan."""
-        ...
-
-    def grid(self) -> OccupancyGrid:
-        """Return the map."""
-        ...
-
-    def figures(self) -> dict[str, object]:
-        """Return state figures for reports."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -66,10 +36,6 @@ class Relations:
 
     def __len__(self) -> int:
         return len(self.times_s)
-
-    def near(self, times_s: FloatArray, tolerance_s: float) -> int:
-        """Number of relations with both ends within ``tolerance_s`` of one of ``times_s`` (m,)."""
-        return len(self.at_stamps(times_s, tolerance_s))
 
     def at_stamps(self, stamps_s: FloatArray, tolerance_s: float) -> Relations:
         """Relations with both ends within ``tolerance_s`` of one of ``stamps_s`` (m,)."""
@@ -173,7 +139,9 @@ def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_
     """Scan times (n,) in the clock that the relations use; the log may have two."""
     own = np.array([entry.scan.stamp_ns * 1e-9 for entry in entries])
     logger = np.array([np.nan if entry.logger_s is None else entry.logger_s for entry in entries])
-    if np.isfinite(logger).all() and relations.near(logger, tolerance_s) > relations.near(own, tolerance_s):
+    if np.isfinite(logger).all() and len(relations.at_stamps(logger, tolerance_s)) > len(
+        relations.at_stamps(own, tolerance_s)
+    ):
         return logger
     return own
 
@@ -189,7 +157,7 @@ class LogResult:
         background_ms: CPU milliseconds of loop closure and optimisation after each scan (n,).
         scores: match score of each scan (n,).
         statuses: count of each status.
-        slam: the final state, with its map.
+        slam: the final state, with its map: of the graph method, or of the paper's particle filter.
     """
 
     trajectory: FloatArray
@@ -198,7 +166,7 @@ class LogResult:
     background_ms: FloatArray
     scores: FloatArray
     statuses: dict[str, int]
-    slam: Slam
+    slam: GridSlam | ParticleSlam
 
     def report(self) -> dict[str, object]:
         """Figures for JSON; the mean counts all CPU time, the 99th percentile that of the scan thread."""
@@ -239,7 +207,7 @@ def run_log(
     Raises:
         LogError: the log has no scan.
     """
-    slam: Slam = GridSlam(config) if particles is None else ParticleSlam(particles, config)
+    slam = GridSlam(config) if particles is None else ParticleSlam(particles, config)
     warm_up(config)
     stamps: list[float] = []
     online: list[FloatArray] = []

@@ -253,9 +253,6 @@ def office(seed: int = 0) -> tuple[list[Wall], list[tuple[float, float]]]:
     return walls, [*eight, *eight, (0.0, 0.0), (14.0, 0.0), (14.0, 12.0), (0.0, 12.0), (0.0, 0.0), (2.0, 0.0)]
 
 
-WORLDS = {"ring": ring, "cells": cells, "office": office}
-
-
 def trajectory_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distance in metres and angle in degrees of each pose (n, 3) from ground truth (n, 3)."""
     rest = np.array([relative2(a, b) for a, b in zip(truth, estimate, strict=True)])

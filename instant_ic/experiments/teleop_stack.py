@@ -135,7 +135,7 @@ class Shown:
     draw: Callable[[], bytes] | None = None
 
 
-class _Port:
+class EmulatedPort:
     """The motor controller's serial line, in memory."""
 
     def __init__(self, controller: RoboclawEmulator) -> None:
@@ -299,7 +299,7 @@ class SimulatedStack:
             "depth_estimator": pictures,
             "depth_scaler": pictures,
         }
-        port = _Port(self.simulation.controller)
+        port = EmulatedPort(self.simulation.controller)
         self.nodes: dict[str, Any] = {}
         for name in names:
             node = make_node(name, None, words)
@@ -520,6 +520,3 @@ def _settled(shown: Shown, whole: bool) -> Shown:
 def _moved(a: FloatArray, b: FloatArray, distance_m: float, angle_rad: float) -> bool:
     x, y, yaw = relative2(a, b)
     return math.hypot(float(x), float(y)) >= distance_m or abs(wrap_angle(float(yaw))) >= angle_rad
-
-
-__all__ = ["DEPTHS", "METHODS", "Log", "Shown", "SimulatedStack", "StackConfig"]
