@@ -70,7 +70,7 @@ def measure(
     """Figures of one world."""
     world = make_world(name)
     renderer = EquirectRenderer(world)
-    start = start_pose(world, None)
+    start = start_pose(world)
     shots = [
         take_shot(renderer, pose, VspaceSettings(), model)
         for behind in range(keyframes - 1, -1, -1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from instant_ic.experiments.pictures import perspective_crop
 from instant_ic.experiments.vspace import FILLED, STRIP_AT_M, Comparison, Row, converge_on, filled, scores
-from instant_ic.experiments.vspace_sources import KEYFRAMES, Place, Shot, VspaceSettings, base_of, make_source
+from instant_ic.experiments.vspace_sources import FOV_RAD, KEYFRAMES, Place, Shot, VspaceSettings, base_of, make_source
 
 if TYPE_CHECKING:
     from instant_ic.vspace import VirtualSpaceConfig
@@ -61,7 +60,7 @@ def compare_recorded(bag: Path, settings: VspaceSettings, number: int) -> Compar
     shots = keyframes[max(0, number + 1 - max(KEYFRAMES.values())) : number + 1]
     nowhere: Any = None
     place = Place(nowhere, nowhere, nowhere, (0.0, 0.0, 0.0), _config(settings), None)
-    here, (width, height), fov = keyframes[number].pose, settings.size, math.radians(settings.fov_deg)
+    here, (width, height) = keyframes[number].pose, settings.size
     near = _later(keyframes, number, settings)
     if not near:
         raise ValueError(f"{bag}: no keyframe after number {number} lies within {settings.reach_m:g} m of it")
@@ -74,8 +73,8 @@ def compare_recorded(bag: Path, settings: VspaceSettings, number: int) -> Compar
         draw, seconds = ready[base]
         for distance, one in near:
             at = settings.step_m * round(distance / settings.step_m)
-            truth = perspective_crop(one.rgb, np.eye(3), width, height, fov)
-            image, confidence = draw(one.pose, width, height, fov)
+            truth = perspective_crop(one.rgb, np.eye(3), width, height, FOV_RAD)
+            image, confidence = draw(one.pose, width, height, FOV_RAD)
             if source in FILLED:
                 image = filled(image, confidence, truth)
             psnr, similarity = scores(image, truth)
@@ -92,10 +91,10 @@ def converge_recorded(bag: Path, settings: VspaceSettings, number: int, times_s:
         ValueError: as ``read_keyframes``.
     """
     keyframes = read_keyframes(bag)
-    here, (width, height), fov = keyframes[number], settings.size, math.radians(settings.fov_deg)
+    here, (width, height) = keyframes[number], settings.size
     beside = [each for each in _later(keyframes, number, settings) if 0.5 <= each[0] <= 1.5]
     chosen = [(0.0, here), *((1.0, one) for _, one in sorted(beside, key=lambda each: abs(each[0] - 1.0))[:1])]
-    views = [(at, one.pose, perspective_crop(one.rgb, np.eye(3), width, height, fov)) for at, one in chosen]
+    views = [(at, one.pose, perspective_crop(one.rgb, np.eye(3), width, height, FOV_RAD)) for at, one in chosen]
     return converge_on(here, views, settings, _config(settings), times_s)
 
 
