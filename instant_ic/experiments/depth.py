@@ -256,13 +256,7 @@ def _within_sigma(depth: Floats, sigma: Floats, truth: Floats) -> tuple[float, f
 
 
 def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: DepthModel | None) -> dict[str, Any]:
-    """Report as plain values: ``mean`` (after scaling), means of ``before`` and ``after``, then each image.
-
-    Args:
-        scored: ``Scored.as_dict`` of each panorama.
-        settings: settings of the scores.
-        model: the model used, if any.
-    """
+    """``Scored.as_dict`` of panoramas with their means: ``mean`` (after scaling), ``before`` and ``after``."""
     means = {key: _mean([row[key] for row in scored if row.get(key)]) for key in _KEYS.values()}
     mean: dict[str, Any] = dict(means["after"] or {})
     for key in ("seconds", "seconds_model", "seconds_source"):

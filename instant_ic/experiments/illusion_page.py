@@ -63,10 +63,7 @@ class Screen:
 def place_on_screen(view: PageView, screen: Screen, map_from_look: NDArray[np.float64]) -> tuple[Floats, Floats]:
     """The view on the screen, (H, W, 3) in 0..1, and how far each pixel lies inside it, (H, W): 1 inside, 0 beyond.
 
-    Args:
-        view: as the page holds it.
-        screen: the page's window.
-        map_from_look: rotation (3, 3) of the shown line of sight.
+    ``map_from_look`` is the rotation (3, 3) of the shown line of sight.
     """
     map_from_view = view.map_from_camera[:3, :3]
     rotation = (map_from_view.T @ map_from_look).astype(np.float32)

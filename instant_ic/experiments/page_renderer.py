@@ -60,12 +60,9 @@ def launch_chromium(playwright: Any) -> Any:
 
 
 class PageRenderer:
-    """A page that shows the layers given to :meth:`load`.
+    """A page in Chromium that shows the layers given to :meth:`load`.
 
-    Args:
-        browser: Chromium, started by Playwright.
-        width, height: of the canvas, pixels.
-        full: as with a GPU; else with the plain look-ups that the page uses where the CPU renders.
+    ``full``: as with a GPU; else with the plain look-ups that the page uses where the CPU renders.
     """
 
     def __init__(self, browser: Any, width: int, height: int, full: bool = True) -> None:
@@ -95,13 +92,10 @@ class PageRenderer:
         fov_rad: float,
         moved: bool,
     ) -> NDArray[np.uint8]:
-        """Return the camera's image as the page shows it in REAL, (height, width, 3).
+        """Return the camera's image (JPEG) as the page shows it in REAL, (height, width, 3).
 
         Args:
-            jpeg: equirectangular image.
-            taken: map_from_camera of that.
-            map_from_camera: pose from which it is shown.
-            fov_rad: horizontal field of view.
+            taken, map_from_camera: map_from_camera of the image, and of the pose from which it is shown.
             moved: by the depth of the layers; else as it was taken.
         """
         self._photo = jpeg

@@ -18,13 +18,9 @@ Image: TypeAlias = NDArray[np.uint8]
 def perspective_crop(
     panorama: NDArray[np.uint8], camera_from_view: NDArray[np.float64], width: int, height: int, hfov_rad: float
 ) -> NDArray[np.uint8]:
-    """Pinhole view from the panorama's centre.
+    """Pinhole view from the centre of a panorama (H, W, 3).
 
-    Args:
-        panorama: (H, W, 3).
-        camera_from_view: rotation (3, 3) of the view, which looks along its own x.
-        width, height: of the crop.
-        hfov_rad: horizontal field of view.
+    ``camera_from_view`` is the rotation (3, 3) of the view, which looks along its own x.
     """
     directions = perspective_directions(width, height, hfov_rad) @ camera_from_view.T.astype(np.float32)
     return np.clip(np.rint(sample_equirect(panorama, directions)), 0, 255).astype(np.uint8)
@@ -184,12 +180,9 @@ def figure_svg(figure: Any, axis: Any) -> str:
 
 
 def image_strip(columns: Sequence[str], rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], tile: int) -> Image:
-    """Rows of labelled images under the columns' names; RGB, ready to be encoded.
+    """Rows of a label and an image a column, all of one shape, under the columns' names; RGB, ready to be encoded.
 
-    Args:
-        columns: names.
-        rows: label and one image a column, all of one shape.
-        tile: width of an image, pixels.
+    ``tile`` is the width of an image in pixels.
     """
     import cv2
 

@@ -48,10 +48,8 @@ def read_keyframes(bag: Path) -> list[Shot]:
 def compare_recorded(bag: Path, settings: VspaceSettings, number: int) -> Comparison:
     """Show what later keyframes saw from an earlier one, at their poses.
 
-    Args:
-        bag: with ``/keyframe``.
-        settings: ``sources`` of ``SOURCES``; keyframes up to ``reach_m`` away count, by steps of ``step_m``.
-        number: of the earlier keyframe.
+    The sources are of ``SOURCES``; keyframes up to ``settings.reach_m`` away count, by steps of ``step_m``. ``number``:
+    of the earlier keyframe.
 
     Raises:
         ValueError: as ``read_keyframes``, or no later keyframe is near enough.

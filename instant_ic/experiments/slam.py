@@ -198,8 +198,6 @@ def run_log(
     one millisecond after it; the trajectory keeps the original stamp.
 
     Args:
-        entries: of `instant_ic.slam.logs.read_log`, or compatible.
-        config: defaults when None.
         particles: run the particle filter instead of the grid SLAM.
         use_wheel_odom: False ignores the log's odometry.
         on_scan: called with the number of processed scans, for a progress bar.
@@ -261,16 +259,14 @@ def _from_anchor(result: SlamResult) -> FloatArray:
     return np.zeros(3) if result.anchor is None else relative2(result.anchor.pose(), result.map_from_base)
 
 
-def perturb_odometry(
-    entries: Iterable[LogEntry], seed: int, noise: float = 0.05, scale: float = 0.02
-) -> Iterator[LogEntry]:
-    """Degrade a log's odometry: Gaussian noise of ``noise`` times each step's size, plus a scale error.
+def perturb_odometry(entries: Iterable[LogEntry], seed: int) -> Iterator[LogEntry]:
+    """Degrade a log's odometry: Gaussian noise of 5 % of each step's size, plus a scale error of 2 %.
 
-    Translation and rotation are each too long or too short by ``scale``; the seed decides which.
+    Translation and rotation are each too long or too short; the seed decides which.
     """
     rng = np.random.default_rng(seed)
     signs = rng.choice([-1.0, 1.0], 2)
-    factor = 1.0 + scale * np.array([signs[0], signs[0], signs[1]])
+    factor = 1.0 + 0.02 * np.array([signs[0], signs[0], signs[1]])
     true: FloatArray | None = None
     worse = np.zeros(3)
     for entry in entries:
@@ -282,7 +278,7 @@ def perturb_odometry(
         else:
             step = relative2(true, entry.odom_pose)
             size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
-            worse = compose2(worse, factor * step + noise * size * rng.standard_normal(3))
+            worse = compose2(worse, factor * step + 0.05 * size * rng.standard_normal(3))
         true = entry.odom_pose
         yield replace(entry, odom_pose=worse)
 

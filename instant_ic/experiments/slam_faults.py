@@ -297,14 +297,11 @@ def evaluate_faults(
     """Put each fault into the log and compare with the clean run; figures for JSON, by fault.
 
     Args:
-        entries: the log.
-        config: defaults when None.
         places: number of places for a fault at a place; chosen by ``seed``, the same for every fault.
         seed: of the places and of all other choices.
         noise_seeds: runs of each fault that lasts the whole log; the first has the log's own odometry, the others noise
             (`perturb_odometry`).
         relations: for the accuracy of the runs over the whole log.
-        faults: names of `FAULTS`.
         on_step: called with the name of what runs next.
 
     Raises:

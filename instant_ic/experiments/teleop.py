@@ -212,12 +212,7 @@ def evaluate(
 ) -> list[Drive]:
     """Drive all courses by all methods, ``jobs`` drives in parallel; with more than one job, each in its own process.
 
-    Args:
-        settings: of the evaluation.
-        jobs: parallel drives.
-        on_drive: called with each finished drive.
-        timeout_s: for all drives.
-        done: finished drives, which are not repeated.
+    The drives in ``done`` are not repeated; ``timeout_s`` is for all drives.
 
     Raises:
         ValueError: nothing to do, no such world, no such log.

@@ -158,11 +158,6 @@ def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
 def compare(world: str, settings: VspaceSettings, config: VirtualSpaceConfig | None = None) -> Comparison:
     """Compare the views of each source with the world's own along each path.
 
-    Args:
-        world: as for ``sim.worlds.make_world``.
-        settings: of the comparison.
-        config: of the virtual space.
-
     Raises:
         ValueError: no such world, its start is not free, or the depth of a panorama cannot be scaled.
     """

@@ -53,10 +53,8 @@ class FileFeed:
     """Batches by number, requested in ascending order: passes over stored panoramas, each in a different order.
 
     Args:
-        samples: the panoramas.
-        indices: indices of the panoramas to use.
+        indices: of the samples to use.
         batch_size: of this process.
-        seed: of the order.
         rank, ranks: this process among those that train together; each gets its own part of a pass.
         info: recipe.
         threads: number of reader threads (decoding images takes longer than a training step of a small network).

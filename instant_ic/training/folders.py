@@ -187,11 +187,7 @@ class FolderDataset:
 
 
 def open_folder(name: str, size: tuple[int, int]) -> FolderDataset | RenderedDataset:
-    """Open ``LAYOUT:FOLDER``.
-
-    Args:
-        name: layout (``rendered`` or one of :data:`LAYOUTS`) and folder.
-        size: height and width to which the panoramas are resized.
+    """Open ``LAYOUT:FOLDER``, layout ``rendered`` or one of :data:`LAYOUTS`; ``size``: height and width of the samples.
 
     Raises:
         DatasetError: unknown layout, missing folder, or no files in this layout.
