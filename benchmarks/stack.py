@@ -81,11 +81,6 @@ class Watch:
     def _on_image(self, message: Any) -> None:
         self.images += 1
 
-    @property
-    def mode(self) -> int | None:
-        """The current mode; None before the first message."""
-        return self.modes[-1][1] if self.modes else None
-
     def since(self, began_s: float) -> list[int]:
         """The mode at a moment and each change after it."""
         before = [mode for at, mode in self.modes if at <= began_s]
@@ -159,7 +154,7 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
 
     began = time.monotonic()
     recorder, watch = DriveRecorder(stack), Watch(stack)
-    stack.wait_for(lambda: watch.mode == ControlState.REAL and recorder.ready, 240, "virtual space fit to show")
+    stack.wait_for(lambda: recorder.mode == ControlState.REAL and recorder.ready, 240, "virtual space fit to show")
     result["ready_s"] = round(time.monotonic() - began, 1)
     with sync_playwright() as playwright:
         browser = launch_chromium(playwright)
@@ -183,10 +178,10 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
             while not condition():
                 page.keyboard.down("KeyW")
                 left = max(1.0, end - time.monotonic())
-                wait(stack, page, lambda: condition() or watch.mode == ControlState.STOPPED, left, what)
-                if watch.mode == ControlState.STOPPED:
+                wait(stack, page, lambda: condition() or recorder.mode == ControlState.STOPPED, left, what)
+                if recorder.mode == ControlState.STOPPED:
                     page.keyboard.up("KeyW")
-                    wait(stack, page, lambda: watch.mode != ControlState.STOPPED, 60, "end of the stop")
+                    wait(stack, page, lambda: recorder.mode != ControlState.STOPPED, 60, "end of the stop")
 
         started, images = time.monotonic(), watch.images
         paces: list[float] = []
@@ -194,7 +189,7 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
 
             def inside() -> bool:
                 paces.append(stack.pace)
-                return watch.mode == ControlState.VIRTUAL
+                return recorder.mode == ControlState.VIRTUAL
 
             hold(inside, 120, "VIRTUAL")
             before = sample(page, run_dir, watch)
@@ -212,7 +207,7 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
             hold(past, 120, "v-bot behind the box")
             page.keyboard.up("KeyW")
             result["virtual"] = between(before, sample(page, run_dir, watch))
-            wait(stack, page, lambda: watch.mode == ControlState.REAL, 180, "REAL behind the box")
+            wait(stack, page, lambda: recorder.mode == ControlState.REAL, 180, "REAL behind the box")
             page.wait_for_timeout(1500)
             shot(page, args, "back")
             result["completed"] = is_passage(watch.since(started)) and not recorder.contact and not errors

@@ -29,7 +29,7 @@ Cloud = tuple[NDArray[np.float32], Picture]
 
 
 class Sheets:
-    """Pages of ``ROWS`` panoramas, or with ``side`` of point clouds: OUT.png, OUT-2.png, ... ``close`` writes the last."""
+    """Pages of ``ROWS`` panoramas, or with ``side`` of point clouds: OUT.png, OUT-2.png; ``close`` writes the last."""
 
     def __init__(self, path: Path, side: bool = False) -> None:
         self.path = path

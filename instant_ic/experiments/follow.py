@@ -115,7 +115,7 @@ class _Drive:
         self.mask = worlds.filled(self.room.shapes, self.room.size, 0.01, worlds.IN_THE_WAY_M)
         coarse = worlds.filled(self.room.shapes, self.room.size, 0.025, worlds.IN_THE_WAY_M)
         goal = np.array([*self.room.goal, 0.0])
-        self.optimum = worlds.shortest_way(coarse, self.room.start, goal, 0.05, SPARE_M)
+        self.optimum = worlds.shortest_way(coarse, self.room.start, goal, SPARE_M)
         self.people = worlds.add_people(self.room, self.rng, int(self.rng.integers(1, 4))) if index % 5 == 0 else []
         self.episode = Episode(index, len(self.people), self.optimum is not None)
         if self.optimum is not None:

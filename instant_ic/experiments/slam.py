@@ -21,7 +21,7 @@ import numpy as np
 
 from instant_ic.experiments.particle_slam import ParticleConfig, ParticleSlam
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
-from instant_ic.slam import GridSlam, SlamConfig, SlamResult
+from instant_ic.slam import GridSlam, Scan, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import Anchor, warm_up
 from instant_ic.slam.logs import LogEntry, LogError, open_log
 from instant_ic.slam.scan import FloatArray
@@ -135,7 +135,7 @@ def relation_error(trajectory: FloatArray, relations: Relations) -> RelationErro
     return RelationError(np.array(translation), np.array(rotation))
 
 
-def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_s: float = 0.006) -> FloatArray:
+def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_s: float) -> FloatArray:
     """Scan times (n,) in the clock that the relations use; the log may have two."""
     own = np.array([entry.scan.stamp_ns * 1e-9 for entry in entries])
     logger = np.array([np.nan if entry.logger_s is None else entry.logger_s for entry in entries])
@@ -144,6 +144,15 @@ def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_
     ):
         return logger
     return own
+
+
+def log_error(
+    entries: Sequence[LogEntry], poses: FloatArray, relations: Relations, tolerance_s: float = 0.006
+) -> dict[str, float | int]:
+    """``RelationError.summary`` of the poses (n, 3) of a log's scans; raises as ``relation_error``."""
+    times = relation_times(entries, relations, tolerance_s)
+    order = np.argsort(times, kind="stable")
+    return relation_error(np.column_stack([times, poses])[order], relations).summary()
 
 
 @dataclass(frozen=True)
@@ -209,21 +218,16 @@ def run_log(
     warm_up(config)
     stamps: list[float] = []
     online: list[FloatArray] = []
-    anchors: list[tuple[Anchor | None, FloatArray]] = []
+    anchored: list[tuple[Anchor | None, FloatArray]] = []
     cpu_ms: list[float] = []
     background_ms: list[float] = []
     scores: list[float] = []
     statuses: dict[str, int] = {}
-    last_ns: int | None = None
-    for entry in entries:
-        scan = entry.scan
-        if last_ns is not None and scan.stamp_ns <= last_ns:
-            scan = replace(scan, stamp_ns=last_ns + 1_000_000)
-        last_ns = scan.stamp_ns
+    for entry, scan in ascending(entries):
         begin = time.thread_time()
         result = slam.process(scan, entry.odom_pose if use_wheel_odom else None, entry.base_from_laser)
         scanned = time.thread_time()
-        anchors.append((result.anchor, _from_anchor(result)))
+        anchored.append(from_anchor(result))
         job = slam.background_job()
         outcome = None if job is None else job()
         worked = time.thread_time()
@@ -240,12 +244,8 @@ def run_log(
     if not online:
         raise LogError("the log contains no scan")
     slam.finish()
-    final = [
-        pose if anchor is None else compose2(anchor.pose(), there)
-        for pose, (anchor, there) in zip(online, anchors, strict=True)
-    ]
     return LogResult(
-        np.column_stack([stamps, np.array(final)]),
+        np.column_stack([stamps, final_poses(anchored)]),
         np.column_stack([stamps, np.array(online)]),
         np.array(cpu_ms),
         np.array(background_ms),
@@ -255,8 +255,26 @@ def run_log(
     )
 
 
-def _from_anchor(result: SlamResult) -> FloatArray:
-    return np.zeros(3) if result.anchor is None else relative2(result.anchor.pose(), result.map_from_base)
+def ascending(entries: Iterable[LogEntry], last_ns: int | None = None) -> Iterator[tuple[LogEntry, Scan]]:
+    """Each entry with its scan; a scan that is not newer than the previous one is stamped a millisecond after it."""
+    for entry in entries:
+        scan = entry.scan
+        if last_ns is not None and scan.stamp_ns <= last_ns:
+            scan = replace(scan, stamp_ns=last_ns + 1_000_000)
+        last_ns = scan.stamp_ns
+        yield entry, scan
+
+
+def from_anchor(result: SlamResult) -> tuple[Anchor | None, FloatArray]:
+    """The pose (3,) relative to its keyframe; the pose itself without one."""
+    if result.anchor is None:
+        return None, result.map_from_base
+    return result.anchor, relative2(result.anchor.pose(), result.map_from_base)
+
+
+def final_poses(anchored: Iterable[tuple[Anchor | None, FloatArray]]) -> FloatArray:
+    """Poses (n, 3) of ``from_anchor`` after the last optimisation."""
+    return np.array([there if anchor is None else compose2(anchor.pose(), there) for anchor, there in anchored])
 
 
 def perturb_odometry(entries: Iterable[LogEntry], seed: int) -> Iterator[LogEntry]:
@@ -267,20 +285,25 @@ def perturb_odometry(entries: Iterable[LogEntry], seed: int) -> Iterator[LogEntr
     rng = np.random.default_rng(seed)
     signs = rng.choice([-1.0, 1.0], 2)
     factor = 1.0 + 0.02 * np.array([signs[0], signs[0], signs[1]])
-    true: FloatArray | None = None
-    worse = np.zeros(3)
+
+    def worse(step: FloatArray) -> FloatArray:
+        size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
+        return np.asarray(factor * step + 0.05 * size * rng.standard_normal(3))
+
+    return changed_odometry(entries, worse)
+
+
+def changed_odometry(entries: Iterable[LogEntry], change: Callable[[FloatArray], FloatArray]) -> Iterator[LogEntry]:
+    """The log with each step (3,) of its odometry changed."""
+    last: FloatArray | None = None
+    pose = np.zeros(3)
     for entry in entries:
         if entry.odom_pose is None:
             yield entry
             continue
-        if true is None:
-            worse = entry.odom_pose
-        else:
-            step = relative2(true, entry.odom_pose)
-            size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
-            worse = compose2(worse, factor * step + 0.05 * size * rng.standard_normal(3))
-        true = entry.odom_pose
-        yield replace(entry, odom_pose=worse)
+        pose = entry.odom_pose if last is None else compose2(pose, change(relative2(last, entry.odom_pose)))
+        last = entry.odom_pose
+        yield replace(entry, odom_pose=pose)
 
 
 def evaluate_log(
@@ -302,11 +325,8 @@ def evaluate_log(
     result = run_log(entries, config, particles=particles, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
     report: dict[str, object] = {}
     if relations is not None:
-        times = relation_times(entries, relations, tolerance_s)
-        order = np.argsort(times, kind="stable")
         final, online = (
-            relation_error(np.column_stack([times, run[:, 1:]])[order], relations).summary()
-            for run in (result.trajectory, result.online)
+            log_error(entries, run[:, 1:], relations, tolerance_s) for run in (result.trajectory, result.online)
         )
         report.update(final)
         report["online_translation_mean_m"] = online["translation_mean_m"]

@@ -165,26 +165,12 @@ class SilentPage:
     def now_ms(self) -> float:
         return 0.0
 
-    def publish(self, kind: str, message: dict[str, Any]) -> None:
-        pass
-
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
-        pass
-
-    def send_layers(self, layers: Any) -> None:
-        pass
-
-    def drawn_ms(self) -> float | None:
-        return None  # it shows rendered views
-
     def needs_views(self) -> bool:
         return True
 
-    def show(self, *kinds: Any) -> None:
-        pass
-
-    def stop(self) -> None:
-        pass
+    def __getattr__(self, name: str) -> Any:
+        """Method that ignores what it is given; ``drawn_ms`` is None as it shows rendered views."""
+        return lambda *_: None
 
 
 class _Page(SilentPage):
