@@ -198,11 +198,6 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def prepare() -> None:
-    """Compile the kernels that the nodes otherwise compile at start-up, so that no episode includes that time."""
-    warm_up()
-
-
 def evaluate(
     settings: TeleopSettings,
     jobs: int = 1,
@@ -224,7 +219,8 @@ def evaluate(
     known = {(drive.index, drive.method) for drive in done}
     tasks = [(settings, i, name) for i in range(settings.episodes) for name in settings.methods]
     tasks = [task for task in tasks if task[1:] not in known]
-    return in_order([*done, *run_all(_drive, tasks, jobs, prepare, on_drive, timeout_s)])
+    # The kernels are compiled first, so that no episode includes that time.
+    return in_order([*done, *run_all(_drive, tasks, jobs, warm_up, on_drive, timeout_s)])
 
 
 def _drive(settings: TeleopSettings, index: int, method: str) -> Drive:

@@ -6,8 +6,7 @@ import functools
 from dataclasses import dataclass
 from pathlib import Path
 
-from instant_ic.experiments.teleop_operator import MANNERS
-from instant_ic.experiments.teleop_stack import DEPTHS, METHODS, StackConfig
+from instant_ic.experiments.teleop_stack import METHODS, StackConfig
 from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS, Course, make_course
 
 
@@ -23,7 +22,7 @@ class TeleopSettings:
         log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
         pictures: whether to render and compare the images on either side of a switch.
         overrides: parameters ``node.key:=value`` on top of the shipped ones.
-        manner: of the scripted operator, of ``MANNERS``.
+        manner: of the scripted operator, of ``teleop_operator.MANNERS``.
     """
 
     episodes: int = 50
@@ -39,15 +38,10 @@ class TeleopSettings:
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
-        for key, given, allowed in (
-            ("methods", self.methods, METHODS),
-            ("depth", (self.depth,), DEPTHS),
-            ("manner", (self.manner,), tuple(MANNERS)),
-        ):
-            unknown = [name for name in given if name not in allowed]
-            if unknown or not given:
-                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
-        StackConfig(overrides=self.overrides)  # raises ValueError on a malformed override
+        unknown = [name for name in self.methods if name not in METHODS]
+        if unknown or not self.methods:
+            raise ValueError(f"methods must be some of {', '.join(METHODS)} (got {', '.join(unknown) or 'none'})")
+        StackConfig(depth=self.depth, overrides=self.overrides)  # raises ValueError on a malformed override
 
     def course(self, index: int) -> Course:
         """Return course ``index``.

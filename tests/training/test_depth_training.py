@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_completion
-from instant_ic.training.dataset import Sample, Selection
+from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import FileFeed
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.slicenet import CheckpointError
@@ -41,7 +41,7 @@ def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, **op
     torch.manual_seed(0)
     return Trainer(
         feed,
-        Selection((samples, range(9, 12))),
+        samples[9:],
         CompletionNet(TINY),
         config,
         output,
