@@ -20,6 +20,7 @@ from typing import Any
 from instant_ic.console import ConsoleServer, Look, ServerConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.experiments.page_renderer import launch_chromium
+from instant_ic.experiments.pictures import jpeg
 from instant_ic.experiments.teleop_stack import CAMERA_HEIGHT_M, STEP_S, SimulatedStack, StackConfig, _Page
 from instant_ic.experiments.teleop_worlds import make_course
 from instant_ic.geometry.poses import pose_matrix
@@ -83,11 +84,9 @@ class Page(_Page):
 
     def photo(self) -> bytes:
         """Render the camera image, which the simulated stack leaves empty."""
-        import cv2
-
         x, y, yaw = self.stack._newest[False].pose
         frame = self.stack.simulation.renderer.render(pose_matrix(x, y, CAMERA_HEIGHT_M, yaw=yaw), 1280, 640)
-        return bytes(cv2.imencode(".jpg", frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+        return jpeg(frame.rgb, 90)
 
 
 class Operator:

@@ -42,17 +42,13 @@ def read_bag(path: Path, scan_topic: str | None = None) -> Iterator[LogEntry]:
             odometry = OdometryBuffer(keep_s=1e9)
             wheels = _choose(path, types, _ODOMETRY, None, ("/wheel/odom", "/odom"))
             transforms = TransformBuffer()
-            wanted = [name for name in (wheels, "/tf_static", "/tf") if name in types]
-            for message in bag.messages(wanted):
+            for message in bag.messages([name for name in (wheels, "/tf_static") if name in types]):
                 value = deserialize(message.payload, message.type_name)
                 if message.topic == wheels:
                     odometry.add(stamp_ns(value), pose2_from_message(value))
                     continue
-                for transform in value.transforms:
-                    if message.topic == "/tf_static":
-                        transforms.set(
-                            transform.header.frame_id, transform.child_frame_id, 0, transform_matrix(transform), True
-                        )
+                for one in value.transforms:
+                    transforms.set(one.header.frame_id, one.child_frame_id, 0, transform_matrix(one), True)
             scans = 0
             for message in bag.messages([topic]):
                 value = deserialize(message.payload, message.type_name)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from instant_ic.bag.replay import make_node
 from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.experiments.pictures import jpeg
 from instant_ic.geometry.poses import (
     compose2,
     matrix_from_quaternion,
@@ -391,8 +392,7 @@ class SimulatedStack:
             self._exposed.append((now, self.robot))
             if self.config.method == "ic" and self._worth_drawing():
                 self._drawn[START_NS + round(now * 1e9)] = self.robot
-                jpeg = self._draw()
-                self._for_depth.append((now + self.config.depth_latency_s, now, jpeg))
+                self._for_depth.append((now + self.config.depth_latency_s, now, self._draw()))
         # Images in transit: the console itself takes the first off the queue.
         while self._exposed and now - self._exposed[0][0] >= self.config.camera_latency_s - 1e-9:
             waiting, exposure = len(self._exposed), self._exposed[0][0]
@@ -400,11 +400,11 @@ class SimulatedStack:
             if len(self._exposed) == waiting:  # the console is not available
                 self._exposed.popleft()
         while self._for_depth and now >= self._for_depth[0][0] - 1e-9:
-            _, exposure, jpeg = self._for_depth.popleft()
-            self._publish_picture("/camera/for_depth", jpeg, exposure)
+            _, exposure, image = self._for_depth.popleft()
+            self._publish_picture("/camera/for_depth", image, exposure)
 
-    def _publish_picture(self, topic: str, jpeg: bytes, exposure_s: float) -> None:
-        message = compressed_image_message(jpeg, "camera", START_NS + round(exposure_s * 1e9))
+    def _publish_picture(self, topic: str, image: bytes, exposure_s: float) -> None:
+        message = compressed_image_message(image, "camera", START_NS + round(exposure_s * 1e9))
         self.bus.publish(topic, message)
 
     def _worth_drawing(self) -> bool:
@@ -424,11 +424,7 @@ class SimulatedStack:
         return worth
 
     def _draw(self) -> bytes:
-        import cv2
-
-        rgb = self.simulation.panorama(self.config.panorama, self.config.panorama // 2).rgb
-        _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-        return bytes(jpeg.tobytes())
+        return jpeg(self.simulation.panorama(self.config.panorama, self.config.panorama // 2).rgb, 92)
 
     # -- time
 
