@@ -56,13 +56,7 @@ def reference_loop() -> Iterator[ReferenceLoop]:
 
 @dataclass(frozen=True)
 class Usage:
-    """CPU seconds and resident memory of each process of a stack, at one moment of the machine's steady clock.
-
-    Attributes:
-        monotonic_s: the moment.
-        cpu_s: CPU seconds since the start, user and system, by node name.
-        rss_mb: resident memory in megabytes, by node name.
-    """
+    """CPU seconds since the start and resident memory by node name, at one moment of the machine's steady clock."""
 
     monotonic_s: float
     cpu_s: dict[str, float]

@@ -41,13 +41,9 @@ Still = dict[str, NDArray[np.uint8]]
 
 @dataclass
 class Film:
-    """The frames of one episode.
+    """The frames of one episode in the order of time, and whether the drive reached its goal.
 
-    Attributes:
-        index: number of the episode.
-        completed: whether the drive reached its goal.
-        frames: in the order of time.
-        stills: of the frame nearest to each multiple of ``STEP_M``, by that distance, metres.
+    ``stills`` are of the frame nearest to each multiple of ``STEP_M``, by that distance in metres.
     """
 
     index: int

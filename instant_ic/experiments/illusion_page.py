@@ -29,13 +29,7 @@ NIGHT = np.array([0.035, 0.043, 0.055], np.float32)
 
 @dataclass(frozen=True)
 class PageView:
-    """A rendered view as the page holds it.
-
-    Attributes:
-        rgb: (h, w, 3) float32 in 0..1.
-        map_from_camera: (4, 4) for which it was rendered.
-        fov_rad: horizontal field of view.
-    """
+    """A rendered view (h, w, 3) in 0..1 as the page holds it, with the pose (4, 4) for which it was rendered."""
 
     rgb: Floats
     map_from_camera: NDArray[np.float64]

@@ -86,7 +86,6 @@ class Unit:
     """One unit of work.
 
     Attributes:
-        experiment: its name.
         arguments: all that the result depends on beside the program, as JSON has it.
         cost_s: expected CPU seconds, for the progress.
     """
@@ -130,14 +129,7 @@ def _state_of(place: str) -> list[Any]:
 
 @dataclass(frozen=True)
 class Result:
-    """What a unit measured.
-
-    Attributes:
-        unit: of the measurement.
-        data: as ``measure`` returned it; empty where it failed.
-        wall_s, cpu_s: time it took.
-        error: why it failed; empty where it did not.
-    """
+    """What ``measure`` returned for a unit and the time it took; empty ``data`` and an ``error`` where it failed."""
 
     unit: Unit
     data: dict[str, Any]

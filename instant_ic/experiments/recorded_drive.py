@@ -41,8 +41,7 @@ class RecordedDrive:
     Attributes:
         drive: figures, as of a simulated one; the r-bot's pose is the stack's estimate.
         moments: before, during and after the first passage through the virtual space; else of the first minute.
-        plot: PNG of both trajectories on the map.
-        modes: PNG of the arbiter's mode over time.
+        plot, modes: PNG of both trajectories on the map, and of the arbiter's mode over time.
     """
 
     drive: Drive

@@ -26,8 +26,7 @@ class RoomsConfig:
     """Recipe of generated panoramas.
 
     Attributes:
-        worlds: number of worlds.
-        poses: panoramas in each.
+        worlds, poses: number of worlds, and panoramas in each.
         priors: fused depth images of each panorama, with other faults and another number of revolutions each.
         first_world: seed of the first world; the others follow.
         height: rows of a panorama.

@@ -204,12 +204,8 @@ class Trainer:
         feed: training batches, of ``config.batch_size``.
         held_out: panoramas for evaluation, from worlds or scenes that are not in the feed.
         model: network to train; it keeps the weights it has.
-        origin: where these weights come from, for the record.
-        config: training parameters.
         output: checkpoint file.
-        team: the processes of this training; by default this one on the CPU.
-        command: the user's command line, for the record.
-        report: receives human-readable lines.
+        origin, command: where these weights come from, and the user's command line, for the record.
         bar: receives the progress 0..1 after each step.
         stop: set it to end early.
     """
