@@ -10,14 +10,13 @@ from the image alone; ``inpaint``: OpenCV's (Telea); ``exact``: the truth there,
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from reporting import parser_of, report
 
 from instant_ic.experiments.vspace import path_poses
 from instant_ic.experiments.vspace_sources import CAMERA_HEIGHT_M
@@ -148,7 +147,7 @@ def measure(renderer: EquirectRenderer, kind: str, start: Any, number: int, olde
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--worlds", nargs="+", default=["corridor-free", "random:3", "random:8", "random:21"])
     parser.add_argument("--places", type=int, default=2, help="of each kind in a world (default 2)")
     parser.add_argument("--older", type=int, default=2, help="older keyframes, 1 m apart (default 2)")
@@ -176,7 +175,7 @@ def main() -> None:
             distances = sorted({distance for distance, _ in all_rows})
             by_distance = {str(d): means([row for row in all_rows if row[0] == d]) for d in distances}
             result[kind] = {"mean": means(all_rows), "by_distance_m": by_distance}
-    print(json.dumps(result, indent=2))
+    report(result, arguments.json)
 
 
 def means(rows: list[Any]) -> dict[str, dict[str, float]]:

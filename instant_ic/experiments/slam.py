@@ -83,26 +83,6 @@ def read_stamps(path: str | Path) -> FloatArray:
     return _read_columns(path, 1, "a stamp")[:, 0]
 
 
-@dataclass(frozen=True)
-class RelationError:
-    """Errors of each relation: metres (n,), degrees (n,)."""
-
-    translation_m: FloatArray
-    rotation_deg: FloatArray
-
-    def summary(self) -> dict[str, float | int]:
-        """Mean, standard deviation, median and maximum."""
-        return {
-            "translation_mean_m": float(self.translation_m.mean()),
-            "translation_std_m": float(self.translation_m.std()),
-            "translation_median_m": float(np.median(self.translation_m)),
-            "translation_max_m": float(self.translation_m.max()),
-            "rotation_mean_deg": float(self.rotation_deg.mean()),
-            "rotation_std_deg": float(self.rotation_deg.std()),
-            "relations": len(self.translation_m),
-        }
-
-
 def interpolate_trajectory(trajectory: FloatArray, times_s: FloatArray) -> FloatArray:
     """Poses (m, 3) at ``times_s`` (m,) of a trajectory ``t x y yaw`` (n, 4), times ascending; clamped at its ends."""
     yaw = np.interp(times_s, trajectory[:, 0], np.unwrap(trajectory[:, 3]))
@@ -111,8 +91,8 @@ def interpolate_trajectory(trajectory: FloatArray, times_s: FloatArray) -> Float
     return np.stack([x, y, yaw], axis=1)
 
 
-def relation_error(trajectory: FloatArray, relations: Relations) -> RelationError:
-    """Error of a trajectory ``t x y yaw`` (n, 4) against the relations within its time range.
+def relation_error(trajectory: FloatArray, relations: Relations) -> dict[str, float | int]:
+    """Figures of the errors of a trajectory ``t x y yaw`` (n, 4) against the relations within its time range.
 
     Raises:
         ValueError: no relation is within the trajectory's time range.
@@ -127,12 +107,20 @@ def relation_error(trajectory: FloatArray, relations: Relations) -> RelationErro
     times, truth = relations.times_s[inside], relations.poses[inside]
     first = interpolate_trajectory(trajectory, times[:, 0])
     second = interpolate_trajectory(trajectory, times[:, 1])
-    translation, rotation = [], []
+    errors = []
     for a, b, relation in zip(first, second, truth, strict=True):
         rest = relative2(relation, relative2(a, b))
-        translation.append(math.hypot(rest[0], rest[1]))
-        rotation.append(math.degrees(abs(wrap_angle(float(rest[2])))))
-    return RelationError(np.array(translation), np.array(rotation))
+        errors.append((math.hypot(rest[0], rest[1]), math.degrees(abs(wrap_angle(float(rest[2]))))))
+    translation_m, rotation_deg = np.ascontiguousarray(np.array(errors).T)
+    return {
+        "translation_mean_m": float(translation_m.mean()),
+        "translation_std_m": float(translation_m.std()),
+        "translation_median_m": float(np.median(translation_m)),
+        "translation_max_m": float(translation_m.max()),
+        "rotation_mean_deg": float(rotation_deg.mean()),
+        "rotation_std_deg": float(rotation_deg.std()),
+        "relations": len(errors),
+    }
 
 
 def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_s: float) -> FloatArray:
@@ -149,10 +137,10 @@ def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_
 def log_error(
     entries: Sequence[LogEntry], poses: FloatArray, relations: Relations, tolerance_s: float = 0.006
 ) -> dict[str, float | int]:
-    """``RelationError.summary`` of the poses (n, 3) of a log's scans; raises as ``relation_error``."""
+    """``relation_error`` of the poses (n, 3) of a log's scans."""
     times = relation_times(entries, relations, tolerance_s)
     order = np.argsort(times, kind="stable")
-    return relation_error(np.column_stack([times, poses])[order], relations).summary()
+    return relation_error(np.column_stack([times, poses])[order], relations)
 
 
 @dataclass(frozen=True)
