@@ -41,7 +41,7 @@ def read_keyframes(bag: Path) -> list[Shot]:
         known = sigma[np.isfinite(sigma)]
         middle = float(np.median(known)) if known.size else 1.0
         result = DepthResult(depth, sigma, True, 1.0, 0.0, 1.0, middle, 0, "", "recorded")
-        found.append(Shot(pose, rgb, depth, depth, result, depth))
+        found.append(Shot(np.asarray(pose, np.float64), rgb, depth, depth, result, depth))
     return found
 
 
