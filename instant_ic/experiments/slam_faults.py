@@ -297,13 +297,11 @@ def evaluate_faults(
 
     Raises:
         LogError: the log is too short.
-        ValueError: an unknown fault, or no place asked for.
+        ValueError: an unknown fault.
     """
     unknown = [name for name in faults if name not in FAULTS]
     if unknown:
         raise ValueError(f"unknown fault {unknown[0]!r}; known: {', '.join(FAULTS)}")
-    if places < 1 or noise_seeds < 1:
-        raise ValueError(f"places and noise_seeds must be at least 1 (got {places}, {noise_seeds})")
     if len(entries) < 2 * LEAST_SCANS:
         raise LogError(f"the log has {len(entries)} scans: too few to put faults into it ({2 * LEAST_SCANS} needed)")
     warm_up(config)

@@ -18,7 +18,7 @@ class TeleopSettings:
         episodes, seed: which drives; the same seed gives the same drives.
         world: ``corridors`` (random ones), or a world of the simulator.
         methods: of ``METHODS``.
-        depth: of ``DEPTHS``.
+        depth: as ``StackConfig``.
         log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
         pictures: whether to render and compare the images on either side of a switch.
         overrides: parameters ``node.key:=value`` on top of the shipped ones.
@@ -38,10 +38,10 @@ class TeleopSettings:
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
-        unknown = [name for name in self.methods if name not in METHODS]
-        if unknown or not self.methods:
-            raise ValueError(f"methods must be some of {', '.join(METHODS)} (got {', '.join(unknown) or 'none'})")
-        StackConfig(depth=self.depth, overrides=self.overrides)  # raises ValueError on a malformed override
+        if not self.methods:
+            raise ValueError(f"methods must be some of {', '.join(METHODS)} (got none)")
+        for method in self.methods:
+            StackConfig(method, overrides=self.overrides)  # raises ValueError on a wrong one
 
     def course(self, index: int) -> Course:
         """Return course ``index``.

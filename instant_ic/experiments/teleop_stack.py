@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 FloatArray: TypeAlias = NDArray[np.float64]
 
 METHODS = ("ic", "stop", "shared")
-DEPTHS = ("fused", "lidar")
 NODES = ("crawler_base", "vlp16_driver", "grid_slam", "virtual_robot", "navigator", "arbiter", "console")
 VSPACE_NODES = ("depth_estimator", "depth_scaler", "nerf")
 STEP_S = 1 / 60
@@ -77,7 +76,7 @@ class StackConfig:
 
     Attributes:
         method: of ``METHODS``.
-        depth: depth source, of ``DEPTHS``.
+        depth: depth source, ``fused`` or ``lidar``.
         seed: of the robot's slip, the LiDAR's noise and the delays.
         camera_hz: images per second.
         camera_latency_s: from the exposure to the page, as for the simulated camera.
@@ -102,8 +101,6 @@ class StackConfig:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method must be one of {', '.join(METHODS)} (got {self.method!r})")
-        if self.depth not in DEPTHS:
-            raise ValueError(f"depth must be one of {', '.join(DEPTHS)} (got {self.depth!r})")
         for word in self.overrides:
             if word.partition(".")[0] not in (*NODES, *VSPACE_NODES) or ":=" not in word:
                 names = ", ".join((*NODES, *VSPACE_NODES))

@@ -14,7 +14,6 @@ from instant_ic.training.dataset import save_sample
 
 FIRST_HELD_OUT = 900_000
 """Worlds from this seed on are reserved for the evaluations (``instant_ic.experiments.depth_worlds``)."""
-INTERIORS = ("wide", "random")
 CAMERA_HEIGHT_M, CLEARANCE_M = (0.5, 1.7), (0.3, 0.7)
 """Lowest and highest camera above the floor; distance from objects, minimum and maximum."""
 TILT_DEG = 1.5
@@ -45,8 +44,6 @@ class RoomsConfig:
     def __post_init__(self) -> None:
         if self.worlds < 2 or self.poses < 1:
             raise ValueError(f"at least 2 worlds and 1 pose are needed (got {self.worlds}, {self.poses})")
-        if self.interiors not in INTERIORS:
-            raise ValueError(f"interiors must be one of {', '.join(INTERIORS)} (got {self.interiors!r})")
         if self.first_world < 0 or self.first_world + self.worlds > FIRST_HELD_OUT:
             raise ValueError(f"world seeds must be in 0..{FIRST_HELD_OUT - 1}: higher ones are for evaluation "
                              f"(got {self.first_world}..{self.first_world + self.worlds - 1})")  # fmt: skip

@@ -88,16 +88,6 @@ class TrainingConfig:
     threads: int = 1
     seed: int = 0
 
-    def __post_init__(self) -> None:
-        for key in ("minutes", "epochs", "batch_size", "learning_rate", "checkpoint_s", "max_range_m", "threads",
-                    "evaluation_panoramas"):  # fmt: skip
-            if getattr(self, key) <= 0:
-                raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
-        if not 0 < self.warmup < 1 or not 0 <= self.average < 1:
-            raise ValueError(f"warmup and average must lie in 0..1 (got {self.warmup}, {self.average})")
-        if not 0 <= self.brightness <= 255:
-            raise ValueError(f"brightness must lie in 0..255 (got {self.brightness})")
-
 
 @dataclass(frozen=True)
 class Team:
