@@ -331,6 +331,11 @@ def load_checkpoint(path: str | Path) -> SliceNet:
 
 
 def read_checkpoint(path: Path) -> Any:
+    """Content of a checkpoint, on the CPU; only tensors and plain values, so that a file cannot run code.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, or holds more.
+    """
     try:
         if zipfile.is_zipfile(path):  # torch's format; torch itself does not verify the checksums
             with zipfile.ZipFile(path) as archive:

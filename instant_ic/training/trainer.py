@@ -29,7 +29,7 @@ from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import Ahead, Batch, Feed, Samples, stack
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.losses import depth_loss, edge_loss, sigma_loss
-from instant_ic.training.slicenet import CheckpointError
+from instant_ic.training.slicenet import CheckpointError, read_checkpoint
 
 POLE_WEIGHT = 0.1
 """Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
@@ -403,12 +403,7 @@ class Trainer:
         Raises:
             CheckpointError: the file is not a checkpoint of a run with this network.
         """
-        try:
-            state = torch.load(path, map_location=self.team.device, weights_only=True)
-        except FileNotFoundError:
-            raise CheckpointError(f"{path}: no such checkpoint to resume from") from None
-        except Exception as error:  # torch.load raises anything from KeyError to UnpicklingError
-            raise CheckpointError(f"{path}: not a checkpoint of tensors and plain values ({error})") from error
+        state = read_checkpoint(path)
         if not isinstance(state, dict) or "resume" not in state or state.get("config") != self.network.as_dict():
             raise CheckpointError(f"{path}: not a checkpoint of a run with {self.network}")
         self.average.load_state_dict(state["state_dict"])
