@@ -430,9 +430,10 @@ def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None
         drive = _Drive(seed, episode.index)
         for shape, kind in zip(drive.room.shapes, drive.room.kinds, strict=True):
             cx, cy, half_x, half_y, yaw = shape[:5]
-            corner, look = (cx - half_x, cy - half_y), {"color": colours[int(kind)], "lw": 0}
-            turned = {"angle": math.degrees(yaw), "rotation_point": "center"}
-            axes.add_patch(Rectangle(corner, 2 * half_x, 2 * half_y, **turned, **look))
+            corner, size = (cx - half_x, cy - half_y), (2 * half_x, 2 * half_y)
+            box = Rectangle(corner, *size, angle=math.degrees(yaw), rotation_point="center", lw=0)
+            box.set_color(colours[int(kind)])
+            axes.add_patch(box)
         if drive.optimum is not None:
             axes.plot(*drive.optimum[:, :2].T, "k--", lw=0.8)
         for name, track in episode.tracks.items():
