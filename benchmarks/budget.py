@@ -71,7 +71,7 @@ def measure(stack: Stack, run_dir: Path, args: argparse.Namespace) -> dict[str, 
     port = stack.arguments["console_port"]
     asyncio.run(drive_through_obstacle(stack, recorder, f"http://127.0.0.1:{port}/", beyond_x_m=5.6))
     result["virtual"] = table(entered[0], left[0], stack.pace)
-    result["modes"], result["contact"] = recorder.record.modes, recorder.record.contact
+    result["modes"], result["contact"] = recorder.modes, recorder.contact
     return result
 
 

@@ -44,10 +44,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from reporting import CHROMIUM_FLAGS, parser_of, report
+from reporting import parser_of, report
 
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.console.view import PROBE
+from instant_ic.experiments.page_renderer import launch_chromium
 from instant_ic.experiments.stack import Stack, free_port
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.launch.pacing import machine_pace
@@ -279,7 +280,7 @@ def part(virtual: bool, args: argparse.Namespace) -> dict[str, Any]:
                     args.wait,
                     "the nodes",
                 )
-                browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+                browser = launch_chromium(playwright)
                 page = browser.new_page(viewport={"width": args.width, "height": args.height})
                 page.add_init_script(WATCH)
                 page.goto(f"http://127.0.0.1:{port}/")

@@ -16,7 +16,6 @@ where the robot is, as the image was taken and moved by the depth of the layers 
 from __future__ import annotations
 
 import math
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,14 @@ from typing import Any
 import cv2
 import numpy as np
 from playwright.sync_api import sync_playwright
-from reporting import CHROMIUM_FLAGS, parser_of, report
+from reporting import parser_of, report
 
 from instant_ic import paths
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayers
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-from instant_ic.experiments.page_renderer import PageRenderer
+from instant_ic.experiments.page_renderer import PageRenderer, launch_chromium
+from instant_ic.experiments.pictures import jpeg
 from instant_ic.experiments.vspace import path_poses, start_pose
 from instant_ic.experiments.vspace_sources import VspaceSettings, take_shot
 from instant_ic.geometry.image_quality import psnr_db
@@ -38,6 +38,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import make_world
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.jobs import decode_panorama
 from instant_ic.vspace.layers import LayerEncoder
 
 FOV = math.pi / 2
@@ -71,7 +72,7 @@ def measure(
     """Figures of one world."""
     world = make_world(name)
     renderer = EquirectRenderer(world)
-    start = start_pose(world, None)
+    start = start_pose(world)
     shots = [
         take_shot(renderer, pose, VspaceSettings(), model)
         for behind in range(keyframes - 1, -1, -1)
@@ -79,10 +80,10 @@ def measure(
     ]
     space, images = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu", keyframes=keyframes)), []
     for shot in shots:
-        jpeg = cv2.imencode(".jpg", shot.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
-        rgb = cv2.cvtColor(cv2.imdecode(jpeg, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-        space.set_keyframe(rgb, shot.result.depth_m, shot.pose, shot.result.sigma)
-        images.insert(0, jpeg.tobytes())
+        images.insert(0, jpeg(shot.rgb, JPEG_QUALITY))
+        space.set_keyframe(
+            decode_panorama(np.frombuffer(images[0], np.uint8)), shot.result.depth_m, shot.pose, shot.result.sigma
+        )
     encoded = LayerEncoder().encode(space._shown, list(range(len(images), 0, -1)), images)
     layers = PageLayers(1, (0.0, 0.0, 0.0), LayerMeshes().layers(encoded))
     for page in pages.values():
@@ -122,15 +123,14 @@ def real(
 ) -> dict[str, dict[str, float]]:
     """PSNR of the camera's image, shown where the robot is some centimetres later."""
     poses = path_poses(world, start, "straight", [PHOTO_M, *(PHOTO_M + cm / 100 for cm in LATER_CM)])
-    photo = renderer.render(poses[0], 1920, 960).rgb[..., ::-1]
-    jpeg = cv2.imencode(".jpg", photo, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    photo = jpeg(renderer.render(poses[0], 1920, 960).rgb, JPEG_QUALITY)
     result = {}
     for cm, pose in zip(LATER_CM, poses[1:], strict=True):
         for name, turn in (("ahead", 0.0), ("to the side", 0.9)):
             looks = pose @ pose_matrix(yaw=turn)
             truth = renderer.render_perspective(looks, *size, FOV, supersample=2).rgb
             result[f"{cm} cm, {name}"] = {
-                key: round(psnr_db(page.render_photo(jpeg, poses[0], looks, FOV, moved), truth), 2)
+                key: round(psnr_db(page.render_photo(photo, poses[0], looks, FOV, moved), truth), 2)
                 for key, moved in (("as_taken", False), ("by_depth", True))
             }
     return result
@@ -147,7 +147,7 @@ def main() -> int:
     size = width, height
     model = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        browser = launch_chromium(playwright)
         pages = {"page": PageRenderer(browser, *size), "page_plain": PageRenderer(browser, *size, full=False)}
         worlds = {
             Path(name).name: measure(name, size, args.keyframes, model, pages, args.strips) for name in args.worlds

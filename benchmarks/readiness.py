@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from reporting import parser_of, report
 
+from instant_ic.control.warmup import warm_up
 from instant_ic.experiments.illusion import TeleopSettings
 from instant_ic.experiments.illusion_stack import LIVE, FilmedStack, IllusionFrame
 from instant_ic.experiments.pictures import new_figure, save_figure
-from instant_ic.experiments.teleop import prepare, run_episode
+from instant_ic.experiments.teleop import run_episode
 from instant_ic.vspace import readiness
 from instant_ic.vspace.view import perspective_rays
 
@@ -103,7 +104,7 @@ def main() -> None:
     parser.add_argument("--fit", action="store_true", help="fit base and gains to these frames")
     parser.add_argument("--plot", type=Path, help="PNG of expected against measured PSNR")
     arguments = parser.parse_args()
-    prepare()
+    warm_up()
     frames = {world: samples(world, arguments.seed, arguments.episodes) for world in arguments.world.split(",")}
     result: dict[str, Any] = {}
     for world, rows in frames.items():

@@ -1,4 +1,4 @@
-"""What the benchmarks share: the command line, the JSON result and the browser's options."""
+"""What the benchmarks share: the command line and the JSON result."""
 
 from __future__ import annotations
 
@@ -7,11 +7,6 @@ import json
 import sys
 from pathlib import Path
 from typing import Any
-
-CHROMIUM_FLAGS = [
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 
 
 def parser_of(doc: str | None) -> argparse.ArgumentParser:

@@ -31,11 +31,11 @@ KEPT = (
 )  # fmt: skip
 
 
-def room_drive(scans: int, beams: int = 720) -> list[dict[str, object]]:
+def room_drive(scans: int) -> list[dict[str, object]]:
     """Circles in a 10 m × 8 m room, VLP-16-like scans: CPU milliseconds for each thousand scans."""
     warm_up()
     slam = GridSlam()
-    rng = np.random.default_rng(0)
+    rng, beams = np.random.default_rng(0), 720
     pose = np.array([0.0, -2.5, 0.0])
     angles = -math.pi + 2 * math.pi / beams * np.arange(beams)
     scan_ms, all_ms = [], []

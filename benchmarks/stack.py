@@ -26,11 +26,12 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from reporting import CHROMIUM_FLAGS, note, parser_of, report
+from reporting import note, parser_of, report
 
 from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.experiments.budget import Usage, cpu_percent, reference_loop, usage
 from instant_ic.experiments.drive import DriveRecorder
+from instant_ic.experiments.page_renderer import launch_chromium
 from instant_ic.experiments.stack import Stack, StackError, free_ports, processes_of
 from instant_ic.msg import ControlState, message_type, twist_values
 
@@ -79,11 +80,6 @@ class Watch:
 
     def _on_image(self, message: Any) -> None:
         self.images += 1
-
-    @property
-    def mode(self) -> int | None:
-        """The current mode; None before the first message."""
-        return self.modes[-1][1] if self.modes else None
 
     def since(self, began_s: float) -> list[int]:
         """The mode at a moment and each change after it."""
@@ -158,10 +154,10 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
 
     began = time.monotonic()
     recorder, watch = DriveRecorder(stack), Watch(stack)
-    stack.wait_for(lambda: watch.mode == ControlState.REAL and recorder.ready, 240, "virtual space fit to show")
+    stack.wait_for(lambda: recorder.mode == ControlState.REAL and recorder.ready, 240, "virtual space fit to show")
     result["ready_s"] = round(time.monotonic() - began, 1)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        browser = launch_chromium(playwright)
         page = browser.new_page(viewport={"width": args.width, "height": args.height})
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -182,10 +178,10 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
             while not condition():
                 page.keyboard.down("KeyW")
                 left = max(1.0, end - time.monotonic())
-                wait(stack, page, lambda: condition() or watch.mode == ControlState.STOPPED, left, what)
-                if watch.mode == ControlState.STOPPED:
+                wait(stack, page, lambda: condition() or recorder.mode == ControlState.STOPPED, left, what)
+                if recorder.mode == ControlState.STOPPED:
                     page.keyboard.up("KeyW")
-                    wait(stack, page, lambda: watch.mode != ControlState.STOPPED, 60, "end of the stop")
+                    wait(stack, page, lambda: recorder.mode != ControlState.STOPPED, 60, "end of the stop")
 
         started, images = time.monotonic(), watch.images
         paces: list[float] = []
@@ -193,7 +189,7 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
 
             def inside() -> bool:
                 paces.append(stack.pace)
-                return watch.mode == ControlState.VIRTUAL
+                return recorder.mode == ControlState.VIRTUAL
 
             hold(inside, 120, "VIRTUAL")
             before = sample(page, run_dir, watch)
@@ -211,10 +207,10 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
             hold(past, 120, "v-bot behind the box")
             page.keyboard.up("KeyW")
             result["virtual"] = between(before, sample(page, run_dir, watch))
-            wait(stack, page, lambda: watch.mode == ControlState.REAL, 180, "REAL behind the box")
+            wait(stack, page, lambda: recorder.mode == ControlState.REAL, 180, "REAL behind the box")
             page.wait_for_timeout(1500)
             shot(page, args, "back")
-            result["completed"] = is_passage(watch.since(started)) and not recorder.record.contact and not errors
+            result["completed"] = is_passage(watch.since(started)) and not recorder.contact and not errors
         finally:
             ended = time.monotonic()
             result["mode_changes"] = len(watch.since(started)) - 1
@@ -223,10 +219,9 @@ def drive(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace, resul
             result["camera_hz"] = round((watch.images - images) / (ended - started), 2)
             result["page_fps"] = result.get("virtual", {}).get("page_fps")
             result["pace"] = {"mean": round(statistics.mean(paces), 2), "min": round(min(paces), 2)} if paces else None
-            result["contact"], result["page_errors"] = recorder.record.contact, errors
-            record = recorder.record
-            result["keyframe_to_ready_s"] = [round(seconds, 2) for seconds in record.ready_seconds]
-            result["render_ms"] = round(statistics.median(record.render_ms), 1) if record.render_ms else None
+            result["contact"], result["page_errors"] = recorder.contact, errors
+            result["keyframe_to_ready_s"] = [round(seconds, 2) for seconds in recorder.ready_seconds]
+            result["render_ms"] = round(statistics.median(recorder.render_ms), 1) if recorder.render_ms else None
             browser.close()
 
 

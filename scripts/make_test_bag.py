@@ -21,6 +21,7 @@ import numpy as np
 from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bus import LATCHED, SENSOR, QoS
 from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.experiments.teleop_stack import EmulatedPort
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar.stream import PacketStream
 from instant_ic.msg import (
@@ -51,28 +52,6 @@ STANDING_S = 0.6
 """The robot stands still at first, so that the map starts at a known pose."""
 
 
-class SimulatedPort:
-    """Replaces the serial port: passes bytes straight to the emulated motor controller."""
-
-    def __init__(self, simulation: Simulation) -> None:
-        self._controller = simulation.controller
-        self._replies = b""
-
-    def write(self, data: bytes) -> int:
-        self._replies += self._controller.feed(bytes(data))
-        return len(data)
-
-    def read(self, count: int = 1) -> bytes:
-        taken, self._replies = self._replies[:count], self._replies[count:]
-        return taken
-
-    def reset_input_buffer(self) -> None:
-        self._replies = b""
-
-    def close(self) -> None:
-        """Do nothing: no port is open."""
-
-
 def twist(time_s: float, seconds: float) -> tuple[float, float]:
     """Commanded twist: drive ahead in a gentle S curve, then stop."""
     if time_s < STANDING_S or time_s > seconds - 0.6:
@@ -93,7 +72,7 @@ def make(path: Path, seconds: float, quality: int) -> None:
                 writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
 
         class Base(CrawlerBaseNode):
-            open_port = staticmethod(lambda config: SimulatedPort(simulation))
+            open_port = staticmethod(lambda config: EmulatedPort(simulation.controller))
 
         write("/tf_static", mounts(simulation), START_NS, LATCHED)
         with LockstepBus(start_ns=START_NS, keep=False, on_record=record) as bus:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import shutil
 import sys
 import time
 from pathlib import Path
@@ -20,16 +19,22 @@ from typing import Any
 
 from instant_ic.console import ConsoleServer, Look, ServerConfig
 from instant_ic.console.drive import DriveConfig
+from instant_ic.experiments.page_renderer import launch_chromium
+from instant_ic.experiments.pictures import jpeg
 from instant_ic.experiments.teleop_stack import CAMERA_HEIGHT_M, STEP_S, SimulatedStack, StackConfig, _Page
 from instant_ic.experiments.teleop_worlds import make_course
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import ControlState
 from instant_ic.vspace import State
 
-CHROMIUM_FLAGS = [
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
+WORLD, SEED = "corridor", 1
+FPS, EVERY = 10, 2
+"""Frames per simulated second; every second one is kept."""
+SIZE, OUT_WIDTH, QUALITY = (960, 600), 704, 50
+SKIP_S, SPEED, AFTER_S = 4.4, 1.5, 1.5
+"""Seconds to skip at the start, playback speed, and seconds to keep driving after the switch back."""
+SETTLE_MS = 120
+"""Real time to wait for each frame: images arrive over a real socket and are decoded."""
 CLOCK = """
 // The page uses the video's time and renders only when the video steps.
 window.filmMs = 1;
@@ -79,11 +84,9 @@ class Page(_Page):
 
     def photo(self) -> bytes:
         """Render the camera image, which the simulated stack leaves empty."""
-        import cv2
-
         x, y, yaw = self.stack._newest[False].pose
         frame = self.stack.simulation.renderer.render(pose_matrix(x, y, CAMERA_HEIGHT_M, yaw=yaw), 1280, 640)
-        return bytes(cv2.imencode(".jpg", frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+        return jpeg(frame.rgb, 90)
 
 
 class Operator:
@@ -102,29 +105,22 @@ class Operator:
     def on_look(self, look: Look) -> None:
         self.stack.nodes["console"].on_look(look)
 
-    def on_estop(self, stop: bool) -> None:
-        raise RuntimeError("the emergency stop is not used in this video")
+    def unused(self, *_: Any) -> None:
+        raise RuntimeError("only driving and looking are used in this video")
 
-    def on_record(self, on: bool) -> None:
-        raise RuntimeError("recording is not used in this video")
-
-    def on_snapshot(self) -> None:
-        raise RuntimeError("snapshots are not used in this video")
-
-    def on_bookmark(self, name: str) -> None:
-        raise RuntimeError("bookmarks are not used in this video")
+    on_estop = on_record = on_snapshot = on_bookmark = unused
 
     def export_map(self) -> dict[str, bytes]:
         return {}
 
 
-def film(args: argparse.Namespace) -> list[bytes]:
-    """PNG screenshots of the page, ``args.fps`` per second of simulated time."""
+def film() -> list[bytes]:
+    """PNG screenshots of the page, ``FPS`` per second of simulated time."""
     from playwright.sync_api import sync_playwright
 
-    course = make_course(args.world, args.seed, 0)
+    course = make_course(WORLD, SEED, 0)
     words = ("console.view.width:=480", "console.view.height:=270", "console.map_rate_hz:=2.0")
-    config = StackConfig(depth=args.depth, seed=args.seed, whole_views=True, overrides=words)
+    config = StackConfig(seed=SEED, whole_views=True, overrides=words)
     with SimulatedStack(course.world, config) as stack:
         operator = Operator(stack)
         patient = DriveConfig(watchdog_s=60.0, lease_timeout_s=600.0, max_command_age_s=60.0, beat_timeout_s=60.0)
@@ -135,30 +131,30 @@ def film(args: argparse.Namespace) -> list[bytes]:
         server.start()
         try:
             with sync_playwright() as playwright:
-                browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
-                context = browser.new_context(viewport={"width": args.width, "height": args.height})
+                browser = launch_chromium(playwright)
+                context = browser.new_context(viewport=dict(zip(("width", "height"), SIZE, strict=True)))
                 context.add_init_script(CLOCK)
                 page = context.new_page()
                 page.goto(f"{server.url}?quality=full")
-                frames = drive(stack, page, page_in, operator, args)
+                frames = drive(stack, page, page_in, operator)
                 browser.close()
         finally:
             server.stop()
     return frames
 
 
-def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator, args: argparse.Namespace) -> list[bytes]:
+def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator) -> list[bytes]:
     """Wait until the virtual space is ready, hold W through the obstacle, release it behind the obstacle."""
     frames: list[bytes] = []
-    steps = round(1.0 / args.fps / STEP_S)
+    steps = round(1.0 / FPS / STEP_S)
     ready_s = pressed_s = back_s = None
     was_virtual = False
     while True:
         for _ in range(steps):
             stack.step(lambda: operator.command)
-        page.wait_for_timeout(args.settle_ms)  # images arrive over a real socket and are decoded
+        page.wait_for_timeout(SETTLE_MS)
         for part in (0.5, 1.0):
-            page.evaluate("(ms) => film(ms)", 1e3 * (stack.time_s - (1 - part) / args.fps))
+            page.evaluate("(ms) => film(ms)", 1e3 * (stack.time_s - (1 - part) / FPS))
         now, state = stack.time_s, stack.state
         if now > LONGEST_S:
             raise RuntimeError(f"the drive has not finished after {LONGEST_S:g} s: {state and state.reason}")
@@ -175,9 +171,9 @@ def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator, args
         was_virtual |= told.virtual
         if was_virtual and not told.virtual and back_s is None:
             back_s = now
-        if back_s is not None and now > back_s + args.after_s:
+        if back_s is not None and now > back_s + AFTER_S:
             page.keyboard.up("w")
-        if back_s is not None and now > back_s + args.after_s + 0.8:
+        if back_s is not None and now > back_s + AFTER_S + 0.8:
             print(file=sys.stderr)
             return frames
 
@@ -186,52 +182,28 @@ def vspace_ready(stack: SimulatedStack) -> bool:
     return stack.nodes["nerf"].schedule.state == State.READY
 
 
-def write(frames: list[bytes], args: argparse.Namespace) -> None:
+def write(frames: list[bytes], out: Path) -> None:
     """Write an animated WebP, which GitHub shows in a README."""
     from PIL import Image
 
-    kept = frames[round(args.skip_s * args.fps) :: args.every]
-    pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in kept]
-    if args.frames:
-        args.frames.mkdir(parents=True, exist_ok=True)
-        for number, frame in enumerate(frames):
-            (args.frames / f"{number:04d}.png").write_bytes(frame)
-    small = [picture.resize((args.out_width, round(args.out_width * picture.height / picture.width)), Image.LANCZOS)
-             for picture in pictures]  # fmt: skip
+    size = OUT_WIDTH, round(OUT_WIDTH * SIZE[1] / SIZE[0])
+    kept = frames[round(SKIP_S * FPS) :: EVERY]
+    small = [Image.open(io.BytesIO(frame)).convert("RGB").resize(size, Image.LANCZOS) for frame in kept]
     small[0].save(
-        args.out, save_all=True, append_images=small[1:], duration=round(1000 * args.every / args.fps / args.speed),
-        loop=0, quality=args.quality, method=2,
+        out, save_all=True, append_images=small[1:], duration=round(1000 * EVERY / FPS / SPEED), loop=0,
+        quality=QUALITY, method=2,
     )  # fmt: skip
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="animated WebP to write")
-    parser.add_argument("--world", default="corridor", help="as for `ic evaluate teleop` (default corridor)")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--depth", default="fused", choices=("fused", "lidar"))
-    parser.add_argument("--fps", type=int, default=10, help="frames per second; must divide 60 (default 10)")
-    parser.add_argument("--width", type=int, default=960)
-    parser.add_argument("--height", type=int, default=600)
-    parser.add_argument("--out-width", type=int, default=704)
-    parser.add_argument("--quality", type=int, default=50)
-    parser.add_argument("--every", type=int, default=2, help="keep every Nth frame (default 2)")
-    parser.add_argument("--skip-s", type=float, default=4.4, help="seconds to skip at the start (default 4.4)")
-    parser.add_argument("--speed", type=float, default=1.5, help="playback speed (default 1.5)")
-    parser.add_argument(
-        "--after-s", type=float, default=1.5, help="seconds to keep driving after the switch back (default 1.5)"
-    )
-    parser.add_argument("--settle-ms", type=int, default=120, help="real time to wait for each frame (default 120)")
-    parser.add_argument("--frames", type=Path, metavar="DIR", help="also write all frames to this folder")
-    args = parser.parse_args()
-    if round(1 / STEP_S) % args.fps:
-        parser.error(f"--fps must divide {round(1 / STEP_S)}")
+    out = parser.parse_args().out
     began = time.monotonic()
-    frames = film(args)
-    write(frames, args)
-    megabytes = args.out.stat().st_size / 1e6
-    seconds = (len(frames) / args.fps - args.skip_s) / args.speed
-    print(f"{args.out}: {seconds:.1f} s, {megabytes:.2f} MB, made in {time.monotonic() - began:.0f} s")
+    frames = film()
+    write(frames, out)
+    seconds = (len(frames) / FPS - SKIP_S) / SPEED
+    print(f"{out}: {seconds:.1f} s, {out.stat().st_size / 1e6:.2f} MB, made in {time.monotonic() - began:.0f} s")
     return 0
 
 

@@ -191,22 +191,23 @@ def _trainer(args: argparse.Namespace, network: CompletionConfig, team: Team, re
 
 def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, report: Any) -> tuple[Feed, Samples]:
     """Training batches and evaluation panoramas selected on the command line."""
-    from instant_ic.training.dataset import Selection
+    from torch.utils.data import ConcatDataset, Dataset, Subset
+
     from instant_ic.training.feeds import FileFeed, MixedFeed
     from instant_ic.training.folders import open_folder
 
     folders = [open_folder(name, (network.height, network.width)) for name in args.data]
     if args.batch_size < len(folders):
         raise ValueError(f"a batch of {args.batch_size} is too small for {len(folders)} folders: increase --batch-size")
-    feeds: list[Feed] = []
-    held_out: list[tuple[Samples, Any]] = []
+    feeds: list[FileFeed] = []
+    held_out: list[Dataset[Any]] = []
     for number, folder in enumerate(folders):
         part = (args.batch_size + number) // len(folders)
         training, kept = folder.split()
         report(f"{folder.folder}: {len(training)} panoramas for training, {len(kept)} for evaluation")
         feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers))
-        held_out.append((folder, kept))
-    return feeds[0] if len(feeds) == 1 else MixedFeed(feeds), Selection(*held_out)
+        held_out.append(Subset(folder, kept.tolist()))  # type: ignore[arg-type]
+    return feeds[0] if len(feeds) == 1 else MixedFeed(feeds), ConcatDataset(held_out)
 
 
 def add_render_parser(commands: Any) -> None:

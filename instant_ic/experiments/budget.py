@@ -56,13 +56,7 @@ def reference_loop() -> Iterator[ReferenceLoop]:
 
 @dataclass(frozen=True)
 class Usage:
-    """CPU seconds and resident memory of each process of a stack, at one moment of the machine's steady clock.
-
-    Attributes:
-        monotonic_s: the moment.
-        cpu_s: CPU seconds since the start, user and system, by node name.
-        rss_mb: resident memory in megabytes, by node name.
-    """
+    """CPU seconds since the start and resident memory by node name, at one moment of the machine's steady clock."""
 
     monotonic_s: float
     cpu_s: dict[str, float]
@@ -90,11 +84,9 @@ def usage(run_dir: Path) -> Usage:
 
 
 def cpu_percent(before: Usage, after: Usage, stack_s: float) -> dict[str, float]:
-    """CPU of each process between two samples, in percent of one core of a machine that runs at the stack's pace.
+    """CPU of each process between two samples, ``stack_s`` of the stack's time apart, in percent of one core.
 
-    Args:
-        before, after: the samples.
-        stack_s: seconds of the stack's time between them.
+    The core is of a machine that runs at the stack's pace.
     """
     return {
         name: round(100.0 * (seconds - before.cpu_s.get(name, 0.0)) / stack_s, 1)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,30 +18,12 @@ from instant_ic.experiments.depth_lidar import Errors, measure
 from instant_ic.geometry.projections import equirect_directions, sample_equirect
 
 if TYPE_CHECKING:
-    from instant_ic.depth.manifest import ModelManifest
+    from instant_ic.depth.model import DepthModel
 
 Floats = NDArray[np.floating]
 _EDGE = 0.2
 """Relative difference of neighbours above which interpolated depth would lie between two surfaces."""
 _UP = np.array([0.0, 0.0, 1.0])
-
-
-class Model(Protocol):
-    """A depth model: ``depth.model.DepthModel`` or a replacement."""
-
-    manifest: ModelManifest
-
-    @property
-    def provider(self) -> str:
-        """Name of the execution provider."""
-
-    def estimate(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Depth (h, w) in the model's unit of a panorama (H, W, 3), 0 = unknown."""
-
-    def complete(
-        self, rgb: NDArray[np.uint8], prior: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Depth in metres and relative sigma, (h, w) each, of a panorama and a prior (5, h, w)."""
 
 
 class DepthEvaluationError(ValueError):
@@ -163,7 +145,7 @@ class Evaluator:
         DepthEvaluationError: the settings need a model, or a different one.
     """
 
-    def __init__(self, settings: DepthSettings, model: Model | None, completion: Model | None = None) -> None:
+    def __init__(self, settings: DepthSettings, model: DepthModel | None, completion: DepthModel | None = None) -> None:
         self.settings, self.completion = settings, completion
         self.model = model if settings.source != "lidar" else None
         if self.model is None and settings.source != "lidar":
@@ -273,14 +255,8 @@ def _within_sigma(depth: Floats, sigma: Floats, truth: Floats) -> tuple[float, f
     return float((ratio <= 1).mean()), float((ratio <= 2).mean()), float((ratio <= 3).mean())
 
 
-def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: Model | None) -> dict[str, Any]:
-    """Report as plain values: ``mean`` (after scaling), means of ``before`` and ``after``, then each image.
-
-    Args:
-        scored: ``Scored.as_dict`` of each panorama.
-        settings: settings of the scores.
-        model: the model used, if any.
-    """
+def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: DepthModel | None) -> dict[str, Any]:
+    """``Scored.as_dict`` of panoramas with their means: ``mean`` (after scaling), ``before`` and ``after``."""
     means = {key: _mean([row[key] for row in scored if row.get(key)]) for key in _KEYS.values()}
     mean: dict[str, Any] = dict(means["after"] or {})
     for key in ("seconds", "seconds_model", "seconds_source"):

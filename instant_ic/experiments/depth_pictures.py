@@ -29,12 +29,7 @@ Cloud = tuple[NDArray[np.float32], Picture]
 
 
 class Sheets:
-    """Pages of ``ROWS`` panoramas: OUT.png, then OUT-2.png and so on. ``close`` writes the last one.
-
-    Args:
-        path: of the first page.
-        side: show point clouds instead of depth images.
-    """
+    """Pages of ``ROWS`` panoramas, or with ``side`` of point clouds: OUT.png, OUT-2.png; ``close`` writes the last."""
 
     def __init__(self, path: Path, side: bool = False) -> None:
         self.path = path

@@ -29,15 +29,9 @@ _MESH_POSITIONS = {
 
 @dataclass(frozen=True)
 class Scene:
-    """One panorama of a held-out world.
+    """One panorama of a held-out world: level pose (4, 4), (H, W, 3) and ground-truth radial depth (H, W).
 
-    Attributes:
-        name: kind, world and place.
-        renderer: of the world, also for ray casting.
-        map_from_camera: (4, 4), level.
-        rgb: (H, W, 3) uint8.
-        depth_m: (H, W) float32 ground-truth radial depth; 0 where the ray hits nothing.
-        camera_height_m: above the floor.
+    The depth is 0 where the ray hits nothing. ``renderer`` is that of the world, ``name``: kind, world and place.
     """
 
     name: str

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,67 +15,72 @@ from instant_ic.console.client import ConsoleClient
 from instant_ic.experiments.stack import Stack, StackError
 from instant_ic.msg import message_type, pose2_from_message
 
-
-@dataclass
-class DriveRecord:
-    """Messages recorded during a drive."""
-
-    modes: list[int] = field(default_factory=list)
-    """Every change of mode, including the first mode (ControlState.REAL, ...)."""
-    reasons: list[str] = field(default_factory=list)
-    truth: list[NDArray[np.float64]] = field(default_factory=list)
-    """Ground-truth poses of the r-bot, (x, y, yaw) in the world."""
-    vbot: list[NDArray[np.float64]] = field(default_factory=list)
-    """Poses of the v-bot in the map while it was active."""
-    contact: bool = False
-    ready_seconds: list[float] = field(default_factory=list)
-    """For each keyframe: seconds from its arrival until the virtual space was ready to be shown."""
-    render_ms: list[float] = field(default_factory=list)
+SPEED_M_S = 0.35
 
 
 class DriveRecorder:
-    """Fills a :class:`DriveRecord` from the bus."""
+    """Records a drive from the bus.
+
+    Attributes:
+        modes: every change of mode, including the first mode (ControlState.REAL, ...), with its reason in ``reasons``.
+        truth: ground-truth poses of the r-bot, (x, y, yaw) in the world.
+        vbot: poses of the v-bot in the map while it was active.
+        contact: whether the r-bot touched something.
+        ready_seconds: for each keyframe: seconds from its arrival until the virtual space was ready to be shown.
+        render_ms: of each view.
+    """
 
     def __init__(self, stack: Stack) -> None:
-        self.record = DriveRecord()
-        self.mode: int | None = None
+        self.modes: list[int] = []
+        self.reasons: list[str] = []
+        self.truth: list[NDArray[np.float64]] = []
+        self.vbot: list[NDArray[np.float64]] = []
+        self.contact = False
+        self.ready_seconds: list[float] = []
+        self.render_ms: list[float] = []
         self.vspace: Any = None
         self.vbot_pose: NDArray[np.float64] | None = None
         self._virtual = message_type("ControlState").VIRTUAL
         self._ready_keyframe = -1
         observer = stack.observer
         observer.subscribe("/ic/state", message_type("ControlState"), self._on_state, LATCHED)
-        observer.subscribe("/ground_truth/odom", message_type("Odometry"), self._on_truth)
+        observer.subscribe(
+            "/ground_truth/odom",
+            message_type("Odometry"),
+            lambda message: self.truth.append(pose2_from_message(message)),
+        )
         observer.subscribe("/ground_truth/contact", message_type("Bool"), self._on_contact, LATCHED)
         observer.subscribe("/vbot/odom", message_type("Odometry"), self._on_vbot)
         observer.subscribe("/vspace/status", message_type("VspaceStatus"), self._on_vspace, LATCHED)
-        observer.subscribe("/vspace/view", message_type("RenderedView"), self._on_view)
+        observer.subscribe(
+            "/vspace/view",
+            message_type("RenderedView"),
+            lambda message: self.render_ms.append(float(message.render_ms)),
+        )
+
+    @property
+    def mode(self) -> int | None:
+        """The current mode; None before the first message."""
+        return self.modes[-1] if self.modes else None
 
     def _on_state(self, message: Any) -> None:
         if message.mode != self.mode:
-            self.mode = message.mode
-            self.record.modes.append(message.mode)
-            self.record.reasons.append(message.reason)
-
-    def _on_truth(self, message: Any) -> None:
-        self.record.truth.append(pose2_from_message(message))
+            self.modes.append(message.mode)
+            self.reasons.append(message.reason)
 
     def _on_contact(self, message: Any) -> None:
-        self.record.contact |= bool(message.data)
+        self.contact |= bool(message.data)
 
     def _on_vbot(self, message: Any) -> None:
         self.vbot_pose = pose2_from_message(message)
         if self.mode == self._virtual:
-            self.record.vbot.append(self.vbot_pose)
+            self.vbot.append(self.vbot_pose)
 
     def _on_vspace(self, message: Any) -> None:
         self.vspace = message
         if message.state == message.READY and message.keyframe_id != self._ready_keyframe:
             self._ready_keyframe = message.keyframe_id
-            self.record.ready_seconds.append(float(message.ready_seconds))
-
-    def _on_view(self, message: Any) -> None:
-        self.record.render_ms.append(float(message.render_ms))
+            self.ready_seconds.append(float(message.ready_seconds))
 
     @property
     def ready(self) -> bool:
@@ -122,9 +126,7 @@ async def pump(stack: Stack) -> AsyncIterator[Callable[[Callable[[], Any], float
             await task
 
 
-async def drive_through_obstacle(
-    stack: Stack, recorder: DriveRecorder, console_url: str, beyond_x_m: float, speed_mps: float = 0.35
-) -> None:
+async def drive_through_obstacle(stack: Stack, recorder: DriveRecorder, console_url: str, beyond_x_m: float) -> None:
     """Drive straight ahead until the v-bot is past the obstacle, stop there, and wait for the r-bot.
 
     If late sensor data stops the robot on the way, the operator releases the controls and continues, as a person would.
@@ -134,7 +136,6 @@ async def drive_through_obstacle(
         recorder: of the same stack.
         console_url: the page's address; the drive uses its WebSocket.
         beyond_x_m: map x to which the v-bot is driven.
-        speed_mps: forward speed.
 
     Raises:
         StackError: a condition was not met in time.
@@ -147,7 +148,7 @@ async def drive_through_obstacle(
             async def drive_until(condition: Callable[[], Any], timeout_s: float, what: str) -> None:
                 deadline = asyncio.get_running_loop().time() + timeout_s / stack.pace
                 while True:
-                    console.drive(speed_mps, 0.0)
+                    console.drive(SPEED_M_S, 0.0)
                     left = (deadline - asyncio.get_running_loop().time()) * stack.pace
                     await until(lambda: condition() or recorder.mode == control.STOPPED, max(left, 0.0), what)
                     if condition():
@@ -165,7 +166,7 @@ async def drive_through_obstacle(
             )
             await console.stop()
             await until(lambda: recorder.mode == control.REAL, 120, "passage back to the real robot")
-            console.drive(speed_mps, 0.0)
+            console.drive(SPEED_M_S, 0.0)
             await asyncio.sleep(1.5 / stack.pace)
             await console.stop()
             await asyncio.sleep(1.0 / stack.pace)

@@ -38,6 +38,7 @@ from instant_ic.control.walls import WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import follow_worlds as worlds
 from instant_ic.experiments.processes import run_all
+from instant_ic.experiments.results import finite
 from instant_ic.geometry.poses import matrix_from_pose2, relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 
@@ -114,7 +115,7 @@ class _Drive:
         self.mask = worlds.filled(self.room.shapes, self.room.size, 0.01, worlds.IN_THE_WAY_M)
         coarse = worlds.filled(self.room.shapes, self.room.size, 0.025, worlds.IN_THE_WAY_M)
         goal = np.array([*self.room.goal, 0.0])
-        self.optimum = worlds.shortest_way(coarse, self.room.start, goal, 0.05, SPARE_M)
+        self.optimum = worlds.shortest_way(coarse, self.room.start, goal, SPARE_M)
         self.people = worlds.add_people(self.room, self.rng, int(self.rng.integers(1, 4))) if index % 5 == 0 else []
         self.episode = Episode(index, len(self.people), self.optimum is not None)
         if self.optimum is not None:
@@ -403,9 +404,9 @@ def report(episodes: list[Episode], seed: int) -> dict[str, Any]:
         row = {key: value for key, value in asdict(episode).items() if key not in left_out}
         row["path_ratio"] = episode.ratio if episode.reached and episode.reachable else None
         row["planner_ms_max"] = max(episode.planner_ms, default=None)
-        rows.append({k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()})
-    figures = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in summary(episodes).items()}
-    return {"seed": seed, **figures, "each": rows}
+        rows.append(row)
+    figures: dict[str, Any] = finite({"seed": seed, **summary(episodes), "each": rows})
+    return figures
 
 
 def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None:
@@ -429,20 +430,12 @@ def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None
         drive = _Drive(seed, episode.index)
         for shape, kind in zip(drive.room.shapes, drive.room.kinds, strict=True):
             cx, cy, half_x, half_y, yaw = shape[:5]
-            corner = (cx - half_x, cy - half_y)
-            axes.add_patch(
-                Rectangle(
-                    corner,
-                    2 * half_x,
-                    2 * half_y,
-                    angle=math.degrees(yaw),
-                    rotation_point="center",
-                    color=colours[int(kind)],
-                    lw=0,
-                )
-            )
+            corner, size = (cx - half_x, cy - half_y), (2 * half_x, 2 * half_y)
+            box = Rectangle(corner, *size, angle=math.degrees(yaw), rotation_point="center", lw=0)
+            box.set_color(colours[int(kind)])
+            axes.add_patch(box)
         if drive.optimum is not None:
-            axes.plot(drive.optimum[:, 0], drive.optimum[:, 1], "k--", lw=0.8)
+            axes.plot(*drive.optimum[:, :2].T, "k--", lw=0.8)
         for name, track in episode.tracks.items():
             line = np.array(track)
             if len(line) == 0:
@@ -453,19 +446,15 @@ def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None
                 axes.add_patch(Circle(tuple(line[-1, :2]), worlds.PERSON_M, color="tab:green", alpha=0.5))
         end = np.array(episode.tracks["robot"][-1])
         for pose, colour in ((drive.room.start, "tab:orange"), (end, "tab:red")):
-            corners = Footprint().corners() @ np.array(
-                [[math.cos(pose[2]), math.sin(pose[2])], [-math.sin(pose[2]), math.cos(pose[2])]]
-            )
-            closed = np.concatenate([corners, corners[:1]]) + pose[:2]
-            axes.plot(closed[:, 0], closed[:, 1], color=colour, lw=1.0)
+            corners = Footprint().corners() @ matrix_from_pose2(pose)[:2, :2].T + pose[:2]
+            axes.plot(*np.concatenate([corners, corners[:1]]).T, color=colour, lw=1.0)
         axes.plot(*drive.room.goal, "k*", ms=8)
         verdict = "reached" if episode.reached else ("not reached" if episode.reachable else "unreachable")
         ratio = f", {episode.ratio:.2f} × optimum" if episode.reachable and episode.reached else ""
         touched = f", {episode.contacts + episode.people_contacts} contacts"
         axes.set_title(f"{episode.index}: {verdict}{ratio}{touched}, {episode.seconds:.0f} s", fontsize=8)
-        axes.set_aspect("equal")
-        axes.set_xlim(-0.3, float(drive.room.size[0]) + 0.3)
-        axes.set_ylim(-0.3, float(drive.room.size[1]) + 0.3)
+        width, height = drive.room.size
+        axes.set(aspect="equal", xlim=(-0.3, width + 0.3), ylim=(-0.3, height + 0.3))
         axes.tick_params(labelsize=6)
     figure.suptitle(
         "red: robot, blue: v-bot, dashed: shortest way; olive: low things, purple: hanging, green: people", fontsize=9

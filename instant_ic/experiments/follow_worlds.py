@@ -129,7 +129,7 @@ def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> R
         every, kept = every[clear], np.array(kinds)[clear]
         if min(_away(s, p) for s in walls for p in (start[:2], goal)) < 0.6:
             continue
-        route = shortest_way(plan, start, np.array([*goal, 0.0]), 0.05, 0.12)
+        route = shortest_way(plan, start, np.array([*goal, 0.0]), 0.12)
         if route is None or _length(route) < 5.0:
             continue
         return Room(size, every, kept, start, goal, route[:, :2])
@@ -334,9 +334,7 @@ _STEPS = np.array(
 """Cells (dx, dy) of one step along each of 16 headings."""
 
 
-def shortest_way(
-    mask: OccupancyMask, start: FloatArray, goal: FloatArray, cell_m: float, margin_m: float
-) -> FloatArray | None:
+def shortest_way(mask: OccupancyMask, start: FloatArray, goal: FloatArray, margin_m: float) -> FloatArray | None:
     """Shortest path (N, 3) of the true footprint with ``margin_m`` on every side; None if there is none.
 
     Search over 5 cm cells and 16 headings, with steps along the heading in both directions and turns on the spot at
@@ -345,7 +343,7 @@ def shortest_way(
     import cv2
 
     fine = mask.cell_m
-    every = max(1, round(cell_m / fine))
+    every = max(1, round(0.05 / fine))
     middle = (slice(every // 2, None, every), slice(every // 2, None, every))
     free = np.empty((16, *mask.cells[middle].shape), dtype=bool)
     for h in range(8):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.control.warmup import warm_up
 from instant_ic.experiments.illusion_stack import (
     FRAME_S,
     LIVE,
@@ -25,7 +26,7 @@ from instant_ic.experiments.illusion_stack import (
 )
 from instant_ic.experiments.processes import run_all
 from instant_ic.experiments.results import finite
-from instant_ic.experiments.teleop import prepare, run_episode
+from instant_ic.experiments.teleop import run_episode
 from instant_ic.experiments.teleop_settings import TeleopSettings
 
 STEP_M = 0.5
@@ -40,13 +41,9 @@ Still = dict[str, NDArray[np.uint8]]
 
 @dataclass
 class Film:
-    """The frames of one episode.
+    """The frames of one episode in the order of time, and whether the drive reached its goal.
 
-    Attributes:
-        index: number of the episode.
-        completed: whether the drive reached its goal.
-        frames: in the order of time.
-        stills: of the frame nearest to each multiple of ``STEP_M``, by that distance, metres.
+    ``stills`` are of the frame nearest to each multiple of ``STEP_M``, by that distance in metres.
     """
 
     index: int
@@ -94,7 +91,7 @@ def evaluate(
         RuntimeError: a process died, or a stack did not become ready.
     """
     tasks = [(settings, index) for index in range(settings.episodes)]
-    films = run_all(film_episode, tasks, jobs, prepare, on_film, timeout_s)
+    films = run_all(film_episode, tasks, jobs, warm_up, on_film, timeout_s)
     return sorted(films, key=lambda film: film.index)
 
 
@@ -179,6 +176,3 @@ def readiness(frames: Sequence[IllusionFrame]) -> dict[str, Any]:
 
 def _row(distance_m: float) -> float:
     return STEP_M * round(distance_m / STEP_M) + 0.0  # no −0
-
-
-__all__ = ["Film", "TeleopSettings", "evaluate", "film_episode", "report"]

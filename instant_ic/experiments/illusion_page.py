@@ -29,13 +29,7 @@ NIGHT = np.array([0.035, 0.043, 0.055], np.float32)
 
 @dataclass(frozen=True)
 class PageView:
-    """A rendered view as the page holds it.
-
-    Attributes:
-        rgb: (h, w, 3) float32 in 0..1.
-        map_from_camera: (4, 4) for which it was rendered.
-        fov_rad: horizontal field of view.
-    """
+    """A rendered view (h, w, 3) in 0..1 as the page holds it, with the pose (4, 4) for which it was rendered."""
 
     rgb: Floats
     map_from_camera: NDArray[np.float64]
@@ -63,10 +57,7 @@ class Screen:
 def place_on_screen(view: PageView, screen: Screen, map_from_look: NDArray[np.float64]) -> tuple[Floats, Floats]:
     """The view on the screen, (H, W, 3) in 0..1, and how far each pixel lies inside it, (H, W): 1 inside, 0 beyond.
 
-    Args:
-        view: as the page holds it.
-        screen: the page's window.
-        map_from_look: rotation (3, 3) of the shown line of sight.
+    ``map_from_look`` is the rotation (3, 3) of the shown line of sight.
     """
     map_from_view = view.map_from_camera[:3, :3]
     rotation = (map_from_view.T @ map_from_look).astype(np.float32)

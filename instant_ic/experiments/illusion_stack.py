@@ -88,11 +88,7 @@ class _Taken:
 class FilmedStack(SimulatedStack):
     """Compares what the page shows of the virtual space with the truth, every ``FRAME_S``.
 
-    Args:
-        world, config: as ``SimulatedStack``.
-        course: of the drive.
-        episode: its number.
-        on_frame: called with each frame, its images by source, and the true image.
+    ``on_frame`` is called with each frame, its images by source, and the true image.
     """
 
     def __init__(

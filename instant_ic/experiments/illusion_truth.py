@@ -44,12 +44,9 @@ def corners(obstacle: Obstacle) -> FloatArray:
 
 @dataclass(frozen=True)
 class Passage:
-    """The v-bot's way through obstacles: the line from its pose when it takes over.
+    """The v-bot's way through obstacles: the line from its position (2,) when it takes over along a unit vector (2,).
 
-    Attributes:
-        start: (2,) position, metres.
-        heading: (2,) unit vector.
-        obstacles: those in the way, nearest first, each with the position of its near face along the line, metres.
+    ``obstacles`` are those in the way, nearest first, each with the position of its near face along the line, metres.
     """
 
     start: FloatArray

@@ -25,19 +25,19 @@ class Impairment:
         delay_s: one way.
         jitter_s: added to the delay, uniform in ±; the order of bytes is kept.
         rate_bytes_s: 0 is unlimited.
-        stall_share: share of segments delayed by ``stall_s``, like a segment whose packet was lost.
-        stall_s: duration of a retransmission.
-        queue_bytes: router queue; when it is full the sender is blocked.
+        stall_share: share of segments delayed by ``STALL_S``, like a segment whose packet was lost.
     """
 
     delay_s: float = 0.0
     jitter_s: float = 0.0
     rate_bytes_s: float = 0.0
     stall_share: float = 0.0
-    stall_s: float = 0.2
-    queue_bytes: int = 256 * 1024
 
 
+STALL_S = 0.2
+"""Duration of a retransmission."""
+_QUEUE_BYTES = 256 * 1024
+"""Router queue; when it is full the sender is blocked."""
 _SEGMENT = 4096
 
 
@@ -53,27 +53,13 @@ class _Way:
 
 
 class ImpairedLink:
-    """Context manager that listens on its own port and forwards to ``target``.
+    """Context manager that listens on a port of 127.0.0.1 (0: a free one) and forwards to ``target`` (host, port)."""
 
-    Args:
-        target: host and port.
-        impairment: of both directions; may be replaced while the link runs.
-        host, port: address to listen on; port 0 takes a free one.
-        seed: of jitter and stalls.
-    """
-
-    def __init__(
-        self,
-        target: tuple[str, int],
-        impairment: Impairment | None = None,
-        host: str = "127.0.0.1",
-        seed: int = 1,
-        port: int = 0,
-    ) -> None:
+    def __init__(self, target: tuple[str, int], impairment: Impairment | None = None, port: int = 0) -> None:
         self.target = target
         self.impairment = impairment or Impairment()
-        self._random = random.Random(seed)
-        self._listener = socket.create_server((host, port))
+        self._random = random.Random(1)
+        self._listener = socket.create_server(("127.0.0.1", port))
         self.port: int = self._listener.getsockname()[1]
         self._ways: list[_Way] = []
         self._lock = threading.Lock()
@@ -95,11 +81,6 @@ class ImpairedLink:
         self._thread.join(5)
         self._listener.close()
         self._drop_all()
-
-    @property
-    def connections(self) -> int:
-        """Number of open connections."""
-        return len(self._ways) // 2
 
     def stall(self, seconds: float) -> None:
         """Stop forwarding for a while; no byte is lost."""
@@ -142,7 +123,7 @@ class ImpairedLink:
         while not self._stop.is_set():
             with self._lock:
                 ways = list(self._ways)
-            wanted = {way.source: way for way in ways if way.queued < self.impairment.queue_bytes and not way.ended}
+            wanted = {way.source: way for way in ways if way.queued < _QUEUE_BYTES and not way.ended}
             for key in list(selector.get_map().values()):
                 if key.fileobj is not self._listener and key.fileobj not in wanted:
                     selector.unregister(key.fileobj)
@@ -178,7 +159,7 @@ class ImpairedLink:
         way.free_s = begin + (len(data) / bad.rate_bytes_s if bad.rate_bytes_s else 0.0)
         due = way.free_s + bad.delay_s + self._random.uniform(-bad.jitter_s, bad.jitter_s)
         if self._random.random() < bad.stall_share:
-            due += bad.stall_s
+            due += STALL_S
         way.last_s = max(way.last_s, due)
         way.queue.append((way.last_s, data))
         way.queued += len(data)

@@ -25,15 +25,8 @@ from instant_ic.experiments.processes import LostError, run_all
 from instant_ic.experiments.results import finite, save_json
 from instant_ic.paths import share_dir
 
-EXPERIMENTS = {
-    "reconstruction": "reconstruction",
-    "training-time": "training_time",
-    "ablation": "ablation",
-    "teleoperation": "teleoperation",
-    "operators": "operators",
-    "environments": "environments",
-}
-"""Name of each experiment → its module in this package."""
+EXPERIMENTS = ("reconstruction", "training-time", "ablation", "teleoperation", "operators", "environments")
+"""Each is a module of this package."""
 WORLD = "corridor"
 """Default world."""
 UNIT_TIMEOUT_S = 1800.0
@@ -64,12 +57,6 @@ class Options:
     size: tuple[int, int] | None = None
     meshes: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        if self.seeds < 1:
-            raise ValueError(f"seeds must be at least 1 (got {self.seeds})")
-        if self.method not in ("ours", "paper"):
-            raise ValueError(f"method must be ours or paper (got {self.method!r})")
-
     @property
     def view_size(self) -> tuple[int, int]:
         return self.size or ((96, 54) if self.quick else (320, 180))
@@ -99,7 +86,6 @@ class Unit:
     """One unit of work.
 
     Attributes:
-        experiment: its name.
         arguments: all that the result depends on beside the program, as JSON has it.
         cost_s: expected CPU seconds, for the progress.
     """
@@ -143,14 +129,7 @@ def _state_of(place: str) -> list[Any]:
 
 @dataclass(frozen=True)
 class Result:
-    """What a unit measured.
-
-    Attributes:
-        unit: of the measurement.
-        data: as ``measure`` returned it; empty where it failed.
-        wall_s, cpu_s: time it took.
-        error: why it failed; empty where it did not.
-    """
+    """What ``measure`` returned for a unit and the time it took; empty ``data`` and an ``error`` where it failed."""
 
     unit: Unit
     data: dict[str, Any]
@@ -161,7 +140,7 @@ class Result:
 
 def module(experiment: str) -> Any:
     """Module of an experiment, by its name."""
-    return importlib.import_module(f"instant_ic.experiments.{EXPERIMENTS[experiment]}")
+    return importlib.import_module(f"instant_ic.experiments.{experiment.replace('-', '_')}")
 
 
 def kept(units: Sequence[Unit], folder: Path) -> list[Result]:

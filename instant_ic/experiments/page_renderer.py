@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,10 @@ from instant_ic import console
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
 
+CHROMIUM_FLAGS = [
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
 _STATIC = Path(console.__file__).parent / "static"
 _ORIGIN = "http://page.invalid/"
 _TIMEOUT_MS = 60_000
@@ -49,13 +54,15 @@ _SETUP = """async ([width, height, full]) => {
 }"""
 
 
-class PageRenderer:
-    """A page that shows the layers given to :meth:`load`.
+def launch_chromium(playwright: Any) -> Any:
+    """The machine's Chromium, which renders WebGL on the CPU."""
+    return playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
 
-    Args:
-        browser: Chromium, started by Playwright.
-        width, height: of the canvas, pixels.
-        full: as with a GPU; else with the plain look-ups that the page uses where the CPU renders.
+
+class PageRenderer:
+    """A page in Chromium that shows the layers given to :meth:`load`.
+
+    ``full``: as with a GPU; else with the plain look-ups that the page uses where the CPU renders.
     """
 
     def __init__(self, browser: Any, width: int, height: int, full: bool = True) -> None:
@@ -85,13 +92,10 @@ class PageRenderer:
         fov_rad: float,
         moved: bool,
     ) -> NDArray[np.uint8]:
-        """Return the camera's image as the page shows it in REAL, (height, width, 3).
+        """Return the camera's image (JPEG) as the page shows it in REAL, (height, width, 3).
 
         Args:
-            jpeg: equirectangular image.
-            taken: map_from_camera of that.
-            map_from_camera: pose from which it is shown.
-            fov_rad: horizontal field of view.
+            taken, map_from_camera: map_from_camera of the image, and of the pose from which it is shown.
             moved: by the depth of the layers; else as it was taken.
         """
         self._photo = jpeg

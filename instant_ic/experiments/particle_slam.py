@@ -8,13 +8,13 @@ become too unequal (Grisetti, Stachniss, Burgard, 2007). Between two updates the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, Share, check_ranges
 from instant_ic.experiments.tile_maps import TileMaps, climb
 from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
@@ -53,29 +53,26 @@ class ParticleConfig:
         seed: seed of all random numbers.
     """
 
-    particles: PositiveInt = 30
-    linearUpdate: Positive = 1.0
-    angularUpdate: Positive = 0.5
-    resampleThreshold: Share = 0.5
-    maxUrange: Positive = 20.0
-    sigma: Positive = 0.05
-    kernelSize: NotNegativeInt = 1
-    lstep: Positive = 0.05
-    astep: Positive = 0.05
-    iterations: NotNegativeInt = 5
-    lsigma: Positive = 0.075
-    ogain: Positive = 3.0
-    lskip: NotNegativeInt = 0
-    minimumScore: NotNegative = 0.0
-    srr: NotNegative = 0.1
-    srt: NotNegative = 0.2
-    str: NotNegative = 0.1
-    stt: NotNegative = 0.2
-    delta: Positive = 0.05
-    seed: NotNegativeInt = 0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
+    particles: int = 30
+    linearUpdate: float = 1.0
+    angularUpdate: float = 0.5
+    resampleThreshold: float = 0.5
+    maxUrange: float = 20.0
+    sigma: float = 0.05
+    kernelSize: int = 1
+    lstep: float = 0.05
+    astep: float = 0.05
+    iterations: int = 5
+    lsigma: float = 0.075
+    ogain: float = 3.0
+    lskip: int = 0
+    minimumScore: float = 0.0
+    srr: float = 0.1
+    srt: float = 0.2
+    str: float = 0.1
+    stt: float = 0.2
+    delta: float = 0.05
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ class _PathAnchor:
 
 
 class ParticleSlam:
-    """Particle filter with the interface of `instant_ic.experiments.slam.Slam`."""
+    """Particle filter with the interface of `GridSlam`."""
 
     def __init__(self, particles: ParticleConfig | None = None, config: SlamConfig | None = None) -> None:
         self.config = config = config or SlamConfig()
@@ -185,8 +182,9 @@ class ParticleSlam:
         values[visits == 0] = -1
         return OccupancyGrid(values, self.maps.delta, corner)
 
-    def background_job(self) -> None:
+    def background_job(self) -> Callable[[], Any] | None:
         """Return None: this method has no background jobs."""
+        return None
 
     def take_over(self, outcome: Any) -> None:
         """Do nothing: there are no background jobs."""

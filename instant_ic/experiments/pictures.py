@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,13 +18,9 @@ Image: TypeAlias = NDArray[np.uint8]
 def perspective_crop(
     panorama: NDArray[np.uint8], camera_from_view: NDArray[np.float64], width: int, height: int, hfov_rad: float
 ) -> NDArray[np.uint8]:
-    """Pinhole view from the panorama's centre.
+    """Pinhole view from the centre of a panorama (H, W, 3).
 
-    Args:
-        panorama: (H, W, 3).
-        camera_from_view: rotation (3, 3) of the view, which looks along its own x.
-        width, height: of the crop.
-        hfov_rad: horizontal field of view.
+    ``camera_from_view`` is the rotation (3, 3) of the view, which looks along its own x.
     """
     directions = perspective_directions(width, height, hfov_rad) @ camera_from_view.T.astype(np.float32)
     return np.clip(np.rint(sample_equirect(panorama, directions)), 0, 255).astype(np.uint8)
@@ -65,7 +62,7 @@ def save_depth(path: Path, panorama: NDArray[np.uint8], depth_m: NDArray[np.floa
 
 
 def save_map(
-    path: Path,
+    path: Path | io.BytesIO,
     grid: NDArray[np.int8],
     resolution_m: float,
     origin_xy: tuple[float, float],
@@ -111,9 +108,10 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any,
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a figure, creating its folder if needed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+def save_figure(figure: Any, path: Path | io.BytesIO) -> None:
+    """Write a figure as PNG, creating its folder if needed."""
+    if isinstance(path, Path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
 
 
@@ -167,8 +165,6 @@ def series_colour(number: int) -> str:
 
 def figure_svg(figure: Any, axis: Any) -> str:
     """A figure with one pair of axes as SVG text that follows the page's light or dark colours."""
-    import io
-
     import matplotlib
 
     axis.yaxis.label.set_color(_INK)
@@ -184,12 +180,9 @@ def figure_svg(figure: Any, axis: Any) -> str:
 
 
 def image_strip(columns: Sequence[str], rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], tile: int) -> Image:
-    """Rows of labelled images under the columns' names; RGB, ready to be encoded.
+    """Rows of a label and an image a column, all of one shape, under the columns' names; RGB, ready to be encoded.
 
-    Args:
-        columns: names.
-        rows: label and one image a column, all of one shape.
-        tile: width of an image, pixels.
+    ``tile`` is the width of an image in pixels.
     """
     import cv2
 

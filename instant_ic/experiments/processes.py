@@ -33,8 +33,7 @@ class ProcessPool:
 
     They are killed: SIGTERM has no effect on a stopped process, or if this program was started with SIGTERM ignored.
 
-    Args:
-        prepare: called first in each process.
+    ``prepare`` is called first in each process.
 
     Raises:
         RuntimeError: at the end of the block, a process is still there ``30 s`` after it was killed.
@@ -120,9 +119,7 @@ def run_all(
     Args:
         function: of a module, so that other processes find it.
         tasks: positional arguments of each call.
-        jobs: calls in parallel.
         prepare: called first in each process.
-        on_result: called with each result as it arrives.
         timeout_s: for all calls.
         call_timeout_s: for one call; its process is then killed.
         on_lost: gives the result of a call whose process died or was killed, from the task's number; None: raise.

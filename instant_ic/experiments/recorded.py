@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from instant_ic.experiments.pictures import perspective_crop
 from instant_ic.experiments.vspace import FILLED, STRIP_AT_M, Comparison, Row, converge_on, filled, scores
-from instant_ic.experiments.vspace_sources import KEYFRAMES, Place, Shot, VspaceSettings, base_of, make_source
+from instant_ic.experiments.vspace_sources import FOV_RAD, KEYFRAMES, Place, Shot, VspaceSettings, base_of, make_source
 
 if TYPE_CHECKING:
     from instant_ic.vspace import VirtualSpaceConfig
@@ -23,58 +20,45 @@ SOURCES = ("ours", "older", "no-depth", "depth-warp", "point-warp", "panorama", 
 TOPIC = "/keyframe"
 
 
-@dataclass(frozen=True)
-class RecordedKeyframe:
-    """A keyframe of a bag: panorama (H, 2 H, 3), depth (h, 2 h) in metres, pose (4, 4), relative sigma (h, 2 h)."""
-
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
-    pose: NDArray[np.float64]
-    sigma: NDArray[np.float32]
-
-
 def count_keyframes(bag: Path) -> int:
     """Number of the bag's keyframes whose depth can be trusted; raises as ``read_keyframes``."""
     return len(_messages(bag))
 
 
-def read_keyframes(bag: Path) -> list[RecordedKeyframe]:
-    """Keyframes of a bag whose depth can be trusted, oldest first.
+def read_keyframes(bag: Path) -> list[Shot]:
+    """Keyframes of a bag whose depth can be trusted, oldest first; their true depth is unknown, they have their own.
 
     Raises:
         ValueError: no bag, fewer than two such keyframes, or one that cannot be decoded.
     """
-    from instant_ic.depth.keyframes import decode_sigma
-    from instant_ic.msg import image_array, matrix_from_pose
-    from instant_ic.vspace.jobs import decode_panorama
+    from instant_ic.depth.sources import DepthResult
+    from instant_ic.nerf_messages import decode_keyframe
 
     found = []
     for message in _messages(bag):
-        depth = np.asarray(image_array(message.depth), np.float32)
-        sigma = np.full(depth.shape, message.relative_sigma, np.float32)
-        if message.sigma.data.size:
-            sigma = decode_sigma(image_array(message.sigma))
-        rgb = decode_panorama(np.asarray(message.panorama.data, np.uint8))
-        found.append(RecordedKeyframe(rgb, depth, matrix_from_pose(message.pose), sigma))
+        rgb, depth, pose, sigma = decode_keyframe(message)
+        sigma = sigma if isinstance(sigma, np.ndarray) else np.full(depth.shape, sigma, np.float32)
+        known = sigma[np.isfinite(sigma)]
+        middle = float(np.median(known)) if known.size else 1.0
+        result = DepthResult(True, 1.0, 0.0, depth, 1.0, middle, 0, "", sigma, "recorded")
+        found.append(Shot(np.asarray(pose, np.float64), rgb, depth, depth, result, depth))
     return found
 
 
 def compare_recorded(bag: Path, settings: VspaceSettings, number: int) -> Comparison:
     """Show what later keyframes saw from an earlier one, at their poses.
 
-    Args:
-        bag: with ``/keyframe``.
-        settings: ``sources`` of ``SOURCES``; keyframes up to ``reach_m`` away count, by steps of ``step_m``.
-        number: of the earlier keyframe.
+    The sources are of ``SOURCES``; keyframes up to ``settings.reach_m`` away count, by steps of ``step_m``. ``number``:
+    of the earlier keyframe.
 
     Raises:
         ValueError: as ``read_keyframes``, or no later keyframe is near enough.
     """
     keyframes = read_keyframes(bag)
-    shots = [_shot(one) for one in keyframes[max(0, number + 1 - max(KEYFRAMES.values())) : number + 1]]
+    shots = keyframes[max(0, number + 1 - max(KEYFRAMES.values())) : number + 1]
     nowhere: Any = None
     place = Place(nowhere, nowhere, nowhere, (0.0, 0.0, 0.0), _config(settings), None)
-    here, (width, height), fov = keyframes[number].pose, settings.size, math.radians(settings.fov_deg)
+    here, (width, height) = keyframes[number].pose, settings.size
     near = _later(keyframes, number, settings)
     if not near:
         raise ValueError(f"{bag}: no keyframe after number {number} lies within {settings.reach_m:g} m of it")
@@ -87,8 +71,8 @@ def compare_recorded(bag: Path, settings: VspaceSettings, number: int) -> Compar
         draw, seconds = ready[base]
         for distance, one in near:
             at = settings.step_m * round(distance / settings.step_m)
-            truth = perspective_crop(one.rgb, np.eye(3), width, height, fov)
-            image, confidence = draw(one.pose, width, height, fov)
+            truth = perspective_crop(one.rgb, np.eye(3), width, height, FOV_RAD)
+            image, confidence = draw(one.pose, width, height, FOV_RAD)
             if source in FILLED:
                 image = filled(image, confidence, truth)
             psnr, similarity = scores(image, truth)
@@ -105,11 +89,11 @@ def converge_recorded(bag: Path, settings: VspaceSettings, number: int, times_s:
         ValueError: as ``read_keyframes``.
     """
     keyframes = read_keyframes(bag)
-    here, (width, height), fov = keyframes[number], settings.size, math.radians(settings.fov_deg)
+    here, (width, height) = keyframes[number], settings.size
     beside = [each for each in _later(keyframes, number, settings) if 0.5 <= each[0] <= 1.5]
     chosen = [(0.0, here), *((1.0, one) for _, one in sorted(beside, key=lambda each: abs(each[0] - 1.0))[:1])]
-    views = [(at, one.pose, perspective_crop(one.rgb, np.eye(3), width, height, fov)) for at, one in chosen]
-    return converge_on(_shot(here), views, settings, _config(settings), times_s)
+    views = [(at, one.pose, perspective_crop(one.rgb, np.eye(3), width, height, FOV_RAD)) for at, one in chosen]
+    return converge_on(here, views, settings, _config(settings), times_s)
 
 
 def _config(settings: VspaceSettings) -> VirtualSpaceConfig:
@@ -118,18 +102,7 @@ def _config(settings: VspaceSettings) -> VirtualSpaceConfig:
     return VirtualSpaceConfig(source="auto", panorama_width=settings.panorama_width)
 
 
-def _shot(one: RecordedKeyframe) -> Shot:
-    from instant_ic.depth.sources import DepthResult
-
-    known = one.sigma[np.isfinite(one.sigma)]
-    middle = float(np.median(known)) if known.size else 1.0
-    depth = DepthResult(True, 1.0, 0.0, one.depth_m, 1.0, middle, 0, "", one.sigma, "recorded")
-    return Shot(one.pose, one.rgb, one.depth_m, one.depth_m, depth, one.depth_m)
-
-
-def _later(
-    keyframes: Sequence[RecordedKeyframe], number: int, settings: VspaceSettings
-) -> list[tuple[float, RecordedKeyframe]]:
+def _later(keyframes: Sequence[Shot], number: int, settings: VspaceSettings) -> list[tuple[float, Shot]]:
     """Later keyframes up to ``reach_m`` away, each with its distance in metres."""
     here = keyframes[number].pose[:3, 3]
     away = [(float(np.linalg.norm(one.pose[:3, 3] - here)), one) for one in keyframes[number + 1 :]]
@@ -137,20 +110,11 @@ def _later(
 
 
 def _messages(bag: Path) -> list[Any]:
-    from instant_ic.bag.errors import BagError
-    from instant_ic.bag.files import BagReader
+    from instant_ic.experiments.bags import opened
     from instant_ic.msg import deserialize
 
-    try:
-        with BagReader(bag) as reader:
-            names = [one.topic for one in reader.topics]
-            if TOPIC not in names:
-                raise ValueError(
-                    f"{bag}: {TOPIC} is missing; it has {', '.join(names) or 'no topics'}. Record it again"
-                )
-            messages = [deserialize(one.payload, one.type_name) for one in reader.messages([TOPIC])]
-    except BagError as error:
-        raise ValueError(str(error)) from error
+    with opened(bag, {TOPIC: ("Keyframe",)}, ". Record it again") as reader:
+        messages = [deserialize(one.payload, one.type_name) for one in reader.messages([TOPIC])]
     fit = [message for message in messages if message.fit]
     if len(fit) < 2:
         raise ValueError(f"{bag}: {len(fit)} of {len(messages)} keyframes have trusted depth, 2 are needed")

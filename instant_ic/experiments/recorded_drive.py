@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import math
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from instant_ic.experiments.teleop_stack import Log
 from instant_ic.geometry.poses import pose_matrix
 
 STATE, MAP, CAMERA, KEYFRAME = "/ic/state", "/map", "/camera/image/compressed", "/keyframe"
-TYPES = {STATE: "ControlState", MAP: "OccupancyGrid", CAMERA: "CompressedImage", KEYFRAME: "Keyframe"}
+TYPES = {STATE: ("ControlState",), MAP: ("OccupancyGrid",), CAMERA: ("CompressedImage",), KEYFRAME: ("Keyframe",)}
 SIZE = (320, 180)
 AROUND_S, MOST_S = 2.0, 60.0
 """The film begins and ends this long before and after the virtual space, and is no longer."""
@@ -41,8 +41,7 @@ class RecordedDrive:
     Attributes:
         drive: figures, as of a simulated one; the r-bot's pose is the stack's estimate.
         moments: before, during and after the first passage through the virtual space; else of the first minute.
-        plot: PNG of both trajectories on the map.
-        modes: PNG of the arbiter's mode over time.
+        plot, modes: PNG of both trajectories on the map, and of the arbiter's mode over time.
     """
 
     drive: Drive
@@ -57,50 +56,34 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
     Raises:
         ValueError: no bag, or a topic is missing; names it.
     """
-    from instant_ic.bag.errors import BagError
-    from instant_ic.bag.files import BagReader
+    from instant_ic.experiments.bags import opened
     from instant_ic.msg import deserialize
 
-    try:
-        with BagReader(bag) as reader:
-            types = {one.topic: one.type_name.rpartition("/")[2] for one in reader.topics}
-            names = types.keys()
-            missing = [topic for topic in (STATE, CAMERA, KEYFRAME) if topic not in names]
-            if missing:
-                has = ", ".join(sorted(names)) or "no topics"
-                raise ValueError(
-                    f"{bag}: {', '.join(missing)} missing; it has {has}. Record a drive with the whole stack"
-                )
-            wrong = [f"{topic} has the type {types[topic]}, not {kind}" for topic, kind in TYPES.items()
-                     if types.get(topic, kind) != kind]  # fmt: skip
-            if wrong:
-                raise ValueError(f"{bag}: {'; '.join(wrong)}")
-            begin_ns = 0
-            states: list[tuple[float, Any]] = []
-            keyframes: list[tuple[float, Any]] = []
-            grid = None
-            for one in reader.messages([STATE, KEYFRAME, *([MAP] if MAP in names else [])]):
-                message = deserialize(one.payload, one.type_name)
-                if one.topic == MAP:
-                    grid = message
-                    continue
-                begin_ns = begin_ns or one.stamp_ns
-                time_s = (one.stamp_ns - begin_ns) / 1e9
-                if one.topic == STATE:
-                    states.append((time_s, message))
-                elif message.fit:
-                    keyframes.append((time_s, message))
-            if len(states) < 2:
-                raise ValueError(f"{bag}: {len(states)} messages on {STATE}, 2 are needed")
-            log = as_log(states, len(keyframes))
-            times = film_times(log, frame_s)
-            photos: list[tuple[float, bytes]] = []  # the newest image at each time
-            for one in reader.messages([CAMERA]):
-                time_s = (one.stamp_ns - begin_ns) / 1e9
-                if times[0] - 1.0 <= time_s <= times[-1] and (not photos or time_s >= photos[-1][0] + 0.5 * frame_s):
-                    photos.append((time_s, bytes(deserialize(one.payload, one.type_name).data)))
-    except BagError as error:
-        raise ValueError(str(error)) from error
+    begin_ns = 0
+    states: list[tuple[float, Any]] = []
+    keyframes: list[tuple[float, Any]] = []
+    grid = None
+    with opened(bag, TYPES, ". Record a drive with the whole stack", optional=MAP) as reader:
+        for one in reader.messages([STATE, KEYFRAME, MAP]):
+            message = deserialize(one.payload, one.type_name)
+            if one.topic == MAP:
+                grid = message
+                continue
+            begin_ns = begin_ns or one.stamp_ns
+            time_s = (one.stamp_ns - begin_ns) / 1e9
+            if one.topic == STATE:
+                states.append((time_s, message))
+            elif message.fit:
+                keyframes.append((time_s, message))
+        if len(states) < 2:
+            raise ValueError(f"{bag}: {len(states)} messages on {STATE}, 2 are needed")
+        log = as_log(states, len(keyframes))
+        times = film_times(log, frame_s)
+        photos: list[tuple[float, bytes]] = []  # the newest image at each time
+        for one in reader.messages([CAMERA]):
+            time_s = (one.stamp_ns - begin_ns) / 1e9
+            if times[0] - 1.0 <= time_s <= times[-1] and (not photos or time_s >= photos[-1][0] + 0.5 * frame_s):
+                photos.append((time_s, bytes(deserialize(one.payload, one.type_name).data)))
     drive = Drive(0, "ic", True, seconds=log.time_s[-1] - log.time_s[0])
     judge(drive, log, np.empty((0, 2)))
     return RecordedDrive(drive, _moments(log, times, photos, keyframes), _plot(drive, grid), _modes(drive))
@@ -207,14 +190,14 @@ def _plot(drive: Drive, grid: Any) -> bytes:
     else:
         columns, rows = np.ceil(places.max(axis=0) + 1.5 - corner).astype(int)
         cells = np.zeros((rows, columns), np.int8)
-    with tempfile.TemporaryDirectory() as folder:
-        save_map(Path(folder) / "plot.png", cells, resolution, origin, None, tracks)
-        return (Path(folder) / "plot.png").read_bytes()
+    out = io.BytesIO()
+    save_map(out, cells, resolution, origin, None, tracks)
+    return out.getvalue()
 
 
 def _modes(drive: Drive) -> bytes:
     figure, axes = new_figure(1, 1, (9.0, 1.4))
     draw_modes(axes[0, 0], [drive])
-    with tempfile.TemporaryDirectory() as folder:
-        save_figure(figure, Path(folder) / "modes.png")
-        return (Path(folder) / "modes.png").read_bytes()
+    out = io.BytesIO()
+    save_figure(figure, out)
+    return out.getvalue()

@@ -53,9 +53,6 @@ def evaluate_recordings(
     ``launch.log`` and ``summary.json``, whose content is returned.
 
     Args:
-        pcap: VLP-16 capture.
-        panorama: equirect photo.
-        out: output folder.
         timeout_s: total time limit, in seconds of the stack.
         tell: called with a description of each wait.
         same_place: photo and capture are from the same place and time: the LiDAR scales the depth, as on the robot.

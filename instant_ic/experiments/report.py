@@ -80,8 +80,6 @@ class Section:
     """One experiment.
 
     Attributes:
-        title: with the paper's section.
-        parts: in order.
         verdict: sentence → whether it holds; None: not measured.
         answers: claim of ``PAPER`` → whether it holds, from the results.
     """

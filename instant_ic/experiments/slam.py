@@ -16,45 +16,15 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from instant_ic.experiments.particle_slam import ParticleConfig, ParticleSlam
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
-from instant_ic.slam import GridSlam, OccupancyGrid, Scan, SlamConfig, SlamResult
+from instant_ic.slam import GridSlam, Scan, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import Anchor, warm_up
 from instant_ic.slam.logs import LogEntry, LogError, open_log
 from instant_ic.slam.scan import FloatArray
-
-
-class Slam(Protocol):
-    """What the evaluation uses of a SLAM method: `GridSlam`, or the paper's particle filter."""
-
-    def process(self, scan: Scan, odom_pose: ArrayLike | None, base_from_laser: ArrayLike) -> SlamResult:
-        """Estimate the pose of a scan."""
-        ...
-
-    def background_job(self) -> Callable[[], Any] | None:
-        """Return pending work or None; pass its result to `take_over`."""
-        ...
-
-    def take_over(self, outcome: Any) -> None:
-        """Apply the result of a background job."""
-        ...
-
-    def finish(self) -> None:
-        """Complete all pending work after the last scan."""
-        ...
-
-    def grid(self) -> OccupancyGrid:
-        """Return the map."""
-        ...
-
-    def figures(self) -> dict[str, object]:
-        """Return state figures for reports."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -66,10 +36,6 @@ class Relations:
 
     def __len__(self) -> int:
         return len(self.times_s)
-
-    def near(self, times_s: FloatArray, tolerance_s: float) -> int:
-        """Number of relations with both ends within ``tolerance_s`` of one of ``times_s`` (m,)."""
-        return len(self.at_stamps(times_s, tolerance_s))
 
     def at_stamps(self, stamps_s: FloatArray, tolerance_s: float) -> Relations:
         """Relations with both ends within ``tolerance_s`` of one of ``stamps_s`` (m,)."""
@@ -117,26 +83,6 @@ def read_stamps(path: str | Path) -> FloatArray:
     return _read_columns(path, 1, "a stamp")[:, 0]
 
 
-@dataclass(frozen=True)
-class RelationError:
-    """Errors of each relation: metres (n,), degrees (n,)."""
-
-    translation_m: FloatArray
-    rotation_deg: FloatArray
-
-    def summary(self) -> dict[str, float | int]:
-        """Mean, standard deviation, median and maximum."""
-        return {
-            "translation_mean_m": float(self.translation_m.mean()),
-            "translation_std_m": float(self.translation_m.std()),
-            "translation_median_m": float(np.median(self.translation_m)),
-            "translation_max_m": float(self.translation_m.max()),
-            "rotation_mean_deg": float(self.rotation_deg.mean()),
-            "rotation_std_deg": float(self.rotation_deg.std()),
-            "relations": len(self.translation_m),
-        }
-
-
 def interpolate_trajectory(trajectory: FloatArray, times_s: FloatArray) -> FloatArray:
     """Poses (m, 3) at ``times_s`` (m,) of a trajectory ``t x y yaw`` (n, 4), times ascending; clamped at its ends."""
     yaw = np.interp(times_s, trajectory[:, 0], np.unwrap(trajectory[:, 3]))
@@ -145,8 +91,8 @@ def interpolate_trajectory(trajectory: FloatArray, times_s: FloatArray) -> Float
     return np.stack([x, y, yaw], axis=1)
 
 
-def relation_error(trajectory: FloatArray, relations: Relations) -> RelationError:
-    """Error of a trajectory ``t x y yaw`` (n, 4) against the relations within its time range.
+def relation_error(trajectory: FloatArray, relations: Relations) -> dict[str, float | int]:
+    """Figures of the errors of a trajectory ``t x y yaw`` (n, 4) against the relations within its time range.
 
     Raises:
         ValueError: no relation is within the trajectory's time range.
@@ -161,21 +107,40 @@ def relation_error(trajectory: FloatArray, relations: Relations) -> RelationErro
     times, truth = relations.times_s[inside], relations.poses[inside]
     first = interpolate_trajectory(trajectory, times[:, 0])
     second = interpolate_trajectory(trajectory, times[:, 1])
-    translation, rotation = [], []
+    errors = []
     for a, b, relation in zip(first, second, truth, strict=True):
         rest = relative2(relation, relative2(a, b))
-        translation.append(math.hypot(rest[0], rest[1]))
-        rotation.append(math.degrees(abs(wrap_angle(float(rest[2])))))
-    return RelationError(np.array(translation), np.array(rotation))
+        errors.append((math.hypot(rest[0], rest[1]), math.degrees(abs(wrap_angle(float(rest[2]))))))
+    translation_m, rotation_deg = np.ascontiguousarray(np.array(errors).T)
+    return {
+        "translation_mean_m": float(translation_m.mean()),
+        "translation_std_m": float(translation_m.std()),
+        "translation_median_m": float(np.median(translation_m)),
+        "translation_max_m": float(translation_m.max()),
+        "rotation_mean_deg": float(rotation_deg.mean()),
+        "rotation_std_deg": float(rotation_deg.std()),
+        "relations": len(errors),
+    }
 
 
-def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_s: float = 0.006) -> FloatArray:
+def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_s: float) -> FloatArray:
     """Scan times (n,) in the clock that the relations use; the log may have two."""
     own = np.array([entry.scan.stamp_ns * 1e-9 for entry in entries])
     logger = np.array([np.nan if entry.logger_s is None else entry.logger_s for entry in entries])
-    if np.isfinite(logger).all() and relations.near(logger, tolerance_s) > relations.near(own, tolerance_s):
+    if np.isfinite(logger).all() and len(relations.at_stamps(logger, tolerance_s)) > len(
+        relations.at_stamps(own, tolerance_s)
+    ):
         return logger
     return own
+
+
+def log_error(
+    entries: Sequence[LogEntry], poses: FloatArray, relations: Relations, tolerance_s: float = 0.006
+) -> dict[str, float | int]:
+    """``relation_error`` of the poses (n, 3) of a log's scans."""
+    times = relation_times(entries, relations, tolerance_s)
+    order = np.argsort(times, kind="stable")
+    return relation_error(np.column_stack([times, poses])[order], relations)
 
 
 @dataclass(frozen=True)
@@ -189,7 +154,7 @@ class LogResult:
         background_ms: CPU milliseconds of loop closure and optimisation after each scan (n,).
         scores: match score of each scan (n,).
         statuses: count of each status.
-        slam: the final state, with its map.
+        slam: the final state, with its map: of the graph method, or of the paper's particle filter.
     """
 
     trajectory: FloatArray
@@ -198,7 +163,7 @@ class LogResult:
     background_ms: FloatArray
     scores: FloatArray
     statuses: dict[str, int]
-    slam: Slam
+    slam: GridSlam | ParticleSlam
 
     def report(self) -> dict[str, object]:
         """Figures for JSON; the mean counts all CPU time, the 99th percentile that of the scan thread."""
@@ -230,8 +195,6 @@ def run_log(
     one millisecond after it; the trajectory keeps the original stamp.
 
     Args:
-        entries: of `instant_ic.slam.logs.read_log`, or compatible.
-        config: defaults when None.
         particles: run the particle filter instead of the grid SLAM.
         use_wheel_odom: False ignores the log's odometry.
         on_scan: called with the number of processed scans, for a progress bar.
@@ -239,25 +202,20 @@ def run_log(
     Raises:
         LogError: the log has no scan.
     """
-    slam: Slam = GridSlam(config) if particles is None else ParticleSlam(particles, config)
+    slam = GridSlam(config) if particles is None else ParticleSlam(particles, config)
     warm_up(config)
     stamps: list[float] = []
     online: list[FloatArray] = []
-    anchors: list[tuple[Anchor | None, FloatArray]] = []
+    anchored: list[tuple[Anchor | None, FloatArray]] = []
     cpu_ms: list[float] = []
     background_ms: list[float] = []
     scores: list[float] = []
     statuses: dict[str, int] = {}
-    last_ns: int | None = None
-    for entry in entries:
-        scan = entry.scan
-        if last_ns is not None and scan.stamp_ns <= last_ns:
-            scan = replace(scan, stamp_ns=last_ns + 1_000_000)
-        last_ns = scan.stamp_ns
+    for entry, scan in ascending(entries):
         begin = time.thread_time()
         result = slam.process(scan, entry.odom_pose if use_wheel_odom else None, entry.base_from_laser)
         scanned = time.thread_time()
-        anchors.append((result.anchor, _from_anchor(result)))
+        anchored.append(from_anchor(result))
         job = slam.background_job()
         outcome = None if job is None else job()
         worked = time.thread_time()
@@ -274,12 +232,8 @@ def run_log(
     if not online:
         raise LogError("the log contains no scan")
     slam.finish()
-    final = [
-        pose if anchor is None else compose2(anchor.pose(), there)
-        for pose, (anchor, there) in zip(online, anchors, strict=True)
-    ]
     return LogResult(
-        np.column_stack([stamps, np.array(final)]),
+        np.column_stack([stamps, final_poses(anchored)]),
         np.column_stack([stamps, np.array(online)]),
         np.array(cpu_ms),
         np.array(background_ms),
@@ -289,34 +243,55 @@ def run_log(
     )
 
 
-def _from_anchor(result: SlamResult) -> FloatArray:
-    return np.zeros(3) if result.anchor is None else relative2(result.anchor.pose(), result.map_from_base)
+def ascending(entries: Iterable[LogEntry], last_ns: int | None = None) -> Iterator[tuple[LogEntry, Scan]]:
+    """Each entry with its scan; a scan that is not newer than the previous one is stamped a millisecond after it."""
+    for entry in entries:
+        scan = entry.scan
+        if last_ns is not None and scan.stamp_ns <= last_ns:
+            scan = replace(scan, stamp_ns=last_ns + 1_000_000)
+        last_ns = scan.stamp_ns
+        yield entry, scan
 
 
-def perturb_odometry(
-    entries: Iterable[LogEntry], seed: int, noise: float = 0.05, scale: float = 0.02
-) -> Iterator[LogEntry]:
-    """Degrade a log's odometry: Gaussian noise of ``noise`` times each step's size, plus a scale error.
+def from_anchor(result: SlamResult) -> tuple[Anchor | None, FloatArray]:
+    """The pose (3,) relative to its keyframe; the pose itself without one."""
+    if result.anchor is None:
+        return None, result.map_from_base
+    return result.anchor, relative2(result.anchor.pose(), result.map_from_base)
 
-    Translation and rotation are each too long or too short by ``scale``; the seed decides which.
+
+def final_poses(anchored: Iterable[tuple[Anchor | None, FloatArray]]) -> FloatArray:
+    """Poses (n, 3) of ``from_anchor`` after the last optimisation."""
+    return np.array([there if anchor is None else compose2(anchor.pose(), there) for anchor, there in anchored])
+
+
+def perturb_odometry(entries: Iterable[LogEntry], seed: int) -> Iterator[LogEntry]:
+    """Degrade a log's odometry: Gaussian noise of 5 % of each step's size, plus a scale error of 2 %.
+
+    Translation and rotation are each too long or too short; the seed decides which.
     """
     rng = np.random.default_rng(seed)
     signs = rng.choice([-1.0, 1.0], 2)
-    factor = 1.0 + scale * np.array([signs[0], signs[0], signs[1]])
-    true: FloatArray | None = None
-    worse = np.zeros(3)
+    factor = 1.0 + 0.02 * np.array([signs[0], signs[0], signs[1]])
+
+    def worse(step: FloatArray) -> FloatArray:
+        size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
+        return np.asarray(factor * step + 0.05 * size * rng.standard_normal(3))
+
+    return changed_odometry(entries, worse)
+
+
+def changed_odometry(entries: Iterable[LogEntry], change: Callable[[FloatArray], FloatArray]) -> Iterator[LogEntry]:
+    """The log with each step (3,) of its odometry changed."""
+    last: FloatArray | None = None
+    pose = np.zeros(3)
     for entry in entries:
         if entry.odom_pose is None:
             yield entry
             continue
-        if true is None:
-            worse = entry.odom_pose
-        else:
-            step = relative2(true, entry.odom_pose)
-            size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
-            worse = compose2(worse, factor * step + noise * size * rng.standard_normal(3))
-        true = entry.odom_pose
-        yield replace(entry, odom_pose=worse)
+        pose = entry.odom_pose if last is None else compose2(pose, change(relative2(last, entry.odom_pose)))
+        last = entry.odom_pose
+        yield replace(entry, odom_pose=pose)
 
 
 def evaluate_log(
@@ -338,11 +313,8 @@ def evaluate_log(
     result = run_log(entries, config, particles=particles, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
     report: dict[str, object] = {}
     if relations is not None:
-        times = relation_times(entries, relations, tolerance_s)
-        order = np.argsort(times, kind="stable")
         final, online = (
-            relation_error(np.column_stack([times, run[:, 1:]])[order], relations).summary()
-            for run in (result.trajectory, result.online)
+            log_error(entries, run[:, 1:], relations, tolerance_s) for run in (result.trajectory, result.online)
         )
         report.update(final)
         report["online_translation_mean_m"] = online["translation_mean_m"]

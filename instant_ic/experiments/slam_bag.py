@@ -23,17 +23,12 @@ def is_bag(path: Path) -> bool:
     return path.is_dir() or path.suffix in (".mcap", ".db3")
 
 
-def read_bag(path: Path, scan_topic: str | None = None, base_frame: str = "base_link") -> Iterator[LogEntry]:
-    """Scans of a bag.
+def read_bag(path: Path, scan_topic: str | None = None) -> Iterator[LogEntry]:
+    """Scans of a bag: of ``scan_topic``, or of ``/scan``, or of the only topic of type LaserScan.
 
     Odometry comes from the bag's Odometry topic (``/wheel/odom`` before ``/odom`` before any other), interpolated to
-    the scan's stamp; the mount from ``/tf_static``. A scan outside the odometry's time range has none.
-
-    Args:
-        path: bag folder or file.
-        scan_topic: of type LaserScan; None: ``/scan``, or the only one.
-        base_frame: the robot's frame; without a transform to it, the laser is assumed to be mounted at the robot's
-            centre.
+    the scan's stamp; the mount from ``/tf_static``. A scan outside the odometry's time range has none. Without a
+    transform to ``base_link``, the laser is assumed to be mounted at the robot's centre.
 
     Raises:
         LogError: not a bag, no such topic, or a malformed scan.
@@ -47,17 +42,13 @@ def read_bag(path: Path, scan_topic: str | None = None, base_frame: str = "base_
             odometry = OdometryBuffer(keep_s=1e9)
             wheels = _choose(path, types, _ODOMETRY, None, ("/wheel/odom", "/odom"))
             transforms = TransformBuffer()
-            wanted = [name for name in (wheels, "/tf_static", "/tf") if name in types]
-            for message in bag.messages(wanted):
+            for message in bag.messages([name for name in (wheels, "/tf_static") if name in types]):
                 value = deserialize(message.payload, message.type_name)
                 if message.topic == wheels:
                     odometry.add(stamp_ns(value), pose2_from_message(value))
                     continue
-                for transform in value.transforms:
-                    if message.topic == "/tf_static":
-                        transforms.set(
-                            transform.header.frame_id, transform.child_frame_id, 0, transform_matrix(transform), True
-                        )
+                for one in value.transforms:
+                    transforms.set(one.header.frame_id, one.child_frame_id, 0, transform_matrix(one), True)
             scans = 0
             for message in bag.messages([topic]):
                 value = deserialize(message.payload, message.type_name)
@@ -70,7 +61,7 @@ def read_bag(path: Path, scan_topic: str | None = None, base_frame: str = "base_
                 except ValueError as error:
                     raise LogError(f"{path}: scan {scans + 1} on {topic}: {error}") from None
                 scans += 1
-                yield LogEntry(scan, odometry.at(stamp), _mount(transforms, base_frame, value.header.frame_id))
+                yield LogEntry(scan, odometry.at(stamp), _mount(transforms, value.header.frame_id))
             if scans == 0:
                 raise LogError(f"{path}: no scan on {topic}")
     except BagError as error:
@@ -91,8 +82,8 @@ def _choose(path: Path, types: dict[str, str], kind: str, wanted: str | None, us
     return found[0] if found else None
 
 
-def _mount(transforms: TransformBuffer, base_frame: str, laser_frame: str) -> Pose2:
+def _mount(transforms: TransformBuffer, laser_frame: str) -> Pose2:
     try:
-        return pose2_from_matrix(transforms.lookup(base_frame, laser_frame))
+        return pose2_from_matrix(transforms.lookup("base_link", laser_frame))
     except TransformError:
         return np.zeros(3)

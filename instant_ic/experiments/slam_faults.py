@@ -15,7 +15,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.slam import Relations, perturb_odometry, relation_error, relation_times
+from instant_ic.experiments.slam import (
+    Relations,
+    ascending,
+    changed_odometry,
+    final_poses,
+    from_anchor,
+    log_error,
+    perturb_odometry,
+)  # fmt: skip
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import warm_up
@@ -144,20 +152,7 @@ def _with_ranges(entry: LogEntry, ranges: FloatArray) -> LogEntry:
 
 def _scaled_yaw(entries: Sequence[LogEntry], factor: float) -> list[LogEntry]:
     """The log with each turn of the odometry ``factor`` times as large."""
-    out: list[LogEntry] = []
-    pose: FloatArray | None = None
-    last: FloatArray | None = None
-    for entry in entries:
-        if entry.odom_pose is not None:
-            if pose is None or last is None:
-                pose = entry.odom_pose
-            else:
-                step = relative2(last, entry.odom_pose)
-                pose = compose2(pose, [step[0], step[1], factor * step[2]])
-            last = entry.odom_pose
-            entry = replace(entry, odom_pose=pose)
-        out.append(entry)
-    return out
+    return list(changed_odometry(entries, lambda step: np.array([step[0], step[1], factor * step[2]])))
 
 
 def _without_third(entries: Sequence[LogEntry], rng: np.random.Generator) -> list[LogEntry]:
@@ -203,11 +198,7 @@ FAULTS = (*PLACE_FAULTS, *KIDNAPPINGS, "odometry_noise", "yaw_scale_plus", "yaw_
 
 def _steps(slam: GridSlam, entries: Sequence[LogEntry], last_ns: int | None = None) -> Iterator[SlamResult]:
     """Run the SLAM over entries; background work runs between the scans."""
-    for entry in entries:
-        scan = entry.scan
-        if last_ns is not None and scan.stamp_ns <= last_ns:
-            scan = replace(scan, stamp_ns=last_ns + 1_000_000)
-        last_ns = scan.stamp_ns
+    for entry, scan in ascending(entries, last_ns):
         result = slam.process(scan, entry.odom_pose, entry.base_from_laser)
         yield result
         job = slam.background_job()
@@ -297,25 +288,20 @@ def evaluate_faults(
     """Put each fault into the log and compare with the clean run; figures for JSON, by fault.
 
     Args:
-        entries: the log.
-        config: defaults when None.
         places: number of places for a fault at a place; chosen by ``seed``, the same for every fault.
         seed: of the places and of all other choices.
         noise_seeds: runs of each fault that lasts the whole log; the first has the log's own odometry, the others noise
             (`perturb_odometry`).
         relations: for the accuracy of the runs over the whole log.
-        faults: names of `FAULTS`.
         on_step: called with the name of what runs next.
 
     Raises:
         LogError: the log is too short.
-        ValueError: an unknown fault, or no place asked for.
+        ValueError: an unknown fault.
     """
     unknown = [name for name in faults if name not in FAULTS]
     if unknown:
         raise ValueError(f"unknown fault {unknown[0]!r}; known: {', '.join(FAULTS)}")
-    if places < 1 or noise_seeds < 1:
-        raise ValueError(f"places and noise_seeds must be at least 1 (got {places}, {noise_seeds})")
     if len(entries) < 2 * LEAST_SCANS:
         raise LogError(f"the log has {len(entries)} scans: too few to put faults into it ({2 * LEAST_SCANS} needed)")
     warm_up(config)
@@ -389,9 +375,7 @@ def _whole_log(
             "trusted_wrong_scans": int((wrong & run.trusted).sum()),
         }
         if relations is not None:
-            times = relation_times(entries, relations)
-            order = np.argsort(times, kind="stable")
-            error = relation_error(np.column_stack([times, run.final])[order], relations).summary()
+            error = log_error(entries, run.final, relations)
             figures.update({key: error[key] for key in ("translation_mean_m", "rotation_mean_deg")})
         runs.append(figures)
     key = "final_error_mean_m" if relations is None else "translation_mean_m"
@@ -457,18 +441,16 @@ def _clean_run(
     """The run without a fault, and copies of the SLAM before the scans ``at``."""
     slam = GridSlam(config)
     before: list[tuple[int, GridSlam]] = []
-    online, trusted, anchors = [], [], []
+    online, trusted, anchored = [], [], []
     for k, result in enumerate(_steps(slam, entries)):
         online.append(result.map_from_base)
         trusted.append(result.trusted)
-        anchors.append((result.anchor, result.map_from_base if result.anchor is None
-                        else relative2(result.anchor.pose(), result.map_from_base)))  # fmt: skip
+        anchored.append(from_anchor(result))
         if k + 1 in at:
             # The generator has not run the background work of this scan yet: that belongs to the copy, too.
             before.append((k + 1, copy.deepcopy(slam)))
     slam.finish()
-    final = [there if anchor is None else compose2(anchor.pose(), there) for anchor, there in anchors]
-    return CleanRun(np.array(online), np.array(final), np.array(trusted), slam), before
+    return CleanRun(np.array(online), final_poses(anchored), np.array(trusted), slam), before
 
 
 def _localized(

@@ -19,7 +19,7 @@ from instant_ic.experiments.slam_worlds import trajectory_errors
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 from instant_ic.sim.world import World
-from instant_ic.slam import GridSlam, Scan, SlamConfig
+from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.logs import LogEntry
 from instant_ic.slam.scan import FloatArray
 
@@ -47,14 +47,7 @@ class RoundTrip:
 def round_trip(
     world: World, slip: float = 0.2, seed: int = 0, rounds: int = 2, route: Sequence[tuple[float, float]] = ROUTE
 ) -> RoundTrip:
-    """Drive ``route`` ``rounds`` times with tracks that lose ``slip`` (one standard deviation) of their motion.
-
-    Args:
-        world: of `instant_ic.sim`.
-        slip: share of a track's motion, 0..0.5.
-        seed: of slip and noise.
-        rounds: number of rounds.
-        route: waypoints in the world.
+    """Drive ``route`` ``rounds`` times with tracks that lose a share ``slip`` (1σ, 0..0.5) of their motion.
 
     Raises:
         ValueError: the robot hit something.
@@ -113,14 +106,10 @@ def _entry(
 
 
 def evaluate_round_trip(
-    trip: RoundTrip,
-    config: SlamConfig | None = None,
-    *,
-    particles: ParticleConfig | None = None,
-    use_wheel_odom: bool = True,
+    trip: RoundTrip, particles: ParticleConfig | None = None, use_wheel_odom: bool = True
 ) -> tuple[dict[str, object], LogResult]:
     """Run SLAM on the trip and compare with ground truth: figures for JSON, and the run itself."""
-    result = run_log(trip.entries, config, particles=particles, use_wheel_odom=use_wheel_odom)
+    result = run_log(trip.entries, particles=particles, use_wheel_odom=use_wheel_odom)
     final_m, final_deg = trajectory_errors(result.trajectory[:, 1:], trip.truth)
     online_m, online_deg = trajectory_errors(result.online[:, 1:], trip.truth)
     wheels = np.array([entry.odom_pose for entry in trip.entries])

@@ -97,15 +97,9 @@ def drive(
     scale: float = 0.03,
     slip: float = 0.0,
 ) -> Drive:
-    """Drive from waypoint to waypoint, turning on the spot, with one scan per step.
+    """Drive between waypoints, at least two, turning on the spot, with a scan every ``step_m`` or ``step_rad``.
 
     Args:
-        walls: of the world.
-        waypoints: at least two.
-        laser: see `LASERS`.
-        seed: of all random choices.
-        step_m: between scans.
-        step_rad: between scans while turning.
         noise: standard deviation (1σ) of each odometry step, relative to its size.
         scale: largest systematic odometry error, relative, for translation and rotation each.
         slip: share of steps, 0..1, in which the tracks spin: the encoders count up to half as much again.
@@ -165,15 +159,13 @@ def _box(x: float, y: float, w: float, h: float) -> list[Wall]:
     return [(x, y, x + w, y), (x + w, y, x + w, y + h), (x + w, y + h, x, y + h), (x, y + h, x, y)]
 
 
-def ring(
-    seed: int = 0, width: float = 60.0, depth: float = 45.0, hall: float = 2.2
-) -> tuple[list[Wall], list[tuple[float, float]]]:
+def ring(seed: int = 0) -> tuple[list[Wall], list[tuple[float, float]]]:
     """A ring of corridors with closed doors set back in niches and a few open rooms; driven twice, once in reverse.
 
-    The centre line is 2·(width + depth) long; only the niches distinguish one stretch from the next.
+    The centre line is 210 m long; only the niches distinguish one stretch from the next.
     """
     rng = np.random.default_rng(seed)
-    half = hall / 2
+    width, depth, half = 60.0, 45.0, 1.1
     walls: list[Wall] = []
     corners = [(0.0, 0.0), (width, 0.0), (width, depth), (0.0, depth)]
     for k in range(4):
@@ -205,8 +197,9 @@ def ring(
     return walls, [*loop, *loop, (6.0, 0.0), *back, (6.0, 0.0)]
 
 
-def cells(rooms: int = 9, room: float = 4.0, hall: float = 2.0) -> tuple[list[Wall], list[tuple[float, float]]]:
+def cells(rooms: int = 9) -> tuple[list[Wall], list[tuple[float, float]]]:
     """A straight corridor with identical rooms on one side, identically furnished; some are visited."""
+    room, hall = 4.0, 2.0
     length = rooms * room
     doors = [(k * room + 1.5, 1.0) for k in range(rooms)]
     walls = _line(0.0, 1.0, length, 1.0, doors) + _line(0.0, 1.0 - hall, length, 1.0 - hall)
@@ -251,9 +244,6 @@ def office(seed: int = 0) -> tuple[list[Wall], list[tuple[float, float]]]:
                 walls += _box(x, wall_y - y - h if side < 0 else wall_y + y, float(w), float(h))
     eight = [(0.0, 0.0), (14.0, 0.0), (14.0, 12.0), (30.0, 12.0), (30.0, 0.0), (14.0, 0.0), (14.0, 12.0), (0.0, 12.0)]
     return walls, [*eight, *eight, (0.0, 0.0), (14.0, 0.0), (14.0, 12.0), (0.0, 12.0), (0.0, 0.0), (2.0, 0.0)]
-
-
-WORLDS = {"ring": ring, "cells": cells, "office": office}
 
 
 def trajectory_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:

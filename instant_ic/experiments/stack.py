@@ -84,8 +84,7 @@ class Stack:
 
     Args:
         launch_file: name or path, as for ``ic launch``.
-        run_dir: run directory; its path must be short (sockets).
-        arguments: launch arguments.
+        run_dir: its path must be short (sockets).
         log_path: file for the launcher's output (default: ``RUN_DIR/launch.log``).
         prefix: command that starts the launcher, such as ``ip netns exec NAME``.
         pace: of the stack's time, see :mod:`instant_ic.pace`; None: what the machine can do.
@@ -203,9 +202,9 @@ class Stack:
                 f"the stack did not end within {timeout_s:g} s of SIGINT and was killed:\n{self.log_tail()}"
             ) from None
 
-    def log_tail(self, lines: int = 40) -> str:
+    def log_tail(self) -> str:
         """Return the last lines of the launcher's output."""
-        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-lines:])
+        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-40:])
 
 
 def processes_of(run_dir: Path) -> Sequence[Any]:

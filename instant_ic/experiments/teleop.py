@@ -21,7 +21,7 @@ from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import teleop_figures as figures
 from instant_ic.experiments.processes import run_all
 from instant_ic.experiments.teleop_figures import Drive, Switch
-from instant_ic.experiments.teleop_operator import Operator, Sight, make_operator, read_commands
+from instant_ic.experiments.teleop_operator import MANNERS, RecordedOperator, ScriptedOperator, Sight, read_commands
 from instant_ic.experiments.teleop_results import in_order
 from instant_ic.experiments.teleop_settings import TeleopSettings
 from instant_ic.experiments.teleop_stack import (
@@ -62,13 +62,13 @@ class _Episode:
         config = StackConfig(method, settings.depth, seed, whole_views=filmed, overrides=words)
         self.settings, self.course = settings, course
         self.drive = Drive(index, method, way_m=course.way_m)
-        log = read_commands(settings.log) if settings.log is not None else None
-        self.recorded = log is not None
-        self.operator: Operator = make_operator(
-            course.goals, lambda: floor_plan(course.world), log, settings.manner, seed
-        )
-        per_obstacle = 20.0 * len(course.obstacles)
-        self.limit_s = READY_S + (log[-1, 0] + 20.0 if log is not None else 20.0 + 4.0 * course.way_m + per_obstacle)
+        self.operator: ScriptedOperator | RecordedOperator
+        if settings.log is None:
+            self.operator = ScriptedOperator(course.goals, floor_plan(course.world), MANNERS[settings.manner], seed)
+            self.limit_s = READY_S + (20.0 + 4.0 * course.way_m + 20.0 * len(course.obstacles))
+        else:
+            self.operator = RecordedOperator(read_commands(settings.log))
+            self.limit_s = READY_S + (self.operator.log[-1, 0] + 20.0)
         self.stack = make_stack(course.world, config)
         self.began_s: float | None = None
         self.ended_s: float | None = None
@@ -95,7 +95,7 @@ class _Episode:
             drive.contacts = stack.simulation.robot.contacts
             drive.completed = self.ended_s is not None
             drive.gave_up = self.operator.gave_up
-            drive.detours = getattr(self.operator, "detours", 0)
+            drive.detours = self.operator.detours
             drive.reason = "" if drive.completed else str(stack.state.reason)
             centres = np.array([(one.x, one.y) for one in self.course.obstacles]).reshape(-1, 2)
             figures.judge(drive, stack.log, centres)
@@ -127,7 +127,7 @@ class _Episode:
         """Whether the operator is done, and the r-bot is at the goal and is the robot shown."""
         if not self.operator.done or self.stack.page.virtual:
             return False
-        if self.recorded:
+        if isinstance(self.operator, RecordedOperator):
             return True
         return float(np.linalg.norm(self.stack.robot[:2] - self.course.goals[-1])) < AT_GOAL_M
 
@@ -198,11 +198,6 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def prepare() -> None:
-    """Compile the kernels that the nodes otherwise compile at start-up, so that no episode includes that time."""
-    warm_up()
-
-
 def evaluate(
     settings: TeleopSettings,
     jobs: int = 1,
@@ -212,12 +207,7 @@ def evaluate(
 ) -> list[Drive]:
     """Drive all courses by all methods, ``jobs`` drives in parallel; with more than one job, each in its own process.
 
-    Args:
-        settings: of the evaluation.
-        jobs: parallel drives.
-        on_drive: called with each finished drive.
-        timeout_s: for all drives.
-        done: finished drives, which are not repeated.
+    The drives in ``done`` are not repeated; ``timeout_s`` is for all drives.
 
     Raises:
         ValueError: nothing to do, no such world, no such log.
@@ -229,11 +219,9 @@ def evaluate(
     known = {(drive.index, drive.method) for drive in done}
     tasks = [(settings, i, name) for i in range(settings.episodes) for name in settings.methods]
     tasks = [task for task in tasks if task[1:] not in known]
-    return in_order([*done, *run_all(_drive, tasks, jobs, prepare, on_drive, timeout_s)])
+    # The kernels are compiled first, so that no episode includes that time.
+    return in_order([*done, *run_all(_drive, tasks, jobs, warm_up, on_drive, timeout_s)])
 
 
 def _drive(settings: TeleopSettings, index: int, method: str) -> Drive:
     return run_episode(settings, index, methods=(method,))[0]
-
-
-__all__ = ["Drive", "TeleopSettings", "evaluate", "run_episode"]

@@ -119,23 +119,23 @@ def shown_speeds(log: Log) -> FloatArray:
     return speeds
 
 
-def ramped(commands: FloatArray, limits: MotionLimits) -> FloatArray:
+def ramped(commands: FloatArray) -> FloatArray:
     """(N, 2) speeds of a robot that follows its commands at once, within its acceleration limits."""
-    speed, out = (0.0, 0.0), np.zeros((len(commands), 2))
+    speed, out, limits = (0.0, 0.0), np.zeros((len(commands), 2)), MotionLimits()
     for k, (linear, angular) in enumerate(commands):
         speed = accelerate(speed, (float(linear), float(angular)), limits, STEP_S)
         out[k] = speed
     return out
 
 
-def obeys(log: Log, limits: MotionLimits | None = None) -> FloatArray:
+def obeys(log: Log) -> FloatArray:
     """(N,) 1 where the shown robot obeyed the command, 0 where it did not, NaN without a command.
 
     It obeyed if its forward speed and yaw rate lie between the minimum and maximum of the ramped command within the
     last ``LATENCY_S``, within ``TOLERANCE_*``. A robot that stands, is slowed down, or turns differently did not.
     """
     commands = np.array(log.command, dtype=np.float64).reshape(-1, 2)
-    wanted, speeds = ramped(commands, limits or MotionLimits()), shown_speeds(log)
+    wanted, speeds = ramped(commands), shown_speeds(log)
     window = round(LATENCY_S / STEP_S)
     tolerance = np.array([TOLERANCE_M_S, TOLERANCE_RAD_S])
     out = np.full(len(commands), math.nan)
@@ -147,9 +147,9 @@ def obeys(log: Log, limits: MotionLimits | None = None) -> FloatArray:
     return out
 
 
-def obedience(log: Log, limits: MotionLimits | None = None) -> float:
+def obedience(log: Log) -> float:
     """Share of the commanded time in which the shown robot obeyed; NaN without commands."""
-    done = obeys(log, limits)
+    done = obeys(log)
     return math.nan if np.isnan(done).all() else float(np.nanmean(done))
 
 

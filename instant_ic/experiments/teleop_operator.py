@@ -5,10 +5,10 @@ from __future__ import annotations
 import csv
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,6 @@ Twist2: TypeAlias = tuple[float, float]
 CRUISE_M_S, TURN_RAD_S = 0.4, 0.8
 """The console's full speed (config/console.yaml: drive)."""
 REACHED_M = 0.25
-NOTICES_S = 1.5
-"""Time without motion under a command after which the operator looks for the reason."""
 BACKS_OFF_S, BACKS_OFF_M_S = 2.0, 0.2
 PASSED_M = 2.2
 """Distance from the blocked place at which a detour ends."""
@@ -58,29 +56,48 @@ class Sight:
     robot: FloatArray
 
 
-class Operator(Protocol):
-    """Source of commands, called twenty times per second."""
+@dataclass(frozen=True)
+class Manner:
+    """How an operator drives.
 
-    done: bool
-    """All goals or commands are finished."""
-    gave_up: bool
+    Attributes:
+        speed: share of the forward speed.
+        delay_s: from what is seen to the command.
+        noise: standard deviation of both speeds, as a share of full speed; it lasts about half a second.
+        notices_s: time without motion under a command after which the operator looks for the reason.
+    """
 
-    def command(self, sight: Sight) -> Twist2:
-        """Return linear m/s and angular rad/s."""
-        ...
+    speed: float = 1.0
+    delay_s: float = 0.0
+    noise: float = 0.0
+    notices_s: float = 1.5
+
+
+_PLAIN = Manner()
+MANNERS = {
+    "plain": _PLAIN,
+    "cautious": Manner(speed=0.5, notices_s=3.0),
+    "hasty": Manner(notices_s=0.4),
+    "late": Manner(delay_s=0.5),
+    "noisy": Manner(noise=0.15),
+}
 
 
 class ScriptedOperator:
-    """Turns towards the next goal and drives at it, through all obstacles.
+    """Turns towards the next goal and drives at it, through all obstacles; the same seed gives the same commands.
 
-    Blocked for NOTICES_S in the real view, the operator looks around with full knowledge: backs off, drives around
+    Blocked for ``notices_s`` in the real view, the operator looks around with full knowledge: backs off, drives around
     along the shortest path with 10 cm margin, and looks at goals again after PASSED_M. In the virtual space the
     operator drives on.
     """
 
-    def __init__(self, goals: FloatArray, plan: OccupancyMask) -> None:
-        self.goals, self.plan = goals, plan
-        self.notices_s = NOTICES_S
+    def __init__(
+        self, goals: FloatArray, plan: OccupancyMask, manner: Manner = MANNERS["plain"], seed: int = 0
+    ) -> None:
+        self.goals, self.plan, self.manner = goals, plan, manner
+        self._rng, self._noise = np.random.default_rng([83, seed]), np.zeros(2)
+        self._waiting: deque[tuple[float, Twist2]] = deque()
+        self._now: Twist2 = (0.0, 0.0)
         self.at = 0
         self.detours = 0
         self.done = self.gave_up = False
@@ -91,7 +108,19 @@ class ScriptedOperator:
         self._held_at: list[FloatArray] = []
 
     def command(self, sight: Sight) -> Twist2:
-        """Return the command for the current view."""
+        """Return the command (m/s, rad/s) for the view of ``delay_s`` ago; called twenty times per second."""
+        linear, angular = self._intended(sight)
+        self._noise = 0.9 * self._noise + self.manner.noise * math.sqrt(0.19) * self._rng.normal(size=2)
+        if linear or angular:
+            angular += float(self._noise[1]) * TURN_RAD_S
+            linear *= self.manner.speed if linear > 0 else 1.0
+            linear += float(self._noise[0]) * CRUISE_M_S if linear else 0.0
+        self._waiting.append((sight.time_s + self.manner.delay_s, (linear, angular)))
+        while self._waiting and self._waiting[0][0] <= sight.time_s + 1e-9:
+            self._now = self._waiting.popleft()[1]
+        return self._now
+
+    def _intended(self, sight: Sight) -> Twist2:
         if self.at < len(self.goals) and _far(sight.pose, self.goals[self.at]) < REACHED_M:
             self.at, self._route = self.at + 1, None
         self.done = self.at == len(self.goals)
@@ -131,7 +160,7 @@ class ScriptedOperator:
             self._held_since = None
         elif self._held_since is None:
             self._held_since = sight.time_s
-        elif sight.time_s - self._held_since > self.notices_s:
+        elif sight.time_s - self._held_since > self.manner.notices_s:
             self._held_since = None
             self._held_at.append(sight.robot[:2].copy())
             self.detours += 1
@@ -149,62 +178,13 @@ class ScriptedOperator:
         return 0.0, 0.0
 
 
-@dataclass(frozen=True)
-class Manner:
-    """How an operator differs from the scripted one.
-
-    Attributes:
-        speed: share of the forward speed.
-        delay_s: from what is seen to the command.
-        noise: standard deviation of both speeds, as a share of full speed; it lasts about half a second.
-        notices_s: time without motion under a command after which the operator looks for the reason.
-    """
-
-    speed: float = 1.0
-    delay_s: float = 0.0
-    noise: float = 0.0
-    notices_s: float = NOTICES_S
-
-
-MANNERS = {
-    "plain": Manner(),
-    "cautious": Manner(speed=0.5, notices_s=3.0),
-    "hasty": Manner(notices_s=0.4),
-    "late": Manner(delay_s=0.5),
-    "noisy": Manner(noise=0.15),
-}
-
-
-class ManneredOperator(ScriptedOperator):
-    """The scripted operator with a manner; the same seed gives the same commands."""
-
-    def __init__(self, goals: FloatArray, plan: OccupancyMask, manner: Manner, seed: int) -> None:
-        super().__init__(goals, plan)
-        self.manner, self.notices_s = manner, manner.notices_s
-        self._rng, self._noise = np.random.default_rng([83, seed]), np.zeros(2)
-        self._waiting: deque[tuple[float, Twist2]] = deque()
-        self._now: Twist2 = (0.0, 0.0)
-
-    def command(self, sight: Sight) -> Twist2:
-        """Return the command for the view of ``delay_s`` ago."""
-        linear, angular = super().command(sight)
-        self._noise = 0.9 * self._noise + self.manner.noise * math.sqrt(0.19) * self._rng.normal(size=2)
-        if linear or angular:
-            angular += float(self._noise[1]) * TURN_RAD_S
-            linear *= self.manner.speed if linear > 0 else 1.0
-            linear += float(self._noise[0]) * CRUISE_M_S if linear else 0.0
-        self._waiting.append((sight.time_s + self.manner.delay_s, (linear, angular)))
-        while self._waiting and self._waiting[0][0] <= sight.time_s + 1e-9:
-            self._now = self._waiting.popleft()[1]
-        return self._now
-
-
 class RecordedOperator:
     """Commands of a log by time, independent of what the robot does."""
 
     def __init__(self, log: FloatArray) -> None:
         self.log = log
         self.done = self.gave_up = False
+        self.detours = 0
         self._began_s: float | None = None
         self._next = 0
 
@@ -273,35 +253,18 @@ def _read_csv(path: Path) -> list[Sequence[float]]:
 
 
 def _read_bag(path: Path) -> list[Sequence[float]]:
-    from instant_ic.bag.errors import BagError
-    from instant_ic.bag.files import BagReader
+    from instant_ic.experiments.bags import opened
     from instant_ic.msg import deserialize, twist_values
 
     topic = "/operator/cmd_vel"
-    rows: list[Sequence[float]] = []
-    try:
-        with BagReader(path) as reader:
-            types = {one.topic: one.type_name for one in reader.topics}
-            if topic not in types:
-                has = ", ".join(sorted(types)) or "none"
-                raise ValueError(f"{path}: {topic} is missing; the bag has these topics: {has}")
-            if types[topic].rpartition("/")[2] not in ("TwistStamped", "Twist"):
-                raise ValueError(f"{path}: {topic} has type {types[topic]}, not geometry_msgs/TwistStamped")
-            for message in reader.messages([topic]):
-                twist = twist_values(deserialize(message.payload, message.type_name))
-                rows.append([message.stamp_ns / 1e9, *twist])
-    except BagError as error:
-        raise ValueError(str(error)) from error
+    with opened(path, {topic: ("TwistStamped", "Twist")}) as reader:
+        rows: list[Sequence[float]] = [
+            [message.stamp_ns / 1e9, *twist_values(deserialize(message.payload, message.type_name))]
+            for message in reader.messages([topic])
+        ]
     if not rows:
         raise ValueError(f"{path}: contains no message on {topic}")
     return rows
-
-
-def make_operator(
-    goals: FloatArray, plan: Callable[[], OccupancyMask], log: FloatArray | None, manner: str = "plain", seed: int = 0
-) -> Operator:
-    """The recorded operator if there is a log, else the scripted one with a manner of ``MANNERS``."""
-    return ManneredOperator(goals, plan(), MANNERS[manner], seed) if log is None else RecordedOperator(log)
 
 
 def _far(a: FloatArray, b: FloatArray) -> float:

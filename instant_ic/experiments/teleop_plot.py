@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
@@ -45,7 +46,7 @@ FPS = 10
 
 
 def save_plot(
-    path: Path, drives: Sequence[Drive], report: dict[str, Any], settings: TeleopSettings, most: int = 4
+    path: Path | io.BytesIO, drives: Sequence[Drive], report: dict[str, Any], settings: TeleopSettings, most: int = 4
 ) -> None:
     """Save figures by method, every course's time and obedience, and maps of the worst courses.
 
@@ -216,14 +217,11 @@ class Video:
     def __init__(self, path: Path) -> None:
         import cv2
 
-        self.path = path
         size = (_PICTURE[0] + _MAP, _PICTURE[1])
         self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, size)
         if not self._writer.isOpened():
             raise ValueError(f"{path}: the video cannot be written")
-        self._map: PlanImage | None = None
-        self._next_s = 0.0
-        self.pictures = 0
+        self._frames = screen_frames(1.0 / FPS)
 
     def __enter__(self) -> Self:
         return self
@@ -236,13 +234,25 @@ class Video:
 
     def on_step(self, stack: SimulatedStack) -> None:
         """Add a frame when one is due; pass this method to ``teleop.run_episode``."""
-        if stack.time_s < self._next_s or not stack.log.pictures or not stack.log.time_s:
-            return
-        self._next_s = stack.time_s + 1.0 / FPS - 1e-6
-        if self._map is None:
-            self._map = PlanImage(floor_plan(stack.simulation.world, 0.05))
-        self._writer.write(np.hstack([operator_image(stack), self._map.draw(stack)]))
-        self.pictures += 1
+        frame = self._frames(stack)
+        if frame is not None:
+            self._writer.write(frame)
+
+
+def screen_frames(period_s: float) -> Callable[[SimulatedStack], NDArray[np.uint8] | None]:
+    """Function that returns what the operator sees beside the map, (360, 1000, 3) BGR, if a frame is due, else None."""
+    plan: PlanImage | None = None
+    next_s = 0.0
+
+    def frame(stack: SimulatedStack) -> NDArray[np.uint8] | None:
+        nonlocal plan, next_s
+        if stack.time_s < next_s or not stack.log.pictures or not stack.log.time_s:
+            return None
+        next_s = stack.time_s + period_s - 1e-6
+        plan = plan or PlanImage(floor_plan(stack.simulation.world, 0.05))
+        return np.hstack([operator_image(stack), plan.draw(stack)])
+
+    return frame
 
 
 def operator_image(stack: SimulatedStack) -> NDArray[np.uint8]:
@@ -301,6 +311,3 @@ class PlanImage:
             cv2.polylines(frame, [self.pixels(nose)], False, colour, 1, cv2.LINE_AA)
         cv2.putText(frame, f"{stack.time_s:.1f} s", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
         return frame
-
-
-__all__ = ["FPS", "PlanImage", "Video", "draw_modes", "operator_image", "save_plot"]

@@ -6,8 +6,7 @@ import functools
 from dataclasses import dataclass
 from pathlib import Path
 
-from instant_ic.experiments.teleop_operator import MANNERS
-from instant_ic.experiments.teleop_stack import DEPTHS, METHODS, StackConfig
+from instant_ic.experiments.teleop_stack import METHODS, StackConfig
 from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS, Course, make_course
 
 
@@ -19,11 +18,11 @@ class TeleopSettings:
         episodes, seed: which drives; the same seed gives the same drives.
         world: ``corridors`` (random ones), or a world of the simulator.
         methods: of ``METHODS``.
-        depth: of ``DEPTHS``.
+        depth: as ``StackConfig``.
         log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
         pictures: whether to render and compare the images on either side of a switch.
         overrides: parameters ``node.key:=value`` on top of the shipped ones.
-        manner: of the scripted operator, of ``MANNERS``.
+        manner: of the scripted operator, of ``teleop_operator.MANNERS``.
     """
 
     episodes: int = 50
@@ -39,15 +38,10 @@ class TeleopSettings:
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
-        for key, given, allowed in (
-            ("methods", self.methods, METHODS),
-            ("depth", (self.depth,), DEPTHS),
-            ("manner", (self.manner,), tuple(MANNERS)),
-        ):
-            unknown = [name for name in given if name not in allowed]
-            if unknown or not given:
-                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
-        StackConfig(overrides=self.overrides)  # raises ValueError on a malformed override
+        if not self.methods:
+            raise ValueError(f"methods must be some of {', '.join(METHODS)} (got none)")
+        for method in self.methods:
+            StackConfig(method, overrides=self.overrides)  # raises ValueError on a wrong one
 
     def course(self, index: int) -> Course:
         """Return course ``index``.

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from instant_ic.bag.replay import make_node
 from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.experiments.pictures import jpeg
 from instant_ic.geometry.poses import (
     compose2,
     matrix_from_quaternion,
@@ -54,7 +55,6 @@ if TYPE_CHECKING:
 FloatArray: TypeAlias = NDArray[np.float64]
 
 METHODS = ("ic", "stop", "shared")
-DEPTHS = ("fused", "lidar")
 NODES = ("crawler_base", "vlp16_driver", "grid_slam", "virtual_robot", "navigator", "arbiter", "console")
 VSPACE_NODES = ("depth_estimator", "depth_scaler", "nerf")
 STEP_S = 1 / 60
@@ -76,7 +76,7 @@ class StackConfig:
 
     Attributes:
         method: of ``METHODS``.
-        depth: depth source, of ``DEPTHS``.
+        depth: depth source, ``fused`` or ``lidar``.
         seed: of the robot's slip, the LiDAR's noise and the delays.
         camera_hz: images per second.
         camera_latency_s: from the exposure to the page, as for the simulated camera.
@@ -101,8 +101,6 @@ class StackConfig:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method must be one of {', '.join(METHODS)} (got {self.method!r})")
-        if self.depth not in DEPTHS:
-            raise ValueError(f"depth must be one of {', '.join(DEPTHS)} (got {self.depth!r})")
         for word in self.overrides:
             if word.partition(".")[0] not in (*NODES, *VSPACE_NODES) or ":=" not in word:
                 names = ", ".join((*NODES, *VSPACE_NODES))
@@ -135,7 +133,7 @@ class Shown:
     draw: Callable[[], bytes] | None = None
 
 
-class _Port:
+class EmulatedPort:
     """The motor controller's serial line, in memory."""
 
     def __init__(self, controller: RoboclawEmulator) -> None:
@@ -165,26 +163,12 @@ class SilentPage:
     def now_ms(self) -> float:
         return 0.0
 
-    def publish(self, kind: str, message: dict[str, Any]) -> None:
-        pass
-
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
-        pass
-
-    def send_layers(self, layers: Any) -> None:
-        pass
-
-    def drawn_ms(self) -> float | None:
-        return None  # it shows rendered views
-
     def needs_views(self) -> bool:
         return True
 
-    def show(self, *kinds: Any) -> None:
-        pass
-
-    def stop(self) -> None:
-        pass
+    def __getattr__(self, name: str) -> Any:
+        """Method that ignores what it is given; ``drawn_ms`` is None as it shows rendered views."""
+        return lambda *_: None
 
 
 class _Page(SilentPage):
@@ -299,7 +283,7 @@ class SimulatedStack:
             "depth_estimator": pictures,
             "depth_scaler": pictures,
         }
-        port = _Port(self.simulation.controller)
+        port = EmulatedPort(self.simulation.controller)
         self.nodes: dict[str, Any] = {}
         for name in names:
             node = make_node(name, None, words)
@@ -405,8 +389,7 @@ class SimulatedStack:
             self._exposed.append((now, self.robot))
             if self.config.method == "ic" and self._worth_drawing():
                 self._drawn[START_NS + round(now * 1e9)] = self.robot
-                jpeg = self._draw()
-                self._for_depth.append((now + self.config.depth_latency_s, now, jpeg))
+                self._for_depth.append((now + self.config.depth_latency_s, now, self._draw()))
         # Images in transit: the console itself takes the first off the queue.
         while self._exposed and now - self._exposed[0][0] >= self.config.camera_latency_s - 1e-9:
             waiting, exposure = len(self._exposed), self._exposed[0][0]
@@ -414,11 +397,11 @@ class SimulatedStack:
             if len(self._exposed) == waiting:  # the console is not available
                 self._exposed.popleft()
         while self._for_depth and now >= self._for_depth[0][0] - 1e-9:
-            _, exposure, jpeg = self._for_depth.popleft()
-            self._publish_picture("/camera/for_depth", jpeg, exposure)
+            _, exposure, image = self._for_depth.popleft()
+            self._publish_picture("/camera/for_depth", image, exposure)
 
-    def _publish_picture(self, topic: str, jpeg: bytes, exposure_s: float) -> None:
-        message = compressed_image_message(jpeg, "camera", START_NS + round(exposure_s * 1e9))
+    def _publish_picture(self, topic: str, image: bytes, exposure_s: float) -> None:
+        message = compressed_image_message(image, "camera", START_NS + round(exposure_s * 1e9))
         self.bus.publish(topic, message)
 
     def _worth_drawing(self) -> bool:
@@ -438,11 +421,7 @@ class SimulatedStack:
         return worth
 
     def _draw(self) -> bytes:
-        import cv2
-
-        rgb = self.simulation.panorama(self.config.panorama, self.config.panorama // 2).rgb
-        _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-        return bytes(jpeg.tobytes())
+        return jpeg(self.simulation.panorama(self.config.panorama, self.config.panorama // 2).rgb, 92)
 
     # -- time
 
@@ -520,6 +499,3 @@ def _settled(shown: Shown, whole: bool) -> Shown:
 def _moved(a: FloatArray, b: FloatArray, distance_m: float, angle_rad: float) -> bool:
     x, y, yaw = relative2(a, b)
     return math.hypot(float(x), float(y)) >= distance_m or abs(wrap_angle(float(yaw))) >= angle_rad
-
-
-__all__ = ["DEPTHS", "METHODS", "Log", "Shown", "SimulatedStack", "StackConfig"]

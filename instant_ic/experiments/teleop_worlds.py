@@ -31,6 +31,8 @@ _TALL_M = (1.5, 1.9)
 """In furnished worlds, objects in this height range are not hidden from the operator; a door's lintel is above it."""
 _DRIVE_M = (3.5, 10.0)
 """Shortest and longest drive across a furnished world."""
+_BEFORE_WALL_M = 1.2
+"""Distance from the wall at which a drive straight ahead ends, at most ``_DRIVE_M[1]`` from its start."""
 _ROOM_M = 0.45
 """Distance from everything at the start and the goal of such a drive."""
 _LONGEST_THING_M = 1.5
@@ -178,7 +180,7 @@ def route(mask: OccupancyMask, start: FloatArray, goals: FloatArray, spare_m: fl
     """Shortest path (N, 3) of the true footprint over all goals (M, 2); None if there is none."""
     way, pose = [np.asarray(start, np.float64)[None]], np.asarray(start, np.float64)
     for goal in goals:
-        leg = shortest_way(mask, pose, np.array([*goal, 0.0]), 0.05, spare_m)
+        leg = shortest_way(mask, pose, np.array([*goal, 0.0]), spare_m)
         if leg is None:
             return None
         way.append(leg[1:])
@@ -186,7 +188,7 @@ def route(mask: OccupancyMask, start: FloatArray, goals: FloatArray, spare_m: fl
     return np.concatenate(way)
 
 
-def straight_ahead(world: World, most_m: float = 10.0, before_wall_m: float = 1.2) -> Course:
+def straight_ahead(world: World) -> Course:
     """Course in any world: the operator drives straight ahead from the start, as far as the walls allow.
 
     Objects taller than 1.9 m count as walls; the others on the path count as obstacles.
@@ -196,13 +198,13 @@ def straight_ahead(world: World, most_m: float = 10.0, before_wall_m: float = 1.
     """
     x, y, yaw = world.spawn
     heading = np.array([math.cos(yaw), math.sin(yaw)])
-    steps = np.arange(0.0, most_m + before_wall_m, 0.05)
+    steps = np.arange(0.0, _DRIVE_M[1] + _BEFORE_WALL_M, 0.05)
     line = np.array([x, y]) + steps[:, None] * heading
     wall = np.flatnonzero(world.occupied(*_TALLER_THAN_THINGS_M, 0.05).at(line))
-    reach = float(steps[wall[0]] if wall.size else steps[-1]) - before_wall_m
+    reach = float(steps[wall[0]] if wall.size else steps[-1]) - _BEFORE_WALL_M
     if reach < 2.0:
         raise ValueError(
-            f"world {world.name!r}: a wall stands {reach + before_wall_m:.1f} m ahead of the start; "
+            f"world {world.name!r}: a wall stands {reach + _BEFORE_WALL_M:.1f} m ahead of the start; "
             "the operator drives straight on and needs 3.2 m"
         )
     goal = np.array([x, y]) + reach * heading

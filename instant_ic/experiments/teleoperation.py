@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import io
 import math
-import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,9 +22,8 @@ from instant_ic.experiments.pictures import jpeg
 from instant_ic.experiments.recorded_drive import Moment, read_drive
 from instant_ic.experiments.report import Answer, Figure, Part, Section, Table, Text, image_address
 from instant_ic.experiments.teleop import run_episode
-from instant_ic.experiments.teleop_plot import PlanImage, operator_image, save_plot
+from instant_ic.experiments.teleop_plot import save_plot, screen_frames
 from instant_ic.experiments.teleop_settings import TeleopSettings
-from instant_ic.experiments.teleop_worlds import floor_plan
 
 _FRAME_S = 0.25
 _SIZE = (500, 180)
@@ -33,31 +31,21 @@ _BESIDE_S = 1.0
 """Stills 1 and 5 are this long before and after the virtual space."""
 
 
-@dataclass(frozen=True)
-class _Frame:
-    time_s: float
-    virtual: bool
-    image: NDArray[np.uint8]
-
-
 class _Recorded(FilmedStack):
     """Keeps what the operator sees, beside the map."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self.frames: list[_Frame] = []
-        self._plan = PlanImage(floor_plan(self.simulation.world, 0.05))
+        self.frames: list[Moment] = []
+        self._frame = screen_frames(_FRAME_S)
 
     def step(self, operate: Callable[[], tuple[float, float]] | None = None) -> None:
         """As ``FilmedStack.step``; then keep a frame if one is due."""
         super().step(operate)
-        due = not self.frames or self.time_s >= self.frames[-1].time_s + _FRAME_S - 1e-6
-        if due and self.log.pictures and self.log.time_s:
-            image = cv2.resize(
-                np.hstack([operator_image(self), self._plan.draw(self)]), _SIZE, interpolation=cv2.INTER_AREA
-            )
-            rgb = np.ascontiguousarray(image[..., ::-1])
-            self.frames.append(_Frame(self.time_s, self.log.pictures[-1].virtual, rgb))
+        frame = self._frame(self)
+        if frame is not None:
+            rgb = np.ascontiguousarray(cv2.resize(frame, _SIZE, interpolation=cv2.INTER_AREA)[..., ::-1])
+            self.frames.append(Moment(self.time_s, self.log.pictures[-1].virtual, rgb))
 
 
 _COST_S = 60.0
@@ -92,10 +80,9 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
     frames = stacks[0].frames
     if arguments["images"] and frames:
         images = _shown(frames, _FRAME_S)
-        with tempfile.TemporaryDirectory() as folder:
-            plot = Path(folder) / "plot.png"
-            save_plot(plot, [drive], teleop_results.report([drive], settings), settings, 1)
-            images["Trajectories of r-bot and v-bot, state over time"] = image_address(plot.read_bytes(), "image/png")
+        plot = io.BytesIO()
+        save_plot(plot, [drive], teleop_results.report([drive], settings), settings, 1)
+        images["Trajectories of r-bot and v-bot, state over time"] = image_address(plot.getvalue(), "image/png")
     row = {key: value for key, value in asdict(drive).items() if key != "tracks"}
     views = {source: illusion.figures(film.frames, source) for source in SOURCES} if film.frames else {}
     return {"drive": row, "views": views, "images": images}
@@ -110,7 +97,7 @@ def _recorded(bag: Path) -> dict[str, Any]:
     return {"drive": row | {"contacts": None}, "views": {}, "images": images}
 
 
-def _shown(frames: Sequence[_Frame | Moment], frame_s: float) -> dict[str, str]:
+def _shown(frames: Sequence[Moment], frame_s: float) -> dict[str, str]:
     """Numbered stills and a film."""
     images = {}
     for number, frame in enumerate(stills(frames), 1):
@@ -120,7 +107,7 @@ def _shown(frames: Sequence[_Frame | Moment], frame_s: float) -> dict[str, str]:
     return images
 
 
-def stills(frames: Sequence[_Frame | Moment]) -> list[_Frame | Moment]:
+def stills(frames: Sequence[Moment]) -> list[Moment]:
     """Five frames as in the paper's Fig. 9: before, first, middle and last in the virtual space, and after it."""
     shown = [frame for frame in frames if frame.virtual]
     if not shown:

@@ -105,7 +105,7 @@ def register(table, references, free, counters, cells, delta, pose, laser, point
 
 
 @njit(cache=True)
-def _full(table, cells, ix, iy, threshold):  # type: ignore[no-untyped-def]
+def _full(table, cells, ix, iy):  # type: ignore[no-untyped-def]
     """Tile of a cell if the cell is occupied; −1 if it is free or unknown."""
     size = table.shape[0] * TILE
     if ix < 0 or iy < 0 or ix >= size or iy >= size:
@@ -115,7 +115,7 @@ def _full(table, cells, ix, iy, threshold):  # type: ignore[no-untyped-def]
         return -1
     visits = cells[tile, iy % TILE, ix % TILE, 0]
     hits = cells[tile, iy % TILE, ix % TILE, 1]
-    return tile if visits > 0 and hits > threshold * visits else -1
+    return tile if visits > 0 and hits > 0.1 * visits else -1
 
 
 @njit(cache=True)
@@ -141,8 +141,8 @@ def score(table, cells, delta, pose, laser, points, kernel, sigma, lsigma):  # t
         best = 1e30
         for v in range(-kernel, kernel + 1):
             for u in range(-kernel, kernel + 1):
-                tile = _full(table, cells, ix + u, iy + v, 0.1)
-                if tile < 0 or _full(table, cells, fx + u, fy + v, 0.1) >= 0:
+                tile = _full(table, cells, ix + u, iy + v)
+                if tile < 0 or _full(table, cells, fx + u, fy + v) >= 0:
                     continue
                 cell = cells[tile, (iy + v) % TILE, (ix + u) % TILE]
                 dx, dy = x - cell[2] / cell[1], y - cell[3] / cell[1]
@@ -194,12 +194,7 @@ def climb(table, cells, delta, start, laser, points, kernel, sigma, lsigma, lste
 
 
 class TileMaps:
-    """Maps of all particles.
-
-    Args:
-        particles: number of particles.
-        delta: metres per cell.
-        size_m: side of the square about the origin that a map can cover.
+    """Maps of all particles; ``delta``: metres per cell, ``size_m``: side of the square that a map can cover.
 
     Attributes:
         tables: int32 (particles, n, n).

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from instant_ic.experiments.vspace_sources import (
     CAMERA_HEIGHT_M,
+    FOV_RAD,
     KEYFRAMES,
     Drawer,
     Picture,
@@ -106,18 +107,12 @@ def path_poses(world: World, start: tuple[float, float, float], path: str, dista
     return max((along(side / radius) for radius in _RADII_M for side in (1, -1)), key=len)
 
 
-def start_pose(world: World, start: tuple[float, float, float] | None, seed: int = 0) -> tuple[float, float, float]:
-    """The given start, or the world's own; with a seed above 0 a random free one; rotated to the longest straight path.
+def start_pose(world: World, seed: int = 0) -> tuple[float, float, float]:
+    """The world's own start; with a seed above 0 a random free one; rotated to the longest straight path.
 
     Raises:
         ValueError: the start is not free.
     """
-    if start is not None:
-        if not path_poses(world, start, "straight", [0.0]):
-            raise ValueError(
-                f"start {start[0]:g},{start[1]:g} is not {CLEARANCE_M} m clear of everything: choose another"
-            )
-        return start
     places = [world.spawn]
     if seed:
         places = [tuple(pose) for pose in world.sample_free_poses(np.random.default_rng([79, seed]), 4, 0.5).tolist()]
@@ -129,16 +124,11 @@ def start_pose(world: World, start: tuple[float, float, float] | None, seed: int
     return best
 
 
-def make_place(
-    world: str,
-    settings: VspaceSettings,
-    start: tuple[float, float, float] | None = None,
-    config: VirtualSpaceConfig | None = None,
-) -> Place:
+def make_place(world: str, settings: VspaceSettings, config: VirtualSpaceConfig | None = None) -> Place:
     """Make what the sources need.
 
     Raises:
-        ValueError: world or start is invalid.
+        ValueError: no such world, or its start is not free.
     """
     from instant_ic import paths
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
@@ -156,8 +146,8 @@ def make_place(
     before = (
         made if world.partition(":")[0] != "corridor" else make_world(world.replace("corridor", "corridor-free", 1))
     )
-    begin = start_pose(made, start, settings.start_seed)
-    return Place(made, before, EquirectRenderer(made), begin, config, model, walkers)
+    start = start_pose(made, settings.start_seed)
+    return Place(made, before, EquirectRenderer(made), start, config, model, walkers)
 
 
 def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
@@ -165,27 +155,16 @@ def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
     return min(psnr_db(picture, truth), 99.0), ssim(picture, truth)
 
 
-def compare(
-    world: str,
-    settings: VspaceSettings,
-    start: tuple[float, float, float] | None = None,
-    config: VirtualSpaceConfig | None = None,
-) -> Comparison:
+def compare(world: str, settings: VspaceSettings, config: VirtualSpaceConfig | None = None) -> Comparison:
     """Compare the views of each source with the world's own along each path.
 
-    Args:
-        world: as for ``sim.worlds.make_world``.
-        settings: of the comparison.
-        start: (x, y, yaw) of the last panorama; None: the world's own start.
-        config: of the virtual space.
-
     Raises:
-        ValueError: world, start or a setting is invalid, or the depth of a panorama cannot be scaled.
+        ValueError: no such world, its start is not free, or the depth of a panorama cannot be scaled.
     """
-    place = make_place(world, settings, start, config)
+    place = make_place(world, settings, config)
     comparison = Comparison(place.start)
     width, height = settings.size
-    fov = math.radians(settings.fov_deg)
+    fov = FOV_RAD
     ready: dict[str, tuple[Drawer, float]] = {}
     for path in settings.paths:
         # The path must also be free behind the start; where it ends, fewer keyframes are taken.
@@ -274,21 +253,17 @@ def slam_errors(world: World, poses: Sequence[Any], settings: VspaceSettings) ->
 
 
 def converge(
-    world: str,
-    settings: VspaceSettings,
-    times_s: Sequence[float],
-    start: tuple[float, float, float] | None = None,
-    config: VirtualSpaceConfig | None = None,
+    world: str, settings: VspaceSettings, times_s: Sequence[float], config: VirtualSpaceConfig | None = None
 ) -> list[Row]:
     """Views at the panorama and 1 m ahead by training time: ``ours`` as shown, its ``field`` alone, and ``paper``.
 
     Args: as ``compare``; ``times_s`` are CPU seconds.
     """
-    place = make_place(world, settings, start, config)
+    place = make_place(world, settings, config)
     width, height = settings.size
     poses = path_poses(place.world, place.start, "straight", (0.0, 1.0))
     views = [
-        (distance, pose, place.renderer.render_perspective(pose, width, height, math.radians(settings.fov_deg), 3).rgb)
+        (distance, pose, place.renderer.render_perspective(pose, width, height, FOV_RAD, 3).rgb)
         for distance, pose in zip((0.0, 1.0), poses, strict=False)
     ]
     shot = take_shot(place.renderer, poses[0], settings, place.model)
@@ -315,7 +290,7 @@ def converge_on(
             for source in shown_as:
                 space.config = field_alone(own) if source == "field" else own
                 for distance, pose, truth in views:
-                    view = space.render(pose, width, height, math.radians(settings.fov_deg))
+                    view = space.render(pose, width, height, FOV_RAD)
                     confidence = float(view.confidence.mean())
                     rows.append(_row("straight", source, distance, view.rgb, truth, seconds, confidence))
             space.config = own

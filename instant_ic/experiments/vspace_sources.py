@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 PATHS = ("straight", "curve")
 SOURCES = {
     "ours": "depth of the shipped model scaled by the LiDAR, field trained from it",
-    "field": "the same, the field alone from its first step on, never the warp",
     "true-depth": "the same with the world's own depth: the ceiling",
     "no-depth": "field trained from colours alone (paper: -depth)",
     "no-scale": "the model's depth as it comes, not scaled (paper: -scale)",
@@ -37,7 +36,6 @@ SOURCES = {
     "panorama": "the panorama turned, without depth",
     "depth-warp": "the panorama warped by the depth of `ours`, as a mesh",
     "point-warp": "the same as points",
-    "true-warp": "mesh warp by the world's own depth",
     "mesh": "conventional IC with a perfect scan: exact geometry, obstacle not there yet, colours fitted",
     **{name: f"conventional IC with a real scan: {name}" for name in QUALITIES},
 }
@@ -47,6 +45,8 @@ KEYFRAMES = {"older": 3}
 """Number of panoramas of the sources that have several."""
 Picture = NDArray[np.uint8]
 CAMERA_HEIGHT_M, LIDAR_HEIGHT_M = 1.2, 0.6
+FOV_RAD = math.pi / 2
+"""Horizontal field of view of the views."""
 Drawer: TypeAlias = Callable[[NDArray[np.float64], int, int, float], tuple[Picture, Any]]
 """Renders the place from a pose (4, 4) at width, height, field of view; returns image and confidence, (H, W) or one for
 all pixels: 0 where no panorama has seen the place."""
@@ -59,7 +59,7 @@ class VspaceSettings:
     Attributes:
         paths: of ``PATHS``; sources: of ``SOURCES``.
         seconds: CPU seconds of training.
-        size: width and height of the views; fov_deg: their horizontal field of view.
+        size: width and height of the views.
         panorama_width: of the keyframes, pixels.
         step_m, reach_m: distances from the last panorama are multiples of ``step_m`` up to ``reach_m``.
         seed: of LiDAR noise, training, scans and changed colours.
@@ -71,27 +71,12 @@ class VspaceSettings:
     sources: tuple[str, ...] = ("ours", "no-depth", "no-scale", "panorama", "depth-warp", "mesh")
     seconds: float = 8.0
     size: tuple[int, int] = (640, 360)
-    fov_deg: float = 90.0
     panorama_width: int = 2048
     step_m: float = 0.25
     reach_m: float = 4.0
     seed: int = 0
     start_seed: int = 0
     method: str = "ours"
-
-    def __post_init__(self) -> None:
-        for key, allowed in (("paths", PATHS), ("sources", tuple(SOURCES))):
-            unknown = [name for name in getattr(self, key) if name not in allowed]
-            if unknown or not getattr(self, key):
-                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
-        if not self.seconds > 0:
-            raise ValueError(f"seconds must be > 0 (got {self.seconds:g})")
-        if not (0 < self.step_m <= self.reach_m <= 20):
-            raise ValueError(f"distances must be 0 < step <= reach <= 20 m (got {self.step_m:g}, {self.reach_m:g})")
-        if not 64 <= self.panorama_width <= 8192 or self.panorama_width % 8:
-            raise ValueError(f"panorama width must be 64 to 8192, a multiple of 8 (got {self.panorama_width})")
-        if not 1 <= self.fov_deg < 170:
-            raise ValueError(f"field of view must be from 1 to 170 degrees (got {self.fov_deg:g})")
 
     @property
     def distances_m(self) -> list[float]:
@@ -260,9 +245,9 @@ def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: P
 
         return draw
 
-    if name in ("ours", "field", "no-scale", "true-depth", "older", "paper", "paper-no-scale"):
+    if name in ("ours", "no-scale", "true-depth", "older", "paper", "paper-no-scale"):
         count = KEYFRAMES.get(name, 1)
-        own = paper_config(config) if name.startswith("paper") else field_alone(config) if name == "field" else config
+        own = paper_config(config) if name.startswith("paper") else config
         space = make_space(shots[-count:], name, settings, own)
         train(space, settings.seconds)
         return of_view(space), time.process_time() - start
@@ -293,9 +278,7 @@ def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: P
             return point_warp(last.rgb, last.result.depth_m, last.pose, pose, width, height, fov)
 
         return draw_points, 0.0
-    true = name == "true-warp"
-    depth_m = last.true_depth_m if true else last.result.depth_m
-    warp = PanoramaWarp(prepare(last.rgb, depth_m, last.pose, 0.0, GeometryConfig(), 4096))
+    warp = PanoramaWarp(prepare(last.rgb, last.result.depth_m, last.pose, 0.0, GeometryConfig(), 4096))
     if name != "panorama":
         return of_view(warp), time.process_time() - start
 

@@ -19,12 +19,7 @@ _MAX_GAIN = 2.5
 
 
 def to_brightness(rgb: Tensor, brightness: float) -> Tensor:
-    """Scale each image's mean byte to ``brightness`` by one factor, as inference does with the manifest's value.
-
-    Args:
-        rgb: (B, 3, H, W) in 0..1.
-        brightness: mean byte; 0 leaves the images unchanged.
-    """
+    """Scale the mean byte of images (B, 3, H, W) in 0..1, as inference does; 0: leave them unchanged."""
     if not brightness:
         return rgb
     mean = rgb.mean(dim=(1, 2, 3), keepdim=True).clamp_min(1 / 255)
@@ -34,9 +29,7 @@ def to_brightness(rgb: Tensor, brightness: float) -> Tensor:
 def turn_and_mirror(generator: torch.Generator, *maps: Tensor) -> list[Tensor]:
     """Rotate every panorama by a random yaw and mirror half of them; both are exact on equirect images.
 
-    Args:
-        generator: source of randomness.
-        maps: images and depth of the panoramas, (B, ..., H, W) each; all change in the same way.
+    All ``maps`` of the panoramas, (B, ..., H, W) each, change in the same way.
     """
     count, width = len(maps[0]), maps[0].shape[-1]
     shifts = torch.randint(0, width, (count,), generator=generator).tolist()

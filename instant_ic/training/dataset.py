@@ -44,21 +44,6 @@ def save_sample(path: Path, rgb: NDArray[np.uint8], depth_m: Floats, priors: Seq
     part.replace(path)
 
 
-class Selection:
-    """Panoramas selected from collections: pairs of a collection and the indices to take from it, in this order."""
-
-    def __init__(self, *parts: tuple[Any, Sequence[int] | NDArray[np.intp]]) -> None:
-        self._places = [(samples, int(index)) for samples, indices in parts for index in indices]
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    def __getitem__(self, index: int) -> Sample:
-        samples, place = self._places[index]
-        sample: Sample = samples[place]
-        return sample
-
-
 class RenderedDataset:
     """Panoramas of ``ic depth render``; each of their priors is a sample. One world in twelve is held out.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,26 +31,6 @@ class Samples(Protocol):
     def __getitem__(self, index: int) -> Sample: ...
 
 
-class Feed(Protocol):
-    """Batches by number, requested in ascending order."""
-
-    batch_size: int
-
-    @property
-    def info(self) -> dict[str, Any]:
-        """Recipe, for the training record (plain values)."""
-        ...
-
-    @property
-    def steps_an_epoch(self) -> int:
-        """Number of batches that cover all panoramas once."""
-        ...
-
-    def batch(self, step: int) -> Batch: ...
-
-    def close(self) -> None: ...
-
-
 def stack(samples: Sequence[Sample], rng: np.random.Generator | None = None) -> Batch:
     """Stack panoramas of one size into a batch; ``rng`` draws the prior of those without one.
 
@@ -70,13 +50,11 @@ def stack(samples: Sequence[Sample], rng: np.random.Generator | None = None) -> 
 
 
 class FileFeed:
-    """Passes over stored panoramas, each in a different order.
+    """Batches by number, requested in ascending order: passes over stored panoramas, each in a different order.
 
     Args:
-        samples: the panoramas.
-        indices: indices of the panoramas to use.
+        indices: of the samples to use.
         batch_size: of this process.
-        seed: of the order.
         rank, ranks: this process among those that train together; each gets its own part of a pass.
         info: recipe.
         threads: number of reader threads (decoding images takes longer than a training step of a small network).
@@ -102,10 +80,12 @@ class FileFeed:
 
     @property
     def info(self) -> dict[str, Any]:
+        """Recipe, for the training record (plain values)."""
         return {**self._info, "panoramas": len(self.indices)}
 
     @property
     def steps_an_epoch(self) -> int:
+        """Number of batches that cover all panoramas once."""
         return max(1, len(self.indices) // (self.batch_size * self.ranks))
 
     def batch(self, step: int) -> Batch:
@@ -123,7 +103,7 @@ class FileFeed:
 class MixedFeed:
     """Combines feeds: each batch concatenates one batch of every feed."""
 
-    def __init__(self, feeds: Sequence[Feed]) -> None:
+    def __init__(self, feeds: Sequence[FileFeed]) -> None:
         self.feeds = list(feeds)
         self.batch_size = sum(feed.batch_size for feed in feeds)
 
@@ -143,6 +123,9 @@ class MixedFeed:
     def close(self) -> None:
         for feed in self.feeds:
             feed.close()
+
+
+Feed: TypeAlias = FileFeed | MixedFeed
 
 
 class Ahead:

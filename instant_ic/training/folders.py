@@ -41,13 +41,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Layout:
-    """Directory layout of a data set.
-
-    Attributes:
-        looks_like: description of the expected files, for messages.
-        pictures: lists the images of a folder, each with its depth file.
-        units_per_m: units per metre of the PNG values.
-    """
+    """Directory layout of a data set: description for messages, lister of images with depth, units a metre in PNG."""
 
     looks_like: str
     pictures: Callable[[Path], Iterator[Pair]]
@@ -110,10 +104,8 @@ class FolderDataset:
     """Panoramas of a folder, resized on reading: images by area averaging, depth by the nearest pixel.
 
     Attributes:
-        folder: of the panoramas.
         layout: one of :data:`LAYOUTS`.
         size: height and width.
-        pairs: images and depth files found.
         alone: images without depth, which are skipped.
         unreadable: damaged files; up to 1 % of the panoramas are skipped with a warning.
     """
@@ -187,11 +179,7 @@ class FolderDataset:
 
 
 def open_folder(name: str, size: tuple[int, int]) -> FolderDataset | RenderedDataset:
-    """Open ``LAYOUT:FOLDER``.
-
-    Args:
-        name: layout (``rendered`` or one of :data:`LAYOUTS`) and folder.
-        size: height and width to which the panoramas are resized.
+    """Open ``LAYOUT:FOLDER``, layout ``rendered`` or one of :data:`LAYOUTS`; ``size``: height and width of the samples.
 
     Raises:
         DatasetError: unknown layout, missing folder, or no files in this layout.

@@ -29,11 +29,8 @@ _HALLS = ("library", "exhibition", "canteen", "office", "store")
 def interior_world(seed: int, kind: str = "", light_cell_m: float = 0.45, rays: int = 12) -> World:
     """Interior of one of :data:`KINDS`; the same seed gives the same world.
 
-    Args:
-        seed: of all random choices.
-        kind: one of :data:`KINDS`; empty: chosen at random by frequency.
-        light_cell_m: resolution of the baked light.
-        rays: rays per light texel.
+    Without a kind, it is chosen at random by frequency. The baked light has texels of ``light_cell_m``, each of so many
+    ``rays``.
 
     Raises:
         ValueError: unknown kind.

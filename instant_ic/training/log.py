@@ -16,10 +16,8 @@ COLUMNS = (
 class TrainingLog:
     """Rows of numbers by step, beside the checkpoint: ``NAME.csv`` and the folder ``NAME.tensorboard``.
 
-    Args:
-        checkpoint: the training's checkpoint file.
-        step: first step of this run; rows after the last checkpoint of an interrupted run are dropped.
-        report: receives human-readable lines.
+    ``step`` is the first of this run; rows after the last checkpoint of an interrupted run are dropped. ``report``
+    receives human-readable lines.
     """
 
     def __init__(self, checkpoint: Path, step: int, report: Callable[[str], None]) -> None:

@@ -14,7 +14,10 @@ from instant_ic.training.dataset import save_sample
 
 FIRST_HELD_OUT = 900_000
 """Worlds from this seed on are reserved for the evaluations (``instant_ic.experiments.depth_worlds``)."""
-INTERIORS = ("wide", "random")
+CAMERA_HEIGHT_M, CLEARANCE_M = (0.5, 1.7), (0.3, 0.7)
+"""Lowest and highest camera above the floor; distance from objects, minimum and maximum."""
+TILT_DEG = 1.5
+"""Standard deviation of roll and pitch."""
 
 
 @dataclass(frozen=True)
@@ -22,15 +25,11 @@ class RoomsConfig:
     """Recipe of generated panoramas.
 
     Attributes:
-        worlds: number of worlds.
-        poses: panoramas in each.
+        worlds, poses: number of worlds, and panoramas in each.
         priors: fused depth images of each panorama, with other faults and another number of revolutions each.
         first_world: seed of the first world; the others follow.
         height: rows of a panorama.
         interiors: ``wide``: ``interiors.interior_world``; ``random``: only ``sim.worlds.random_world``.
-        camera_height_m: lowest and highest camera above the floor.
-        tilt_deg: standard deviation of roll and pitch.
-        clearance_m: distance from objects, minimum and maximum.
         textures: folder of photographs that replace most procedural textures; empty: none.
     """
 
@@ -40,16 +39,11 @@ class RoomsConfig:
     first_world: int = 1000
     height: int = 256
     interiors: str = "wide"
-    camera_height_m: tuple[float, float] = (0.5, 1.7)
-    tilt_deg: float = 1.5
-    clearance_m: tuple[float, float] = (0.3, 0.7)
     textures: str = ""
 
     def __post_init__(self) -> None:
         if self.worlds < 2 or self.poses < 1:
             raise ValueError(f"at least 2 worlds and 1 pose are needed (got {self.worlds}, {self.poses})")
-        if self.interiors not in INTERIORS:
-            raise ValueError(f"interiors must be one of {', '.join(INTERIORS)} (got {self.interiors!r})")
         if self.first_world < 0 or self.first_world + self.worlds > FIRST_HELD_OUT:
             raise ValueError(f"world seeds must be in 0..{FIRST_HELD_OUT - 1}: higher ones are for evaluation "
                              f"(got {self.first_world}..{self.first_world + self.worlds - 1})")  # fmt: skip
@@ -77,12 +71,12 @@ def render_rooms(config: RoomsConfig, folder: Path, worlds: Iterable[int]) -> It
             world = with_photographs(world, config.textures, rng)
         renderer = EquirectRenderer(world)
         try:
-            poses = world.sample_free_poses(rng, config.poses, clearance_m=rng.uniform(*config.clearance_m))
+            poses = world.sample_free_poses(rng, config.poses, clearance_m=rng.uniform(*CLEARANCE_M))
         except ValueError:  # no free place
             continue
         for number, (x, y, yaw) in enumerate(poses):
-            roll, pitch = np.radians(config.tilt_deg) * rng.standard_normal(2)
-            height = rng.uniform(*config.camera_height_m)
+            roll, pitch = np.radians(TILT_DEG) * rng.standard_normal(2)
+            height = rng.uniform(*CAMERA_HEIGHT_M)
             pose = pose_matrix(x, y, height, roll, pitch, math.remainder(yaw, math.tau))
             frame = renderer.render(pose, 2 * config.height, config.height)
             priors = [sample_prior(renderer, pose, frame.rgb, frame.depth_m, prior_rng) for _ in range(config.priors)]

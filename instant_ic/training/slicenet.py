@@ -14,7 +14,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -84,10 +84,6 @@ class SliceNetConfig:
     def base_channels(self) -> int:
         """Channels after the stem, a multiple of 8 so that each contraction to an eighth is an integer."""
         return max(8, round(64 * self.width_multiplier / 8) * 8)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, for checkpoints and training records."""
-        return asdict(self)
 
 
 class CircularPad(nn.Module):
@@ -233,30 +229,6 @@ class Contraction(nn.Module):
         return x.flatten(1, 2)
 
 
-class SlicingModule(nn.Module):
-    """The four contracted levels concatenated: one feature vector per column."""
-
-    def __init__(self, channels: list[int]) -> None:
-        super().__init__()
-        self.slc_lst = nn.ModuleList(Contraction(count) for count in channels)
-
-    def forward(self, levels: list[Tensor], columns: int) -> Tensor:
-        """Levels -> (B, features, columns)."""
-        parts = [part(x, columns) for part, x in zip(self.slc_lst, levels, strict=True)]
-        return torch.cat(parts, dim=1)
-
-
-class _FeatureExtractor(nn.Module):
-    """Exists only to match the published parameter names (``feature_extractor.encoder``)."""
-
-    def __init__(self, config: SliceNetConfig) -> None:
-        super().__init__()
-        self.encoder = Encoder(config)
-
-    def forward(self, x: Tensor) -> list[Tensor]:
-        return self.encoder(x)
-
-
 class SliceNet(nn.Module):
     """(B, 3, H, 2H) RGB, 0..1 -> (B, H, 2H) depth in metres (radial), unclamped.
 
@@ -272,9 +244,12 @@ class SliceNet(nn.Module):
     def __init__(self, config: SliceNetConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or SliceNetConfig()
-        self.feature_extractor = _FeatureExtractor(config)
-        channels = self.feature_extractor.encoder.channels
-        self.slicing_module = SlicingModule(channels)
+        encoder = Encoder(config)
+        channels = encoder.channels
+        # The dictionaries give the parameters their published names.
+        self.feature_extractor = nn.ModuleDict({"encoder": encoder})
+        contractions = nn.ModuleList(Contraction(count) for count in channels)
+        self.slicing_module = nn.ModuleDict({"slc_lst": contractions})
         features = sum(
             (count // 8) * _contracted_height(config.height // 4 // 2**level) for level, count in enumerate(channels)
         )
@@ -291,9 +266,12 @@ class SliceNet(nn.Module):
         self.std.copy_(torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
-        levels = self.feature_extractor((x - self.mean) / self.std)
-        columns = self.slicing_module(levels, self.config.width // self.config.column_stride)
-        sequence, _ = self.bi_rnn(columns.permute(2, 0, 1))  # (columns, B, 2 hidden)
+        levels = self.feature_extractor["encoder"]((x - self.mean) / self.std)
+        columns = self.config.width // self.config.column_stride
+        contractions = enumerate(self.slicing_module["slc_lst"].children())
+        # One feature vector for each column: (B, features, columns).
+        features = torch.cat([part(levels[level], columns) for level, part in contractions], dim=1)
+        sequence, _ = self.bi_rnn(features.permute(2, 0, 1))  # (columns, B, 2 hidden)
         y = sequence.permute(1, 2, 0).unsqueeze(2)  # (B, 2 hidden, 1, columns)
         for stage in self.decoder:
             y = stage(y)
@@ -353,6 +331,11 @@ def load_checkpoint(path: str | Path) -> SliceNet:
 
 
 def read_checkpoint(path: Path) -> Any:
+    """Content of a checkpoint, on the CPU; only tensors and plain values, so that a file cannot run code.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, or holds more.
+    """
     try:
         if zipfile.is_zipfile(path):  # torch's format; torch itself does not verify the checksums
             with zipfile.ZipFile(path) as archive:

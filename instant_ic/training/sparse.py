@@ -38,11 +38,7 @@ def sample_prior(
 ) -> NDArray[np.float32] | None:  # fmt: skip
     """Prior (6, H, W) (``depth.completion``) of a camera (4, 4) in a world with its floor at 0; None without a fit.
 
-    Args:
-        renderer: of the world.
-        map_from_camera: the camera's pose.
-        rgb, depth_m: (H, W, 3) and (H, W) seen from it.
-        rng: source of randomness.
+    The camera sees ``rgb`` (H, W, 3) and ``depth_m`` (H, W).
     """
     camera_m = float(map_from_camera[2, 3])
     lidar_m = min(rng.uniform(0.35, 0.9), camera_m - 0.1)
@@ -130,14 +126,9 @@ def drive(renderer: EquirectRenderer, map_from_camera: Floats, lidar_m: float, r
 
 
 def spoiled(points: Floats, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Faults of a real revolution: lost returns and rings, dark surfaces, glass, mixed pixels at edges.
+    """Points (N, 3) in the LiDAR's frame with the faults of a real revolution, (M, 3), M <= N.
 
-    Args:
-        points: (N, 3) in the LiDAR's frame.
-        rng: source of randomness.
-
-    Returns:
-        (M, 3), M <= N.
+    They are lost returns and rings, dark surfaces, glass, mixed pixels at edges.
     """
     range_m = np.linalg.norm(points, axis=1)
     azimuth = np.arctan2(points[:, 1], points[:, 0])

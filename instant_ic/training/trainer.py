@@ -29,7 +29,7 @@ from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import Ahead, Batch, Feed, Samples, stack
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.losses import depth_loss, edge_loss, sigma_loss
-from instant_ic.training.slicenet import CheckpointError
+from instant_ic.training.slicenet import CheckpointError, read_checkpoint
 
 POLE_WEIGHT = 0.1
 """Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
@@ -87,16 +87,6 @@ class TrainingConfig:
     mixed_precision: bool = True
     threads: int = 1
     seed: int = 0
-
-    def __post_init__(self) -> None:
-        for key in ("minutes", "epochs", "batch_size", "learning_rate", "checkpoint_s", "max_range_m", "threads",
-                    "evaluation_panoramas"):  # fmt: skip
-            if getattr(self, key) <= 0:
-                raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
-        if not 0 < self.warmup < 1 or not 0 <= self.average < 1:
-            raise ValueError(f"warmup and average must lie in 0..1 (got {self.warmup}, {self.average})")
-        if not 0 <= self.brightness <= 255:
-            raise ValueError(f"brightness must lie in 0..255 (got {self.brightness})")
 
 
 @dataclass(frozen=True)
@@ -204,12 +194,8 @@ class Trainer:
         feed: training batches, of ``config.batch_size``.
         held_out: panoramas for evaluation, from worlds or scenes that are not in the feed.
         model: network to train; it keeps the weights it has.
-        origin: where these weights come from, for the record.
-        config: training parameters.
         output: checkpoint file.
-        team: the processes of this training; by default this one on the CPU.
-        command: the user's command line, for the record.
-        report: receives human-readable lines.
+        origin, command: where these weights come from, and the user's command line, for the record.
         bar: receives the progress 0..1 after each step.
         stop: set it to end early.
     """
@@ -417,12 +403,7 @@ class Trainer:
         Raises:
             CheckpointError: the file is not a checkpoint of a run with this network.
         """
-        try:
-            state = torch.load(path, map_location=self.team.device, weights_only=True)
-        except FileNotFoundError:
-            raise CheckpointError(f"{path}: no such checkpoint to resume from") from None
-        except Exception as error:  # torch.load raises anything from KeyError to UnpicklingError
-            raise CheckpointError(f"{path}: not a checkpoint of tensors and plain values ({error})") from error
+        state = read_checkpoint(path)
         if not isinstance(state, dict) or "resume" not in state or state.get("config") != self.network.as_dict():
             raise CheckpointError(f"{path}: not a checkpoint of a run with {self.network}")
         self.average.load_state_dict(state["state_dict"])

@@ -132,7 +132,7 @@ class TestShortestWay:
     @staticmethod
     def way(*shapes: tuple[float, ...], margin: float = 0.0) -> np.ndarray | None:
         mask = worlds.filled(room(*shapes).shapes, np.array([10.0, 8.0]), 0.025, worlds.IN_THE_WAY_M)
-        return worlds.shortest_way(mask, np.array([2.0, 4.0, 0.0]), np.array([8.0, 4.0, 0.0]), 0.05, margin)
+        return worlds.shortest_way(mask, np.array([2.0, 4.0, 0.0]), np.array([8.0, 4.0, 0.0]), margin)
 
     def test_straight_where_nothing_is_and_over_and_under_what_is_not_in_the_way(self) -> None:
         flat, high = (5.0, 4.0, 0.3, 3.0, 0.0, 0.0, 0.04), (6.0, 4.0, 0.3, 3.0, 0.0, 1.4, 2.0)

@@ -409,7 +409,7 @@ class TestRecordedInABag:
         ("topic", "message", "told"),
         [
             ("/cmd_vel", "TwistStamped", "/operator/cmd_vel is missing; the bag has these topics: /cmd_vel"),
-            ("/operator/cmd_vel", "Bool", "has type std_msgs/msg/Bool, not geometry_msgs/TwistStamped"),
+            ("/operator/cmd_vel", "Bool", "has the type Bool, not TwistStamped"),
         ],
     )
     def test_another_bag(self, topic: str, message: str, told: str, tmp_path: Path) -> None:
@@ -426,7 +426,7 @@ class TestRecordedInABag:
     ("words", "told"),
     [
         (["--episodes", "0"], "episodes must be at least 1"),
-        (["--methods", "ic,magic"], "methods must be some of"),
+        (["--methods", "ic,magic"], "method must be one of"),
         (["--world", "nowhere"], "neither corridor"),
         (["--jobs", "0"], "jobs must be at least 1"),
         (["--operator", "recorded"], "needs --log"),
@@ -458,11 +458,10 @@ def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp
     if method == "shared":  # its film and its plot, once
         with Video(tmp_path / "drive.mp4") as video:
             drive = episode.run(video.on_step)
-        assert video.pictures > 10 * (drive.seconds - 0.5)
         read = cv2.VideoCapture(str(tmp_path / "drive.mp4"))
         frames = int(read.get(cv2.CAP_PROP_FRAME_COUNT))
         picture, plan = np.hsplit(read.read()[1], [640])
-        assert frames == video.pictures and plan.shape == (360, 360, 3)
+        assert frames > 10 * (drive.seconds - 0.5) and plan.shape == (360, 360, 3)
         assert picture.std() > 20 and (plan > 240).mean() > 0.5  # a corridor, and a drawing on white
         save_plot(tmp_path / "drive.png", [drive], teleop_results.report([drive], settings), settings)
         assert cv2.imread(str(tmp_path / "drive.png")).std() > 10
@@ -529,8 +528,6 @@ def test_shared_control_goes_round_by_itself_and_gives_back() -> None:
 def test_the_stack_refuses_what_it_cannot_run() -> None:
     with pytest.raises(ValueError, match="method must be one of ic, stop, shared"):
         StackConfig(method="magic")
-    with pytest.raises(ValueError, match="depth must be one of"):
-        StackConfig(depth="true")
 
 
 def test_at_a_switch_both_pictures_are_drawn_whole() -> None:

@@ -31,6 +31,7 @@ from instant_ic.experiments.illusion_truth import moved_by, things
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.pictures import curves_svg, image_strip, jpeg
 from instant_ic.experiments.places import Walker, make_place_world, world_after
+from instant_ic.experiments.recorded_drive import Moment
 from instant_ic.experiments.scan import (
     QUALITIES,
     ScanQuality,
@@ -41,8 +42,8 @@ from instant_ic.experiments.scan import (
     scan_world,
     station_places,
 )
-from instant_ic.experiments.teleop_operator import MANNERS, ManneredOperator, Sight
-from instant_ic.experiments.teleoperation import _Frame, _webp, stills
+from instant_ic.experiments.teleop_operator import MANNERS, ScriptedOperator, Sight
+from instant_ic.experiments.teleoperation import _webp, stills
 from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
@@ -412,7 +413,7 @@ def test_a_recorded_drive_is_shown(tmp_path) -> None:
     assert section.answers["flow"].held is True
     with pytest.raises(ValueError, match="does not react"):
         operators.units(options)
-    with pytest.raises(ValueError, match="/ic/state, /camera/image/compressed missing"):
+    with pytest.raises(ValueError, match="/ic/state, /camera/image/compressed are missing"):
         with BagWriter(tmp_path / "other") as writer:
             writer.write("/keyframe", kinds["key"], bytes(serialize(key)), start, LATCHED)
         teleoperation.measure({"bag": str(tmp_path / "other")})
@@ -513,7 +514,7 @@ def test_operators_differ_as_their_manners_say() -> None:
     ahead = np.array([[10.0, 0.0]])
 
     def commands(manner: str, seed: int = 0) -> list[tuple[float, float]]:
-        operator = ManneredOperator(ahead, None, MANNERS[manner], seed)
+        operator = ScriptedOperator(ahead, None, MANNERS[manner], seed)
         return [operator.command(sight(0.05 * step)) for step in range(20)]
 
     assert commands("plain") == [(0.4, 0.0)] * 20
@@ -526,7 +527,7 @@ def test_operators_differ_as_their_manners_say() -> None:
 
 def test_stills_are_before_first_middle_last_and_after() -> None:
     shown = [False] * 10 + [True] * 21 + [False] * 3
-    frames = [_Frame(0.25 * k, virtual, np.zeros((2, 2, 3), np.uint8)) for k, virtual in enumerate(shown)]
+    frames = [Moment(0.25 * k, virtual, np.zeros((2, 2, 3), np.uint8)) for k, virtual in enumerate(shown)]
     assert [frame.time_s / 0.25 for frame in stills(frames)] == [6, 10, 20, 30, 33]
     assert stills(frames[:3]) == frames[:1]
 

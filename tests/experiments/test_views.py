@@ -7,7 +7,7 @@ import pytest
 
 from instant_ic.experiments import box_room, vspace, vspace_sources
 from instant_ic.experiments.colour_only import ColourOnlyField, composite_gradient, density
-from instant_ic.experiments.vspace import compare, converge, path_poses, scores, start_pose
+from instant_ic.experiments.vspace import compare, converge, path_poses, scores
 from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.worlds import corridor_world
@@ -46,13 +46,6 @@ def test_a_curve_keeps_its_distances_and_looks_along_itself(world):
         assert here[:2, 0] == pytest.approx(along / np.linalg.norm(along), abs=0.03)
 
 
-def test_a_start_in_the_wall_is_refused(world):
-    with pytest.raises(ValueError, match="m clear of everything"):
-        start_pose(world, (0.0, 1.2, 0.0))
-    with pytest.raises(ValueError, match="m clear of everything"):
-        start_pose(world, (99.0, 0.0, 0.0))
-
-
 def test_scores_by_hand():
     black, grey = np.zeros((32, 32, 3), np.uint8), np.full((32, 32, 3), 51, np.uint8)
     psnr, ssim = scores(black, grey)
@@ -60,22 +53,6 @@ def test_scores_by_hand():
     # Uniform pictures: (2 · 0 · 51 + C1) / (0² + 51² + C1), C1 = (0.01 · 255)²
     assert ssim == pytest.approx(6.5025 / (51**2 + 6.5025), rel=1e-4)
     assert scores(grey, grey) == (99.0, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"paths": ("zigzag",)}, "straight, curve"),
-        ({"sources": ()}, "got none"),
-        ({"seconds": 0.0}, "seconds"),
-        ({"step_m": 0.0}, "step"),
-        ({"panorama_width": 100}, "multiple of 8"),
-        ({"fov_deg": 180.0}, "field of view"),
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(change, words):
-    with pytest.raises(ValueError, match=words):
-        VspaceSettings(**change)
 
 
 def test_points_from_the_panoramas_own_place_are_its_picture():
@@ -126,7 +103,7 @@ def test_colours_alone_are_learnt_but_not_where_they_are():
 
 
 SETTINGS = VspaceSettings(
-    sources=("ours", "older", "no-depth", "panorama", "depth-warp", "true-warp", "exact-fill", "paper", "mesh"),
+    sources=("ours", "older", "no-depth", "panorama", "depth-warp", "exact-fill", "paper", "mesh"),
     seconds=0.2, size=(96, 54), panorama_width=256, step_m=1.0, reach_m=1.0,
 )  # fmt: skip
 
@@ -138,13 +115,12 @@ def two_worlds(world, monkeypatch):
 
 
 def test_every_source_has_its_rows(two_worlds):
-    found = compare("corridor", SETTINGS, None, SMALL)
+    found = compare("corridor", SETTINGS, SMALL)
     assert len(found.rows) == len(SETTINGS.sources) * 2 * 2
     assert all(0 < row.psnr_db <= 99 and -1 <= row.ssim <= 1 and row.seconds >= 0 for row in found.rows)
     psnr = {(row.source, row.distance_m): row.psnr_db for row in found.rows if row.path == "straight"}
     # At the panorama itself no depth is needed; away from it the panorama alone will not do.
     assert abs(psnr["panorama", 0.0] - psnr["depth-warp", 0.0]) < 1
-    assert psnr["true-warp", 1.0] > psnr["panorama", 1.0] + 4
     assert psnr["ours", 1.0] > psnr["panorama", 1.0] + 3
     assert psnr["exact-fill", 1.0] > psnr["ours", 1.0]
     assert found.depth["straight"]["median_relative_error"] < 0.1
@@ -152,7 +128,7 @@ def test_every_source_has_its_rows(two_worlds):
 
 
 def test_training_times_are_measured_at_the_panorama_and_ahead(two_worlds):
-    rows = converge("corridor", SETTINGS, (0.2, 0.1), None, SMALL)
+    rows = converge("corridor", SETTINGS, (0.2, 0.1), SMALL)
     assert [(row.source, row.distance_m) for row in rows[:4]] == [
         ("ours", 0.0), ("ours", 1.0), ("field", 0.0), ("field", 1.0),
     ]  # fmt: skip

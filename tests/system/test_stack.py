@@ -20,7 +20,7 @@ from rosbags.highlevel import AnyReader
 
 from instant_ic.bus import registry
 from instant_ic.experiments.budget import cpu_percent, reference_loop, usage
-from instant_ic.experiments.drive import DriveRecord, DriveRecorder, drive_through_obstacle
+from instant_ic.experiments.drive import DriveRecorder, drive_through_obstacle
 from instant_ic.experiments.stack import Stack, free_ports, processes_of
 from instant_ic.geometry.poses import compose2
 from instant_ic.launch.pacing import machine_pace
@@ -36,7 +36,7 @@ OBSTACLE = (4.0, -0.25, 4.5, 0.25)
 
 @dataclass
 class Outcome:
-    record: DriveRecord
+    record: DriveRecorder
     bag: Path
     topics: dict[str, str]
     nodes: set[str]
@@ -72,7 +72,7 @@ def outcome(tmp_path_factory):
             left = [" ".join(p.cmdline()) for p in processes_of(run_dir)]
             log = stack.log_path.read_text(errors="replace")
         sockets = list(run_dir.glob("topics/*/*.sock"))
-        yield Outcome(recorder.record, bag, topics, nodes, status, left, sockets, log, loops)
+        yield Outcome(recorder, bag, topics, nodes, status, left, sockets, log, loops)
     finally:
         shutil.rmtree(run_dir, ignore_errors=True)
 

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ def random_network(config: SliceNetConfig = TINY) -> SliceNet:
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.pt"
-    torch.save({"config": TINY.as_dict(), "state_dict": random_network().state_dict(), "record": {"steps": 3}}, path)
+    torch.save({"config": asdict(TINY), "state_dict": random_network().state_dict(), "record": {"steps": 3}}, path)
     return path
 
 

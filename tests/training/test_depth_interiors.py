@@ -86,8 +86,6 @@ def test_worlds_of_the_evaluations_are_never_trained_on() -> None:
     recipe = RoomsConfig(first_world=FIRST_HELD_OUT - 400)
     with pytest.raises(ValueError, match="for evaluation"):
         replace(recipe, worlds=401)
-    with pytest.raises(ValueError, match="interiors must be one of"):
-        replace(recipe, interiors="caves")
 
 
 def test_a_panorama_to_which_no_prior_fitted_gives_no_sample(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_completion
-from instant_ic.training.dataset import Sample, Selection
+from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import FileFeed
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.slicenet import CheckpointError
@@ -41,7 +41,7 @@ def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, **op
     torch.manual_seed(0)
     return Trainer(
         feed,
-        Selection((samples, range(9, 12))),
+        samples[9:],
         CompletionNet(TINY),
         config,
         output,
@@ -113,8 +113,8 @@ def test_only_a_run_of_this_network_is_taken_up(tmp_path: Path) -> None:
     run = trainer(tmp_path / "x.pt", 1)
     torch.save({"config": CompletionConfig().as_dict(), "state_dict": {}, "resume": {}}, tmp_path / "other.pt")
     (tmp_path / "broken.pt").write_bytes(b"no checkpoint")
-    for name, words in (("other", "not a checkpoint of a run"), ("broken", "not a checkpoint of tensors"),
-                        ("absent", "no such checkpoint")):  # fmt: skip
+    for name, words in (("other", "not a checkpoint of a run"), ("broken", "not a torch checkpoint"),
+                        ("absent", "no such file")):  # fmt: skip
         with pytest.raises(CheckpointError, match=words):
             run.resume(tmp_path / f"{name}.pt")
     run.close()
@@ -180,12 +180,6 @@ def test_devices_that_are_not_there() -> None:
         assert Team.join("auto").device.type == "cpu"
         with pytest.raises(ValueError, match="finds no CUDA GPU"):
             Team.join("cuda")
-
-
-@pytest.mark.parametrize("key", ["minutes", "batch_size", "learning_rate", "warmup", "brightness"])
-def test_wrong_settings_are_named(key: str) -> None:
-    with pytest.raises(ValueError, match=key):
-        TrainingConfig(**{key: -1})
 
 
 def test_tensorboard_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -134,7 +135,7 @@ def test_contraction_turns_with_the_panorama() -> None:
 def test_own_checkpoint_loads_strictly(tmp_path: Path) -> None:
     model = SliceNet(TINY).eval()
     path = tmp_path / "tiny.pt"
-    torch.save({"config": TINY.as_dict(), "state_dict": model.state_dict()}, path)
+    torch.save({"config": asdict(TINY), "state_dict": model.state_dict()}, path)
     loaded = load_checkpoint(path)
     picture = torch.rand(1, 3, 64, 128)
     with torch.inference_mode():
@@ -176,7 +177,7 @@ def test_smaller_backbones_load_strictly(tmp_path: Path, backbone: str, full_siz
 def tiny_checkpoint(path: Path, **changes: object) -> Path:
     """A checkpoint of ours with another value for a key of the file, or of its state (None: left out)."""
     state = SliceNet(TINY).state_dict()
-    payload: dict[str, object] = {"config": TINY.as_dict(), "state_dict": state}
+    payload: dict[str, object] = {"config": asdict(TINY), "state_dict": state}
     for key, value in changes.items():
         target = payload if key in ("config", "kwargs", "state_dict") else state
         target.pop(key.replace("__", "."), None)
