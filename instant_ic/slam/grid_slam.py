@@ -15,9 +15,9 @@ from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import Matrix, compose2, inverse2, matrix_from_pose2, relative2
 from instant_ic.jit import leave_out_blas
 from instant_ic.slam.config import GridSlamConfig, SlamConfig
-from instant_ic.slam.front_end import FrontEnd, Guess, SlamStatus, Track
+from instant_ic.slam.front_end import MIN_POINTS, FrontEnd, Guess, SlamStatus, Track
 from instant_ic.slam.integrity import Integrity, IntegrityMonitor, mixture
-from instant_ic.slam.keyframes import Keyframe
+from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, Keyframe
 from instant_ic.slam.localization import Place, SavedMap
 from instant_ic.slam.loop_closure import QUERY_KEYFRAMES, LoopClosure, Outcome, correction
 from instant_ic.slam.map_files import load_graph, load_grid, save_graph, save_grid
@@ -167,7 +167,7 @@ class GridSlam:
         points = scan_points(scan, mount, self.config.map.no_return_clear_m)
         self._points = points
         guess = self._guess(odometry, scan.stamp_ns)
-        if len(points.points) >= self.config.match.min_points:
+        if len(points.points) >= MIN_POINTS:
             track = self._track(points, guess, scan.stamp_ns)
         elif self._stamp_ns is None:  # nothing to match against yet: the next scan becomes the first one
             return self._unplaced(SlamStatus.NO_POINTS)
@@ -374,7 +374,7 @@ class GridSlam:
             self.monitor.matched(contradicted, score, elapsed_s, recovered)
             if self._before is not None:
                 # What is older than the local map may contradict a right pose, which has drifted.
-                before = self._before.map.contradiction(pose, points, self.config.field.keyframes)
+                before = self._before.map.contradiction(pose, points, LOCAL_KEYFRAMES)
                 step = relative2(self.map_from_base, pose)
                 self.monitor.compared(before - contradicted, math.hypot(step[0], step[1]) + 0.5 * abs(float(step[2])))
             return not self.monitor.doubts

@@ -12,7 +12,6 @@ from slam_planar_world import PlanarWorld, rectangle
 from instant_ic.experiments.slam_worlds import LASERS, Drive, Laser, cells, drive, trajectory_errors
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
-from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.loop_closure import LoopClosure, _Candidate, _chained, _reversed
 from instant_ic.slam.loop_search import find_place, peaks, pool, score_volume, spread
@@ -144,7 +143,7 @@ def test_a_loop_that_waits_does_not_outlive_its_keyframe() -> None:
 
 
 def field_of(walls: PlanarWorld, poses: list[tuple[float, float, float]]) -> LikelihoodField:
-    field = LikelihoodField(FieldConfig(max_range_m=12.0), 4.0)
+    field = LikelihoodField(0.05, 16.0)
     angles = -math.pi + 2 * math.pi / 360 * np.arange(360)
     surfaces = []
     for pose in poses:
@@ -188,7 +187,7 @@ def test_a_corridor_has_no_shape_and_a_symmetric_room_two_answers() -> None:
 
 
 def test_nothing_to_find_is_no_answer() -> None:
-    empty = LikelihoodField(FieldConfig(max_range_m=5.0), 1.0)
+    empty = LikelihoodField(0.05, 6.0)
     empty.rebuild(np.zeros(3), [])
     assert find_place(empty, np.array([[1.0, 0.0]]), np.zeros(3), 1.0, 0.5) is None
 
