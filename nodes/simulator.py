@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
 from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.capture import CaptureError
@@ -11,18 +9,13 @@ from instant_ic.msg import Bool, Float32, Odometry, PoseStamped, odometry_messag
 from instant_ic.pace import current
 from instant_ic.paths import run_dir
 from instant_ic.sim.capture_replay import CaptureReplay
-from instant_ic.sim.real_time import ACCEPTABLE_LAG_S, DevicesConfig, RealTimeLoop, SimulatedDevices
+from instant_ic.sim.real_time import ACCEPTABLE_LAG_S, RealTimeLoop, SimulatedDevices, SimulatorConfig
 from instant_ic.sim.simulation import Simulation
 from instant_ic.sim.theta import ACCEPTABLE_DELAY_S
 from instant_ic.sim.vlp16 import Vlp16Server
 
 _TRUTH_S = 1.0 / 30.0
 _LATE_S = 0.2
-
-
-@dataclass(frozen=True)
-class SimulatorConfig(DevicesConfig):
-    """Parameters of the node ``simulator``."""
 
 
 class SimulatorNode(Node[SimulatorConfig]):

@@ -61,7 +61,7 @@ def round_trip(
     """
     config = RobotConfig(slip=slip, turn_slip=slip)
     start = (*route[0], math.atan2(route[1][1] - route[0][1], route[1][0] - route[0][0]))
-    robot = TrackedRobot(config, world.occupied(config.contact_low, config.contact_high), start, seed)
+    robot = TrackedRobot(config, world.occupied(), start, seed)
     kinematics = robot.kinematics
     rng = np.random.default_rng([37, seed])
     angles = np.asarray(-math.pi + 2 * math.pi / BEAMS * np.arange(BEAMS), dtype=np.float64)

@@ -30,8 +30,8 @@ _VISIBLE_MOTION = 1e-4
 
 
 @dataclass(frozen=True)
-class DevicesConfig(SimulationConfig):
-    """Parameters of the simulation and its devices.
+class SimulatorConfig(SimulationConfig):
+    """Parameters of the node ``simulator``: the simulation and its devices.
 
     Attributes:
         panorama: image file that the camera shows instead of the world; empty: the world.
@@ -55,7 +55,9 @@ class SimulatedDevices:
         ValueError, OSError, CaptureError: a device cannot be opened.
     """
 
-    def __init__(self, config: DevicesConfig, simulation: Simulation, serial_folder: Path, log: logging.Logger) -> None:
+    def __init__(
+        self, config: SimulatorConfig, simulation: Simulation, serial_folder: Path, log: logging.Logger
+    ) -> None:
         self.scanner: Vlp16Server | CaptureReplay | None = None
         self.camera: ThetaServer | None = None
         self._base: RoboClawServer | None = None
@@ -68,7 +70,7 @@ class SimulatedDevices:
             self.close()
             raise
 
-    def _open(self, config: DevicesConfig, serial_folder: Path, log: logging.Logger) -> None:
+    def _open(self, config: SimulatorConfig, serial_folder: Path, log: logging.Logger) -> None:
         simulation, lidar = self._simulation, config.lidar
         if lidar.enabled and config.pcap:
             path = Path(config.pcap).expanduser()
@@ -82,7 +84,7 @@ class SimulatedDevices:
             self.camera = ThetaServer(config.camera, source, config.seed)
             log.info("Theta Web API on http://%s:%d", config.camera.host, self.camera.port)
         if config.base.enabled:
-            link = serial_folder / config.base.link
+            link = serial_folder / "roboclaw"
             self._base = RoboClawServer(simulation.controller, simulation.lock, link)
             log.info("RoboClaw on %s (%s)", link, self._base.device)
 

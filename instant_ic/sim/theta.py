@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instant_ic.camera.config import PREVIEW_FORMATS
-from instant_ic.config.ranges import NotNegative, Percent, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import NotNegative, PositiveInt, Range, check_ranges
 from instant_ic.limits import load_image
 from instant_ic.pace import current
 
@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 BOUNDARY = "---osclivepreview---"
 #: Delay of an image with which the stack still works as with a punctual camera, seconds.
 ACCEPTABLE_DELAY_S = 0.06
+JPEG_QUALITY = 92
 #: Time after setting options during which the preview is not ready, seconds.
 SETTLE_S = 0.8
 
@@ -39,7 +40,6 @@ class ThetaConfig:
         width, height: preview format until a driver sets another.
         rate: largest frame rate, even if the format promises more.
         latency_s: time from the exposure of an image to its delivery.
-        quality: JPEG quality, 1-100.
         noise: standard deviation of a pixel value, of 255.
         user, password: credentials of HTTP digest (client mode); an empty user disables it.
     """
@@ -51,7 +51,6 @@ class ThetaConfig:
     height: PositiveInt = 512
     rate: Annotated[float, Range(above=0, high=30)] = 5.0
     latency_s: Annotated[float, Range(0, below=2)] = 0.20
-    quality: Percent = 92
     noise: NotNegative = 0.0
     user: str = ""
     password: str = ""
@@ -179,7 +178,7 @@ class ThetaServer:
             grain = self.config.noise * self._rng.standard_normal(rgb.shape[:2], np.float32)
             rgb = np.clip(np.rint(rgb + grain[..., None]), 0, 255).astype(np.uint8)
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-        ok, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])
+        ok, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not ok:
             raise RuntimeError(f"OpenCV could not encode an image of {rgb.shape[1]}x{rgb.shape[0]}")
         return encoded.tobytes()
