@@ -64,7 +64,7 @@ def ours_sub(topics, address, receiver):
     node = ours_node(address, f"sub{os.getpid()}")
     for topic in topics:
         qos = RELIABLE if topic.startswith("flood") else SENSOR
-        node.subscribe_raw(f"/{topic}", lambda _t, _n, payload, _s: receiver.got(payload), qos)
+        node.subscribe_received(f"/{topic}", lambda received: receiver.got(received.payload), qos)
     return node.spin
 
 

@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, get_args
 
+import numpy as np
+
 from instant_ic.bus.clock import Clock, JumpDetector, ManualClock
 from instant_ic.bus.parameter_event import TOPIC as PARAMETER_EVENTS
 from instant_ic.bus.parameter_event import parameter_event
@@ -343,20 +345,10 @@ class Node(Generic[ConfigT]):
 
         return self._subscribe(topic, name, decode, qos)
 
-    def subscribe_raw(
-        self, topic: str, callback: Callable[[str, str, bytes | memoryview, int], None], qos: QoS = RELIABLE
-    ) -> Subscription:
-        """Subscribe to any type; ``callback(topic, type_name, payload, publish_ns)`` gets the bytes."""
-
-        def forward(received: Received) -> None:
-            callback(received.topic, received.type_name, received.payload, received.publish_ns)
-
-        return self._subscribe(topic, None, forward, qos)
-
     def subscribe_received(
         self, topic: str, callback: Callable[[Received], None], qos: QoS = RELIABLE, message_class: Any = None
     ) -> Subscription:
-        """Like :meth:`subscribe_raw`, with all that is known of a message; ``message_class`` restricts the type."""
+        """Subscribe to bytes, with all that is known of a message; without ``message_class`` to any type."""
         return self._subscribe(topic, type_name(message_class) if message_class else None, callback, qos)
 
     def drop(self, item: Publisher | Subscription) -> None:
@@ -765,15 +757,15 @@ class Node(Generic[ConfigT]):
                 cpu_percent=100.0 * (cpu_s - before_cpu_s) / max(at_s - before_s, 1e-3),
                 rss_mb=int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 1e6,
                 inputs=[s.topic for s in inputs],
-                input_rates_hz=_f32(s.stats.rate_hz(now) for s in inputs),
-                input_ages_s=_f32(s.stats.age_s(now) for s in inputs),
-                input_lost=_u64(s.stats.lost for s in inputs),
+                input_rates_hz=np.array([s.stats.rate_hz(now) for s in inputs], np.float32),
+                input_ages_s=np.array([s.stats.age_s(now) for s in inputs], np.float32),
+                input_lost=np.array([s.stats.lost for s in inputs], np.uint64),
                 lost_topics=[topic for topic, _, _ in losses],
                 lost_publishers=[node for _, node, _ in losses],
-                lost_counts=_u64(count for _, _, count in losses),
+                lost_counts=np.array([count for _, _, count in losses], np.uint64),
                 outputs=[p.topic for p in outputs],
-                output_rates_hz=_f32(p.stats.rate_hz(now) for p in outputs),
-                output_ages_s=_f32(p.stats.age_s(now) for p in outputs),
+                output_rates_hz=np.array([p.stats.rate_hz(now) for p in outputs], np.float32),
+                output_ages_s=np.array([p.stats.age_s(now) for p in outputs], np.float32),
             )
         )
 
@@ -880,18 +872,6 @@ class _RosoutHandler(logging.Handler):
             )
         except Exception:  # noqa: BLE001 - a bad log line must not end the callback that wrote it
             self.handleError(record)
-
-
-def _f32(values: Any) -> Any:
-    import numpy as np
-
-    return np.array(list(values), np.float32)
-
-
-def _u64(values: Any) -> Any:
-    import numpy as np
-
-    return np.array(list(values), np.uint64)
 
 
 def _key_values(values: dict[str, Any]) -> list[Any]:

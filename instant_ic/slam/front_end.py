@@ -11,7 +11,7 @@ import numpy as np
 
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, Keyframe, Trajectory, grown_drift, turned
+from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, Keyframe, grown_drift, turned
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.loop_search import find_place
 from instant_ic.slam.matcher import Match, Window, match_scan
@@ -106,11 +106,15 @@ class Track:
 
 
 class FrontEnd:
-    """Scan-to-local-map matching with keyframes, which are stored in ``trajectory``."""
+    """Scan-to-local-map matching with keyframes.
+
+    Attributes:
+        trajectory: all keyframes in time order.
+    """
 
     def __init__(self, config: SlamConfig) -> None:
         self.config = config
-        self.trajectory = Trajectory()
+        self.trajectory: list[Keyframe] = []
         self._field = LikelihoodField(config.field.resolution_m, config.field.max_range_m + (RECOVERY_M + 0.5))
         self._lost_sigma_m = 0.0
         self._usual_score = 0.0
@@ -180,7 +184,7 @@ class FrontEnd:
                 becomes a keyframe only if it returns True.
         """
         points = self._match_points(scan)
-        if len(self.trajectory) == 0:
+        if not self.trajectory:
             keyframe = self._add_keyframe(guess.pose, np.zeros((3, 3)), scan, stamp_ns, dead_reckoned=False)
             return Track(guess.pose, np.zeros((3, 3)), 1.0, SlamStatus.FIRST, keyframe)
 
@@ -215,7 +219,7 @@ class FrontEnd:
     def restart(self, scan: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
         """Start a new local map and trajectory with a scan, at the predicted pose."""
         self._known = None
-        self.trajectory = Trajectory()
+        self.trajectory = []
         covariance = self._grown_covariance(guess)
         self._lost_sigma_m = 0.0
         keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
@@ -268,7 +272,7 @@ class FrontEnd:
         return few and status is SlamStatus.TRACKED and match.score < RECOVERY_SCORE
 
     def _moved(self, pose: FloatArray) -> bool:
-        last = self.trajectory.keyframes[-1].map_from_base
+        last = self.trajectory[-1].map_from_base
         step = relative2(last, pose)
         return math.hypot(step[0], step[1]) >= KEYFRAME_M or abs(step[2]) >= KEYFRAME_RAD
 
@@ -276,8 +280,8 @@ class FrontEnd:
         self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int, dead_reckoned: bool
     ) -> Keyframe:
         step, step_covariance, drift = np.zeros(3), np.zeros((3, 3)), covariance.copy()
-        if len(self.trajectory):
-            last = self.trajectory.last
+        if self.trajectory:
+            last = self.trajectory[-1]
             yaw = float(last.map_from_base[2])
             step = relative2(last.map_from_base, pose)
             step_covariance = turned(covariance, -yaw)
@@ -286,7 +290,7 @@ class FrontEnd:
         keyframe = Keyframe(
             stamp_ns, pose.copy(), covariance.copy(), scan, dead_reckoned, step, step_covariance, drift
         )  # fmt: skip
-        self.trajectory.add(keyframe)
+        self.trajectory.append(keyframe)
         self.rebuild_field()
         return keyframe
 
@@ -295,7 +299,7 @@ class FrontEnd:
         if self._known is not None:
             self._build_known(self._built_at)
             return
-        recent = self.trajectory.recent(LOCAL_KEYFRAMES)
+        recent = self.trajectory[-LOCAL_KEYFRAMES:]
         surfaces = [Surface(k.map_from_base, k.scan.points, k.scan.joined) for k in recent]
         self._field.rebuild(recent[-1].map_from_base, surfaces)
 

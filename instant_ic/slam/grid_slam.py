@@ -176,7 +176,7 @@ class GridSlam:
             self.monitor.unmatched(False, self._elapsed_s(scan.stamp_ns))
         self._extend_map(track)
         self._follow(track, odometry, scan.stamp_ns)
-        anchor = self.front_end.trajectory.last
+        anchor = self.front_end.trajectory[-1]
         covariance = track.covariance + anchor.drift
         integrity = self.monitor.integrity(covariance, self.localized)
         covariance = mixture(covariance, integrity.lost_probability)
@@ -215,7 +215,7 @@ class GridSlam:
 
     def _graph(self, count: int | None = None) -> tuple[list[Keyframe], list[Edge]]:
         """The first ``count`` keyframes, or all, that have not been removed, and the edges between them."""
-        keyframes = self.front_end.trajectory.keyframes[:count]
+        keyframes = self.front_end.trajectory[:count]
         edges = [edge for edge in self._edges if max(edge.a, edge.b) < len(keyframes)]
         known = max((edge.b for edge in edges), default=0) + 1
         for k in range(known, len(keyframes)):  # keyframes that the loop closure has not processed yet
@@ -256,11 +256,11 @@ class GridSlam:
             return None
         job: Callable[[], Place | Outcome] | None = None
         if self.saved is not None and not self.saved.located:
-            recent = self.front_end.trajectory.recent(QUERY_KEYFRAMES)
+            recent = self.front_end.trajectory[-QUERY_KEYFRAMES:]
             if self._points is not None and self._stamp_ns is not None:
                 job = self.saved.search_job(recent, self.map_from_base, self._points, self._stamp_ns, self._reach_m)
         elif self.config.loop.enabled and not self._broken and not self.front_end.in_known_map:
-            new = self.front_end.trajectory.keyframes[self._handed_over :]
+            new = self.front_end.trajectory[self._handed_over :]
             self._handed_over += len(new)
             job = (lambda: self.loop_closure.update(new)) if new else None
         self._busy = job is not None
@@ -291,8 +291,8 @@ class GridSlam:
         if not self.localized or self._broken or self.front_end.in_known_map:
             return
         self._settle()
-        new = self.front_end.trajectory.keyframes[self._handed_over :]
-        if self.config.loop.enabled and self.front_end.trajectory.keyframes:
+        new = self.front_end.trajectory[self._handed_over :]
+        if self.config.loop.enabled and self.front_end.trajectory:
             self._handed_over += len(new)
             self.take_over(self.loop_closure.update(new, last=True))
 
@@ -306,7 +306,7 @@ class GridSlam:
 
     def _take_over_loops(self, outcome: Outcome) -> None:
         """Apply optimised poses, the rebuilt map and merged keyframes."""
-        keyframes = self.front_end.trajectory.keyframes
+        keyframes = self.front_end.trajectory
         if self._before is not None:
             first = self._before.keyframes
             if outcome.poses is not None or any(edge.robust and edge.b >= first for edge in outcome.edges):
@@ -323,18 +323,18 @@ class GridSlam:
     def _join(self, saved: SavedMap, moved: FloatArray, covariance: FloatArray, built: OccupancyMap | None) -> None:
         """Join the current map to the saved one: ``moved`` transforms everything mapped so far into the saved map."""
         self._settle()
-        own = self.front_end.trajectory.keyframes
+        own = self.front_end.trajectory
         for keyframe in own:
             keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
         self._move(moved)
         saved.located = self._framed = True
-        self.monitor.restart()
+        self.monitor = IntegrityMonitor()
         if not saved.extends:
             own[-1].drift = covariance
             self.front_end.use_known_map(saved.localizer.points, self.map_from_base)
             return
         self.loop_closure = saved.join(own, covariance)
-        self.front_end.trajectory.keyframes = [*saved.keyframes, *own]
+        own[:] = [*saved.keyframes, *own]
         self._edges, self._handed_over = list(saved.edges), len(saved.keyframes)
         self._replace_map(built or saved.build_map(), len(saved.keyframes))
         self.front_end.rebuild_field()
@@ -343,7 +343,7 @@ class GridSlam:
         """Continue with a map that contains the first ``count`` keyframes."""
         rebuilt.version = self.map.version + 1
         self.map = rebuilt
-        for keyframe in self.front_end.trajectory.keyframes[count:]:
+        for keyframe in self.front_end.trajectory[count:]:
             self.map.insert(keyframe.map_from_base, keyframe.scan)
 
     # -- integrity ------------------------------------------------------------------------------
@@ -416,7 +416,7 @@ class GridSlam:
         self._found_before = None
         # After a gap the robot is where odometry says, within its error; otherwise it may have been carried anywhere.
         self._reach_m = NEAR_M + self.front_end.reach_m(guess) if self.monitor.after_gap else math.inf
-        self.monitor.restart()
+        self.monitor = IntegrityMonitor()
         return self.front_end.restart(points, guess, stamp_ns)
 
     def _recognized(self, saved: SavedMap, moved: FloatArray, here: FloatArray) -> bool:
@@ -426,7 +426,7 @@ class GridSlam:
         missing in it, and another one look like it. A place far from where odometry says must therefore be found
         twice, from two places.
         """
-        recent = self.front_end.trajectory.recent(QUERY_KEYFRAMES)
+        recent = self.front_end.trajectory[-QUERY_KEYFRAMES:]
         shares = [self._cells_of(saved).contradiction(compose2(moved, k.map_from_base), k.scan) for k in recent]
         if float(np.mean(shares)) > MOST_JOIN_CONTRADICTION:
             return False

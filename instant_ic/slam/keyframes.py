@@ -51,32 +51,6 @@ class Keyframe:
         return compose2(other.pose(), other_from_this)
 
 
-class Trajectory:
-    """All keyframes in time order."""
-
-    def __init__(self) -> None:
-        self.keyframes: list[Keyframe] = []
-
-    def __len__(self) -> int:
-        return len(self.keyframes)
-
-    @property
-    def last(self) -> Keyframe:
-        """The newest keyframe."""
-        return self.keyframes[-1]
-
-    def add(self, keyframe: Keyframe) -> None:
-        self.keyframes.append(keyframe)
-
-    def recent(self, count: int) -> list[Keyframe]:
-        """The last ``count`` keyframes, oldest first."""
-        return self.keyframes[-count:]
-
-    def poses(self) -> FloatArray:
-        """map_from_base of every keyframe, (n, 3)."""
-        return np.array([keyframe.map_from_base for keyframe in self.keyframes]).reshape(-1, 3)
-
-
 def grown_drift(drift: FloatArray, way: FloatArray, yaw: float, step_covariance: FloatArray) -> FloatArray:
     """Covariance (3, 3), map frame, one step after a pose with covariance ``drift``.
 

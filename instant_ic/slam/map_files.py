@@ -154,9 +154,9 @@ def _number(path: Path, content: dict[str, Any], key: str, default: float | None
     return float(value)
 
 
-def occupied_points(grid: OccupancyGrid, threshold: int = 65) -> FloatArray:
+def occupied_points(grid: OccupancyGrid) -> FloatArray:
     """Centres of the occupied cells in the map, (n, 2)."""
-    rows, columns = np.nonzero(grid.values >= threshold)
+    rows, columns = np.nonzero(grid.values >= round(100 * OCCUPIED_THRESH))
     points: FloatArray = grid.origin + grid.resolution * (np.column_stack([columns, rows]) + 0.5)
     return points
 

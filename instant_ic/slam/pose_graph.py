@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from instant_ic.slam.scan import FloatArray
 
-ROBUST_WIDTHS = (1e4, 1e2, 1.0)
-"""Widths of the robust kernel per stage, in multiples of the final width."""
+ROBUST_WIDTHS = (25e4, 25e2, 25.0)
+"""Width of the robust kernel per stage: an edge keeps its full weight up to this χ², and less beyond it."""
+ITERATIONS = 10
+"""Maximum number of iterations per stage."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +66,13 @@ def residuals(poses: FloatArray, a: NDArray[np.intp], b: NDArray[np.intp], measu
     return np.column_stack([cos * dx + sin * dy - measured[:, 0], -sin * dx + cos * dy - measured[:, 1], turn])
 
 
-def optimise(
-    poses: FloatArray, edges: Sequence[Edge], index: dict[int, int], robust_chi2: float = 25.0, iterations: int = 10
-) -> Solution:
+def optimise(poses: FloatArray, edges: Sequence[Edge], index: dict[int, int]) -> Solution:
     """Optimise the poses over all edges; the first node stays fixed.
 
     Args:
         poses: (n, 3), initial values.
         edges: between the nodes.
         index: row in ``poses`` of each node's id.
-        robust_chi2: width of the robust kernel: an edge keeps its full weight up to this χ², and less beyond it.
-        iterations: maximum number of iterations per stage.
 
     Raises:
         ValueError: an edge refers to an unknown node, or part of the graph is not connected to the first node.
@@ -90,13 +88,13 @@ def optimise(
     measured = np.array([edge.a_from_b for edge in edges])
     information = np.linalg.inv(np.array([edge.covariance for edge in edges]))
     robust = np.array([edge.robust for edge in edges])
-    stages = [width * robust_chi2 for width in ROBUST_WIDTHS] if robust.any() else [math.inf]
+    stages = ROBUST_WIDTHS if robust.any() else (math.inf,)
     for width in stages:
         damping = 1e-6
         error = residuals(poses, a, b, measured)
         chi2 = np.einsum("mi,mij,mj->m", error, information, error)
         cost = _robust_cost(chi2, robust, width)
-        for _ in range(iterations):
+        for _ in range(ITERATIONS):
             step = _step(poses, a, b, error, information * _weights(chi2, robust, width)[:, None, None] ** 2, damping)
             if not np.isfinite(step).all():
                 raise ValueError("the graph is not connected: no path from some nodes to the first one")

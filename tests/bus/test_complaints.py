@@ -156,7 +156,7 @@ def test_dora_3518_loss_of_a_reader_that_stands_still_is_counted(bus: Bus) -> No
 def test_losses_stand_in_heartbeat_and_diagnostics_by_publisher(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     out = bus.publisher()
     node = Node[None](None, bus.node("reader"), SystemClock(), "reader")
-    subscription = node.subscribe_raw("/x", lambda *_: None)
+    subscription = node.subscribe_received("/x", lambda _: None)
     node.start()
     wait_for(lambda: out.subscriber_count == 1)
     out.send(numbered(1))
