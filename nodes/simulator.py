@@ -113,8 +113,7 @@ class SimulatorNode(Node[SimulatorConfig]):
             text = f"{lost} packets left out: the machine is too slow" if lost else "all packets sent"
             self.diagnose("lidar", WARN if lost else OK, text, sent=scanner.sent, left_out=scanner.skipped)
         elif isinstance(scanner, CaptureReplay):
-            text = "the recording has ended" if scanner.finished else "recording runs"
-            self.diagnose("lidar", OK, text, sent=scanner.sent)
+            self.diagnose("lidar", OK, "recording runs", sent=scanner.sent)
         if camera is not None:
             rate, wanted = camera.rate_hz, self.config.camera.rate
             slow = camera.watched and 0 < rate < 0.8 * wanted

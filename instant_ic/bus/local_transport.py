@@ -51,11 +51,7 @@ class LocalTransport:
     """
 
     def __init__(
-        self,
-        run_dir: Path,
-        node: str,
-        now_ns: Callable[[], int],
-        steady_ns: Callable[[], int] = time.monotonic_ns,
+        self, run_dir: Path, node: str, now_ns: Callable[[], int], steady_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self.patient = False
         self._host = Host(run_dir, node, now_ns, steady_ns)
@@ -73,10 +69,6 @@ class LocalTransport:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bus", daemon=True)
         self._thread.start()
-
-    def waker(self) -> LocalTransport:
-        """The event that the node's thread waits on."""
-        return self
 
     def set(self) -> None:
         """End the present or the next wait; may be called from any thread."""

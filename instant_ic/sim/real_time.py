@@ -18,6 +18,8 @@ from instant_ic.sim.simulation import Simulation, SimulationConfig
 from instant_ic.sim.theta import ThetaServer, panorama_file
 from instant_ic.sim.vlp16 import Vlp16Server
 
+SERIAL_LINK = "roboclaw"
+"""Name of the link to the motor controller's pseudo-terminal."""
 _STEP_S = 0.01
 _MAX_WAIT_S = 0.3
 """Longest wait for a running step at shutdown."""
@@ -84,7 +86,7 @@ class SimulatedDevices:
             self.camera = ThetaServer(config.camera, source, config.seed)
             log.info("Theta Web API on http://%s:%d", config.camera.host, self.camera.port)
         if config.base.enabled:
-            link = serial_folder / "roboclaw"
+            link = serial_folder / SERIAL_LINK
             self._base = RoboClawServer(simulation.controller, simulation.lock, link)
             log.info("RoboClaw on %s (%s)", link, self._base.device)
 

@@ -1,5 +1,6 @@
 """VLP-16 as UDP packets: rays with firing times and motion distortion."""
 
+import contextlib
 import math
 import socket
 from collections.abc import Callable
@@ -255,7 +256,6 @@ class Vlp16Server:
         self._next_position_s = 0.0
         self.sent = 0
         self.skipped = 0
-        self.refused = 0
 
     def pump(self, time_s: float) -> None:
         """Send the packets that are complete at simulated time ``time_s``, in bursts."""
@@ -275,8 +275,6 @@ class Vlp16Server:
         self._socket.close()
 
     def _send(self, payload: bytes, port: int) -> None:
-        try:
+        # No listener yet: the kernel reports the error of an earlier packet. A real sensor ignores it too.
+        with contextlib.suppress(ConnectionRefusedError):
             self._socket.sendto(payload, (self._config.host, port))
-        except ConnectionRefusedError:
-            # No listener yet: the kernel reports the error of an earlier packet. A real sensor ignores it too.
-            self.refused += 1

@@ -185,7 +185,7 @@ class FrontEnd:
         """
         points = self._match_points(scan)
         if not self.trajectory:
-            keyframe = self._add_keyframe(guess.pose, np.zeros((3, 3)), scan, stamp_ns, dead_reckoned=False)
+            keyframe = self._add_keyframe(guess.pose, np.zeros((3, 3)), scan, stamp_ns)
             return Track(guess.pose, np.zeros((3, 3)), 1.0, SlamStatus.FIRST, keyframe)
 
         status = SlamStatus.TRACKED
@@ -213,7 +213,7 @@ class FrontEnd:
             if math.hypot(*(match.pose[:2] - self._built_at)) > KNOWN_MAP_STEP_M:
                 self._build_known(match.pose)
         elif accepted and (self._moved(match.pose) or self._first_was_poor(match, status)):
-            added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
+            added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns)
         return Track(match.pose, match.covariance, match.score, status, added)
 
     def restart(self, scan: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
@@ -222,7 +222,7 @@ class FrontEnd:
         self.trajectory = []
         covariance = self._grown_covariance(guess)
         self._lost_sigma_m = 0.0
-        keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
+        keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns)
         return Track(guess.pose, covariance, 0.0, SlamStatus.RESTARTED, keyframe)
 
     def dead_reckon(self, guess: Guess) -> Track:
@@ -276,9 +276,7 @@ class FrontEnd:
         step = relative2(last, pose)
         return math.hypot(step[0], step[1]) >= KEYFRAME_M or abs(step[2]) >= KEYFRAME_RAD
 
-    def _add_keyframe(
-        self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int, dead_reckoned: bool
-    ) -> Keyframe:
+    def _add_keyframe(self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int) -> Keyframe:
         step, step_covariance, drift = np.zeros(3), np.zeros((3, 3)), covariance.copy()
         if self.trajectory:
             last = self.trajectory[-1]
@@ -287,9 +285,7 @@ class FrontEnd:
             step_covariance = turned(covariance, -yaw)
             step_covariance += np.diag(np.square([STEP_SIGMA_M, STEP_SIGMA_M, STEP_SIGMA_RAD]))
             drift = grown_drift(last.drift, pose[:2] - last.map_from_base[:2], yaw, step_covariance)
-        keyframe = Keyframe(
-            stamp_ns, pose.copy(), covariance.copy(), scan, dead_reckoned, step, step_covariance, drift
-        )  # fmt: skip
+        keyframe = Keyframe(stamp_ns, pose.copy(), scan, step, step_covariance, drift)
         self.trajectory.append(keyframe)
         self.rebuild_field()
         return keyframe

@@ -23,9 +23,7 @@ class Keyframe:
     Attributes:
         stamp_ns: time of the scan.
         map_from_base: (3,), changed by optimisation.
-        covariance: (3, 3) of the match, relative to the preceding keyframes.
         scan: its points in the base frame.
-        dead_reckoned: whether the scan did not match and the pose comes from odometry.
         step: measured pose (3,) relative to the previous keyframe, at creation; zero for the first.
         step_covariance: of ``step``, in the frame of the previous keyframe (3, 3).
         drift: covariance of the pose in the whole map (3, 3), map frame; grows with the distance since the last loop
@@ -35,9 +33,7 @@ class Keyframe:
 
     stamp_ns: int
     map_from_base: FloatArray
-    covariance: FloatArray
     scan: ScanPoints
-    dead_reckoned: bool
     step: FloatArray
     step_covariance: FloatArray
     drift: FloatArray

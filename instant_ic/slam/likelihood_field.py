@@ -52,9 +52,8 @@ def accumulate(  # type: ignore[no-untyped-def]
     """Add the hits of one keyframe, and the surface between joined hits, to the cell sums.
 
     Args:
-        weight: float64 (H, W), as sum_x and sum_y, changed in place; coordinates in cells.
-        sum_x: weighted sum of the hits' x.
-        sum_y: weighted sum of the hits' y.
+        weight: float64 (H, W), changed in place, as sum_x and sum_y.
+        sum_x, sum_y: weighted sums of the hits' coordinates, in cells.
         touched: int32 (n, 2), row and column of the cells with weight; the first ``count`` are in use.
         count: see ``touched``.
         origin: (2,) centre of cell (0, 0), metres.
@@ -95,11 +94,7 @@ def fill_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # typ
 
     Args:
         field: float32 (H, W), changed in place.
-        weight: as in `accumulate`.
-        sum_x: as in `accumulate`.
-        sum_y: as in `accumulate`.
-        touched: as in `accumulate`.
-        count: as in `accumulate`.
+        weight, sum_x, sum_y, touched, count: as in `accumulate`.
         sigma: of the field, in cells.
         pull: σ, in cells, within which the hits of neighbouring cells count as the same surface.
     """

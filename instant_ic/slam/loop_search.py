@@ -60,15 +60,7 @@ def pool(field: NDArray[np.float32], size: int) -> NDArray[np.float32]:
 def score_volume(field, origin, resolution, points, centre, cells, rotations, rotation_step):  # type: ignore[no-untyped-def]
     """Mean field value of the points at each pose of a window.
 
-    Args:
-        field: float32 (H, W).
-        origin: (2,) centre of cell (0, 0).
-        resolution: metres per cell.
-        points: (n, 2) in the base frame, n > 0.
-        centre: field_from_base (3,), middle of the window.
-        cells: half width of the window.
-        rotations: half its number of rotations.
-        rotation_step: radians.
+    Arguments as of `matcher.correlate`.
 
     Returns:
         float32 (2·rotations + 1, 2·cells + 1, 2·cells + 1): rotation, y, x.

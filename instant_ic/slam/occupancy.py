@@ -81,8 +81,7 @@ def cast_scan(  # type: ignore[no-untyped-def]
 
     Args:
         cells: changed in place.
-        seen: int32 (H, W), ``mark`` where this scan has changed the cell.
-        mark: > 0, grows from scan to scan.
+        seen: int32 (H, W), ``mark`` where this scan has changed the cell; it is > 0 and grows from scan to scan.
         origin: (2,) corner of cell (0, 0).
         resolution: metres per cell.
         pose: map_from_base (3,).

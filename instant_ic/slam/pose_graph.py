@@ -48,12 +48,10 @@ class Solution:
 
     Attributes:
         poses: (n, 3).
-        chi2: of each edge (m,), without robust scaling.
         weights: weight of each edge after the robust kernel (m,), 0..1; 1 for edges that are not robust.
     """
 
     poses: FloatArray
-    chi2: FloatArray
     weights: FloatArray
 
 
@@ -84,7 +82,7 @@ def optimise(poses: FloatArray, edges: Sequence[Edge], index: dict[int, int]) ->
         raise ValueError(f"an edge refers to node {missing}, which is not in the graph") from None
     poses = poses.copy()
     if len(edges) == 0 or len(poses) < 2:
-        return Solution(poses, np.zeros(len(edges)), np.ones(len(edges)))
+        return Solution(poses, np.ones(len(edges)))
     measured = np.array([edge.a_from_b for edge in edges])
     information = np.linalg.inv(np.array([edge.covariance for edge in edges]))
     robust = np.array([edge.robust for edge in edges])
@@ -113,7 +111,7 @@ def optimise(poses: FloatArray, edges: Sequence[Edge], index: dict[int, int]) ->
             if gain <= 1e-4 * cost + 1e-9 or np.abs(step).max() < 1e-4:
                 break
     poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
-    return Solution(poses, chi2, _weights(chi2, robust, stages[-1]))
+    return Solution(poses, _weights(chi2, robust, stages[-1]))
 
 
 def _weights(chi2: FloatArray, robust: NDArray[np.bool_], width: float) -> FloatArray:

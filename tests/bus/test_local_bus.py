@@ -300,7 +300,7 @@ def test_signal_while_the_loop_holds_its_lock_does_not_hang(run_dir):
 def test_an_event_that_is_written_late_ends_one_wait_not_all(bus):
     """`clear` may come between a `set` and its write in another thread; the node would then spin until the next one."""
     transport = bus.node("reader")
-    waker = transport.waker()
+    waker = transport
     ends: list[None] = []
     os.eventfd_write(transport._wake, 1)
     deadline = time.monotonic() + 0.3
@@ -313,7 +313,7 @@ def test_an_event_that_is_written_late_ends_one_wait_not_all(bus):
 
 def test_an_event_during_a_long_callback_does_not_keep_the_bus_thread_busy(bus, monkeypatch):
     transport = bus.node("reader")
-    waker = transport.waker()
+    waker = transport
     subscription = transport.subscribe("/x", BYTES, RELIABLE, waker.set)
     publisher = bus.publisher("/x")
     wait_for(lambda: publisher.subscriber_count)
@@ -332,7 +332,7 @@ def test_an_event_during_a_long_callback_does_not_keep_the_bus_thread_busy(bus, 
 
 def test_messages_do_not_wake_a_patient_node_and_are_all_read_when_it_wakes(bus):
     transport = bus.node("reader")
-    waker = transport.waker()
+    waker = transport
     transport.patient = True
     waker.wait(0.0)  # until the first wait the bus thread reads
     subscription = transport.subscribe("/x", BYTES, RELIABLE, waker.set)
