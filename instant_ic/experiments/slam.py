@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from instant_ic.experiments.particle_slam import ParticleConfig, ParticleSlam
+from instant_ic.experiments.slam_logs import LogEntry, LogError, open_log
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, OccupancyGrid, Scan, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import Anchor, warm_up
-from instant_ic.slam.logs import LogEntry, LogError, open_log
 from instant_ic.slam.scan import FloatArray
 
 
@@ -230,7 +230,7 @@ def run_log(
     one millisecond after it; the trajectory keeps the original stamp.
 
     Args:
-        entries: of `instant_ic.slam.logs.read_log`, or compatible.
+        entries: of `instant_ic.experiments.slam_logs.read_log`, or compatible.
         config: defaults when None.
         particles: run the particle filter instead of the grid SLAM.
         use_wheel_odom: False ignores the log's odometry.

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.slam import Relations, perturb_odometry, relation_error, relation_times
+from instant_ic.experiments.slam_logs import LogEntry, LogError
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import warm_up
 from instant_ic.slam.localization import SavedMap
-from instant_ic.slam.logs import LogEntry, LogError
 from instant_ic.slam.scan import FloatArray
 
 WRONG_M = 0.5

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import LogResult, run_log
+from instant_ic.experiments.slam_logs import LogEntry
 from instant_ic.experiments.slam_worlds import trajectory_errors
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 from instant_ic.sim.world import World
 from instant_ic.slam import GridSlam, Scan, SlamConfig
-from instant_ic.slam.logs import LogEntry
 from instant_ic.slam.scan import FloatArray
 
 BEAMS = 720

@@ -24,7 +24,7 @@ from instant_ic.experiments.slam import (
     relation_error,
     run_log,
 )
-from instant_ic.slam.logs import LogEntry, LogError, read_carmen, read_log, read_mines
+from instant_ic.experiments.slam_logs import LogEntry, LogError, read_carmen, read_log, read_mines
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "slam2d"
 real_data = [
