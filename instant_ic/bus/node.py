@@ -204,14 +204,14 @@ class Worker:
             self._node.call_soon(self._on_result, result)
 
 
+@dataclasses.dataclass
 class Timer:
     """A callback once per period."""
 
-    def __init__(self, period_ns: int, due_ns: int, callback: Callable[[], None]) -> None:
-        self.period_ns = period_ns
-        self.due_ns = due_ns
-        self.callback = callback
-        self.cancelled = False
+    period_ns: int
+    due_ns: int
+    callback: Callable[[], None]
+    cancelled: bool = False
 
     def cancel(self) -> None:
         """Stop the timer; it never fires again."""
