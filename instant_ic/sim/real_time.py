@@ -83,7 +83,7 @@ class SimulatedDevices:
             if not config.panorama:
                 self._see(config.camera.width, config.camera.height)  # compiles before the clock starts
             source = panorama_file(Path(config.panorama).expanduser()) if config.panorama else self._see
-            self.camera = ThetaServer(config.camera, source, config.seed)
+            self.camera = ThetaServer(config.camera, source)
             log.info("Theta Web API on http://%s:%d", config.camera.host, self.camera.port)
         if config.base.enabled:
             link = serial_folder / SERIAL_LINK

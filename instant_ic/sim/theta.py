@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instant_ic.camera.config import PREVIEW_FORMATS
-from instant_ic.config.ranges import NotNegative, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import PositiveInt, Range, check_ranges
 from instant_ic.limits import load_image
 from instant_ic.pace import current
 
@@ -40,7 +40,6 @@ class ThetaConfig:
         width, height: preview format until a driver sets another.
         rate: largest frame rate, even if the format promises more.
         latency_s: time from the exposure of an image to its delivery.
-        noise: standard deviation of a pixel value, of 255.
         user, password: credentials of HTTP digest (client mode); an empty user disables it.
     """
 
@@ -51,7 +50,6 @@ class ThetaConfig:
     height: PositiveInt = 512
     rate: Annotated[float, Range(above=0, high=30)] = 5.0
     latency_s: Annotated[float, Range(0, below=2)] = 0.20
-    noise: NotNegative = 0.0
     user: str = ""
     password: str = ""
 
@@ -101,7 +99,6 @@ class ThetaServer:
     Args:
         config: parameters.
         source: returns the camera's view; called on the camera's thread.
-        seed: seed of the noise.
 
     Raises:
         OSError: the port is in use.
@@ -113,7 +110,7 @@ class ThetaServer:
         late_s: recent delay of the images behind their plan, in the stack's seconds; 0 without a viewer.
     """
 
-    def __init__(self, config: ThetaConfig, source: PictureSource, seed: int = 0) -> None:
+    def __init__(self, config: ThetaConfig, source: PictureSource) -> None:
         self.config = config
         self.source = source
         self.rate_hz = 0.0
@@ -125,7 +122,6 @@ class ThetaServer:
         self._options_set_s = -1e9
         self._began_s = time.monotonic()
         self._nonce = secrets.token_hex(16)
-        self._rng = np.random.default_rng([41, seed])
         self._frame: bytes | None = None
         self._number = 0
         self._viewers = 0
@@ -174,9 +170,6 @@ class ThetaServer:
     def _jpeg(self, rgb: npt.NDArray[np.uint8]) -> bytes:
         import cv2
 
-        if self.config.noise > 0:
-            grain = self.config.noise * self._rng.standard_normal(rgb.shape[:2], np.float32)
-            rgb = np.clip(np.rint(rgb + grain[..., None]), 0, 255).astype(np.uint8)
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
         ok, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not ok:
@@ -199,7 +192,7 @@ class ThetaServer:
                 width, height, promised = self._format
             began = current().steady_s()
             rgb = self.source(width, height)
-            if rgb is not shown or self.config.noise > 0:
+            if rgb is not shown:
                 shown, jpeg = rgb, self._jpeg(rgb)
             self._sleep(began + self.config.latency_s)
             late_s = current().steady_s() - began - self.config.latency_s
