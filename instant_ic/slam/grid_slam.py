@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,6 +108,7 @@ class GridSlam:
 
     Attributes:
         map_from_base: pose of the last scan (3,).
+        in_map_frame: whether the pose continues one in the map's frame; False until the place in a saved map is found.
         front_end: matches scans and makes keyframes.
         loop_closure: finds loops and optimises the keyframes' poses.
         motion: compares wheel odometry with scan matching.
@@ -122,7 +123,7 @@ class GridSlam:
         self.map = OccupancyMap(self.config.map)
         self.motion = MotionMonitor()
         self.monitor = IntegrityMonitor()
-        self._framed = saved is None
+        self.in_map_frame = saved is None
         self._apart = False  # a session began after the robot was lost in the map being made
         self._reach_m = math.inf  # distance from odometry within which the robot is searched for
         self._found_before: tuple[FloatArray, FloatArray] | None = None
@@ -187,11 +188,6 @@ class GridSlam:
     def localized(self) -> bool:
         """Whether the robot is located in the saved map; True without one."""
         return self.saved is None or self.saved.located
-
-    @property
-    def in_map_frame(self) -> bool:
-        """Whether the pose continues one in the map's frame; False until the robot is located in a saved map."""
-        return self._framed
 
     def grid(self) -> OccupancyGrid:
         """The map: int8 array (H, W) of −1, 0..100, resolution, origin (2,)."""
@@ -327,7 +323,7 @@ class GridSlam:
         for keyframe in own:
             keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
         self._move(moved)
-        saved.located = self._framed = True
+        saved.located = self.in_map_frame = True
         self.monitor = IntegrityMonitor()
         if not saved.extends:
             own[-1].drift = covariance
@@ -547,19 +543,12 @@ def transforms(
         limiter.reset()
 
 
-@dataclass(frozen=True)
-class JobResult:
-    """Outcome of a background job of one SLAM, None if it failed; ``fault`` is the text of the error, if any."""
+class JobResult(NamedTuple):
+    """Outcome of a background job of one SLAM; None with a diagnosis if it failed."""
 
     slam: GridSlam
     outcome: Place | Outcome | None
-    fault: str = ""
-
-    @property
-    def diagnosis(self) -> Diagnosis | None:
-        """None when it did not fail."""
-        text = f"loop closure failed and is off until the node restarts: {self.fault}"
-        return Diagnosis("loops", Level.ERROR, text) if self.fault else None
+    diagnosis: Diagnosis | None = None
 
 
 def run_job(item: tuple[GridSlam, Callable[[], Place | Outcome]]) -> JobResult:
@@ -568,4 +557,5 @@ def run_job(item: tuple[GridSlam, Callable[[], Place | Outcome]]) -> JobResult:
     try:
         return JobResult(slam, job())
     except Exception as error:  # noqa: BLE001 - scans go on
-        return JobResult(slam, None, f"{type(error).__name__}: {error}")
+        text = f"loop closure failed and is off until the node restarts: {type(error).__name__}: {error}"
+        return JobResult(slam, None, Diagnosis("loops", Level.ERROR, text))
