@@ -105,9 +105,8 @@ class ControlServer:
 
     def _serve(self, connection: socket.socket) -> None:
         try:
-            with connection:
+            with connection, connection.makefile("rb") as reader:
                 connection.settimeout(_IDLE_S)
-                reader = connection.makefile("rb")
                 while line := _read_line(reader, MAX_REQUEST_BYTES):
                     _send(connection, self.answer(line))
         except _RequestError as error:
@@ -281,7 +280,8 @@ class NodeControl:
             try:
                 connection.connect(str(path))
                 _send(connection, request)
-                line = _read_line(connection.makefile("rb"), MAX_ANSWER_BYTES)
+                with connection.makefile("rb") as reader:
+                    line = _read_line(reader, MAX_ANSWER_BYTES)
             except TimeoutError:
                 raise ControlError(
                     f"node {self.node} did not answer within {self.timeout_s:g} s: its process hangs or is stopped "

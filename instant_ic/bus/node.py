@@ -204,7 +204,7 @@ class Worker:
             self._node.call_soon(self._on_result, result)
 
 
-@dataclasses.dataclass
+@dataclasses.dataclass(eq=False)
 class Timer:
     """A callback once per period."""
 

@@ -107,6 +107,7 @@ class ThetaServer:
         port: listening port.
         rate_hz: recent frame rate; 0 without a viewer and for the first four frames.
         frames: number of delivered images.
+        stopping: the camera is closing.
         late_s: recent delay of the images behind their plan, in the stack's seconds; 0 without a viewer.
     """
 
@@ -126,7 +127,7 @@ class ThetaServer:
         self._number = 0
         self._viewers = 0
         self._changed = threading.Condition()
-        self._stopping = False
+        self.stopping = False
         server = self
 
         class Handler(_Handler):
@@ -157,7 +158,7 @@ class ThetaServer:
     def close(self) -> None:
         """End the streams and the server."""
         with self._changed:
-            self._stopping = True
+            self.stopping = True
             self._changed.notify_all()
         self._http.shutdown()
         self._http.server_close()
@@ -183,11 +184,11 @@ class ThetaServer:
         jpeg = b""
         while True:
             with self._changed:
-                while self._viewers == 0 and not self._stopping:
+                while self._viewers == 0 and not self.stopping:
                     self.rate_hz, self.late_s, made = 0.0, 0.0, 0
                     self._changed.wait(1.0)
                     due = current().steady_s()
-                if self._stopping:
+                if self.stopping:
                     return
                 width, height, promised = self._format
             began = current().steady_s()
@@ -218,19 +219,19 @@ class ThetaServer:
     def _sleep(self, until: float) -> None:
         """Sleep until a time on the stack's steady clock."""
         with self._changed:
-            while not self._stopping and (left := until - current().steady_s()) > 0:
+            while not self.stopping and (left := until - current().steady_s()) > 0:
                 self._changed.wait(current().wait_s(left))
 
     def next_frame(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
         """Number and JPEG of the newest image after number ``after``; None on a time-out or at shutdown."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
-            while (self._number <= after or self._frame is None) and not self._stopping:
+            while (self._number <= after or self._frame is None) and not self.stopping:
                 left = deadline - time.monotonic()
                 if left <= 0:
                     return None
                 self._changed.wait(left)
-            if self._stopping or self._frame is None:
+            if self.stopping or self._frame is None:
                 return None
             return self._number, self._frame
 
@@ -370,10 +371,6 @@ class ThetaServer:
         """Remove a viewer."""
         with self._changed:
             self._viewers -= 1
-
-    @property
-    def stopping(self) -> bool:
-        return self._stopping
 
 
 class _Handler(BaseHTTPRequestHandler):
