@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from contextlib import ExitStack
+
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
 from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.capture import CaptureError
@@ -27,8 +30,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         """Create the world and open the devices."""
         if self.lockstep:
             raise NodeError("the simulator serves real devices in real time; use sim.Simulation in lockstep tests")
-        self._devices: SimulatedDevices | None = None
-        self._loop: RealTimeLoop | None = None
+        self._open = ExitStack()
         self._published: tuple[bool | None, int] = (None, 0)
         self._skipped = 0
         leave_out_blas()
@@ -37,13 +39,12 @@ class SimulatorNode(Node[SimulatorConfig]):
             self._devices = SimulatedDevices(self.config, self.simulation, run_dir() / "dev", self.log)
         except (ValueError, OSError, CaptureError) as error:
             raise NodeError(f"simulator: {error}") from error
+        self._open.callback(self._devices.close)
         self.odom = self.publisher("/ground_truth/odom", Odometry, qos=SENSOR)
         self.contact = self.publisher("/ground_truth/contact", Bool, qos=LATCHED)
-
-        def report(error: Exception) -> None:
-            self.call_soon(self.fault, "simulation", error)
-
-        self._loop = RealTimeLoop(self.simulation, self._devices.scanner, report)
+        fault = functools.partial(self.call_soon, self.fault, "simulation")
+        self._loop = RealTimeLoop(self.simulation, self._devices.scanner, fault)
+        self._open.callback(self._loop.stop)
         self.late = self.publisher("/simulation/late", Float32, qos=SENSOR)
         self.subscribe("/simulation/put_down", PoseStamped, self._put_down, qos=RELIABLE)
         self.timer(_TRUTH_S, self._publish_truth)
@@ -51,12 +52,8 @@ class SimulatorNode(Node[SimulatorConfig]):
         self.timer(1.0, self._check)
 
     def teardown(self) -> None:
-        if not hasattr(self, "_loop"):  # the node failed before its setup
-            return
-        if self._loop is not None:
-            self._loop.stop()
-        if self._devices is not None:
-            self._devices.close()
+        if hasattr(self, "_open"):  # else the node failed before its setup
+            self._open.close()
 
     def _put_down(self, message: PoseStamped) -> None:
         """Lift the robot and put it down elsewhere in the world."""
@@ -82,15 +79,12 @@ class SimulatorNode(Node[SimulatorConfig]):
 
     def _publish_late(self) -> None:
         """Publish the devices' delay as a share of the acceptable one; above 1 the launcher slows the stack."""
-        loop, devices = self._loop, self._devices
-        if loop is not None and devices is not None:
-            camera_s = devices.camera.late_s if devices.camera is not None else 0.0
-            self.late.publish(Float32(max(loop.take_lag_s() / ACCEPTABLE_LAG_S, camera_s / ACCEPTABLE_DELAY_S)))
+        camera = self._devices.camera
+        camera_s = camera.late_s if camera is not None else 0.0
+        self.late.publish(Float32(max(self._loop.take_lag_s() / ACCEPTABLE_LAG_S, camera_s / ACCEPTABLE_DELAY_S)))
 
     def _check(self) -> None:
         loop, robot = self._loop, self.simulation.robot
-        if loop is None:
-            return
         if (fault := loop.fault) is not None:
             text = f"the simulation stopped: {type(fault).__name__}: {fault}; restart it"
             self.diagnose("simulation", ERROR, text)
@@ -105,8 +99,6 @@ class SimulatorNode(Node[SimulatorConfig]):
         self._check_devices()
 
     def _check_devices(self) -> None:
-        if self._devices is None:
-            return
         scanner, camera = self._devices.scanner, self._devices.camera
         if isinstance(scanner, Vlp16Server):
             lost, self._skipped = scanner.skipped - self._skipped, scanner.skipped

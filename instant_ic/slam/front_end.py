@@ -191,7 +191,7 @@ class FrontEnd:
         status = SlamStatus.TRACKED
         match = match_scan(self._field, points, guess.pose, guess.sigma, guess.window)
         if match.score < RECOVERY_SCORE or match.at_border:
-            recovered = self._recover(points, guess)
+            recovered = match_scan(self._field, points, guess.pose, guess.sigma, Window(RECOVERY_M, RECOVERY_RAD))
             # Unless the first window was too small, the wide search must be clearly better: a window this large always
             # contains a slightly better pose.
             margin = 0.0 if match.at_border else RECOVERY_MARGIN
@@ -232,9 +232,6 @@ class FrontEnd:
     def _match_points(self, scan: ScanPoints) -> FloatArray:
         near = (scan.points**2).sum(axis=1) <= self.config.field.max_range_m**2
         return thin(scan.points[near], scan.joined[near], self.config.match.max_points)
-
-    def _recover(self, points: FloatArray, guess: Guess) -> Match:
-        return match_scan(self._field, points, guess.pose, guess.sigma, Window(RECOVERY_M, RECOVERY_RAD))
 
     def _doubtful(self, match: Match, guess: Guess) -> bool:
         """Whether the scan may fit better at a heading that the local search does not reach."""
