@@ -378,11 +378,7 @@ class TopicFolder:
 
 
 class TopicWatch:
-    """Topics of a run directory, to be polled at low cost.
-
-    Args:
-        run_dir: the run directory.
-    """
+    """Topics of a run directory, to be polled at low cost."""
 
     def __init__(self, run_dir: Path) -> None:
         self._root = run_dir / "topics"

@@ -48,7 +48,6 @@ class SimulatedDevices:
     """The enabled devices of a simulation, open until ``close``.
 
     Args:
-        config: parameters.
         simulation: robot and world.
         serial_folder: folder of the link to the motor controller's pseudo-terminal.
         log: receives the devices' addresses.

@@ -50,7 +50,6 @@ class TrackedRobot:
     """Robot on the floor plan.
 
     Args:
-        config: dynamics.
         mask: where objects stop the robot.
         pose: x, y, yaw at the start.
         seed: seed of slip and noise.

@@ -96,9 +96,7 @@ class _ApiError(Exception):
 class ThetaServer:
     """Camera with its Web API; it renders images only while a client reads the preview.
 
-    Args:
-        config: parameters.
-        source: returns the camera's view; called on the camera's thread.
+    Its source is called on the camera's thread.
 
     Raises:
         OSError: the port is in use.

@@ -125,11 +125,8 @@ class Vlp16:
     """Optics and clock of the scanner: produces packets for intervals of simulated time.
 
     Args:
-        config: parameters.
-        world: the world to scan.
         pose_at: pose of base_link at given times.
         epoch_ns: epoch time of a simulated time, which gives the packets' microseconds past the hour.
-        seed: seed of the noise.
         mount: pose on base_link.
     """
 

@@ -128,10 +128,7 @@ class World:
     def sample_free_poses(self, rng: np.random.Generator, n: int, clearance_m: float = 0.35) -> npt.NDArray[np.float64]:
         """Random poses (n, 3), x, y, yaw, that are reachable from the spawn pose.
 
-        Args:
-            rng: source of randomness.
-            n: number of poses.
-            clearance_m: smallest distance to objects between 0.03 m and 1.9 m above the floor.
+        Objects between 0.03 m and 1.9 m above the floor are at least ``clearance_m`` away.
 
         Raises:
             ValueError: no pose has this much clearance.

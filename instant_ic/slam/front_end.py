@@ -168,20 +168,11 @@ class FrontEnd:
         return Guess(pose, np.array([sigma_m, sigma_m, sigma_rad]), window, doubtful)
 
     def track(
-        self,
-        scan: ScanPoints,
-        guess: Guess,
-        stamp_ns: int,
-        accept: Callable[[FloatArray, float, bool], bool] | None = None,
+        self, scan: ScanPoints, guess: Guess, stamp_ns: int, accept: Callable[[FloatArray, float, bool], bool]
     ) -> Track:
-        """Match a scan that has at least `MIN_POINTS` points.
+        """Match a scan that has at least `MIN_POINTS` points; it becomes a keyframe only if ``accept`` returns True.
 
-        Args:
-            scan: its points.
-            guess: predicted pose.
-            stamp_ns: of the scan.
-            accept: gets the pose (3,) and the score of a match, and whether only the wide search has found it; the scan
-                becomes a keyframe only if it returns True.
+        ``accept`` gets the pose (3,) and the score of the match, and whether only the wide search has found it.
         """
         points = self._match_points(scan)
         if not self.trajectory:
@@ -204,7 +195,7 @@ class FrontEnd:
         if match.score < MIN_SCORE:
             return Track(guess.pose, self._grown_covariance(guess), match.score, SlamStatus.LOST, None)
 
-        accepted = accept is None or accept(match.pose, match.score, status is SlamStatus.RECOVERED)
+        accepted = accept(match.pose, match.score, status is SlamStatus.RECOVERED)
         self._lost_sigma_m = 0.0
         self._usual_score += SCORE_MEMORY * (match.score - self._usual_score)
         self._covariance = match.covariance

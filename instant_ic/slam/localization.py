@@ -237,7 +237,6 @@ class SavedMap:
     """A map from disk, in which the robot is located first.
 
     Args:
-        config: parameters.
         grid: the map.
         graph: its keyframes and edges, to extend the map; None: the map stays unchanged.
 
