@@ -55,15 +55,14 @@ class Peer:
             [sys.executable, str(PEER), transport, role, wanted, address],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        self._os_stderr = self.process.stderr
 
     def answer(self) -> Any:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
             self.process.kill()
-            assert self._os_stderr is not None
-            raise RuntimeError(self._os_stderr.read().strip().splitlines()[-1:] or ["ended without a word"])
+            assert self.process.stderr is not None
+            raise RuntimeError(self.process.stderr.read().strip().splitlines()[-1:] or ["ended without a word"])
         return json.loads(line)
 
     def ask(self, command: dict[str, Any] | None = None) -> Any:
@@ -87,7 +86,6 @@ class Pair:
 
     pub: Peer
     subs: list[Peer]
-    address: str
 
     def send(self, topic: str, count: int, period_s: float, seconds: float = 60.0) -> tuple[dict[str, Any], list[Any]]:
         """Send frames and wait until all expected ones have arrived."""
@@ -129,7 +127,6 @@ def joined(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
         "count": a["count"] + b["count"],
         "bytes": a["bytes"] + b["bytes"],
         "seconds": seconds,
-        "cpu_s": b["cpu_s"],
     }
 
 
@@ -163,7 +160,7 @@ def open_pair(transport: str, address: str, topics: dict[str, int], readers: int
         for _ in range(readers):
             peers.append(Peer(transport, "sub", topics, address))
             peers[-1].answer()
-        pair = Pair(pub, peers[1:], address)
+        pair = Pair(pub, peers[1:])
         for topic in topics:
             pair.warm_up(topic)
         return pair

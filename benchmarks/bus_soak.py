@@ -83,7 +83,7 @@ def make_node(run_dir: str, name: str) -> Node[None]:
     return node
 
 
-def publish(run_dir: str, name: str, seconds: float, factor: float) -> dict[str, Any]:
+def publish(run_dir: str, name: str, seconds: float, factor: float) -> None:
     """Publish this process's topics once all readers have subscribed."""
     node = make_node(run_dir, f"{name}_out")
     sent = dict.fromkeys((t for t, topic in LOAD.items() if topic.publisher == name), 0)
@@ -117,7 +117,6 @@ def publish(run_dir: str, name: str, seconds: float, factor: float) -> dict[str,
     print(json.dumps({"sent": sent, "cpu_s": cpu, "not_shared": not_shared}), flush=True)
     sys.stdin.read()  # wait until the readers have counted; the sockets may close after that
     node.close()
-    return {}
 
 
 def read(run_dir: str, name: str) -> None:

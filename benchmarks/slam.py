@@ -18,11 +18,11 @@ from reporting import parser_of, report
 
 from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
+from instant_ic.experiments.slam_logs import LogEntry, read_log
 from instant_ic.experiments.slam_worlds import LASERS, cells, drive, office, ring, trajectory_errors
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.grid_slam import warm_up
-from instant_ic.slam.logs import LogEntry, read_log
 
 KEPT = (
     "translation_mean_m", "translation_median_m", "translation_max_m", "rotation_mean_deg", "relations",

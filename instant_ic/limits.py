@@ -32,9 +32,7 @@ def limit_opencv() -> None:
 def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
     """Decode a JPEG or PNG from an untrusted source, up to `MOST_PIXELS`; None if that fails.
 
-    Args:
-        data: the encoded image.
-        flags: as for ``cv2.imdecode``.
+    ``flags`` as for ``cv2.imdecode``.
     """
     import cv2
     import numpy as np
@@ -90,9 +88,7 @@ def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: 
 def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
     """Read an image file in any format that OpenCV supports, up to `MOST_FILE_PIXELS`; None if that fails.
 
-    Args:
-        path: the file.
-        flags: as for ``cv2.imread``.
+    ``flags`` as for ``cv2.imread``.
     """
     import cv2
 

@@ -11,7 +11,7 @@ from instant_ic.bag.choice import TopicChoice
 from instant_ic.bridge.commands import CommandGate, CommandLimits
 from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerConfig
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
-from instant_ic.bus.topic_watch import TopicWatch
+from instant_ic.bus.registry import TopicWatch
 from instant_ic.config.ranges import Range
 from instant_ic.web_access import is_loopback
 

@@ -23,17 +23,14 @@ _POLL_S = 0.05  # odometry comes more often; where it does not, a scan is placed
 
 class GridSlamNode(Node[GridSlamConfig]):
     name = "grid_slam"
-    live_parameters = (
-        *("max_scan_age_s", "reset_on_time_jump_s", "odom_wait_s", "odom_startup_wait_s", "odom_extrapolate_s"),
-        *("correction_speed_mps", "correction_yaw_rate_radps"),
-    )
+    live_parameters = ("max_scan_age_s", "odom_wait_s")
 
     def setup(self) -> None:
         warm_up(self.config)
         self.poll: Any = None  # timer while scans wait for odometry, which may have gone silent
         self.worker = self.background(run_job, self.take_over)
         self.queue = ScanQueue(self.config)
-        self.limiter = CorrectionLimiter(self.config.correction_speed_mps, self.config.correction_yaw_rate_radps)
+        self.limiter = CorrectionLimiter()
         self.map_out = self.publisher("/map", msg.OccupancyGrid, qos=LATCHED)
         self.update_out = self.publisher("/map_updates", msg.OccupancyGridUpdate, qos=RELIABLE)
         self.saved_out = self.publisher("/slam/saved", msg.String, qos=RELIABLE)
@@ -57,8 +54,6 @@ class GridSlamNode(Node[GridSlamConfig]):
     def reconfigure(self, config: GridSlamConfig) -> None:
         super().reconfigure(config)
         self.queue.config = config
-        self.limiter.speed_mps = config.correction_speed_mps
-        self.limiter.yaw_rate_radps = config.correction_yaw_rate_radps
 
     def restart(self) -> None:
         config = self.config

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from contextlib import ExitStack
 
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
 from instant_ic.jit import leave_out_blas
@@ -11,18 +12,13 @@ from instant_ic.msg import Bool, Float32, Odometry, PoseStamped, odometry_messag
 from instant_ic.pace import current
 from instant_ic.paths import run_dir
 from instant_ic.sim.capture_replay import CaptureReplay
-from instant_ic.sim.real_time import ACCEPTABLE_LAG_S, DevicesConfig, RealTimeLoop, SimulatedDevices
+from instant_ic.sim.real_time import ACCEPTABLE_LAG_S, RealTimeLoop, SimulatedDevices, SimulatorConfig
 from instant_ic.sim.simulation import Simulation
 from instant_ic.sim.theta import ACCEPTABLE_DELAY_S
 from instant_ic.sim.vlp16 import Vlp16Server
 
 _TRUTH_S = 1.0 / 30.0
 _LATE_S = 0.2
-
-
-@dataclass(frozen=True)
-class SimulatorConfig(DevicesConfig):
-    """Parameters of the node ``simulator``."""
 
 
 class SimulatorNode(Node[SimulatorConfig]):
@@ -34,8 +30,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         """Create the world and open the devices."""
         if self.lockstep:
             raise NodeError("the simulator serves real devices in real time; use sim.Simulation in lockstep tests")
-        self._devices: SimulatedDevices | None = None
-        self._loop: RealTimeLoop | None = None
+        self._open = ExitStack()
         self._published: tuple[bool | None, int] = (None, 0)
         self._skipped = 0
         leave_out_blas()
@@ -44,13 +39,12 @@ class SimulatorNode(Node[SimulatorConfig]):
             self._devices = SimulatedDevices(self.config, self.simulation, run_dir() / "dev", self.log)
         except (ValueError, OSError, CaptureError) as error:
             raise NodeError(f"simulator: {error}") from error
+        self._open.callback(self._devices.close)
         self.odom = self.publisher("/ground_truth/odom", Odometry, qos=SENSOR)
         self.contact = self.publisher("/ground_truth/contact", Bool, qos=LATCHED)
-
-        def report(error: Exception) -> None:
-            self.call_soon(self.fault, "simulation", error)
-
-        self._loop = RealTimeLoop(self.simulation, self._devices.scanner, report)
+        fault = functools.partial(self.call_soon, self.fault, "simulation")
+        self._loop = RealTimeLoop(self.simulation, self._devices.scanner, fault)
+        self._open.callback(self._loop.stop)
         self.late = self.publisher("/simulation/late", Float32, qos=SENSOR)
         self.subscribe("/simulation/put_down", PoseStamped, self._put_down, qos=RELIABLE)
         self.timer(_TRUTH_S, self._publish_truth)
@@ -58,12 +52,8 @@ class SimulatorNode(Node[SimulatorConfig]):
         self.timer(1.0, self._check)
 
     def teardown(self) -> None:
-        if not hasattr(self, "_loop"):  # the node failed before its setup
-            return
-        if self._loop is not None:
-            self._loop.stop()
-        if self._devices is not None:
-            self._devices.close()
+        if hasattr(self, "_open"):  # else the node failed before its setup
+            self._open.close()
 
     def _put_down(self, message: PoseStamped) -> None:
         """Lift the robot and put it down elsewhere in the world."""
@@ -89,15 +79,12 @@ class SimulatorNode(Node[SimulatorConfig]):
 
     def _publish_late(self) -> None:
         """Publish the devices' delay as a share of the acceptable one; above 1 the launcher slows the stack."""
-        loop, devices = self._loop, self._devices
-        if loop is not None and devices is not None:
-            camera_s = devices.camera.late_s if devices.camera is not None else 0.0
-            self.late.publish(Float32(max(loop.take_lag_s() / ACCEPTABLE_LAG_S, camera_s / ACCEPTABLE_DELAY_S)))
+        camera = self._devices.camera
+        camera_s = camera.late_s if camera is not None else 0.0
+        self.late.publish(Float32(max(self._loop.take_lag_s() / ACCEPTABLE_LAG_S, camera_s / ACCEPTABLE_DELAY_S)))
 
     def _check(self) -> None:
         loop, robot = self._loop, self.simulation.robot
-        if loop is None:
-            return
         if (fault := loop.fault) is not None:
             text = f"the simulation stopped: {type(fault).__name__}: {fault}; restart it"
             self.diagnose("simulation", ERROR, text)
@@ -112,16 +99,13 @@ class SimulatorNode(Node[SimulatorConfig]):
         self._check_devices()
 
     def _check_devices(self) -> None:
-        if self._devices is None:
-            return
         scanner, camera = self._devices.scanner, self._devices.camera
         if isinstance(scanner, Vlp16Server):
             lost, self._skipped = scanner.skipped - self._skipped, scanner.skipped
             text = f"{lost} packets left out: the machine is too slow" if lost else "all packets sent"
             self.diagnose("lidar", WARN if lost else OK, text, sent=scanner.sent, left_out=scanner.skipped)
         elif isinstance(scanner, CaptureReplay):
-            text = "the recording has ended" if scanner.finished else "recording runs"
-            self.diagnose("lidar", OK, text, sent=scanner.sent)
+            self.diagnose("lidar", OK, "recording runs", sent=scanner.sent)
         if camera is not None:
             rate, wanted = camera.rate_hz, self.config.camera.rate
             slow = camera.watched and 0 < rate < 0.8 * wanted

@@ -21,7 +21,7 @@ from instant_ic.bridge.zenoh_session import (
 )
 from instant_ic.bridge.zenoh_topics import Namespace, parse_subscribe
 from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main, registry
-from instant_ic.bus.topic_watch import TopicWatch
+from instant_ic.bus.registry import TopicWatch
 from instant_ic.msg import MessageError
 
 _AGAIN_S = 2.0

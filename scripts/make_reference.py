@@ -15,13 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "docs" / "reference.md"
-CALLS = {
-    "publisher": "gives",
-    "subscribe": "takes",
-    "latest": "takes",
-    "subscribe_raw": "takes",
-    "subscribe_received": "takes",
-}
+CALLS = {"publisher": "gives", "subscribe": "takes", "latest": "takes", "subscribe_received": "takes"}
 
 
 def topics(source: str) -> dict[str, dict[str, str]]:
@@ -39,7 +33,7 @@ def topics(source: str) -> dict[str, dict[str, str]]:
             topic = arguments[0].value
             if isinstance(topic, str) and topic.startswith("/"):
                 kind = arguments[1]
-                if name in ("subscribe_raw", "subscribe_received"):  # raw bytes, passed on or decoded by the callback
+                if name == "subscribe_received":  # raw bytes, passed on or decoded by the callback
                     kind = next((k.value for k in call.keywords if k.arg == "message_class"), ast.Name("bytes"))
                 found[CALLS[name]][topic] = re.sub(r"^msg\.|^message_type\('(\w+)'\)$", r"\1", ast.unparse(kind))
         elif name == "tf_broadcast":

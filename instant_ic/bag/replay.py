@@ -25,8 +25,7 @@ from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.bus.node import Node
 from instant_ic.bus.node_files import node_class
-from instant_ic.bus.process import load_config
-from instant_ic.config.params import SHARED
+from instant_ic.config.params import SHARED, configure, gather
 from instant_ic.config.yaml_text import read_yaml
 from instant_ic.msg import deserialize
 
@@ -117,7 +116,7 @@ def make_node(name: str, params_files: Sequence[Path] | None, overrides: Sequenc
     files = shipped_parameter_files(name) if params_files is None else list(params_files)
     own = [word.removeprefix(f"{name}.") for word in overrides if word.startswith(f"{name}.")]
     found = node_class(name)
-    config, _ = load_config(found, name, files, own)
+    config, _ = configure(found.config_class(), gather(name, files, own))
     return ReplayNode(name, found, config)
 
 

@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from instant_ic.bus import registry
 from instant_ic.bus.node import NodeError
@@ -105,10 +105,9 @@ class ControlServer:
 
     def _serve(self, connection: socket.socket) -> None:
         try:
-            with connection:
+            with connection, connection.makefile("rb") as reader:
                 connection.settimeout(_IDLE_S)
-                reader = _LineReader(connection, MAX_REQUEST_BYTES)
-                while (line := reader.line()) is not None:
+                while line := _read_line(reader, MAX_REQUEST_BYTES):
                     _send(connection, self.answer(line))
         except _RequestError as error:
             log.warning("control: %s", error)
@@ -281,7 +280,8 @@ class NodeControl:
             try:
                 connection.connect(str(path))
                 _send(connection, request)
-                line = _LineReader(connection, MAX_ANSWER_BYTES).line()
+                with connection.makefile("rb") as reader:
+                    line = _read_line(reader, MAX_ANSWER_BYTES)
             except TimeoutError:
                 raise ControlError(
                     f"node {self.node} did not answer within {self.timeout_s:g} s: its process hangs or is stopped "
@@ -291,7 +291,7 @@ class NodeControl:
                 raise NodeMissingError(self._not_there()) from None
             except OSError as error:
                 raise ControlError(f"node {self.node}: {path}: {error}") from error
-        if line is None:
+        if not line:
             raise ControlError(f"node {self.node} ended before it answered")
         answer = _parse(line)
         if answer.get("ok"):
@@ -308,26 +308,12 @@ class NodeControl:
         return f"node {self.node!r} does not run in {self.run_dir} ({hint})"
 
 
-class _LineReader:
-    """Reads lines of limited length from a socket."""
-
-    def __init__(self, connection: socket.socket, max_bytes: int) -> None:
-        self._connection = connection
-        self._max_bytes = max_bytes
-        self._buffer = bytearray()
-
-    def line(self) -> bytes | None:
-        """The next line without its line end; None when the other side has closed."""
-        while (end := self._buffer.find(b"\n")) < 0:
-            if len(self._buffer) > self._max_bytes:
-                raise _RequestError(f"line longer than {self._max_bytes} bytes")
-            part = self._connection.recv(65536)
-            if not part:
-                return None
-            self._buffer += part
-        line = bytes(self._buffer[:end])
-        del self._buffer[: end + 1]
-        return line
+def _read_line(reader: BinaryIO, max_bytes: int) -> bytes:
+    """The next line; empty when the other side has closed."""
+    line = reader.readline(max_bytes + 1)
+    if len(line) > max_bytes:
+        raise _RequestError(f"line longer than {max_bytes} bytes")
+    return line if line.endswith(b"\n") else b""
 
 
 def _send(connection: socket.socket, content: Mapping[str, Any]) -> None:

@@ -34,16 +34,11 @@ _NOBLOCK = int(zmq.NOBLOCK)
 
 log = logging.getLogger(__name__)
 
-
 _Message = tuple[int, int, int, Buffer, Slot | None]  # sequence, publication time in ns, size, body, its slot
 
 
 class LocalPublisher:
     """Publisher of one topic of one node.
-
-    Args:
-        host: the node's transport.
-        topic, type_name, qos: what it publishes.
 
     Attributes:
         closed: it takes no more messages, and its socket closes.
@@ -110,7 +105,7 @@ class LocalPublisher:
         with self._lock:
             if not self.closed:
                 self._send(size, body, publish_ns)
-        self.stats.add(self._steady_ns(), size)
+        self.stats.add(self._steady_ns())
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
         """Send ``size`` bytes that ``fill`` writes in place, without a further copy and without waiting.
@@ -145,12 +140,12 @@ class LocalPublisher:
                 self._send(size, body, publish_ns)
             else:
                 self._sequence += 1  # readers count the gap
-        self.stats.add(self._steady_ns(), size)
+        self.stats.add(self._steady_ns())
 
     def serve(self) -> None:
-        """Handle new and ended subscriptions; on the bus thread, when :attr:`fd` is readable.
+        """Handle new and ended subscriptions.
 
-        Sending may take the event from the descriptor, so it is called every second in any case.
+        On the bus thread, when :attr:`fd` is readable; and every second, since sending may take the event from it.
         """
         with self._lock:
             while not self.closed and int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:

@@ -69,11 +69,6 @@ class _Source:
 class LocalSubscription:
     """Subscription of one topic, for all its publishers.
 
-    Args:
-        host: the node's transport.
-        topic, type_name, qos: what it reads; ``type_name`` None accepts any type.
-        on_ready: called when there are messages after there were none; it must not wait.
-
     Raises:
         RegistryError: the topic's name is invalid, or its folder cannot be used.
     """
@@ -186,9 +181,7 @@ class LocalSubscription:
         elif len(body) != size:
             raise FrameError(f"message of {len(body)} bytes, {size} announced")
         source.expected = sequence + 1
-        if gap and self._depth == 1:
-            self.stats.skipped += gap  # a newest-only reader needs only the newest
-        elif gap:
+        if gap and self._depth > 1:  # a newest-only reader needs only the newest
             self.stats.lose(source.node, gap)
         if size >= _LARGE_FROM_BYTES:
             store_progress(self._page, source.place, publisher, sequence)
@@ -210,7 +203,7 @@ class LocalSubscription:
             queue.append(message)
         if not waiting:
             self._on_ready()
-        self.stats.add(steady, size)
+        self.stats.add(steady)
 
     def _met(self, publisher: bytes) -> _Source:
         """The publisher of a first message.

@@ -34,7 +34,7 @@ _CLOSE_S = 5.0
 log = logging.getLogger(__name__)
 
 
-class LocalTransport:
+class LocalTransport(Host):
     """Topics of one node, and the event that its thread waits on: waiting reads the node's sockets.
 
     Args:
@@ -51,32 +51,21 @@ class LocalTransport:
     """
 
     def __init__(
-        self,
-        run_dir: Path,
-        node: str,
-        now_ns: Callable[[], int],
-        steady_ns: Callable[[], int] = time.monotonic_ns,
+        self, run_dir: Path, node: str, now_ns: Callable[[], int], steady_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
+        super().__init__(run_dir, node, now_ns, steady_ns)
         self.patient = False
-        self._host = Host(run_dir, node, now_ns, steady_ns)
-        self.run_dir = self._host.run_dir
-        self.node = node
         self._driver: int | None = None  # the thread that waits
         self._set = self._waiting = False
         self._left_s = 0.0  # when it last stopped waiting
         self._next_look_s = 0.0
-        self._read_lock, self._readers, self._inputs = self._host.read_lock, self._host.readers, self._host.inputs
         self._unread: list[int] = []  # of these sockets only one message was read
         self._writers: list[LocalPublisher] = []
         self._wake, self._poke = (os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) for _ in range(2))
-        self._inputs.register(self._wake, select.EPOLLIN)
+        self.inputs.register(self._wake, select.EPOLLIN)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bus", daemon=True)
         self._thread.start()
-
-    def waker(self) -> LocalTransport:
-        """The event that the node's thread waits on."""
-        return self
 
     def set(self) -> None:
         """End the present or the next wait; may be called from any thread."""
@@ -95,8 +84,8 @@ class LocalTransport:
         Raises:
             RegistryError: the node already publishes the topic, or the path is too long.
         """
-        publisher = LocalPublisher(self._host, registry.check_topic(topic), type_name, qos)
-        with self._read_lock:
+        publisher = LocalPublisher(self, registry.check_topic(topic), type_name, qos)
+        with self.read_lock:
             self._writers = [*(writer for writer in self._writers if not writer.closed), publisher]
         os.eventfd_write(self._poke, 1)
         return publisher
@@ -110,8 +99,8 @@ class LocalTransport:
             on_ready: called when :meth:`LocalSubscription.take` has messages again, on the thread that reads; it must
                 not wait.
         """
-        with self._read_lock:
-            subscription = LocalSubscription(self._host, topic, type_name, qos, on_ready)
+        with self.read_lock:
+            subscription = LocalSubscription(self, topic, type_name, qos, on_ready)
         self._next_look_s = 0.0
         os.eventfd_write(self._poke, 1)
         return subscription
@@ -123,17 +112,17 @@ class LocalTransport:
         self._stop.set()
         os.eventfd_write(self._poke, 1)
         self._thread.join(timeout=_CLOSE_S)
-        for subscription in list(self._readers.values()):
+        for subscription in list(self.readers.values()):
             subscription.close()
         for publisher in self._writers:
             publisher.close()
-        with self._read_lock:
+        with self.read_lock:
             self._set = True  # later calls of `set` do nothing
-            self._inputs.close()
+            self.inputs.close()
             os.close(self._wake)
             os.close(self._poke)
         started_s = time.monotonic()
-        self._host.context.term()
+        self.context.term()
         if time.monotonic() - started_s > LINGER_S / 2:  # no later message will reveal the gap to the readers
             log.warning("%s closed: its last messages are lost, a reader was too slow to take them", self.node)
 
@@ -147,9 +136,9 @@ class LocalTransport:
         self._waiting = timeout > 0.0  # a mere look leaves the reading to the bus thread, if that has taken over
         patient = self.patient
         if patient:
-            ready = [*_readable([self._wake], timeout), *self._readers]
+            ready = [*_readable([self._wake], timeout), *self.readers]
         else:
-            ready = [fd for fd, _ in self._inputs.poll(timeout, 64)]
+            ready = [fd for fd, _ in self.inputs.poll(timeout, 64)]
         self._read(ready, one=not patient)
         self._unread = [] if patient else ready
         if self._wake in ready:  # left as it is, it would end every later wait
@@ -158,9 +147,9 @@ class LocalTransport:
         self._waiting, self._left_s = False, time.monotonic()
 
     def _read(self, fds: Iterable[int], one: bool = False) -> None:
-        with self._read_lock:
+        with self.read_lock:
             for fd in fds:
-                if (subscription := self._readers.get(fd)) is not None:
+                if (subscription := self.readers.get(fd)) is not None:
                     subscription.read(one)
 
     def _run(self) -> None:
@@ -170,7 +159,7 @@ class LocalTransport:
                 if now >= self._next_look_s:
                     self._next_look_s = now + _IDLE_S
                     self._look()
-                    self._next_look_s = min(self._next_look_s, now + (_LOOK_S if self._readers else _IDLE_S))
+                    self._next_look_s = min(self._next_look_s, now + (_LOOK_S if self.readers else _IDLE_S))
                 writers = {writer.fd: writer for writer in self._writers if not writer.closed}
                 inputs: list[int] = []
                 timeout_s = self._next_look_s - now
@@ -178,7 +167,7 @@ class LocalTransport:
                     if (away_in_s := self._left_s + _AWAY_S - now) > 0:
                         timeout_s = min(timeout_s, away_in_s)
                     else:
-                        inputs = list(self._readers)
+                        inputs = list(self.readers)
                         self._read(self._unread)  # their descriptors will not report what is there already
                 ready = _readable([self._poke, *writers, *inputs], max(0.0, timeout_s))
                 if self._poke in ready:
@@ -202,9 +191,9 @@ class LocalTransport:
         fault: Exception | None = None
         for publisher in self._writers:
             publisher.serve()
-        for fd, subscription in list(self._readers.items()):
-            with self._read_lock:
-                if self._readers.get(fd) is subscription:  # not just closed
+        for fd, subscription in list(self.readers.items()):
+            with self.read_lock:
+                if self.readers.get(fd) is subscription:  # not just closed
                     try:
                         subscription.discover()
                     except Exception as error:  # noqa: BLE001 - raised below: other topics do not wait for this one

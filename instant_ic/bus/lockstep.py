@@ -50,7 +50,7 @@ class _Publisher:
 
     def send(self, payload: Payload, publish_ns: int | None = None) -> None:
         data = bytes(joined(payload))
-        self.stats.add(self._bus.clock.steady_ns(), len(data))
+        self.stats.add(self._bus.clock.steady_ns())
         self._bus.route(self.topic, self.type_name, data, self._node, self.qos, publish_ns)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
@@ -69,7 +69,6 @@ class _Subscription:
     topic: str
     type_name: str | None
     qos: QoS
-    on_ready: Callable[[], None]
     stats: Stats = field(default_factory=Stats)
     queue: deque[Received] = field(default_factory=deque)
 
@@ -84,14 +83,12 @@ class _Subscription:
         self.bus.subscriptions[self.topic].remove(self)
 
 
-class _Transport:
+class _Transport(threading.Event):
     run_dir: Path | None = None
     patient = False
 
-    def waker(self) -> threading.Event:
-        return threading.Event()
-
     def __init__(self, bus: LockstepBus, node: str) -> None:
+        super().__init__()
         self._bus = bus
         self._node = node
         self.waiting = 0
@@ -101,7 +98,7 @@ class _Transport:
         return _Publisher(self._bus, self._node, topic, name, qos)
 
     def subscribe(self, topic: str, name: str | None, qos: QoS, on_ready: Callable[[], None]) -> _Subscription:
-        subscription = _Subscription(self._bus, self, topic, name, qos, on_ready)
+        subscription = _Subscription(self._bus, self, topic, name, qos)
         self._bus.subscriptions[topic].append(subscription)
         for record in self._bus.latched.get(topic, {}).values():
             self._bus.deliver(subscription, record)
@@ -232,7 +229,7 @@ class LockstepBus(Closing):
             return
         now = self.clock.now_ns()
         steady = self.clock.steady_ns()
-        subscription.stats.add(steady, len(record.payload))
+        subscription.stats.add(steady)
         subscription.transport.waiting += 1
         subscription.queue.append(
             Received(

@@ -15,6 +15,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, get_args
 
+import numpy as np
+
 from instant_ic.bus.clock import Clock, JumpDetector, ManualClock
 from instant_ic.bus.parameter_event import TOPIC as PARAMETER_EVENTS
 from instant_ic.bus.parameter_event import parameter_event
@@ -202,14 +204,14 @@ class Worker:
             self._node.call_soon(self._on_result, result)
 
 
+@dataclasses.dataclass(eq=False)
 class Timer:
     """A callback once per period."""
 
-    def __init__(self, period_ns: int, due_ns: int, callback: Callable[[], None]) -> None:
-        self.period_ns = period_ns
-        self.due_ns = due_ns
-        self.callback = callback
-        self.cancelled = False
+    period_ns: int
+    due_ns: int
+    callback: Callable[[], None]
+    cancelled: bool = False
 
     def cancel(self) -> None:
         """Stop the timer; it never fires again."""
@@ -261,7 +263,6 @@ class Node(Generic[ConfigT]):
         self._timers: list[tuple[int, int, Timer]] = []
         self._timer_orders = itertools.count()
         self._soon: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
-        self._wake = transport.waker()
         self._stop = threading.Event()
         self._workers: list[Worker] = []
         self._diagnoses: dict[str, tuple[int, str, dict[str, Any]]] = {}
@@ -343,20 +344,10 @@ class Node(Generic[ConfigT]):
 
         return self._subscribe(topic, name, decode, qos)
 
-    def subscribe_raw(
-        self, topic: str, callback: Callable[[str, str, bytes | memoryview, int], None], qos: QoS = RELIABLE
-    ) -> Subscription:
-        """Subscribe to any type; ``callback(topic, type_name, payload, publish_ns)`` gets the bytes."""
-
-        def forward(received: Received) -> None:
-            callback(received.topic, received.type_name, received.payload, received.publish_ns)
-
-        return self._subscribe(topic, None, forward, qos)
-
     def subscribe_received(
         self, topic: str, callback: Callable[[Received], None], qos: QoS = RELIABLE, message_class: Any = None
     ) -> Subscription:
-        """Like :meth:`subscribe_raw`, with all that is known of a message; ``message_class`` restricts the type."""
+        """Subscribe to bytes, with all that is known of a message; without ``message_class`` to any type."""
         return self._subscribe(topic, type_name(message_class) if message_class else None, callback, qos)
 
     def drop(self, item: Publisher | Subscription) -> None:
@@ -395,7 +386,7 @@ class Node(Generic[ConfigT]):
         period = int(period_s * 1e9)
         timer = Timer(period, self.clock.steady_ns() + period, callback)
         heapq.heappush(self._timers, (timer.due_ns, next(self._timer_orders), timer))
-        self._wake.set()
+        self._transport.set()
         return timer
 
     def background(self, work: Callable[[Any], Any], on_result: Callable[[Any], None] | None = None) -> Worker:
@@ -407,7 +398,7 @@ class Node(Generic[ConfigT]):
     def call_soon(self, function: Callable[..., None], *args: Any) -> None:
         """Run a function on the node's thread; may be called from any thread."""
         self._soon.append((function, args))
-        self._wake.set()
+        self._transport.set()
 
     def diagnose(self, name: str, level: int, message: str, **values: Any) -> None:
         """Set a named diagnosis; it is published until the next one of that name."""
@@ -446,7 +437,7 @@ class Node(Generic[ConfigT]):
     def stop(self) -> None:
         """End the loop; may be called from any thread and from a signal handler."""
         self._stop.set()
-        self._wake.set()
+        self._transport.set()
 
     @property
     def starting(self) -> bool:
@@ -609,7 +600,7 @@ class Node(Generic[ConfigT]):
         next_report = 0.0
         system_clock = JumpDetector()
         while not self._stop.is_set():
-            self._wake.clear()
+            self._transport.clear()
             self.spin_once()
             now = time.monotonic()
             if now >= next_report:
@@ -628,7 +619,7 @@ class Node(Generic[ConfigT]):
                 wait = min(wait, 0.01 if self.use_sim_time else current().wait_s(due))
             if self._soon:
                 continue
-            self._wake.wait(max(0.0, wait))
+            self._transport.wait(max(0.0, wait))
 
     def spin_once(self) -> bool:
         """Run what is due: results of workers, messages in order of arrival, timers. True if anything ran."""
@@ -650,7 +641,7 @@ class Node(Generic[ConfigT]):
         for index, (_, subscription, received) in enumerate(pending):
             if index and subscription.raw.qos.depth == 1 and not self.lockstep:
                 # Earlier callbacks may have taken long: for a newest-only topic, use what has arrived since.
-                self._wake.wait(0.0)
+                self._transport.wait(0.0)
                 for newer in subscription.raw.take():
                     if newer.publisher == received.publisher:
                         received = newer
@@ -664,7 +655,7 @@ class Node(Generic[ConfigT]):
         """Run the callbacks of all messages that have arrived, also of those still in the sockets, but no timers."""
         # A wait reads one message of each of 64 sockets at most, and all that is left in those of the wait before it.
         for _ in range(2 + len(self.subscriptions) // 64):
-            self._wake.wait(0.0)
+            self._transport.wait(0.0)
         self._run_arrived()
 
     def _fire_timers(self) -> bool:
@@ -765,30 +756,20 @@ class Node(Generic[ConfigT]):
                 cpu_percent=100.0 * (cpu_s - before_cpu_s) / max(at_s - before_s, 1e-3),
                 rss_mb=int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 1e6,
                 inputs=[s.topic for s in inputs],
-                input_rates_hz=_f32(s.stats.rate_hz(now) for s in inputs),
-                input_ages_s=_f32(s.stats.age_s(now) for s in inputs),
-                input_lost=_u64(s.stats.lost for s in inputs),
+                input_rates_hz=np.array([s.stats.rate_hz(now) for s in inputs], np.float32),
+                input_ages_s=np.array([s.stats.age_s(now) for s in inputs], np.float32),
+                input_lost=np.array([s.stats.lost for s in inputs], np.uint64),
                 lost_topics=[topic for topic, _, _ in losses],
                 lost_publishers=[node for _, node, _ in losses],
-                lost_counts=_u64(count for _, _, count in losses),
+                lost_counts=np.array([count for _, _, count in losses], np.uint64),
                 outputs=[p.topic for p in outputs],
-                output_rates_hz=_f32(p.stats.rate_hz(now) for p in outputs),
-                output_ages_s=_f32(p.stats.age_s(now) for p in outputs),
+                output_rates_hz=np.array([p.stats.rate_hz(now) for p in outputs], np.float32),
+                output_ages_s=np.array([p.stats.age_s(now) for p in outputs], np.float32),
             )
         )
 
     def _publish_diagnostics(self) -> None:
-        array, status = message_type("DiagnosticArray"), message_type("DiagnosticStatus")
-        entries = [
-            status(
-                level=level,
-                name=f"{self.node_name}: {name}",
-                message=message,
-                hardware_id="",
-                values=_key_values(values),
-            )
-            for name, (level, message, values) in self._diagnoses.items()
-        ]
+        found = [(name, *diagnosis) for name, diagnosis in self._diagnoses.items()]
         now = self.clock.steady_ns()
         for subscription in self.subscriptions:
             stats = subscription.raw.stats
@@ -802,34 +783,34 @@ class Node(Generic[ConfigT]):
                 "rate_hz": round(stats.rate_hz(now), 2),
                 "age_s": round(stats.age_s(now), 3),
             }
-            entries.append(
-                status(
-                    level=ERROR if stats.rejected or stats.overwritten else WARN,
-                    name=f"{self.node_name}: input {subscription.raw.topic}",
-                    message=f"{stats.lost} messages lost, {stats.rejected} refused",
-                    hardware_id="",
-                    values=_key_values(values),
-                )
-            )
+            level = ERROR if stats.rejected or stats.overwritten else WARN
+            text = f"{stats.lost} messages lost, {stats.rejected} refused"
+            found.append((f"input {subscription.raw.topic}", level, text, values))
         for publisher in self.publishers:
-            if count := publisher.raw.stats.not_shared:
-                entries.append(
-                    status(
-                        level=WARN,
-                        name=f"{self.node_name}: output {publisher.topic}",
-                        message=f"{count} large messages without shared memory: {publisher.raw.stats.not_shared_why}",
-                        hardware_id="",
-                        values=_key_values({"not_shared": count, "sent": publisher.raw.stats.count}),
-                    )
-                )
-        self._diagnostics.publish(array(header=header("", time.time_ns()), status=entries))
+            sent = publisher.raw.stats
+            if sent.not_shared:
+                text = f"{sent.not_shared} large messages without shared memory: {sent.not_shared_why}"
+                values = {"not_shared": sent.not_shared, "sent": sent.count}
+                found.append((f"output {publisher.topic}", WARN, text, values))
+        status, key_value = message_type("DiagnosticStatus"), message_type("diagnostic_msgs/KeyValue")
+        entries = [
+            status(
+                level=level,
+                name=f"{self.node_name}: {name}",
+                message=text,
+                hardware_id="",
+                values=[key_value(key=str(key), value=str(value)) for key, value in values.items()],
+            )
+            for name, level, text, values in found
+        ]
+        self._diagnostics.publish(message_type("DiagnosticArray")(header=header("", time.time_ns()), status=entries))
 
     # -- internals -------------------------------------------------------------------------------
 
     def _subscribe(self, topic: str, name: str | None, callback: Callable[[Received], None], qos: QoS) -> Subscription:
         topic = self.resolve(topic)
         subscription = Subscription(topic, callback)
-        subscription.raw = self._transport.subscribe(topic, name, qos, self._wake.set)
+        subscription.raw = self._transport.subscribe(topic, name, qos, self._transport.set)
         self.subscriptions.append(subscription)
         self._registry_changed()
         return subscription
@@ -880,20 +861,3 @@ class _RosoutHandler(logging.Handler):
             )
         except Exception:  # noqa: BLE001 - a bad log line must not end the callback that wrote it
             self.handleError(record)
-
-
-def _f32(values: Any) -> Any:
-    import numpy as np
-
-    return np.array(list(values), np.float32)
-
-
-def _u64(values: Any) -> Any:
-    import numpy as np
-
-    return np.array(list(values), np.uint64)
-
-
-def _key_values(values: dict[str, Any]) -> list[Any]:
-    key_value = message_type("diagnostic_msgs/KeyValue")
-    return [key_value(key=str(key), value=str(value)) for key, value in values.items()]

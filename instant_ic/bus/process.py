@@ -54,17 +54,6 @@ def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
     return parser
 
 
-def load_config(
-    node_class: type[Node[Any]], name: str, files: Sequence[Path], overrides: Sequence[str]
-) -> tuple[Any, params.ProcessParameters]:
-    """Typed configuration of a node, and the parameters of its process.
-
-    Raises:
-        ParameterError: a file or an override is wrong; the message says where.
-    """
-    return params.configure(node_class.config_class(), params.gather(name, files, overrides))
-
-
 def parse_remaps(words: Sequence[str]) -> dict[str, str]:
     """Parse ``from:=to`` arguments.
 
@@ -139,7 +128,8 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     for logger in (log, logging.getLogger("instant_ic")):
         logger.setLevel(args.log_level.upper())
     try:
-        config, process = load_config(node_class, args.name, args.params_file, args.param)
+        values = params.gather(args.name, args.params_file, args.param)
+        config, process = params.configure(node_class.config_class(), values)
         remaps = parse_remaps(args.remap)
         registry.check_node_name(args.name)
     except (params.ParameterError, registry.RegistryError) as error:

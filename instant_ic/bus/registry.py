@@ -377,6 +377,31 @@ class TopicFolder:
         self.publishers = [_publisher(entry) for entry in _entries(self._folder)]
 
 
+class TopicWatch:
+    """Topics of a run directory, to be polled at low cost."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self._root = run_dir / "topics"
+        self._folders: dict[Path, TopicFolder] = {}
+
+    def topics(self) -> list[TopicInfo]:
+        """Return the topics with a live publisher, by name."""
+        paths = sorted(self._root.iterdir()) if self._root.is_dir() else []
+        self._folders = {path: self._folders.get(path) or TopicFolder(path) for path in paths}
+        found = []
+        for path, folder in self._folders.items():
+            with suppress(OSError):  # just removed: the next call finds out
+                folder.look()
+            if publishers := folder.publishers:
+                found.append(TopicInfo("/" + path.name.replace(".", "/"), publishers[0].type_name, publishers))
+        return found
+
+
+def list_topics(run_dir: Path) -> list[TopicInfo]:
+    """Topics with a live publisher, by name."""
+    return TopicWatch(run_dir).topics()
+
+
 def _publisher(entry: dict[str, Any]) -> PublisherInfo:
     return PublisherInfo(
         node=entry["node"],
@@ -406,18 +431,6 @@ def running(publisher: PublisherInfo) -> bool:
     except OSError:  # another user's process has the number
         return True
     return True
-
-
-def list_topics(run_dir: Path) -> list[TopicInfo]:
-    """Topics with a live publisher, by name."""
-    topics = []
-    root = run_dir / "topics"
-    for folder in sorted(root.iterdir()) if root.is_dir() else []:
-        entries = list(_entries(folder))
-        if entries:
-            publishers = [_publisher(entry) for entry in entries]
-            topics.append(TopicInfo(entries[0]["topic"], publishers[0].type_name, publishers))
-    return topics
 
 
 def list_nodes(run_dir: Path) -> list[NodeInfo]:

@@ -64,11 +64,8 @@ class Stats:
     def __init__(self) -> None:
         self.count = 0
         self.lost_by: dict[str, int] = {}
-        self.skipped = 0
-        """Messages that a newest-only reader did not need to look at."""
         self.rejected = 0
         self.overwritten = 0
-        self.bytes = 0
         self.newest_ns = 0
         self._arrivals: deque[int] = deque(maxlen=50)
 
@@ -82,9 +79,9 @@ class Stats:
         if count > 0:
             self.lost_by = {**self.lost_by, publisher: self.lost_by.get(publisher, 0) + count}
 
-    def add(self, now_ns: int, size: int) -> None:
+    def add(self, now_ns: int) -> None:
+        """Count a message."""
         self.count += 1
-        self.bytes += size
         self.newest_ns = now_ns
         self._arrivals.append(now_ns)
 
@@ -155,16 +152,8 @@ class RawSubscription(Protocol):
     def close(self) -> None: ...
 
 
-class Waker(Protocol):
-    """Event that a node's thread waits on; a :class:`threading.Event` is one."""
-
-    def set(self) -> None: ...
-    def clear(self) -> None: ...
-    def wait(self, timeout: float) -> object: ...
-
-
 class Transport(Protocol):
-    """Topics of one node.
+    """Topics of one node, and the event that its thread waits on; a wait may read the node's sockets.
 
     Attributes:
         patient: messages do not end a wait of the node's thread; they are read when it ends.
@@ -177,10 +166,9 @@ class Transport(Protocol):
         """Run directory of the topics; None in lockstep."""
         ...
 
-    def waker(self) -> Waker:
-        """Event for the node's own thread; waiting on it may read the node's sockets."""
-        ...
-
+    def set(self) -> None: ...
+    def clear(self) -> None: ...
+    def wait(self, timeout: float) -> object: ...
     def advertise(self, topic: str, type_name: str, qos: QoS) -> RawPublisher: ...
     def subscribe(
         self, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from instant_ic.experiments.tile_maps import TileMaps, climb
 from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
+from instant_ic.slam.front_end import MIN_POINTS
 from instant_ic.slam.grid_slam import GridSlam, SlamResult, SlamStatus
 from instant_ic.slam.occupancy import OccupancyGrid
 from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
@@ -137,7 +138,7 @@ class ParticleSlam:
             odometry = self._lidar.process(scan, None, base_from_laser).map_from_base
         mount = np.asarray(base_from_laser, dtype=np.float64)
         points = scan_points(scan, mount, 0.0)
-        empty = len(points.points) < self.config.match.min_points
+        empty = len(points.points) < MIN_POINTS
         if self._stamp_ns is None:
             if empty:
                 return SlamResult(self.map_from_base, np.zeros((3, 3)), 0.0, SlamStatus.NO_POINTS, False)

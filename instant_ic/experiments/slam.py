@@ -20,10 +20,10 @@ from pathlib import Path
 import numpy as np
 
 from instant_ic.experiments.particle_slam import ParticleConfig, ParticleSlam
+from instant_ic.experiments.slam_logs import LogEntry, LogError, open_log
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, Scan, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import Anchor, warm_up
-from instant_ic.slam.logs import LogEntry, LogError, open_log
 from instant_ic.slam.scan import FloatArray
 
 
@@ -195,6 +195,7 @@ def run_log(
     one millisecond after it; the trajectory keeps the original stamp.
 
     Args:
+        entries: of `instant_ic.experiments.slam_logs.read_log`, or compatible.
         particles: run the particle filter instead of the grid SLAM.
         use_wheel_odom: False ignores the log's odometry.
         on_scan: called with the number of processed scans, for a progress bar.

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from instant_ic.bag import BagError, BagReader
+from instant_ic.experiments.slam_logs import LogEntry, LogError
 from instant_ic.geometry.poses import Pose2, pose2_from_matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import deserialize, pose2_from_message, stamp_ns, transform_matrix
 from instant_ic.slam import Scan
-from instant_ic.slam.logs import LogEntry, LogError
 from instant_ic.slam.odometry import OdometryBuffer
 
 _SCAN, _ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"

@@ -24,11 +24,11 @@ from instant_ic.experiments.slam import (
     log_error,
     perturb_odometry,
 )  # fmt: skip
+from instant_ic.experiments.slam_logs import LogEntry, LogError
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import warm_up
 from instant_ic.slam.localization import SavedMap
-from instant_ic.slam.logs import LogEntry, LogError
 from instant_ic.slam.scan import FloatArray
 
 WRONG_M = 0.5

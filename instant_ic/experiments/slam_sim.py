@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import LogResult, run_log
+from instant_ic.experiments.slam_logs import LogEntry
 from instant_ic.experiments.slam_worlds import trajectory_errors
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 from instant_ic.sim.world import World
 from instant_ic.slam import GridSlam, Scan
-from instant_ic.slam.logs import LogEntry
 from instant_ic.slam.scan import FloatArray
 
 BEAMS = 720
@@ -54,7 +54,7 @@ def round_trip(
     """
     config = RobotConfig(slip=slip, turn_slip=slip)
     start = (*route[0], math.atan2(route[1][1] - route[0][1], route[1][0] - route[0][0]))
-    robot = TrackedRobot(config, world.occupied(config.contact_low, config.contact_high), start, seed)
+    robot = TrackedRobot(config, world.occupied(), start, seed)
     kinematics = robot.kinematics
     rng = np.random.default_rng([37, seed])
     angles = np.asarray(-math.pi + 2 * math.pi / BEAMS * np.arange(BEAMS), dtype=np.float64)

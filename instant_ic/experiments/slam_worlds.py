@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from instant_ic.experiments.slam_logs import LogEntry
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import Scan
-from instant_ic.slam.logs import LogEntry
 from instant_ic.slam.scan import FloatArray
 
 Wall = tuple[float, float, float, float]

@@ -60,8 +60,8 @@ class Observer(Node[_NoParameters]):
         """Sleep until a message or timer is due; for a program that calls :meth:`spin_once` itself."""
         if self._timers:
             timeout_s = min(timeout_s, (self._timers[0][0] - self.clock.steady_ns()) / 1e9)
-        self._wake.wait(max(0.0, timeout_s))
-        self._wake.clear()
+        self._transport.wait(max(0.0, timeout_s))
+        self._transport.clear()
 
 
 def _observer(run_dir: Path) -> Observer:

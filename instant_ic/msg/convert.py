@@ -288,11 +288,15 @@ def matrix_from_pose(pose: Any) -> Matrix:
     """
     while hasattr(pose, "pose"):
         pose = pose.pose
-    p, q = pose.position, pose.orientation
+    return _matrix(pose.orientation, pose.position, "pose")
+
+
+def _matrix(rotation: Any, translation: Any, what: str) -> Matrix:
+    q, t = rotation, translation
     try:
-        return matrix_from_quaternion((q.x, q.y, q.z, q.w), (p.x, p.y, p.z))
+        return matrix_from_quaternion((q.x, q.y, q.z, q.w), (t.x, t.y, t.z))
     except ValueError as error:
-        raise MessageError(f"pose: {error}") from None
+        raise MessageError(f"{what}: {error}") from None
 
 
 def pose_stamped(matrix: Matrix, frame_id: str, stamp: int) -> Any:
@@ -318,11 +322,7 @@ def transform_matrix(message: Any) -> Matrix:
         MessageError: the quaternion is zero or not finite.
     """
     transform = getattr(message, "transform", message)
-    t, q = transform.translation, transform.rotation
-    try:
-        return matrix_from_quaternion((q.x, q.y, q.z, q.w), (t.x, t.y, t.z))
-    except ValueError as error:
-        raise MessageError(f"transform: {error}") from None
+    return _matrix(transform.rotation, transform.translation, "transform")
 
 
 def twist_message(v: float = 0.0, w: float = 0.0) -> Any:

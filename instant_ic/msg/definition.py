@@ -28,10 +28,7 @@ def own_types() -> list[str]:
 
 
 def definition(name: str) -> str:
-    """Definition of a type with its comments, without nested types.
-
-    Args:
-        name: full or short type name.
+    """Definition of a type, by full or short name, with its comments, without nested types.
 
     Raises:
         MessageError: no such type.
@@ -54,9 +51,7 @@ def definition(name: str) -> str:
 def expanded_definition(name: str, all_comments: bool = False) -> str:
     """Definition of a type; the fields of nested types follow each field, indented by a tab.
 
-    Args:
-        name: full or short type name.
-        all_comments: also show the comments of nested types.
+    ``all_comments`` shows the comments of nested types, too.
 
     Raises:
         MessageError: no such type.

@@ -191,12 +191,7 @@ class Building:
                 x, y = zone.x0 + (i + 0.5) * w / nx, zone.y0 + (j + 0.5) * h / ny
                 low = zone.height - 0.04
                 self.builder.box((x, y), (lx + 0.04, ly + 0.04, 0.035), low, side=Material("metal", 0.5))
-                self.builder.panel(
-                    np.asarray([x - lx / 2, y - ly / 2, low - 0.002]),
-                    np.asarray([lx, 0, 0]),
-                    np.asarray([0, ly, 0]),
-                    lamp,
-                )
+                self.builder.panel((x - lx / 2, y - ly / 2, low - 0.002), (lx, 0, 0), (0, ly, 0), lamp)
 
     def open_leaf(self, door: Zone, towards: str, hinge_high: bool, angle_deg: float, variant: int) -> None:
         """Add a door leaf that is open into the zone on one side (``north``...) of the doorway."""
@@ -226,7 +221,7 @@ class Building:
         c, s = math.cos(yaw), math.sin(yaw)
         x, y = np.asarray([c, s, 0.0]), np.asarray([-s, c, 0.0])
         corner = np.asarray([*at, size[2]]) - x * (size[0] / 2 + 0.001) + y * size[1] / 2
-        self.builder.panel(corner, -y * size[1], np.asarray([0, 0, -size[2]]), face)
+        self.builder.panel(corner, -y * size[1], (0, 0, -size[2]), face)
 
     def world(self, name: str, spawn: tuple[float, float, float], light_cell_m: float = 0.1, rays: int = 48) -> World:
         """Build the world: mesh, textures and baked light."""
@@ -240,10 +235,8 @@ class Building:
     def _shell(self, zone: Zone) -> None:
         f, build = zone.finish, self.builder
         w, h = zone.x1 - zone.x0, zone.y1 - zone.y0
-        build.panel(np.asarray([zone.x0, zone.y1, 0]), np.asarray([w, 0, 0]), np.asarray([0, -h, 0]), f.floor)
-        build.panel(
-            np.asarray([zone.x0, zone.y0, zone.height]), np.asarray([w, 0, 0]), np.asarray([0, h, 0]), f.ceiling
-        )
+        build.panel((zone.x0, zone.y1, 0), (w, 0, 0), (0, -h, 0), f.floor)
+        build.panel((zone.x0, zone.y0, zone.height), (w, 0, 0), (0, h, 0), f.ceiling)
         for side in SIDES:
             self._wall(zone, side)
 
@@ -264,8 +257,7 @@ class Building:
         if length - at > 1e-6:
             pieces.append((at, length, 0.0))
         for low, high, bottom in pieces:
-            a = tuple(np.asarray(start) + right * low)
-            b = tuple(np.asarray(start) + right * high)
+            a, b = (np.asarray(start) + right * at for at in (low, high))
             self.builder.wall((a[0], a[1]), (b[0], b[1]), bottom, zone.height, zone.finish.wall)
             if bottom == 0.0 and zone.finish.skirting is not None:
                 self.relief(start, end, (low, high), (0.0, 0.09), 0.014, zone.finish.skirting)

@@ -11,11 +11,12 @@ from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES
 class CaptureReplay:
     """Sends the data and position packets of a VLP-16 capture with unchanged payloads and recorded timing.
 
+    It starts again after the end, with a pause of one packet.
+
     Args:
         path: pcap or pcapng.
         host: destination address.
         data_port, position_port: destination UDP ports; the recorded ports are ignored.
-        loop: whether to restart after the end, with a pause of one packet.
 
     Attributes:
         sent: datagrams sent.
@@ -26,7 +27,7 @@ class CaptureReplay:
         ValueError: the file has no VLP-16 packets.
     """
 
-    def __init__(self, path: str | Path, host: str, data_port: int, position_port: int, loop: bool = True) -> None:
+    def __init__(self, path: str | Path, host: str, data_port: int, position_port: int) -> None:
         ports = {DATA_PACKET_BYTES: data_port, POSITION_PACKET_BYTES: position_port}
         datagrams = [d for d in CaptureReader(path) if len(d.payload) in ports]
         if not datagrams:
@@ -40,28 +41,22 @@ class CaptureReplay:
         count = len(self._items)
         self.duration_s = self._items[-1][0]
         self._period_s = self.duration_s * (count + 1) / count if count > 1 else 0.1
-        self._loop = loop
         self._next = 0
         self._began_s = 0.0
         self.sent = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
 
-    @property
-    def finished(self) -> bool:
-        """Whether all packets were sent; always false with ``loop``."""
-        return self._next >= len(self._items)
-
     def pump(self, time_s: float) -> None:
         """Send the packets that are due at ``time_s`` (seconds since the start)."""
-        while not self.finished and self._items[self._next][0] + self._began_s <= time_s:
+        while self._items[self._next][0] + self._began_s <= time_s:
             _, address, payload = self._items[self._next]
             # The kernel reports the refusal of an earlier datagram here; a real sensor ignores it.
             with contextlib.suppress(ConnectionRefusedError):
                 self._socket.sendto(payload, address)
             self.sent += 1
             self._next += 1
-            if self.finished and self._loop:
+            if self._next == len(self._items):
                 self._next = 0
                 self._began_s = max(self._began_s + self._period_s, time_s - self._period_s)
 

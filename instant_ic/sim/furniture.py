@@ -69,7 +69,7 @@ def boxes(build: WorldBuilder, centre: Point, rng: np.random.Generator) -> None:
     """Add a stack of one to three cardboard boxes."""
     low = 0.0
     for _ in range(int(rng.integers(1, 4))):
-        size = (float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.3, 0.5)), float(rng.uniform(0.22, 0.4)))
-        at = (centre[0] + float(rng.uniform(-0.05, 0.05)), centre[1] + float(rng.uniform(-0.05, 0.05)))
-        build.box(at, size, low, float(rng.uniform(-0.3, 0.3)), side=Material("cardboard", 0))
+        size = (rng.uniform(0.3, 0.5), rng.uniform(0.3, 0.5), rng.uniform(0.22, 0.4))
+        at = (centre[0] + rng.uniform(-0.05, 0.05), centre[1] + rng.uniform(-0.05, 0.05))
+        build.box(at, size, low, rng.uniform(-0.3, 0.3), side=Material("cardboard", 0))
         low += size[2] + 0.001

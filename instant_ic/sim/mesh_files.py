@@ -53,9 +53,6 @@ def _spawn(world: World) -> tuple[float, float, float]:
 def load_world(path: str | Path) -> World:
     """Load a world from a mesh file: apply node transforms, repeat textures, bake soft light.
 
-    Args:
-        path: the file.
-
     Raises:
         ValueError: the file cannot be read or has no triangles.
     """

@@ -18,6 +18,8 @@ from instant_ic.sim.simulation import Simulation, SimulationConfig
 from instant_ic.sim.theta import ThetaServer, panorama_file
 from instant_ic.sim.vlp16 import Vlp16Server
 
+SERIAL_LINK = "roboclaw"
+"""Name of the link to the motor controller's pseudo-terminal."""
 _STEP_S = 0.01
 _MAX_WAIT_S = 0.3
 """Longest wait for a running step at shutdown."""
@@ -30,8 +32,8 @@ _VISIBLE_MOTION = 1e-4
 
 
 @dataclass(frozen=True)
-class DevicesConfig(SimulationConfig):
-    """Parameters of the simulation and its devices.
+class SimulatorConfig(SimulationConfig):
+    """Parameters of the node ``simulator``: the simulation and its devices.
 
     Attributes:
         panorama: image file that the camera shows instead of the world; empty: the world.
@@ -46,7 +48,6 @@ class SimulatedDevices:
     """The enabled devices of a simulation, open until ``close``.
 
     Args:
-        config: parameters.
         simulation: robot and world.
         serial_folder: folder of the link to the motor controller's pseudo-terminal.
         log: receives the devices' addresses.
@@ -55,7 +56,9 @@ class SimulatedDevices:
         ValueError, OSError, CaptureError: a device cannot be opened.
     """
 
-    def __init__(self, config: DevicesConfig, simulation: Simulation, serial_folder: Path, log: logging.Logger) -> None:
+    def __init__(
+        self, config: SimulatorConfig, simulation: Simulation, serial_folder: Path, log: logging.Logger
+    ) -> None:
         self.scanner: Vlp16Server | CaptureReplay | None = None
         self.camera: ThetaServer | None = None
         self._base: RoboClawServer | None = None
@@ -68,7 +71,7 @@ class SimulatedDevices:
             self.close()
             raise
 
-    def _open(self, config: DevicesConfig, serial_folder: Path, log: logging.Logger) -> None:
+    def _open(self, config: SimulatorConfig, serial_folder: Path, log: logging.Logger) -> None:
         simulation, lidar = self._simulation, config.lidar
         if lidar.enabled and config.pcap:
             path = Path(config.pcap).expanduser()
@@ -79,10 +82,10 @@ class SimulatedDevices:
             if not config.panorama:
                 self._see(config.camera.width, config.camera.height)  # compiles before the clock starts
             source = panorama_file(Path(config.panorama).expanduser()) if config.panorama else self._see
-            self.camera = ThetaServer(config.camera, source, config.seed)
+            self.camera = ThetaServer(config.camera, source)
             log.info("Theta Web API on http://%s:%d", config.camera.host, self.camera.port)
         if config.base.enabled:
-            link = serial_folder / config.base.link
+            link = serial_folder / SERIAL_LINK
             self._base = RoboClawServer(simulation.controller, simulation.lock, link)
             log.info("RoboClaw on %s (%s)", link, self._base.device)
 

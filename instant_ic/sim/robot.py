@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges, require
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.config.robot import Rectangle
 from instant_ic.sim.contact import OccupancyMask
 
@@ -26,7 +26,6 @@ class RobotConfig:
     """Parameters of the simulated robot.
 
     Attributes:
-        contact_low, contact_high: objects between these heights stop the robot, metres.
         track_acceleration: largest acceleration of a track by its motor, m/s².
         motor_lag_s: time constant with which a track follows its set point.
         rolling_resistance: deceleration of a track by friction, m/s². The speed controller compensates for it, except
@@ -36,8 +35,6 @@ class RobotConfig:
         encoder_noise_pulses: standard deviation of the encoder counts while a track moves.
     """
 
-    contact_low: NotNegative = 0.03
-    contact_high: Positive = 0.9
     track_acceleration: Positive = 2.0
     motor_lag_s: Positive = 0.06
     rolling_resistance: NotNegative = 0.5
@@ -47,14 +44,12 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        require(self, "contact_low", self.contact_low < self.contact_high, "below contact_high")
 
 
 class TrackedRobot:
     """Robot on the floor plan.
 
     Args:
-        config: dynamics.
         mask: where objects stop the robot.
         pose: x, y, yaw at the start.
         seed: seed of slip and noise.

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instant_ic.base.config import SkidSteerConfig
-from instant_ic.config.ranges import NotNegativeInt, Positive, Range, check_ranges
+from instant_ic.config.ranges import NotNegativeInt, Range, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, LIDAR_MOUNT, Mount, Rectangle
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer, Frame
@@ -24,6 +24,8 @@ from instant_ic.sim.worlds import make_world
 STEP_S = 0.02
 #: Length of the pose history, seconds.
 HISTORY_S = 3.0
+#: Voltage of the full battery at rest.
+BATTERY_V = 25.2
 
 
 @dataclass(frozen=True)
@@ -32,19 +34,13 @@ class BaseConfig:
 
     Attributes:
         enabled: whether the controller is simulated.
-        link: name of the link to its pseudo-terminal under RUN_DIR/dev.
         address: packet serial address.
-        battery_v: voltage of the full battery at rest.
     """
 
     enabled: bool = True
-    link: str = "roboclaw"
     address: Annotated[int, Range(128, 135)] = 0x80
-    battery_v: Positive = 25.2
 
     def __post_init__(self) -> None:
-        if not self.link or "/" in self.link:
-            raise ValueError(f"link must be a plain file name (got {self.link!r})")
         check_ranges(self)
 
 
@@ -99,11 +95,11 @@ class Simulation:
         self.start_ns = start_ns
         self.world = world or make_world(config.world)
         start = config.start or self.world.spawn
-        mask = self.world.occupied(config.robot.contact_low, config.robot.contact_high, 0.01)
+        mask = self.world.occupied(cell_m=0.01)
         pose = (start[0], start[1], start[2])
         self.robot = TrackedRobot(config.robot, mask, pose, config.seed, config.footprint, config.geometry)
         self.controller = RoboclawEmulator(config.base.address, ideal_motors=False)
-        self.controller.battery_v = config.base.battery_v
+        self.controller.battery_v = BATTERY_V
         self.lock = threading.Lock()
         self.renderer = EquirectRenderer(self.world)
         self.time_s = 0.0
@@ -130,7 +126,7 @@ class Simulation:
                 self.controller.speed_pps[:] = self.robot.motor_speed_pps
                 load = float(np.abs(self.robot.tracks).mean())
                 used = self.time_s / 3600.0 * 0.4
-                self.controller.battery_v = max(20.0, self.config.base.battery_v - used - 0.6 * load)
+                self.controller.battery_v = max(20.0, BATTERY_V - used - 0.6 * load)
             self.time_s += part
             self._remember()
 

@@ -169,32 +169,33 @@ def _wallpaper(rng: np.random.Generator) -> FloatArray:
     return _grey(field)
 
 
-def _brick(rng: np.random.Generator) -> FloatArray:
-    n, rows, columns = 512, 16, 8
+def _courses(
+    rng: np.random.Generator, n: int, rows: int, tones: tuple[float, float], joint: float
+) -> tuple[FloatArray, FloatArray]:
+    """Masonry of stones twice as long as high: the stones' tones (n, n), and 0 in their joints to 1 on them (n, n)."""
+    columns = rows // 2
     y, x = np.mgrid[0:n, 0:n] / n
     row = np.floor(y * rows).astype(int)
     shifted = (x * columns + 0.5 * (row % 2)) % columns
     column = np.floor(shifted).astype(int)
-    tone = rng.uniform(0.42, 0.72, (rows, columns))[row, column]
+    tone = rng.uniform(*tones, (rows, columns))[row, column]
     fy, fx = (y * rows) % 1, shifted % 1
-    mortar = np.clip(np.minimum(np.minimum(fx, 1 - fx) * 2.0, np.minimum(fy, 1 - fy)) / 0.07, 0, 1)
-    tone = tone + 0.05 * _noise(rng, n, 0.6, 8)
-    brick = _grey(tone, (0.95, 0.62, 0.48))
+    return tone, np.clip(np.minimum(np.minimum(fx, 1 - fx) * 2.0, np.minimum(fy, 1 - fy)) / joint, 0, 1)
+
+
+def _brick(rng: np.random.Generator) -> FloatArray:
+    n = 512
+    tone, stones = _courses(rng, n, 16, (0.42, 0.72), 0.07)
+    brick = _grey(tone + 0.05 * _noise(rng, n, 0.6, 8), (0.95, 0.62, 0.48))
     joint = _grey(0.62 + 0.04 * _noise(rng, n, 0.5, 8))
-    return np.asarray(joint + (brick - joint) * mortar[..., None], np.float32)
+    return np.asarray(joint + (brick - joint) * stones[..., None], np.float32)
 
 
 def _blocks(rng: np.random.Generator) -> FloatArray:
     """Concrete blocks with a coat of paint."""
-    n, rows, columns = 512, 10, 5
-    y, x = np.mgrid[0:n, 0:n] / n
-    row = np.floor(y * rows).astype(int)
-    shifted = (x * columns + 0.5 * (row % 2)) % columns
-    column = np.floor(shifted).astype(int)
-    tone = rng.uniform(0.70, 0.78, (rows, columns))[row, column]
-    fy, fx = (y * rows) % 1, shifted % 1
-    joint = np.clip(np.minimum(np.minimum(fx, 1 - fx) * 2.0, np.minimum(fy, 1 - fy)) / 0.05, 0, 1)
-    return _grey((tone + 0.035 * _noise(rng, n, 0.6, 16)) * (0.72 + 0.28 * joint))
+    n = 512
+    tone, stones = _courses(rng, n, 10, (0.70, 0.78), 0.05)
+    return _grey((tone + 0.035 * _noise(rng, n, 0.6, 16)) * (0.72 + 0.28 * stones))
 
 
 def _floor_tiles(rng: np.random.Generator) -> FloatArray:

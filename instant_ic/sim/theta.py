@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instant_ic.camera.config import PREVIEW_FORMATS
-from instant_ic.config.ranges import NotNegative, Percent, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import PositiveInt, Range, check_ranges
 from instant_ic.limits import load_image
 from instant_ic.pace import current
 
@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 BOUNDARY = "---osclivepreview---"
 #: Delay of an image with which the stack still works as with a punctual camera, seconds.
 ACCEPTABLE_DELAY_S = 0.06
+JPEG_QUALITY = 92
 #: Time after setting options during which the preview is not ready, seconds.
 SETTLE_S = 0.8
 
@@ -39,8 +40,6 @@ class ThetaConfig:
         width, height: preview format until a driver sets another.
         rate: largest frame rate, even if the format promises more.
         latency_s: time from the exposure of an image to its delivery.
-        quality: JPEG quality, 1-100.
-        noise: standard deviation of a pixel value, of 255.
         user, password: credentials of HTTP digest (client mode); an empty user disables it.
     """
 
@@ -51,8 +50,6 @@ class ThetaConfig:
     height: PositiveInt = 512
     rate: Annotated[float, Range(above=0, high=30)] = 5.0
     latency_s: Annotated[float, Range(0, below=2)] = 0.20
-    quality: Percent = 92
-    noise: NotNegative = 0.0
     user: str = ""
     password: str = ""
 
@@ -99,10 +96,7 @@ class _ApiError(Exception):
 class ThetaServer:
     """Camera with its Web API; it renders images only while a client reads the preview.
 
-    Args:
-        config: parameters.
-        source: returns the camera's view; called on the camera's thread.
-        seed: seed of the noise.
+    Its source is called on the camera's thread.
 
     Raises:
         OSError: the port is in use.
@@ -111,10 +105,11 @@ class ThetaServer:
         port: listening port.
         rate_hz: recent frame rate; 0 without a viewer and for the first four frames.
         frames: number of delivered images.
+        stopping: the camera is closing.
         late_s: recent delay of the images behind their plan, in the stack's seconds; 0 without a viewer.
     """
 
-    def __init__(self, config: ThetaConfig, source: PictureSource, seed: int = 0) -> None:
+    def __init__(self, config: ThetaConfig, source: PictureSource) -> None:
         self.config = config
         self.source = source
         self.rate_hz = 0.0
@@ -126,12 +121,11 @@ class ThetaServer:
         self._options_set_s = -1e9
         self._began_s = time.monotonic()
         self._nonce = secrets.token_hex(16)
-        self._rng = np.random.default_rng([41, seed])
         self._frame: bytes | None = None
         self._number = 0
         self._viewers = 0
         self._changed = threading.Condition()
-        self._stopping = False
+        self.stopping = False
         server = self
 
         class Handler(_Handler):
@@ -162,7 +156,7 @@ class ThetaServer:
     def close(self) -> None:
         """End the streams and the server."""
         with self._changed:
-            self._stopping = True
+            self.stopping = True
             self._changed.notify_all()
         self._http.shutdown()
         self._http.server_close()
@@ -175,11 +169,8 @@ class ThetaServer:
     def _jpeg(self, rgb: npt.NDArray[np.uint8]) -> bytes:
         import cv2
 
-        if self.config.noise > 0:
-            grain = self.config.noise * self._rng.standard_normal(rgb.shape[:2], np.float32)
-            rgb = np.clip(np.rint(rgb + grain[..., None]), 0, 255).astype(np.uint8)
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-        ok, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])
+        ok, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not ok:
             raise RuntimeError(f"OpenCV could not encode an image of {rgb.shape[1]}x{rgb.shape[0]}")
         return encoded.tobytes()
@@ -191,16 +182,16 @@ class ThetaServer:
         jpeg = b""
         while True:
             with self._changed:
-                while self._viewers == 0 and not self._stopping:
+                while self._viewers == 0 and not self.stopping:
                     self.rate_hz, self.late_s, made = 0.0, 0.0, 0
                     self._changed.wait(1.0)
                     due = current().steady_s()
-                if self._stopping:
+                if self.stopping:
                     return
                 width, height, promised = self._format
             began = current().steady_s()
             rgb = self.source(width, height)
-            if rgb is not shown or self.config.noise > 0:
+            if rgb is not shown:
                 shown, jpeg = rgb, self._jpeg(rgb)
             self._sleep(began + self.config.latency_s)
             late_s = current().steady_s() - began - self.config.latency_s
@@ -226,19 +217,19 @@ class ThetaServer:
     def _sleep(self, until: float) -> None:
         """Sleep until a time on the stack's steady clock."""
         with self._changed:
-            while not self._stopping and (left := until - current().steady_s()) > 0:
+            while not self.stopping and (left := until - current().steady_s()) > 0:
                 self._changed.wait(current().wait_s(left))
 
     def next_frame(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
         """Number and JPEG of the newest image after number ``after``; None on a time-out or at shutdown."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
-            while (self._number <= after or self._frame is None) and not self._stopping:
+            while (self._number <= after or self._frame is None) and not self.stopping:
                 left = deadline - time.monotonic()
                 if left <= 0:
                     return None
                 self._changed.wait(left)
-            if self._stopping or self._frame is None:
+            if self.stopping or self._frame is None:
                 return None
             return self._number, self._frame
 
@@ -378,10 +369,6 @@ class ThetaServer:
         """Remove a viewer."""
         with self._changed:
             self._viewers -= 1
-
-    @property
-    def stopping(self) -> bool:
-        return self._stopping
 
 
 class _Handler(BaseHTTPRequestHandler):

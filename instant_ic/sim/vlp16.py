@@ -1,5 +1,6 @@
 """VLP-16 as UDP packets: rays with firing times and motion distortion."""
 
+import contextlib
 import math
 import socket
 from collections.abc import Callable
@@ -13,7 +14,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic.config.ranges import NotNegative, PositiveInt, Range, check_ranges, require
+from instant_ic.config.ranges import NotNegative, PositiveInt, Range, check_ranges
 from instant_ic.config.robot import LIDAR_MOUNT, Mount
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar import packets as wire
@@ -21,6 +22,10 @@ from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
+#: Revolutions per minute.
+RPM = 600.0
+#: A nearer surface gives no return, metres.
+MIN_RANGE_M = 0.2
 #: Returns x, y, yaw (N, 3) of base_link at simulated times (N,) in seconds.
 PoseAt = Callable[[FloatArray], FloatArray]
 
@@ -33,9 +38,8 @@ class Vlp16Config:
         enabled: whether the scanner is simulated.
         host: destination of the packets.
         data_port, position_port: destination UDP ports.
-        rpm: revolutions per minute, 300-1200.
         range_noise: standard deviation of a range, metres.
-        min_range, max_range: limits of a return, metres; anything nearer or farther gives none.
+        max_range: a surface farther away gives no return, metres.
         burst: packets sent together (1.33 ms each); larger bursts need less CPU.
     """
 
@@ -43,15 +47,12 @@ class Vlp16Config:
     host: str = "127.0.0.1"
     data_port: Annotated[int, Range(1, 65535)] = 2368
     position_port: Annotated[int, Range(1, 65535)] = 8308
-    rpm: Annotated[float, Range(300, 1200)] = 600.0
     range_noise: NotNegative = 0.01
-    min_range: NotNegative = 0.2
-    max_range: Annotated[float, Range(above=0, high=131)] = 100.0
+    max_range: Annotated[float, Range(above=MIN_RANGE_M, high=131)] = 100.0
     burst: PositiveInt = 8
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        require(self, "min_range", self.min_range < self.max_range, "below max_range")
 
 
 @numba.njit(cache=True, nogil=True)
@@ -124,11 +125,8 @@ class Vlp16:
     """Optics and clock of the scanner: produces packets for intervals of simulated time.
 
     Args:
-        config: parameters.
-        world: the world to scan.
         pose_at: pose of base_link at given times.
         epoch_ns: epoch time of a simulated time, which gives the packets' microseconds past the hour.
-        seed: seed of the noise.
         mount: pose on base_link.
     """
 
@@ -156,7 +154,7 @@ class Vlp16:
         laser = np.arange(wire.LASERS)[None, None, :] * wire.LASER_PERIOD_US
         after_us = block + firing + laser
         # Azimuth is clockwise when viewed from above, 0 ahead (the sensor's x in ROS axes).
-        turned = -np.radians(after_us * 1e-6 * config.rpm * 6.0)
+        turned = -np.radians(after_us * 1e-6 * RPM * 6.0)
         elevation = np.radians(wire.LASER_ELEVATION_DEG)
         #: Beams of a packet that begins at azimuth 0: direction in the sensor's frame, share of the packet's time, and
         #: height over the sensor's origin.
@@ -191,7 +189,7 @@ class Vlp16:
         config, period_s = self.config, wire.PACKET_PERIOD_US * 1e-6
         times_s = np.asarray((self.packets + np.arange(count + 1)) * period_s, np.float64)
         self.packets += count
-        azimuth_deg = times_s[:-1] * (config.rpm * 6.0) % 360.0
+        azimuth_deg = times_s[:-1] * (RPM * 6.0) % 360.0
         size = count * len(self._beams)
         origins, directions = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
         pose = np.asarray(self._pose_at(times_s), np.float64)
@@ -207,14 +205,14 @@ class Vlp16:
         noise_m = np.float32(config.range_noise) * self._rng.standard_normal(size, np.float32)
         distance, reflectivity = np.zeros(size, np.uint16), np.zeros(size, np.uint8)
         _measure(
-            range_m, face, directions, noise_m, config.min_range, config.max_range, self._world.face_surface,
+            range_m, face, directions, noise_m, MIN_RANGE_M, config.max_range, self._world.face_surface,
             self._world.normal, self._reflectance, distance, reflectivity,
         )  # fmt: skip
 
         out = np.zeros(count, wire.PACKET_DTYPE)
         blocks = out["blocks"]
         blocks["flag"] = wire.BLOCK_FLAG
-        block_deg = azimuth_deg[:, None] + np.arange(wire.BLOCKS) * (wire.BLOCK_PERIOD_US * 1e-6 * config.rpm * 6.0)
+        block_deg = azimuth_deg[:, None] + np.arange(wire.BLOCKS) * (wire.BLOCK_PERIOD_US * 1e-6 * RPM * 6.0)
         blocks["azimuth"] = np.rint(block_deg * 100.0).astype(np.int64) % 36000
         shape = (count, wire.BLOCKS, wire.FIRINGS, wire.LASERS)
         blocks["returns"]["distance"] = distance.reshape(shape)
@@ -255,7 +253,6 @@ class Vlp16Server:
         self._next_position_s = 0.0
         self.sent = 0
         self.skipped = 0
-        self.refused = 0
 
     def pump(self, time_s: float) -> None:
         """Send the packets that are complete at simulated time ``time_s``, in bursts."""
@@ -275,8 +272,6 @@ class Vlp16Server:
         self._socket.close()
 
     def _send(self, payload: bytes, port: int) -> None:
-        try:
+        # No listener yet: the kernel reports the error of an earlier packet. A real sensor ignores it too.
+        with contextlib.suppress(ConnectionRefusedError):
             self._socket.sendto(payload, (self._config.host, port))
-        except ConnectionRefusedError:
-            # No listener yet: the kernel reports the error of an earlier packet. A real sensor ignores it too.
-            self.refused += 1

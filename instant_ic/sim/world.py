@@ -114,11 +114,6 @@ class World:
         ]
         return np.asarray(others, np.int32)
 
-    @property
-    def bounds(self) -> FloatArray:
-        """Lowest and highest corner (2, 3)."""
-        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-
     def occupied(self, low_m: float = 0.03, high_m: float = 0.9, cell_m: float = 0.02) -> OccupancyMask:
         """Floor plan cells with a surface between two heights; cached after the first call."""
         key = (low_m, high_m, cell_m)
@@ -133,10 +128,7 @@ class World:
     def sample_free_poses(self, rng: np.random.Generator, n: int, clearance_m: float = 0.35) -> npt.NDArray[np.float64]:
         """Random poses (n, 3), x, y, yaw, that are reachable from the spawn pose.
 
-        Args:
-            rng: source of randomness.
-            n: number of poses.
-            clearance_m: smallest distance to objects between 0.03 m and 1.9 m above the floor.
+        Objects between 0.03 m and 1.9 m above the floor are at least ``clearance_m`` away.
 
         Raises:
             ValueError: no pose has this much clearance.
@@ -174,7 +166,7 @@ class WorldBuilder:
     def __init__(self) -> None:
         self.panels: list[_Panel] = []
 
-    def panel(self, origin: FloatArray, along_u: FloatArray, along_v: FloatArray, material: Material) -> None:
+    def panel(self, origin: npt.ArrayLike, along_u: npt.ArrayLike, along_v: npt.ArrayLike, material: Material) -> None:
         """Add a rectangle; viewed from its front, ``origin`` is top left, ``along_u`` right, ``along_v`` down."""
         self.panels.append(
             _Panel(np.asarray(origin, float), np.asarray(along_u, float), np.asarray(along_v, float), material)
@@ -184,13 +176,8 @@ class WorldBuilder:
         self, start: tuple[float, float], end: tuple[float, float], low: float, high: float, material: Material
     ) -> None:
         """Add a vertical rectangle whose front is on the right of start → end (left to right in front view)."""
-        a, b = np.asarray(start, float), np.asarray(end, float)
-        self.panel(
-            np.asarray([a[0], a[1], high]),
-            np.asarray([b[0] - a[0], b[1] - a[1], 0.0]),
-            np.asarray([0.0, 0.0, low - high]),
-            material,
-        )
+        (x0, y0), (x1, y1) = start, end
+        self.panel((x0, y0, high), (x1 - x0, y1 - y0, 0.0), (0.0, 0.0, low - high), material)
 
     def box(
         self,
@@ -209,12 +196,7 @@ class WorldBuilder:
         y = np.asarray([-s, c, 0.0]) * size[1] / 2
         z = np.asarray([0.0, 0.0, size[2]])
         base = np.asarray([centre[0], centre[1], low])
-        for normal, right, material in (
-            (x, y, front or side),
-            (-x, -y, side),
-            (y, -x, side),
-            (-y, x, side),
-        ):
+        for normal, right, material in ((x, y, front or side), (-x, -y, side), (y, -x, side), (-y, x, side)):
             self.panel(base + z + normal - right, 2 * right, -z, material)
         self.panel(base + z + x + y, -2 * y, -2 * x, top or side)
         if low > 0.01:

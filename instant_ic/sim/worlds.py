@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from instant_ic.sim import furniture
-from instant_ic.sim.building import INWARD_YAW, SIDES, Building, Finish, Zone
+from instant_ic.sim.building import INWARD_YAW, SIDES, Building, Finish, Point, Zone
 from instant_ic.sim.mesh_files import load_world
-from instant_ic.sim.world import Material, World
+from instant_ic.sim.world import Material, World, WorldBuilder
 
 __all__ = ["World", "corridor_world", "load_world", "long_world", "make_world", "random_world"]
 
@@ -158,9 +158,9 @@ def tint(rng: np.random.Generator, lowest: float) -> tuple[float, float, float]:
 def random_finish(rng: np.random.Generator) -> Finish:
     trim = Material("wood", 1.0, tint(rng, 0.4)) if rng.random() < 0.6 else Material("white", 1.0, tint(rng, 0.5))
     return Finish(
-        Material(str(rng.choice(_WALLS)), float(rng.uniform(1.2, 2.6)), tint(rng, 0.55)),
-        Material(str(rng.choice(_FLOORS)), float(rng.uniform(1.6, 3.0)), tint(rng, 0.5)),
-        Material(str(rng.choice(_CEILINGS)), float(rng.uniform(1.8, 3.0)), tint(rng, 0.8)),
+        Material(str(rng.choice(_WALLS)), rng.uniform(1.2, 2.6), tint(rng, 0.55)),
+        Material(str(rng.choice(_FLOORS)), rng.uniform(1.6, 3.0), tint(rng, 0.5)),
+        Material(str(rng.choice(_CEILINGS)), rng.uniform(1.8, 3.0), tint(rng, 0.8)),
         replace(trim, tint=tint(rng, 0.3)) if rng.random() < 0.75 else None,
         trim,
     )
@@ -170,8 +170,8 @@ def plan(rng: np.random.Generator, building: Building, kind: str = "") -> list[Z
     """Zones of one of five kinds of floor plan (empty: random); the first zone has the spawn point at its centre."""
     drawn = rng.choice(["room", "hall", "corridor", "corner", "crossing"], p=[0.28, 0.12, 0.26, 0.18, 0.16])
     kind = kind or str(drawn)
-    finish, height = random_finish(rng), float(rng.uniform(2.3, 3.4))
-    wall = float(rng.uniform(0.1, 0.25))
+    finish, height = random_finish(rng), rng.uniform(2.3, 3.4)
+    wall = rng.uniform(0.1, 0.25)
     u = rng.uniform
 
     def zone(x0: float, y0: float, x1: float, y1: float, f: Finish = finish, h: float = height) -> Zone:
@@ -212,28 +212,23 @@ def plan(rng: np.random.Generator, building: Building, kind: str = "") -> list[Z
 
 
 def side_room(
-    rng: np.random.Generator,
-    building: Building,
-    zone: Zone,
-    side: str,
-    wall: float,
-    run: tuple[float, float] | None = None,
+    rng: np.random.Generator, building: Building, zone: Zone, side: str, wall: float, run: Point | None = None
 ) -> Zone:
     """Add a room with an open doorway behind a wall of ``zone``."""
     start, end = zone.side(side)
     length = math.dist(start, end)
     low, high = run or (0.4, length - 0.4)
     sign_x, sign_y = np.sign(np.asarray(end) - np.asarray(start))
-    at = float(rng.uniform(low + 0.5, high - 0.5))
+    at = rng.uniform(low + 0.5, high - 0.5)
     centre = start[0] + sign_x * at if side in ("north", "south") else start[1] + sign_y * at
-    width = float(rng.uniform(0.85, 1.2))
+    width = rng.uniform(0.85, 1.2)
     door = building.door(zone, side, centre, wall, width)
     # At most as wide as its share of the wall, so that neighbouring side rooms do not overlap.
     left, right = min(at - low, 3.0) + 0.15, min(high - at, 3.0) + 0.15
     ends = sorted((centre - left, centre + right) if sign_x + sign_y > 0 else (centre + left, centre - right))
-    rect = door.beyond(side, ends[0], ends[1], float(rng.uniform(2.2, 5.0)))
+    rect = door.beyond(side, ends[0], ends[1], rng.uniform(2.2, 5.0))
     finish = random_finish(rng) if rng.random() < 0.7 else zone.finish
-    return building.add(Zone(*rect, height=float(rng.uniform(2.3, max(2.4, zone.height))), finish=finish))
+    return building.add(Zone(*rect, height=rng.uniform(2.3, max(2.4, zone.height)), finish=finish))
 
 
 def decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
@@ -245,9 +240,9 @@ def decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
                 room = high - at
                 choice = rng.random()
                 if choice < 0.18 and room > 1.4:
-                    width = float(rng.uniform(0.8, min(2.2, room - 0.3)))
+                    width = rng.uniform(0.8, min(2.2, room - 0.3))
                     building.window(
-                        zone, side, at + width / 2 + 0.1, width, int(rng.integers(0, 12)), float(rng.uniform(0.8, 2.2))
+                        zone, side, at + width / 2 + 0.1, width, int(rng.integers(0, 12)), rng.uniform(0.8, 2.2)
                     )
                     at += width + 0.3
                 elif choice < 0.33 and zone.height > 2.2:
@@ -256,18 +251,15 @@ def decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
                     )
                     at += 1.15
                 elif choice < 0.6:
-                    w = float(rng.uniform(0.35, 0.95))
-                    name = (
-                        f"poster:{int(rng.integers(0, 40))}"
-                        if rng.random() < 0.8
-                        else f"notices:{int(rng.integers(0, 4))}"
-                    )
-                    height = float(rng.uniform(1.2, 1.7))
+                    w = rng.uniform(0.35, 0.95)
+                    kind, variants = ("poster", 40) if rng.random() < 0.8 else ("notices", 4)
+                    name = f"{kind}:{int(rng.integers(0, variants))}"
+                    height = rng.uniform(1.2, 1.7)
                     building.picture(
-                        zone, side, at + w / 2 + 0.05, height, (w, w * float(rng.uniform(0.6, 1.4))), Material(name)
+                        zone, side, at + w / 2 + 0.05, height, (w, w * rng.uniform(0.6, 1.4)), Material(name)
                     )
                     at += w + 0.2
-                at += float(rng.uniform(0.3, 1.5))
+                at += rng.uniform(0.3, 1.5)
 
 
 def _furnish(rng: np.random.Generator, building: Building, zone: Zone, keep: tuple[float, float] | None) -> None:
@@ -287,56 +279,40 @@ def _furnish(rng: np.random.Generator, building: Building, zone: Zone, keep: tup
         side = str(rng.choice(SIDES))
         gap = 0.45
         if against:
-            x = {"east": zone.x1 - gap, "west": zone.x0 + gap}.get(
-                side, float(rng.uniform(zone.x0 + 0.7, zone.x1 - 0.7))
-            )
-            y = {"north": zone.y1 - gap, "south": zone.y0 + gap}.get(
-                side, float(rng.uniform(zone.y0 + 0.7, zone.y1 - 0.7))
-            )
+            x = {"east": zone.x1 - gap, "west": zone.x0 + gap}.get(side, rng.uniform(zone.x0 + 0.7, zone.x1 - 0.7))
+            y = {"north": zone.y1 - gap, "south": zone.y0 + gap}.get(side, rng.uniform(zone.y0 + 0.7, zone.y1 - 0.7))
         elif narrow:
             continue
         else:
-            x, y = float(rng.uniform(zone.x0 + 0.9, zone.x1 - 0.9)), float(rng.uniform(zone.y0 + 0.9, zone.y1 - 0.9))
+            x, y = rng.uniform(zone.x0 + 0.9, zone.x1 - 0.9), rng.uniform(zone.y0 + 0.9, zone.y1 - 0.9)
         if not (zone.x0 + 0.3 < x < zone.x1 - 0.3 and zone.y0 + 0.3 < y < zone.y1 - 0.3):
             continue
         radius = 0.7
         if any(math.hypot(x - px, y - py) < radius + pr for px, py, pr in placed):
             continue
         placed.append((x, y, radius))
-        _piece(rng, build, (x, y), INWARD_YAW[side] if against else float(rng.uniform(-math.pi, math.pi)), zone.height)
+        _piece(rng, build, (x, y), INWARD_YAW[side] if against else rng.uniform(-math.pi, math.pi), zone.height)
 
 
-def _piece(
-    rng: np.random.Generator, build: "furniture.WorldBuilder", at: tuple[float, float], yaw: float, height: float
-) -> None:
+def _piece(rng: np.random.Generator, build: WorldBuilder, at: Point, yaw: float, height: float) -> None:
     cloth = Material("fabric", 0.5, tint(rng, 0.15))
-    wood = Material("wood", float(rng.uniform(0.6, 1.2)), tint(rng, 0.4))
+    wood = Material("wood", rng.uniform(0.6, 1.2), tint(rng, 0.4))
     choice = rng.choice(["table", "chair", "bookcase", "cabinet", "sofa", "boxes", "block"])
     if choice == "table":
-        furniture.table(
-            build, at, yaw + math.pi / 2, (float(rng.uniform(0.8, 1.3)), float(rng.uniform(0.5, 0.8))), wood
-        )
+        furniture.table(build, at, yaw + math.pi / 2, (rng.uniform(0.8, 1.3), rng.uniform(0.5, 0.8)), wood)
     elif choice == "chair":
         furniture.chair(build, at, yaw, cloth)
     elif choice == "bookcase":
-        furniture.bookcase(build, at, yaw, int(rng.integers(0, 10)), min(height - 0.1, float(rng.uniform(1.0, 2.2))))
+        furniture.bookcase(build, at, yaw, int(rng.integers(0, 10)), min(height - 0.1, rng.uniform(1.0, 2.2)))
     elif choice == "cabinet":
-        size = (
-            float(rng.uniform(0.35, 0.6)),
-            float(rng.uniform(0.6, 1.2)),
-            min(height - 0.1, float(rng.uniform(0.7, 2.0))),
-        )
+        size = (rng.uniform(0.35, 0.6), rng.uniform(0.6, 1.2), min(height - 0.1, rng.uniform(0.7, 2.0)))
         furniture.cabinet(build, at, yaw, size, wood if rng.random() < 0.5 else Material("metal", 0.8, tint(rng, 0.4)))
     elif choice == "sofa":
-        furniture.sofa(build, at, yaw, cloth, float(rng.uniform(0.9, 1.4)))
+        furniture.sofa(build, at, yaw, cloth, rng.uniform(0.9, 1.4))
     elif choice == "boxes":
         furniture.boxes(build, at, rng)
     else:
-        size = (
-            float(rng.uniform(0.2, 0.6)),
-            float(rng.uniform(0.2, 0.6)),
-            float(rng.uniform(0.3, min(height - 0.1, 2.4))),
-        )
+        size = (rng.uniform(0.2, 0.6), rng.uniform(0.2, 0.6), rng.uniform(0.3, min(height - 0.1, 2.4)))
         texture = str(rng.choice(["white", "concrete", "metal", "wood", "brick"]))
         build.box(at, size, 0.0, yaw, side=Material(texture, 1.0, tint(rng, 0.4)))
 
@@ -367,7 +343,7 @@ def interior(
     along = first.x1 - first.x0 > 6.5 and first.y1 - first.y0 < 3.5
     spawn = (0.0, 0.0, 0.0) if along else (*first.centre, 0.0)
     for zone in zones:
-        building.lamps(zone, float(rng.uniform(1.8, 3.6)), float(rng.uniform(2.5, 6.0)), bool(rng.random() < 0.5))
+        building.lamps(zone, rng.uniform(1.8, 3.6), rng.uniform(2.5, 6.0), bool(rng.random() < 0.5))
         fit_out(rng, building, zone)
         _furnish(rng, building, zone, (spawn[0], spawn[1]) if zone is first else None)
     world = building.world(name, spawn, light_cell_m, rays)
@@ -383,8 +359,8 @@ def long_world(seed: int, light_cell_m: float = 0.4, rays: int = 12) -> World:
     """
     rng = np.random.default_rng([29, seed])
     building = Building()
-    finish, wall = random_finish(rng), float(rng.uniform(0.1, 0.25))
-    length = float(rng.uniform(20, 40))
+    finish, wall = random_finish(rng), rng.uniform(0.1, 0.25)
+    length = rng.uniform(20, 40)
     width = float(rng.uniform(8, 15) if seed % 2 else rng.uniform(1.8, 3.2))
     height = float(rng.uniform(3.0, 5.0) if seed % 2 else rng.uniform(2.4, 3.2))
     start = float(rng.uniform(-0.7, -0.1) * length)
@@ -396,7 +372,7 @@ def long_world(seed: int, light_cell_m: float = 0.4, rays: int = 12) -> World:
                 low, high = (0.4 + (length - 0.8) * part / 3 for part in (share, share + 1))
                 zones.append(side_room(rng, building, first, side, wall, (low, high)))
     for zone in zones:
-        building.lamps(zone, float(rng.uniform(2.4, 4.0)), float(rng.uniform(2.5, 6.0)), bool(rng.random() < 0.5))
+        building.lamps(zone, rng.uniform(2.4, 4.0), rng.uniform(2.5, 6.0), bool(rng.random() < 0.5))
         decorate(rng, building, zone)
         _furnish(rng, building, zone, (0.0, 0.0) if zone is first else None)
     return building.world(f"long:{seed}", (0.0, 0.0, 0.0), light_cell_m, rays)

@@ -9,30 +9,15 @@ grid, resolution, origin = slam.grid()
 ```
 """
 
-from instant_ic.slam.config import (
-    FieldConfig,
-    KeyframeConfig,
-    LoopConfig,
-    MapConfig,
-    MatchConfig,
-    OdometryNoise,
-    SlamConfig,
-)
+from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.front_end import SlamStatus
 from instant_ic.slam.grid_slam import GridSlam, SlamResult
-from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
+from instant_ic.slam.occupancy import OccupancyGrid
 from instant_ic.slam.scan import Scan
 
 __all__ = [
-    "FieldConfig",
     "GridSlam",
-    "KeyframeConfig",
-    "LoopConfig",
-    "MapConfig",
-    "MatchConfig",
     "OccupancyGrid",
-    "OccupancyMap",
-    "OdometryNoise",
     "Scan",
     "SlamConfig",
     "SlamResult",

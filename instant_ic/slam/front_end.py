@@ -11,12 +11,20 @@ import numpy as np
 
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.keyframes import Keyframe, Trajectory, grown_drift, turned
+from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, Keyframe, grown_drift, turned
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.loop_search import find_place
 from instant_ic.slam.matcher import Match, Window, match_scan
 from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
+MIN_POINTS = 20
+"""A scan with fewer points is not matched; odometry decides."""
+SEARCH_M, SEARCH_RAD = 0.3, 0.3
+"""Half width of the search around the predicted pose; it grows with the odometry step."""
+RECOVERY_M, RECOVERY_RAD = 1.2, 1.2
+"""Half width of the wide search."""
+RECOVERY_SCORE, MIN_SCORE = 0.6, 0.35
+"""A score below the first starts the wide search. Below the second the scan counts as lost: its pose is odometry's."""
 RECOVERY_MARGIN = 0.1
 """Minimum score gain of the wide search over the first search."""
 START_KEYFRAMES = 4
@@ -32,7 +40,13 @@ WIDE_SIGMAS, WIDE_REACH_M = 3.0, 6.0
 """Reach of the search over all headings: standard deviations of the guess since the last match, and its limit."""
 WINDOW_PER_M, WINDOW_PER_RAD, TURN_WINDOW_PER_M = 0.4, 0.4, 0.2
 """Growth of the search window with the odometry step: translation per metre, rotation per radian and per metre; twice
-the default σ of the odometry."""
+the σ of the odometry."""
+FLOOR_SIGMA_M, FLOOR_SIGMA_RAD = 0.01, 0.03
+"""σ of an odometry step, also while standing."""
+SIGMA_M_PER_M, SIGMA_RAD_PER_RAD, SIGMA_RAD_PER_M = 0.2, 0.2, 0.1
+"""σ of an odometry step beyond that: tracks slip, and skid steering turns less than the encoders."""
+KEYFRAME_M, KEYFRAME_RAD = 0.25, 0.2
+"""Motion since the last keyframe after which a scan becomes a keyframe."""
 STEP_SIGMA_M, STEP_SIGMA_RAD = 0.005, 0.0015
 """Scan-matching error between keyframes beyond its own covariance."""
 KNOWN_MAP_STEP_M = 2.0
@@ -92,12 +106,16 @@ class Track:
 
 
 class FrontEnd:
-    """Scan-to-local-map matching with keyframes, which are stored in ``trajectory``."""
+    """Scan-to-local-map matching with keyframes.
+
+    Attributes:
+        trajectory: all keyframes in time order.
+    """
 
     def __init__(self, config: SlamConfig) -> None:
         self.config = config
-        self.trajectory = Trajectory()
-        self._field = LikelihoodField(config.field, config.match.recovery_translation_m + 0.5)
+        self.trajectory: list[Keyframe] = []
+        self._field = LikelihoodField(config.field.resolution_m, config.field.max_range_m + (RECOVERY_M + 0.5))
         self._lost_sigma_m = 0.0
         self._usual_score = 0.0
         self._covariance = np.zeros((3, 3))
@@ -116,25 +134,19 @@ class FrontEnd:
 
     def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
         """Guess at ``pose`` after an odometry step (3,) in the base's own frame."""
-        noise, match = self.config.odometry, self.config.match
         distance, turn = math.hypot(step[0], step[1]), abs(step[2])
-        translation = noise.translation_floor_m + noise.translation_per_m * distance
-        rotation = noise.rotation_floor_rad + noise.rotation_per_rad * turn + noise.rotation_per_m * distance
-        window = Window(
-            match.search_translation_m + WINDOW_PER_M * distance,
-            match.search_rotation_rad + WINDOW_PER_RAD * turn + TURN_WINDOW_PER_M * distance,
-        )
-        sigma = np.array([translation, translation, rotation])
-        return Guess(pose, sigma, self._within_recovery(window), rotation > DOUBTFUL_TURN_RAD)
+        translation = FLOOR_SIGMA_M + SIGMA_M_PER_M * distance
+        rotation = FLOOR_SIGMA_RAD + SIGMA_RAD_PER_RAD * turn + SIGMA_RAD_PER_M * distance
+        window_m = SEARCH_M + WINDOW_PER_M * distance
+        window_rad = SEARCH_RAD + WINDOW_PER_RAD * turn + TURN_WINDOW_PER_M * distance
+        return self._guess(pose, translation, rotation, window_m, window_rad, rotation > DOUBTFUL_TURN_RAD)
 
     def guess_from_velocity(self, pose: FloatArray, elapsed_s: float) -> Guess:
         """Guess at ``pose`` without odometry: the window covers any motion possible in the elapsed time."""
         match = self.config.match
         translation = 0.5 * match.free_motion_speed_mps * elapsed_s + 0.05
         rotation = 0.5 * match.free_motion_yaw_rate_radps * elapsed_s + 0.05
-        window = Window(match.search_translation_m + translation, match.search_rotation_rad + rotation)
-        sigma = np.array([translation, translation, rotation])
-        return Guess(pose, sigma, self._within_recovery(window))
+        return self._guess(pose, translation, rotation, SEARCH_M + translation, SEARCH_RAD + rotation)
 
     def constant_velocity(self, pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:
         """Pose after another ``elapsed_s`` at the velocity of the last ``step`` (3,), which took ``step_s`` seconds.
@@ -148,52 +160,42 @@ class FrontEnd:
         part_rad = min(part, match.free_motion_yaw_rate_radps * elapsed_s / turn) if turn > 0 else 0.0
         return compose2(pose, np.array([part_m * step[0], part_m * step[1], part_rad * wrap_angle(float(step[2]))]))
 
-    def _within_recovery(self, window: Window) -> Window:
-        match = self.config.match
-        return Window(
-            min(window.translation_m, match.recovery_translation_m),
-            min(window.rotation_rad, match.recovery_rotation_rad),
-        )
+    @staticmethod
+    def _guess(
+        pose: FloatArray, sigma_m: float, sigma_rad: float, window_m: float, window_rad: float, doubtful: bool = False
+    ) -> Guess:
+        window = Window(min(window_m, RECOVERY_M), min(window_rad, RECOVERY_RAD))
+        return Guess(pose, np.array([sigma_m, sigma_m, sigma_rad]), window, doubtful)
 
     def track(
-        self,
-        scan: ScanPoints,
-        guess: Guess,
-        stamp_ns: int,
-        accept: Callable[[FloatArray, float, bool], bool] | None = None,
+        self, scan: ScanPoints, guess: Guess, stamp_ns: int, accept: Callable[[FloatArray, float, bool], bool]
     ) -> Track:
-        """Match a scan that has at least ``match.min_points`` points.
+        """Match a scan that has at least `MIN_POINTS` points; it becomes a keyframe only if ``accept`` returns True.
 
-        Args:
-            scan: its points.
-            guess: predicted pose.
-            stamp_ns: of the scan.
-            accept: gets the pose (3,) and the score of a match, and whether only the wide search has found it; the scan
-                becomes a keyframe only if it returns True.
+        ``accept`` gets the pose (3,) and the score of the match, and whether only the wide search has found it.
         """
-        config = self.config.match
         points = self._match_points(scan)
-        if len(self.trajectory) == 0:
-            keyframe = self._add_keyframe(guess.pose, np.zeros((3, 3)), scan, stamp_ns, dead_reckoned=False)
+        if not self.trajectory:
+            keyframe = self._add_keyframe(guess.pose, np.zeros((3, 3)), scan, stamp_ns)
             return Track(guess.pose, np.zeros((3, 3)), 1.0, SlamStatus.FIRST, keyframe)
 
         status = SlamStatus.TRACKED
         match = match_scan(self._field, points, guess.pose, guess.sigma, guess.window)
-        if match.score < config.recovery_score or match.at_border:
-            recovered = self._recover(points, guess)
+        if match.score < RECOVERY_SCORE or match.at_border:
+            recovered = match_scan(self._field, points, guess.pose, guess.sigma, Window(RECOVERY_M, RECOVERY_RAD))
             # Unless the first window was too small, the wide search must be clearly better: a window this large always
             # contains a slightly better pose.
             margin = 0.0 if match.at_border else RECOVERY_MARGIN
-            if recovered.score >= config.min_score and recovered.score > match.score + margin:
+            if recovered.score >= MIN_SCORE and recovered.score > match.score + margin:
                 match, status = recovered, SlamStatus.RECOVERED
         if self._doubtful(match, guess):
             wide = self._search_all_headings(points, guess, match.score)
             if wide is not None:
                 match, status = wide, SlamStatus.RECOVERED
-        if match.score < config.min_score:
+        if match.score < MIN_SCORE:
             return Track(guess.pose, self._grown_covariance(guess), match.score, SlamStatus.LOST, None)
 
-        accepted = accept is None or accept(match.pose, match.score, status is SlamStatus.RECOVERED)
+        accepted = accept(match.pose, match.score, status is SlamStatus.RECOVERED)
         self._lost_sigma_m = 0.0
         self._usual_score += SCORE_MEMORY * (match.score - self._usual_score)
         self._covariance = match.covariance
@@ -202,16 +204,16 @@ class FrontEnd:
             if math.hypot(*(match.pose[:2] - self._built_at)) > KNOWN_MAP_STEP_M:
                 self._build_known(match.pose)
         elif accepted and (self._moved(match.pose) or self._first_was_poor(match, status)):
-            added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
+            added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns)
         return Track(match.pose, match.covariance, match.score, status, added)
 
     def restart(self, scan: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
         """Start a new local map and trajectory with a scan, at the predicted pose."""
         self._known = None
-        self.trajectory = Trajectory()
+        self.trajectory = []
         covariance = self._grown_covariance(guess)
         self._lost_sigma_m = 0.0
-        keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
+        keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns)
         return Track(guess.pose, covariance, 0.0, SlamStatus.RESTARTED, keyframe)
 
     def dead_reckon(self, guess: Guess) -> Track:
@@ -222,20 +224,15 @@ class FrontEnd:
         near = (scan.points**2).sum(axis=1) <= self.config.field.max_range_m**2
         return thin(scan.points[near], scan.joined[near], self.config.match.max_points)
 
-    def _recover(self, points: FloatArray, guess: Guess) -> Match:
-        config = self.config.match
-        window = Window(config.recovery_translation_m, config.recovery_rotation_rad)
-        return match_scan(self._field, points, guess.pose, guess.sigma, window)
-
     def _doubtful(self, match: Match, guess: Guess) -> bool:
         """Whether the scan may fit better at a heading that the local search does not reach."""
-        usual = max(self.config.match.recovery_score, self._usual_score - SCORE_DROP)
+        usual = max(RECOVERY_SCORE, self._usual_score - SCORE_DROP)
         return match.at_border or match.score < usual or guess.doubtful
 
     def _search_all_headings(self, points: FloatArray, guess: Guess, score: float) -> Match | None:
         """Best pose over all headings near the guess; None unless it is unique and clearly better than ``score``."""
         found = find_place(self._field, points, guess.pose, self.reach_m(guess), math.pi)
-        if found is None or found.score < self.config.match.recovery_score:
+        if found is None or found.score < RECOVERY_SCORE:
             return None
         other = max(score, found.runner_up)
         if found.score - other < WIDE_GAIN * (1.0 - other):
@@ -245,7 +242,7 @@ class FrontEnd:
     def reach_m(self, guess: Guess) -> float:
         """Distance from the guess within which the robot is, by odometry since the last match."""
         sigma_m = float(guess.sigma[0]) + self._lost_sigma_m
-        return min(self.config.match.recovery_translation_m + WIDE_SIGMAS * sigma_m, WIDE_REACH_M)
+        return min(RECOVERY_M + WIDE_SIGMAS * sigma_m, WIDE_REACH_M)
 
     def _grown_covariance(self, guess: Guess) -> FloatArray:
         # Odometry errs by its scale: the errors of the steps without a match add up.
@@ -260,29 +257,24 @@ class FrontEnd:
         each scan would start a wide search until the robot moves.
         """
         few = len(self.trajectory) < START_KEYFRAMES
-        return few and status is SlamStatus.TRACKED and match.score < self.config.match.recovery_score
+        return few and status is SlamStatus.TRACKED and match.score < RECOVERY_SCORE
 
     def _moved(self, pose: FloatArray) -> bool:
-        last = self.trajectory.keyframes[-1].map_from_base
-        config = self.config.keyframe
+        last = self.trajectory[-1].map_from_base
         step = relative2(last, pose)
-        return math.hypot(step[0], step[1]) >= config.distance_m or abs(step[2]) >= config.rotation_rad
+        return math.hypot(step[0], step[1]) >= KEYFRAME_M or abs(step[2]) >= KEYFRAME_RAD
 
-    def _add_keyframe(
-        self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int, dead_reckoned: bool
-    ) -> Keyframe:
+    def _add_keyframe(self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int) -> Keyframe:
         step, step_covariance, drift = np.zeros(3), np.zeros((3, 3)), covariance.copy()
-        if len(self.trajectory):
-            last = self.trajectory.last
+        if self.trajectory:
+            last = self.trajectory[-1]
             yaw = float(last.map_from_base[2])
             step = relative2(last.map_from_base, pose)
             step_covariance = turned(covariance, -yaw)
             step_covariance += np.diag(np.square([STEP_SIGMA_M, STEP_SIGMA_M, STEP_SIGMA_RAD]))
             drift = grown_drift(last.drift, pose[:2] - last.map_from_base[:2], yaw, step_covariance)
-        keyframe = Keyframe(
-            stamp_ns, pose.copy(), covariance.copy(), scan, dead_reckoned, step, step_covariance, drift
-        )  # fmt: skip
-        self.trajectory.add(keyframe)
+        keyframe = Keyframe(stamp_ns, pose.copy(), scan, step, step_covariance, drift)
+        self.trajectory.append(keyframe)
         self.rebuild_field()
         return keyframe
 
@@ -291,7 +283,7 @@ class FrontEnd:
         if self._known is not None:
             self._build_known(self._built_at)
             return
-        recent = self.trajectory.recent(self.config.field.keyframes)
+        recent = self.trajectory[-LOCAL_KEYFRAMES:]
         surfaces = [Surface(k.map_from_base, k.scan.points, k.scan.joined) for k in recent]
         self._field.rebuild(recent[-1].map_from_base, surfaces)
 

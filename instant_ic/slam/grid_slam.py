@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,9 +15,9 @@ from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import Matrix, compose2, inverse2, matrix_from_pose2, relative2
 from instant_ic.jit import leave_out_blas
 from instant_ic.slam.config import GridSlamConfig, SlamConfig
-from instant_ic.slam.front_end import FrontEnd, Guess, SlamStatus, Track
+from instant_ic.slam.front_end import MIN_POINTS, FrontEnd, Guess, SlamStatus, Track
 from instant_ic.slam.integrity import Integrity, IntegrityMonitor, mixture
-from instant_ic.slam.keyframes import Keyframe
+from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, Keyframe
 from instant_ic.slam.localization import Place, SavedMap
 from instant_ic.slam.loop_closure import QUERY_KEYFRAMES, LoopClosure, Outcome, correction
 from instant_ic.slam.map_files import load_graph, load_grid, save_graph, save_grid
@@ -108,6 +108,7 @@ class GridSlam:
 
     Attributes:
         map_from_base: pose of the last scan (3,).
+        in_map_frame: whether the pose continues one in the map's frame; False until the place in a saved map is found.
         front_end: matches scans and makes keyframes.
         loop_closure: finds loops and optimises the keyframes' poses.
         motion: compares wheel odometry with scan matching.
@@ -122,7 +123,7 @@ class GridSlam:
         self.map = OccupancyMap(self.config.map)
         self.motion = MotionMonitor()
         self.monitor = IntegrityMonitor()
-        self._framed = saved is None
+        self.in_map_frame = saved is None
         self._apart = False  # a session began after the robot was lost in the map being made
         self._reach_m = math.inf  # distance from odometry within which the robot is searched for
         self._found_before: tuple[FloatArray, FloatArray] | None = None
@@ -167,7 +168,7 @@ class GridSlam:
         points = scan_points(scan, mount, self.config.map.no_return_clear_m)
         self._points = points
         guess = self._guess(odometry, scan.stamp_ns)
-        if len(points.points) >= self.config.match.min_points:
+        if len(points.points) >= MIN_POINTS:
             track = self._track(points, guess, scan.stamp_ns)
         elif self._stamp_ns is None:  # nothing to match against yet: the next scan becomes the first one
             return self._unplaced(SlamStatus.NO_POINTS)
@@ -176,7 +177,7 @@ class GridSlam:
             self.monitor.unmatched(False, self._elapsed_s(scan.stamp_ns))
         self._extend_map(track)
         self._follow(track, odometry, scan.stamp_ns)
-        anchor = self.front_end.trajectory.last
+        anchor = self.front_end.trajectory[-1]
         covariance = track.covariance + anchor.drift
         integrity = self.monitor.integrity(covariance, self.localized)
         covariance = mixture(covariance, integrity.lost_probability)
@@ -187,11 +188,6 @@ class GridSlam:
     def localized(self) -> bool:
         """Whether the robot is located in the saved map; True without one."""
         return self.saved is None or self.saved.located
-
-    @property
-    def in_map_frame(self) -> bool:
-        """Whether the pose continues one in the map's frame; False until the robot is located in a saved map."""
-        return self._framed
 
     def grid(self) -> OccupancyGrid:
         """The map: int8 array (H, W) of −1, 0..100, resolution, origin (2,)."""
@@ -215,7 +211,7 @@ class GridSlam:
 
     def _graph(self, count: int | None = None) -> tuple[list[Keyframe], list[Edge]]:
         """The first ``count`` keyframes, or all, that have not been removed, and the edges between them."""
-        keyframes = self.front_end.trajectory.keyframes[:count]
+        keyframes = self.front_end.trajectory[:count]
         edges = [edge for edge in self._edges if max(edge.a, edge.b) < len(keyframes)]
         known = max((edge.b for edge in edges), default=0) + 1
         for k in range(known, len(keyframes)):  # keyframes that the loop closure has not processed yet
@@ -256,11 +252,11 @@ class GridSlam:
             return None
         job: Callable[[], Place | Outcome] | None = None
         if self.saved is not None and not self.saved.located:
-            recent = self.front_end.trajectory.recent(QUERY_KEYFRAMES)
+            recent = self.front_end.trajectory[-QUERY_KEYFRAMES:]
             if self._points is not None and self._stamp_ns is not None:
                 job = self.saved.search_job(recent, self.map_from_base, self._points, self._stamp_ns, self._reach_m)
         elif self.config.loop.enabled and not self._broken and not self.front_end.in_known_map:
-            new = self.front_end.trajectory.keyframes[self._handed_over :]
+            new = self.front_end.trajectory[self._handed_over :]
             self._handed_over += len(new)
             job = (lambda: self.loop_closure.update(new)) if new else None
         self._busy = job is not None
@@ -291,8 +287,8 @@ class GridSlam:
         if not self.localized or self._broken or self.front_end.in_known_map:
             return
         self._settle()
-        new = self.front_end.trajectory.keyframes[self._handed_over :]
-        if self.config.loop.enabled and self.front_end.trajectory.keyframes:
+        new = self.front_end.trajectory[self._handed_over :]
+        if self.config.loop.enabled and self.front_end.trajectory:
             self._handed_over += len(new)
             self.take_over(self.loop_closure.update(new, last=True))
 
@@ -306,7 +302,7 @@ class GridSlam:
 
     def _take_over_loops(self, outcome: Outcome) -> None:
         """Apply optimised poses, the rebuilt map and merged keyframes."""
-        keyframes = self.front_end.trajectory.keyframes
+        keyframes = self.front_end.trajectory
         if self._before is not None:
             first = self._before.keyframes
             if outcome.poses is not None or any(edge.robust and edge.b >= first for edge in outcome.edges):
@@ -323,18 +319,18 @@ class GridSlam:
     def _join(self, saved: SavedMap, moved: FloatArray, covariance: FloatArray, built: OccupancyMap | None) -> None:
         """Join the current map to the saved one: ``moved`` transforms everything mapped so far into the saved map."""
         self._settle()
-        own = self.front_end.trajectory.keyframes
+        own = self.front_end.trajectory
         for keyframe in own:
             keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
         self._move(moved)
-        saved.located = self._framed = True
-        self.monitor.restart()
+        saved.located = self.in_map_frame = True
+        self.monitor = IntegrityMonitor()
         if not saved.extends:
             own[-1].drift = covariance
             self.front_end.use_known_map(saved.localizer.points, self.map_from_base)
             return
         self.loop_closure = saved.join(own, covariance)
-        self.front_end.trajectory.keyframes = [*saved.keyframes, *own]
+        own[:] = [*saved.keyframes, *own]
         self._edges, self._handed_over = list(saved.edges), len(saved.keyframes)
         self._replace_map(built or saved.build_map(), len(saved.keyframes))
         self.front_end.rebuild_field()
@@ -343,7 +339,7 @@ class GridSlam:
         """Continue with a map that contains the first ``count`` keyframes."""
         rebuilt.version = self.map.version + 1
         self.map = rebuilt
-        for keyframe in self.front_end.trajectory.keyframes[count:]:
+        for keyframe in self.front_end.trajectory[count:]:
             self.map.insert(keyframe.map_from_base, keyframe.scan)
 
     # -- integrity ------------------------------------------------------------------------------
@@ -374,7 +370,7 @@ class GridSlam:
             self.monitor.matched(contradicted, score, elapsed_s, recovered)
             if self._before is not None:
                 # What is older than the local map may contradict a right pose, which has drifted.
-                before = self._before.map.contradiction(pose, points, self.config.field.keyframes)
+                before = self._before.map.contradiction(pose, points, LOCAL_KEYFRAMES)
                 step = relative2(self.map_from_base, pose)
                 self.monitor.compared(before - contradicted, math.hypot(step[0], step[1]) + 0.5 * abs(float(step[2])))
             return not self.monitor.doubts
@@ -416,7 +412,7 @@ class GridSlam:
         self._found_before = None
         # After a gap the robot is where odometry says, within its error; otherwise it may have been carried anywhere.
         self._reach_m = NEAR_M + self.front_end.reach_m(guess) if self.monitor.after_gap else math.inf
-        self.monitor.restart()
+        self.monitor = IntegrityMonitor()
         return self.front_end.restart(points, guess, stamp_ns)
 
     def _recognized(self, saved: SavedMap, moved: FloatArray, here: FloatArray) -> bool:
@@ -426,7 +422,7 @@ class GridSlam:
         missing in it, and another one look like it. A place far from where odometry says must therefore be found
         twice, from two places.
         """
-        recent = self.front_end.trajectory.recent(QUERY_KEYFRAMES)
+        recent = self.front_end.trajectory[-QUERY_KEYFRAMES:]
         shares = [self._cells_of(saved).contradiction(compose2(moved, k.map_from_base), k.scan) for k in recent]
         if float(np.mean(shares)) > MOST_JOIN_CONTRADICTION:
             return False
@@ -547,19 +543,12 @@ def transforms(
         limiter.reset()
 
 
-@dataclass(frozen=True)
-class JobResult:
-    """Outcome of a background job of one SLAM, None if it failed; ``fault`` is the text of the error, if any."""
+class JobResult(NamedTuple):
+    """Outcome of a background job of one SLAM; None with a diagnosis if it failed."""
 
     slam: GridSlam
     outcome: Place | Outcome | None
-    fault: str = ""
-
-    @property
-    def diagnosis(self) -> Diagnosis | None:
-        """None when it did not fail."""
-        text = f"loop closure failed and is off until the node restarts: {self.fault}"
-        return Diagnosis("loops", Level.ERROR, text) if self.fault else None
+    diagnosis: Diagnosis | None = None
 
 
 def run_job(item: tuple[GridSlam, Callable[[], Place | Outcome]]) -> JobResult:
@@ -568,4 +557,5 @@ def run_job(item: tuple[GridSlam, Callable[[], Place | Outcome]]) -> JobResult:
     try:
         return JobResult(slam, job())
     except Exception as error:  # noqa: BLE001 - scans go on
-        return JobResult(slam, None, f"{type(error).__name__}: {error}")
+        text = f"loop closure failed and is off until the node restarts: {type(error).__name__}: {error}"
+        return JobResult(slam, None, Diagnosis("loops", Level.ERROR, text))

@@ -71,43 +71,28 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 10.0, math.pi / math.sqrt(3.0)
 
 
 @njit(cache=True)
-def compare_rays(  # type: ignore[no-untyped-def]
-    cells, seen, since, origin, resolution, pose, laser, points, reach, slack, occupied
-):
-    """Count how the rays of a scan agree with a map.
+def _compare_rays(cells, seen, since, origin, resolution, pose, laser, points):  # type: ignore[no-untyped-def]
+    """Numbers of rays that the map knows something about, that pass through a wall, and that end in free space.
 
-    Args:
-        cells: float32 (H, W) log-odds.
-        seen: int32 (H, W), number of the scan that last changed a cell; 0 where the map is unknown.
-        since: > 0; cells that only scans before this one have changed count as unknown.
-        origin: (2,) corner of cell (0, 0).
-        resolution: metres per cell.
-        pose: map_from_base (3,).
-        laser: (2,) the laser's centre in the base frame.
-        points: (n, 2) hits in the base frame.
-        reach: metres; farther hits are left out.
-        slack: metres between a wall and a hit that agree.
-        occupied: log-odds above which a cell is a wall.
-
-    Returns:
-        Numbers of rays that the map knows something about, that pass through a wall, and that end in free space.
+    Arguments as of `contradiction`; the laser's centre ``laser`` (2,) and the hits ``points`` (n, 2) are in the base
+    frame.
     """
     height, width = cells.shape
     cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
     x0 = (pose[0] + cos_yaw * laser[0] - sin_yaw * laser[1] - origin[0]) / resolution
     y0 = (pose[1] + sin_yaw * laser[0] + cos_yaw * laser[1] - origin[1]) / resolution
-    r = int(slack / resolution)
+    r = int(SLACK_M / resolution)
     known = through = free = 0
     for i in range(points.shape[0]):
         x = (pose[0] + cos_yaw * points[i, 0] - sin_yaw * points[i, 1] - origin[0]) / resolution
         y = (pose[1] + sin_yaw * points[i, 0] + cos_yaw * points[i, 1] - origin[1]) / resolution
         length = math.hypot(x - x0, y - y0)
-        if length * resolution > reach or length < 1.0:
+        if length * resolution > RANGE_M or length < 1.0:
             continue
         crossed = False
-        for k in range(int(length - slack / resolution)):
+        for k in range(int(length - SLACK_M / resolution)):
             u, v = math.floor(x0 + (x - x0) * k / length), math.floor(y0 + (y - y0) * k / length)
-            if 0 <= u < width and 0 <= v < height and seen[v, u] >= since and cells[v, u] > occupied:
+            if 0 <= u < width and 0 <= v < height and seen[v, u] >= since and cells[v, u] > OCCUPIED_LOG_ODDS:
                 crossed = True
                 break
         wall = unknown = False
@@ -150,9 +135,7 @@ def contradiction(
     points = scan.points
     if len(points) > POINTS:
         points = np.ascontiguousarray(points[(np.arange(POINTS) * len(points)) // POINTS])
-    known, through, free = compare_rays(
-        cells, seen, since, origin, resolution, pose, scan.origin, points, RANGE_M, SLACK_M, OCCUPIED_LOG_ODDS
-    )
+    known, through, free = _compare_rays(cells, seen, since, origin, resolution, pose, scan.origin, points)
     return min(1.0, (through + free) / max(known, LEAST_KNOWN))
 
 
@@ -274,10 +257,6 @@ class IntegrityMonitor:
         if self._log_odds < UNSEEN_MOST:
             self.after_gap = self.after_gap or (grown > 0.0 and not self.doubts)
             self._log_odds = min(self._log_odds + grown, UNSEEN_MOST)
-
-    def restart(self) -> None:
-        """Restart in another map: nothing is known against the pose."""
-        self.__init__()  # type: ignore[misc]
 
     def integrity(self, covariance: FloatArray, localized: bool) -> Integrity:
         """Trust in a pose of this ``covariance`` (3, 3); a robot without a place in its saved map is lost."""

@@ -10,6 +10,8 @@ import numpy as np
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
+LOCAL_KEYFRAMES = 40
+"""Number of recent keyframes in the local map; more reduce drift and cost more."""
 NO_SCAN = ScanPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.bool_), np.zeros(2), np.zeros((0, 2)))
 """Empty scan of a removed keyframe."""
 
@@ -21,9 +23,7 @@ class Keyframe:
     Attributes:
         stamp_ns: time of the scan.
         map_from_base: (3,), changed by optimisation.
-        covariance: (3, 3) of the match, relative to the preceding keyframes.
         scan: its points in the base frame.
-        dead_reckoned: whether the scan did not match and the pose comes from odometry.
         step: measured pose (3,) relative to the previous keyframe, at creation; zero for the first.
         step_covariance: of ``step``, in the frame of the previous keyframe (3, 3).
         drift: covariance of the pose in the whole map (3, 3), map frame; grows with the distance since the last loop
@@ -33,9 +33,7 @@ class Keyframe:
 
     stamp_ns: int
     map_from_base: FloatArray
-    covariance: FloatArray
     scan: ScanPoints
-    dead_reckoned: bool
     step: FloatArray
     step_covariance: FloatArray
     drift: FloatArray
@@ -47,32 +45,6 @@ class Keyframe:
             return self.map_from_base
         other, other_from_this = self.merged_into
         return compose2(other.pose(), other_from_this)
-
-
-class Trajectory:
-    """All keyframes in time order."""
-
-    def __init__(self) -> None:
-        self.keyframes: list[Keyframe] = []
-
-    def __len__(self) -> int:
-        return len(self.keyframes)
-
-    @property
-    def last(self) -> Keyframe:
-        """The newest keyframe."""
-        return self.keyframes[-1]
-
-    def add(self, keyframe: Keyframe) -> None:
-        self.keyframes.append(keyframe)
-
-    def recent(self, count: int) -> list[Keyframe]:
-        """The last ``count`` keyframes, oldest first."""
-        return self.keyframes[-count:]
-
-    def poses(self) -> FloatArray:
-        """map_from_base of every keyframe, (n, 3)."""
-        return np.array([keyframe.map_from_base for keyframe in self.keyframes]).reshape(-1, 3)
 
 
 def grown_drift(drift: FloatArray, way: FloatArray, yaw: float, step_covariance: FloatArray) -> FloatArray:

@@ -16,9 +16,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.scan import FloatArray
 
+SIGMA_M = 0.06
+"""σ of the field about a surface: a larger value tolerates larger errors but is less precise."""
 SURFACE_SIGMA_M = 0.04
 """Hits within this distance are averaged to one surface; about the range noise of a laser."""
 GAP_WEIGHT = 0.1
@@ -51,9 +52,8 @@ def accumulate(  # type: ignore[no-untyped-def]
     """Add the hits of one keyframe, and the surface between joined hits, to the cell sums.
 
     Args:
-        weight: float64 (H, W), as sum_x and sum_y, changed in place; coordinates in cells.
-        sum_x: weighted sum of the hits' x.
-        sum_y: weighted sum of the hits' y.
+        weight: float64 (H, W), changed in place, as sum_x and sum_y.
+        sum_x, sum_y: weighted sums of the hits' coordinates, in cells.
         touched: int32 (n, 2), row and column of the cells with weight; the first ``count`` are in use.
         count: see ``touched``.
         origin: (2,) centre of cell (0, 0), metres.
@@ -94,11 +94,7 @@ def fill_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # typ
 
     Args:
         field: float32 (H, W), changed in place.
-        weight: as in `accumulate`.
-        sum_x: as in `accumulate`.
-        sum_y: as in `accumulate`.
-        touched: as in `accumulate`.
-        count: as in `accumulate`.
+        weight, sum_x, sum_y, touched, count: as in `accumulate`.
         sigma: of the field, in cells.
         pull: σ, in cells, within which the hits of neighbouring cells count as the same surface.
     """
@@ -162,17 +158,16 @@ class LikelihoodField:
         resolution: metres per cell.
 
     Args:
-        config: resolution, σ, range.
-        margin_m: extent beyond ``max_range_m`` on each side.
+        resolution_m: cell size.
+        reach_m: half the side of the square.
     """
 
-    def __init__(self, config: FieldConfig, margin_m: float = 0.0) -> None:
-        self.config = config
-        self.resolution = config.resolution_m
-        half = math.ceil((config.max_range_m + margin_m) / config.resolution_m)
+    def __init__(self, resolution_m: float, reach_m: float) -> None:
+        self.resolution = resolution_m
+        half = math.ceil(reach_m / resolution_m)
         size = 2 * half + 1
         self.values = np.zeros((size, size), dtype=np.float32)
-        self.origin = np.array([-half * config.resolution_m, -half * config.resolution_m])
+        self.origin = np.array([-half * resolution_m, -half * resolution_m])
         self._weight = np.zeros((size, size))
         self._sum_x = np.zeros((size, size))
         self._sum_y = np.zeros((size, size))
@@ -180,11 +175,10 @@ class LikelihoodField:
 
     def rebuild(self, centre: FloatArray, surfaces: Sequence[Surface]) -> None:
         """Rebuild the field from ``surfaces``, shifted by whole cells so that ``centre`` (2,) is in the middle."""
-        config = self.config
         half = self.values.shape[0] // 2
         self.origin = (np.round(np.asarray(centre[:2]) / self.resolution) - half) * self.resolution
         self.values.fill(0.0)
-        sigma = config.sigma_m / self.resolution
+        sigma = SIGMA_M / self.resolution
         margin = math.ceil(3.0 * sigma) + 2
         count = 0
         for surface in surfaces:

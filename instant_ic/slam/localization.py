@@ -15,7 +15,7 @@ from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.loop_closure import LoopClosure, gather
-from instant_ic.slam.loop_search import POOL, ROTATION_STEP_RAD, Found, apart, pool, refined
+from instant_ic.slam.loop_search import MIN_PLACE_SCORE, POOL, ROTATION_STEP_RAD, Found, apart, pool, refined
 from instant_ic.slam.map_files import occupied_points
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.pose_graph import Edge
@@ -105,8 +105,7 @@ class Localizer:
         low = np.minimum(self.points.min(axis=0), free.min(axis=0))
         high = np.maximum(self.points.max(axis=0), free.max(axis=0))
         centre = (low + high) / 2
-        field = replace(config.field, max_range_m=float((high - low).max() / 2 + 1.0))
-        self._field = LikelihoodField(field, 0.5)
+        self._field = LikelihoodField(config.field.resolution_m, float((high - low).max() / 2 + 1.0) + 0.5)
         self._field.rebuild(
             np.array([*centre, 0.0]),
             [Surface(np.zeros(3), self.points, np.zeros(len(self.points), dtype=np.bool_))],
@@ -117,7 +116,6 @@ class Localizer:
         for level, mask in enumerate(self._free):
             mask[tuple((cells[:, ::-1] >> level).T)] = True
         self._rotations = math.ceil(2 * math.pi / ROTATION_STEP_RAD)
-        self._min_score = config.loop.min_score
 
     def find(
         self, points: FloatArray, centre: FloatArray | None = None, reach_m: float = math.inf
@@ -143,10 +141,10 @@ class Localizer:
             found = self._refined(points, starts)
             # Every pose with a score of the floor or more is examined. Those below may matter while the best is poor.
             rival = self._rival(found[0].score) if found else 0.0
-            if rival >= floor or floor <= self._min_score:
+            if rival >= floor or floor <= MIN_PLACE_SCORE:
                 break
-            floor = max(self._min_score, floor - FLOOR_STEP, rival)
-        if not found or found[0].score < self._min_score:
+            floor = max(MIN_PLACE_SCORE, floor - FLOOR_STEP, rival)
+        if not found or found[0].score < MIN_PLACE_SCORE:
             return None, False
         best = found[0]
         runner_up = max((one.score for one in found[1:] if apart(one.pose, best.pose)), default=0.0)
@@ -239,7 +237,6 @@ class SavedMap:
     """A map from disk, in which the robot is located first.
 
     Args:
-        config: parameters.
         grid: the map.
         graph: its keyframes and edges, to extend the map; None: the map stays unchanged.
 

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.keyframes import NO_SCAN, Keyframe, grown_drift, turned
+from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, NO_SCAN, Keyframe, grown_drift, turned
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
-from instant_ic.slam.loop_search import Found, find_place, spread
+from instant_ic.slam.loop_search import MIN_PLACE_SCORE, Found, find_place, spread
 from instant_ic.slam.occupancy import OccupancyMap
 from instant_ic.slam.pose_graph import Edge, optimise, residuals
 from instant_ic.slam.scan import FloatArray, ScanPoints
@@ -33,8 +33,8 @@ CHAIN_KEYFRAMES, MIN_CHAIN_KEYFRAMES = 20, 5
 reliable."""
 CHAINS = 2
 """Number of places searched at a time; the drift at the others is larger."""
-SIGMAS = 3.0
-"""Search range in standard deviations of the drift."""
+SIGMAS, MAX_REACH_M, MAX_REACH_RAD = 3.0, 10.0, 0.8
+"""Search range in standard deviations of the drift, and its limits in translation and heading."""
 MIN_SHAPE = 0.05
 """Minimum ratio of least to most information by direction; about 0 in a bare corridor."""
 MIN_GAIN = 0.35
@@ -138,8 +138,7 @@ class LoopClosure:
         self._built: FloatArray = np.zeros((0, 3))
         self._alive = np.zeros(256, dtype=np.bool_)
         self._merged: list[tuple[int, int, FloatArray]] = []
-        field = replace(config.field, max_range_m=QUERY_RANGE_M)
-        self._field = LikelihoodField(field, config.loop.max_reach_m + OVERLAP_M)
+        self._field = LikelihoodField(config.field.resolution_m, QUERY_RANGE_M + (MAX_REACH_M + OVERLAP_M))
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -163,7 +162,7 @@ class LoopClosure:
             if self.config.loop.enabled and self._travelled[here] - self._searched_at_m >= SPACING_M:
                 self._searched_at_m = self._travelled[here]
                 changed |= self._close(here)
-            self._thin_out(here - self.config.field.keyframes - 2 * QUERY_KEYFRAMES)
+            self._thin_out(here - LOCAL_KEYFRAMES - 2 * QUERY_KEYFRAMES)
         if last and self._unsettled:
             changed |= self._optimise(self.edges[len(self.edges) :])
         drift = self._drifts[-1] if self._drifts else np.zeros((3, 3))
@@ -217,16 +216,15 @@ class LoopClosure:
 
     def _close(self, here: int) -> bool:
         """Search for loops that end at keyframe ``here``; return True if poses changed."""
-        loop = self.config.loop
         first = max(0, here - QUERY_KEYFRAMES + 1)
-        old = first - self.config.field.keyframes
+        old = first - LOCAL_KEYFRAMES
         if old < MIN_CHAIN_KEYFRAMES:
             return False
         pose, drift = self._poses[here], self._drifts[here]
         sigma_m = math.sqrt(max(np.linalg.eigvalsh(drift[:2, :2])[-1], 0.0))
         sigma_rad = math.sqrt(max(drift[2, 2], 0.0))
-        reach_m = min(SIGMAS * sigma_m + 0.3, loop.max_reach_m)
-        reach_rad = min(SIGMAS * sigma_rad + 0.1, loop.max_reach_rad)
+        reach_m = min(SIGMAS * sigma_m + 0.3, MAX_REACH_M)
+        reach_rad = min(SIGMAS * sigma_rad + 0.1, MAX_REACH_RAD)
         chains = self._chains(pose, old, reach_m + OVERLAP_M)
         if not chains:
             return False
@@ -281,7 +279,7 @@ class LoopClosure:
         # In a corridor, two walls give a medium score anywhere along it. The criterion is therefore the share of the
         # remainder, unexplained by the second best pose, that the best pose explains.
         gain = (found.score - found.runner_up) / max(1.0 - found.runner_up, 1e-6)
-        return found.score >= self.config.loop.min_score and found.shape >= MIN_SHAPE and gain >= MIN_GAIN
+        return found.score >= MIN_PLACE_SCORE and found.shape >= MIN_SHAPE and gain >= MIN_GAIN
 
     def _edge(self, there: int, here: int, found: Found) -> Edge:
         covariance = _loop_covariance(found.covariance, float(self._poses[there, 2]))
@@ -336,7 +334,7 @@ class LoopClosure:
         near &= np.abs(np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))) <= SAME_PLACE_RAD
         near &= self._alive[:k]
         # the robot's own recent track is not a return to a known place
-        near[max(0, k - 2 * self.config.field.keyframes) :] = False
+        near[max(0, k - 2 * LOCAL_KEYFRAMES) :] = False
         if int(near.sum()) < SAME_PLACE:
             return
         own = [edge for edge in self.edges if k in (edge.a, edge.b)]

@@ -15,11 +15,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import wrap_angle
-from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.likelihood_field import LikelihoodField
 from instant_ic.slam.matcher import correlate, refine
 from instant_ic.slam.scan import FloatArray
 
+MIN_PLACE_SCORE = 0.6
+"""Minimum match score (0..1) of a loop, and of the robot's place in a saved map."""
 POOL = 4
 """Field cells along a side of a pooled cell."""
 
@@ -59,15 +60,7 @@ def pool(field: NDArray[np.float32], size: int) -> NDArray[np.float32]:
 def score_volume(field, origin, resolution, points, centre, cells, rotations, rotation_step):  # type: ignore[no-untyped-def]
     """Mean field value of the points at each pose of a window.
 
-    Args:
-        field: float32 (H, W).
-        origin: (2,) centre of cell (0, 0).
-        resolution: metres per cell.
-        points: (n, 2) in the base frame, n > 0.
-        centre: field_from_base (3,), middle of the window.
-        cells: half width of the window.
-        rotations: half its number of rotations.
-        rotation_step: radians.
+    Arguments as of `matcher.correlate`.
 
     Returns:
         float32 (2·rotations + 1, 2·cells + 1, 2·cells + 1): rotation, y, x.
@@ -198,7 +191,7 @@ def spread(points: FloatArray, cell_m: float, max_points: int) -> FloatArray:
 
 def warm_up() -> None:
     """Compile the kernels of the search."""
-    field = LikelihoodField(FieldConfig())
+    field = LikelihoodField(resolution_m=0.05, reach_m=5.0)
     field.values[:] = 0.5
     # More points than the coarse search takes: of these it takes every second.
     find_place(field, np.zeros((2 * COARSE_POINTS, 2)), np.zeros(3), reach_m=0.5, reach_rad=0.1)

@@ -154,9 +154,9 @@ def _number(path: Path, content: dict[str, Any], key: str, default: float | None
     return float(value)
 
 
-def occupied_points(grid: OccupancyGrid, threshold: int = 65) -> FloatArray:
+def occupied_points(grid: OccupancyGrid) -> FloatArray:
     """Centres of the occupied cells in the map, (n, 2)."""
-    rows, columns = np.nonzero(grid.values >= threshold)
+    rows, columns = np.nonzero(grid.values >= round(100 * OCCUPIED_THRESH))
     points: FloatArray = grid.origin + grid.resolution * (np.column_stack([columns, rows]) + 0.5)
     return points
 
@@ -171,7 +171,6 @@ def save_graph(stem: Path, keyframes: Sequence[Keyframe], edges: Sequence[Edge])
     arrays: dict[str, Any] = {
         "version": np.array(_GRAPH_VERSION),
         "stamps": np.array([k.stamp_ns for k in keyframes], dtype=np.int64),
-        "dead_reckoned": np.array([k.dead_reckoned for k in keyframes], dtype=np.bool_),
         "points": np.concatenate([np.zeros((0, 2)), *(k.scan.points for k in keyframes)]).astype(np.float32),
         "joined": np.concatenate([np.zeros(0, dtype=np.bool_), *(k.scan.joined for k in keyframes)]),
         "point_counts": np.array([len(k.scan.points) for k in keyframes], dtype=np.int64),
@@ -194,7 +193,7 @@ def save_graph(stem: Path, keyframes: Sequence[Keyframe], edges: Sequence[Edge])
     return path
 
 
-_MATRICES = ("covariance", "step_covariance", "drift")
+_MATRICES = ("step_covariance", "drift")
 
 
 def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
@@ -217,8 +216,8 @@ def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
         clear = np.split(data["clear_ends"].astype(np.float64), np.cumsum(data["clear_counts"])[:-1])
         keyframes = [
             Keyframe(
-                int(data["stamps"][k]), data["map_from_base"][k], data["covariance"][k],
-                ScanPoints(points[k], joined[k], data["origins"][k], clear[k]), bool(data["dead_reckoned"][k]),
+                int(data["stamps"][k]), data["map_from_base"][k],
+                ScanPoints(points[k], joined[k], data["origins"][k], clear[k]),
                 data["step"][k], data["step_covariance"][k], data["drift"][k],
             )
             for k in range(len(data["stamps"]))

@@ -249,11 +249,11 @@ class Match:
 def match_scan(
     field: LikelihoodField, points: FloatArray, guess: FloatArray, sigma: FloatArray, window: Window
 ) -> Match:
-    """Find the pose of ``points`` (n, 2), n > 0, in a likelihood field near ``guess`` (3,).
+    """Find the pose of ``points`` (n, 2), n > 0, in a likelihood field, in a window around a guess.
 
     Args:
         field: the local map.
-        points: (n, 2) in the base frame.
+        points: in the base frame.
         guess: field_from_base (3,).
         sigma: standard deviations (3,) of the guess: along, across, rotation.
         window: how far from the guess to search.

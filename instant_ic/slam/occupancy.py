@@ -20,10 +20,15 @@ from instant_ic.slam.scan import FloatArray, ScanPoints
 
 GROW_CELLS = 64
 
-HIT, MISS = 0.7, 0.4
-"""Occupancy probability of a cell in which a beam ended, and of one that a beam passed through."""
-LOW, HIGH = 0.03, 0.97
-"""Limits of a cell's probability, so that changes of the place become visible after a few scans."""
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1.0 - probability))
+
+
+HIT, MISS = _log_odds(0.7), _log_odds(0.4)
+"""Log-odds added to a cell in which a beam ended, and to one that a beam passed through."""
+LOW, HIGH = _log_odds(0.03), _log_odds(0.97)
+"""Limits of a cell's log-odds, so that changes of the place become visible after a few scans."""
 
 
 class OccupancyGrid(NamedTuple):
@@ -41,13 +46,8 @@ class OccupancyGrid(NamedTuple):
 
 
 @njit(cache=True)
-def _log_odds(probability):  # type: ignore[no-untyped-def]
-    return math.log(probability / (1.0 - probability))
-
-
-@njit(cache=True)
-def _cast(cells, seen, mark, x0, y0, x1, y1, change, low):  # type: ignore[no-untyped-def]
-    """Add ``change`` to every cell from (x0, y0) up to, but excluding, the cell of (x1, y1) (Amanatides and Woo, 1987).
+def _cast(cells, seen, mark, x0, y0, x1, y1):  # type: ignore[no-untyped-def]
+    """Add ``MISS`` to every cell from (x0, y0) up to, but excluding, the cell of (x1, y1) (Amanatides and Woo, 1987).
 
     Coordinates in cells; cell i covers i..i + 1.
     """
@@ -64,7 +64,7 @@ def _cast(cells, seen, mark, x0, y0, x1, y1, change, low):  # type: ignore[no-un
     for _ in range(abs(end_x - ix) + abs(end_y - iy)):
         if 0 <= ix < width and 0 <= iy < height and seen[iy, ix] != mark:
             seen[iy, ix] = mark
-            cells[iy, ix] = max(cells[iy, ix] + change, low)
+            cells[iy, ix] = max(cells[iy, ix] + MISS, LOW)
         if next_x < next_y:
             next_x += delta_x
             ix += step_x
@@ -75,14 +75,13 @@ def _cast(cells, seen, mark, x0, y0, x1, y1, change, low):  # type: ignore[no-un
 
 @njit(cache=True)
 def cast_scan(  # type: ignore[no-untyped-def]
-    cells, seen, mark, origin, resolution, pose, laser, points, clear_ends, max_range, hit, miss, low, high
+    cells, seen, mark, origin, resolution, pose, laser, points, clear_ends, max_range
 ):
     """Add one scan to log-odds ``cells`` float32 (H, W).
 
     Args:
         cells: changed in place.
-        seen: int32 (H, W), ``mark`` where this scan has changed the cell.
-        mark: > 0, grows from scan to scan.
+        seen: int32 (H, W), ``mark`` where this scan has changed the cell; it is > 0 and grows from scan to scan.
         origin: (2,) corner of cell (0, 0).
         resolution: metres per cell.
         pose: map_from_base (3,).
@@ -90,10 +89,6 @@ def cast_scan(  # type: ignore[no-untyped-def]
         points: (n, 2) hits in the base frame.
         clear_ends: (m, 2) ends of free rays in the base frame.
         max_range: metres; a farther hit only clears the cells up to it.
-        hit: log-odds added to the cell of a hit.
-        miss: log-odds added to the cells that a ray passes.
-        low: minimum log-odds of a cell.
-        high: maximum log-odds of a cell.
     """
     height, width = cells.shape
     cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
@@ -118,11 +113,11 @@ def cast_scan(  # type: ignore[no-untyped-def]
             ix, iy = math.floor(x), math.floor(y)
             if 0 <= ix < width and 0 <= iy < height and seen[iy, ix] != mark:
                 seen[iy, ix] = mark
-                cells[iy, ix] = min(cells[iy, ix] + hit, high)
+                cells[iy, ix] = min(cells[iy, ix] + HIT, HIGH)
         ends[i, 0] = x
         ends[i, 1] = y
     for i in range(n + m):
-        _cast(cells, seen, mark, laser_x, laser_y, ends[i, 0], ends[i, 1], miss, low)
+        _cast(cells, seen, mark, laser_x, laser_y, ends[i, 0], ends[i, 1])
 
 
 @njit(cache=True)
@@ -151,7 +146,6 @@ class OccupancyMap:
         self.version = 0
         self.clipped = 0
         self._mark = 0
-        self._log_odds = [_log_odds(probability) for probability in (HIT, MISS, LOW, HIGH)]
         self._centre: NDArray[np.int64] | None = None  # cell of the first pose
         self._first = np.zeros(2, dtype=np.int64)  # cell index of the corner; the corner is first·resolution
         self._cells = np.zeros((0, 0), dtype=np.float32)
@@ -169,7 +163,7 @@ class OccupancyMap:
         self._mark += 1
         cast_scan(
             self._cells, self._seen, self._mark, self.origin, self.config.resolution_m, map_from_base, scan.origin,
-            scan.points, scan.clear_ends, self.config.max_range_m, *self._log_odds,
+            scan.points, scan.clear_ends, self.config.max_range_m,
         )  # fmt: skip
         self.version += 1
 
@@ -178,7 +172,7 @@ class OccupancyMap:
         """A map with the walls, the free and the unknown cells of a grid, to compare scans with."""
         made = cls(MapConfig(resolution_m=grid.resolution))
         made._first = np.round(grid.origin / grid.resolution).astype(np.int64)
-        made._cells = np.where(grid.values >= 50, made._log_odds[3], made._log_odds[2]).astype(np.float32)
+        made._cells = np.where(grid.values >= 50, HIGH, LOW).astype(np.float32)
         made._seen = (grid.values >= 0).astype(np.int32)
         return made
 

@@ -79,6 +79,8 @@ def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
     return np.array([c * vx - d * vy, d * vx + c * vy, angle])
 
 
+SPEED_MPS, YAW_RATE_RADPS = 1.0, 1.0
+"""Speed limits of a correction, for the base's position in the map and its heading."""
 JUMP_M, JUMP_RAD = 0.5, 0.5
 """A larger correction is broadcast at once."""
 
@@ -89,15 +91,9 @@ class CorrectionLimiter:
     A recovered track or a closed loop may correct the pose by decimetres at once; the limiter keeps the robot's pose in
     the map continuous. Ordinary corrections of a few centimetres per scan pass unchanged. So does a correction by more
     than ``JUMP_M`` or ``JUMP_RAD``: the old pose is wrong, and the longer it is broadcast, the longer it misleads.
-
-    Args:
-        speed_mps: limit for the base's position in the map, m/s.
-        yaw_rate_radps: limit for its heading, rad/s.
     """
 
-    def __init__(self, speed_mps: float, yaw_rate_radps: float) -> None:
-        self.speed_mps = speed_mps
-        self.yaw_rate_radps = yaw_rate_radps
+    def __init__(self) -> None:
         self._map_from_odom: FloatArray | None = None
         self._stamp_ns = 0
 
@@ -119,9 +115,9 @@ class CorrectionLimiter:
             part = 1.0
             jumps = distance > JUMP_M or abs(turn) > JUMP_RAD
             if distance > 0 and not jumps:
-                part = min(part, self.speed_mps * elapsed_s / distance)
+                part = min(part, SPEED_MPS * elapsed_s / distance)
             if turn != 0 and not jumps:
-                part = min(part, self.yaw_rate_radps * elapsed_s / abs(turn))
+                part = min(part, YAW_RATE_RADPS * elapsed_s / abs(turn))
             if part >= 1.0:
                 limited = map_from_odom.copy()
             else:

@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 
 from instant_ic.slam.scan import FloatArray
 
-ROBUST_WIDTHS = (1e4, 1e2, 1.0)
-"""Widths of the robust kernel per stage, in multiples of the final width."""
+ROBUST_WIDTHS = (25e4, 25e2, 25.0)
+"""Width of the robust kernel per stage: an edge keeps its full weight up to this χ², and less beyond it."""
+ITERATIONS = 10
+"""Maximum number of iterations per stage."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,10 @@ class Solution:
 
     Attributes:
         poses: (n, 3).
-        chi2: of each edge (m,), without robust scaling.
         weights: weight of each edge after the robust kernel (m,), 0..1; 1 for edges that are not robust.
     """
 
     poses: FloatArray
-    chi2: FloatArray
     weights: FloatArray
 
 
@@ -64,17 +64,13 @@ def residuals(poses: FloatArray, a: NDArray[np.intp], b: NDArray[np.intp], measu
     return np.column_stack([cos * dx + sin * dy - measured[:, 0], -sin * dx + cos * dy - measured[:, 1], turn])
 
 
-def optimise(
-    poses: FloatArray, edges: Sequence[Edge], index: dict[int, int], robust_chi2: float = 25.0, iterations: int = 10
-) -> Solution:
+def optimise(poses: FloatArray, edges: Sequence[Edge], index: dict[int, int]) -> Solution:
     """Optimise the poses over all edges; the first node stays fixed.
 
     Args:
         poses: (n, 3), initial values.
         edges: between the nodes.
         index: row in ``poses`` of each node's id.
-        robust_chi2: width of the robust kernel: an edge keeps its full weight up to this χ², and less beyond it.
-        iterations: maximum number of iterations per stage.
 
     Raises:
         ValueError: an edge refers to an unknown node, or part of the graph is not connected to the first node.
@@ -86,17 +82,17 @@ def optimise(
         raise ValueError(f"an edge refers to node {missing}, which is not in the graph") from None
     poses = poses.copy()
     if len(edges) == 0 or len(poses) < 2:
-        return Solution(poses, np.zeros(len(edges)), np.ones(len(edges)))
+        return Solution(poses, np.ones(len(edges)))
     measured = np.array([edge.a_from_b for edge in edges])
     information = np.linalg.inv(np.array([edge.covariance for edge in edges]))
     robust = np.array([edge.robust for edge in edges])
-    stages = [width * robust_chi2 for width in ROBUST_WIDTHS] if robust.any() else [math.inf]
+    stages = ROBUST_WIDTHS if robust.any() else (math.inf,)
     for width in stages:
         damping = 1e-6
         error = residuals(poses, a, b, measured)
         chi2 = np.einsum("mi,mij,mj->m", error, information, error)
         cost = _robust_cost(chi2, robust, width)
-        for _ in range(iterations):
+        for _ in range(ITERATIONS):
             step = _step(poses, a, b, error, information * _weights(chi2, robust, width)[:, None, None] ** 2, damping)
             if not np.isfinite(step).all():
                 raise ValueError("the graph is not connected: no path from some nodes to the first one")
@@ -115,7 +111,7 @@ def optimise(
             if gain <= 1e-4 * cost + 1e-9 or np.abs(step).max() < 1e-4:
                 break
     poses[:, 2] = np.arctan2(np.sin(poses[:, 2]), np.cos(poses[:, 2]))
-    return Solution(poses, chi2, _weights(chi2, robust, stages[-1]))
+    return Solution(poses, _weights(chi2, robust, stages[-1]))
 
 
 def _weights(chi2: FloatArray, robust: NDArray[np.bool_], width: float) -> FloatArray:

@@ -12,6 +12,10 @@ from instant_ic.slam.config import QueueConfig
 from instant_ic.slam.odometry import OdometryBuffer
 from instant_ic.slam.scan import FloatArray, Scan
 
+STARTUP_WAIT_S, EXTRAPOLATE_S = 1.0, 0.2
+"""Longest time that the first scans wait for any odometry; longest extrapolation of the last motion."""
+TIME_JUMP_S = 1.0
+"""A larger jump back in time starts a new map (a bag played again)."""
 SILENT_NS = 500_000_000
 """Odometry is not waited for if its newest stamp is farther than this from the scan's."""
 
@@ -57,7 +61,7 @@ class ScanQueue:
     def add_odometry(self, stamp_ns: int, odom_from_base: FloatArray) -> bool:
         """Add odometry (3,). Return False if it is not finite, or not newer than the last."""
         newest = self._wheel.newest_ns
-        if newest is not None and newest - stamp_ns > self.config.reset_on_time_jump_s * 1e9:
+        if newest is not None and newest - stamp_ns > TIME_JUMP_S * 1e9:
             self._wheel.clear()
         return self._wheel.add(stamp_ns, odom_from_base)
 
@@ -74,7 +78,7 @@ class ScanQueue:
         if self.last_ns is None or stamp_ns > self.last_ns:
             return 0.0
         back_s = (self.last_ns - stamp_ns) * 1e-9
-        if back_s <= self.config.reset_on_time_jump_s:
+        if back_s <= TIME_JUMP_S:
             raise ScanError(f"the scan is not newer than the one before ({back_s:.3f} s back in time)")
         return back_s
 
@@ -111,7 +115,7 @@ class ScanQueue:
                 if odometry is None:
                     if self._worth_waiting(queued, now_ns):
                         return
-                    odometry = self._wheel.at(queued.scan.stamp_ns, self.config.odom_extrapolate_s)
+                    odometry = self._wheel.at(queued.scan.stamp_ns, EXTRAPOLATE_S)
             self._waiting.popleft()
             yield queued, odometry
 
@@ -120,7 +124,7 @@ class ScanQueue:
         newest = self._wheel.newest_ns
         if newest is None:
             self._first_wait_ns = self._first_wait_ns or queued.arrived_ns
-            return now_ns - self._first_wait_ns < self.config.odom_startup_wait_s * 1e9
+            return now_ns - self._first_wait_ns < STARTUP_WAIT_S * 1e9
         if abs(queued.scan.stamp_ns - newest) >= SILENT_NS:
             return False  # the wheels have long been silent, or the scan is older than the stored odometry
         return now_ns - queued.arrived_ns < self.config.odom_wait_s * 1e9

@@ -41,7 +41,7 @@ def test_messages_in_the_sockets_at_the_end_are_in_the_bag(
         publisher.send(b"\0\1\0\0\1")
 
         def arrived() -> bool:
-            with transport._host.read_lock:
+            with transport.read_lock:
                 return bool(int(subscription._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
 
         wait_for(arrived)

@@ -5,7 +5,7 @@ import time
 from live_nodes import Neighbour, wait_for
 
 from instant_ic.bus import registry
-from instant_ic.bus.topic_watch import TopicWatch
+from instant_ic.bus.registry import TopicWatch
 from instant_ic.msg import Bool, String
 
 

@@ -20,7 +20,7 @@ class Interrupted(Node[InterruptedConfig]):
         self.timer(0.05, self.tick)
 
     def tick(self) -> None:
-        with self._transport._read_lock:  # as inside any call of the transport
+        with self._transport.read_lock:  # as inside any call of the transport
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.05)
 

@@ -133,7 +133,7 @@ def test_dora_3518_loss_of_a_reader_that_stands_still_is_counted(bus: Bus) -> No
     """Sockets and queues full, as of a recorder on a stalled disk: received and lost together are what was sent."""
     out, reader = bus.publisher(), bus.reader()
     wait_for(lambda: out.subscriber_count == 1)
-    with reader.transport._read_lock:  # its process stands still
+    with reader.transport.read_lock:  # its process stands still
         for i in range(1, 3001):
             out.send(numbered(i, 2000))
     sent = 3000
@@ -156,7 +156,7 @@ def test_dora_3518_loss_of_a_reader_that_stands_still_is_counted(bus: Bus) -> No
 def test_losses_stand_in_heartbeat_and_diagnostics_by_publisher(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     out = bus.publisher()
     node = Node[None](None, bus.node("reader"), SystemClock(), "reader")
-    subscription = node.subscribe_raw("/x", lambda *_: None)
+    subscription = node.subscribe_received("/x", lambda _: None)
     node.start()
     wait_for(lambda: out.subscriber_count == 1)
     out.send(numbered(1))
@@ -182,7 +182,7 @@ def test_dora_2152_a_node_exits_though_its_reader_stands_still(bus: Bus) -> None
     )
     try:
         wait_for(lambda: len(reader.poll()) > 10)
-        with reader.transport._read_lock:
+        with reader.transport.read_lock:
             process.send_signal(signal.SIGINT)
             assert process.wait(30) == 0
     finally:
@@ -194,7 +194,7 @@ def test_foxglove_bridge_329_stale_flood_after_a_stall(bus: Bus) -> None:
     """After a stall the newest message is there, once; those that nobody wanted any more are not called lost."""
     out, reader = bus.publisher(qos=SENSOR), bus.reader(qos=SENSOR)
     wait_for(lambda: out.subscriber_count == 1)
-    with reader.transport._read_lock:
+    with reader.transport.read_lock:
         for i in range(1, 201):
             out.send(numbered(i, 20_000))  # 4 MB: more than its socket holds
     wait_for(lambda: reader.raw._queue and number(reader.raw._queue[-1]) == 200)
@@ -206,7 +206,7 @@ def test_zeromq_conflate_gives_a_piece_of_a_message(bus: Bus) -> None:
     """The newest message, and the whole of it, when many were replaced on the way."""
     out, reader = bus.publisher(qos=SENSOR), bus.reader(qos=SENSOR)
     wait_for(lambda: out.subscriber_count == 1)
-    with reader.transport._read_lock:
+    with reader.transport.read_lock:
         for i in range(1, 101):
             out.send(numbered(i, 90_000))  # through the socket, which takes it in parts
     wait_for(lambda: reader.raw._queue and number(reader.raw._queue[-1]) == 100)
@@ -497,7 +497,7 @@ def test_writing_over_a_lent_buffer_is_seen_and_told(bus: Bus, caplog: pytest.Lo
     reader.received.clear()
     gc.collect()
     wait_for(lambda: reader.stats.overwritten == 1)
-    with reader.transport._read_lock:
+    with reader.transport.read_lock:
         out.send(numbered(2, LARGE))
         out._pool.slots[-1].finish(98)
     wait_for(lambda: reader.stats.lost_by == {"sender": 1})
@@ -527,7 +527,7 @@ def test_reader_goes_on_after_it_held_all_it_may_hold(bus: Bus, qos: QoS) -> Non
     wait_for(lambda: out.subscriber_count == 2)
     last = 0
     for _ in range(5):
-        with reader.transport._read_lock:  # its process stands still, and then both go on together
+        with reader.transport.read_lock:  # its process stands still, and then both go on together
             for _ in range(30):
                 out.send(numbered(last := last + 1, LARGE))
         out.send(numbered(last := last + 1, LARGE))

@@ -115,7 +115,7 @@ def test_describe_and_get(tuned):
 def test_set_is_taken_on_the_nodes_thread_and_told(tuned):
     node, client = tuned
     heard = []
-    node.subscribe_raw("/parameter_events", lambda *message: heard.append(message))
+    node.subscribe_received("/parameter_events", heard.append)
     node.on_registry_change = lambda: heard.append(node.describe()["params"]["inner"]["gain"])
     deadline = time.monotonic() + 20
     while not node._parameter_events.subscriber_count and time.monotonic() < deadline:
@@ -127,7 +127,7 @@ def test_set_is_taken_on_the_nodes_thread_and_told(tuned):
     while len(heard) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
     assert heard[0] == 1.0  # ic param, the bag's metadata and others read the registry
-    event = deserialize(heard[1][2], heard[1][1])
+    event = deserialize(heard[1].payload, heard[1].type_name)
     assert event.node == "/tuned"
     assert [(p.name, p.value.type) for p in event.changed_parameters] == [("places", 8), ("inner.gain", 3)]
     assert event.changed_parameters[0].value.double_array_value.tolist() == [4.0, 5.0, 6.0]
@@ -198,7 +198,7 @@ def test_command_that_has_started_is_not_reported_as_dropped(tuned, monkeypatch)
 def test_log_level(tuned):
     node, client = tuned
     heard = []
-    node.subscribe_raw("/rosout", lambda *message: heard.append(deserialize(message[2], message[1])))
+    node.subscribe_received("/rosout", lambda m: heard.append(deserialize(m.payload, m.type_name)))
     deadline = time.monotonic() + 20
     while not node._rosout.subscriber_count and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -221,7 +221,7 @@ def test_bad_log_line_ends_no_callback(tuned, capsys):
     """A format that does not fit is told on the error output, as logging does; odd characters are replaced."""
     node, _ = tuned
     heard = []
-    node.subscribe_raw("/rosout", lambda *message: heard.append(deserialize(message[2], message[1]).msg))
+    node.subscribe_received("/rosout", lambda m: heard.append(deserialize(m.payload, m.type_name).msg))
     deadline = time.monotonic() + 20
     while not node._rosout.subscriber_count and time.monotonic() < deadline:
         time.sleep(0.01)

@@ -38,14 +38,14 @@ class Stranger:
         self.out, self.reader = bus.publisher(), bus.reader()
         wait_for(lambda: self.out.subscriber_count == 1)
         raw = self.reader.raw
-        with self.reader.transport._read_lock:
+        with self.reader.transport.read_lock:
             self._socket = raw._host.context.socket(zmq.PUB)
             self._socket.bind("inproc://stranger")
             raw._socket.connect("inproc://stranger")
             raw.read()
 
     def send(self, *parts: bytes) -> None:
-        with self.reader.transport._read_lock:
+        with self.reader.transport.read_lock:
             self._socket.send_multipart(parts)
             self.reader.raw.read()
 
@@ -269,7 +269,7 @@ def test_larger_and_larger_messages_reach_the_reader(bus: Bus) -> None:
 def test_stopped_reader_costs_bounded_memory_and_loses_nothing_up_to_there(bus: Bus) -> None:
     out, reader = bus.publisher(), bus.reader()
     wait_for(lambda: out.subscriber_count == 1)
-    with reader.transport._read_lock:
+    with reader.transport.read_lock:
         for i in range(1, 41):
             out.send(numbered(i, LARGE))
         assert len(out._pool.slots) <= 9 and out.stats.not_shared >= 30

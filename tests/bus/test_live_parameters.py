@@ -62,8 +62,8 @@ def test_depth_scaler(bus):
 
 def test_grid_slam(bus):
     node = bus.add(node_class("grid_slam"))
-    node.set_parameters({"correction_speed_mps": 0.5})
-    assert node.limiter.speed_mps == 0.5
+    node.set_parameters({"odom_wait_s": 0.3})
+    assert node.queue.config.odom_wait_s == 0.3
 
 
 def test_mount_of_the_camera_is_told_anew(bus, tmp_path):

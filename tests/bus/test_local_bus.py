@@ -300,54 +300,51 @@ def test_signal_while_the_loop_holds_its_lock_does_not_hang(run_dir):
 def test_an_event_that_is_written_late_ends_one_wait_not_all(bus):
     """`clear` may come between a `set` and its write in another thread; the node would then spin until the next one."""
     transport = bus.node("reader")
-    waker = transport.waker()
     ends: list[None] = []
     os.eventfd_write(transport._wake, 1)
     deadline = time.monotonic() + 0.3
     while time.monotonic() < deadline:
-        waker.wait(0.1)
-        waker.clear()
+        transport.wait(0.1)
+        transport.clear()
         ends.append(None)
     assert len(ends) <= 6
 
 
 def test_an_event_during_a_long_callback_does_not_keep_the_bus_thread_busy(bus, monkeypatch):
     transport = bus.node("reader")
-    waker = transport.waker()
-    subscription = transport.subscribe("/x", BYTES, RELIABLE, waker.set)
+    subscription = transport.subscribe("/x", BYTES, RELIABLE, transport.set)
     publisher = bus.publisher("/x")
     wait_for(lambda: publisher.subscriber_count)
-    waker.wait(0.01)
+    transport.wait(0.01)
     rounds: list[None] = []
     read = transport._read
     monkeypatch.setattr(transport, "_read", lambda *args, **names: (rounds.append(None), read(*args, **names)))
     publisher.send(b"first")  # the bus thread reads it and sets the event
-    wait_for(lambda: waker._set)
+    wait_for(lambda: transport._set)
     time.sleep(0.2)
     assert len(rounds) <= 6
-    waker.wait(3600.0)  # ended by the event
-    waker.clear()
+    transport.wait(3600.0)  # ended by the event
+    transport.clear()
     assert [bytes(received.payload) for received in subscription.take()] == [b"first"]
 
 
 def test_messages_do_not_wake_a_patient_node_and_are_all_read_when_it_wakes(bus):
     transport = bus.node("reader")
-    waker = transport.waker()
     transport.patient = True
-    waker.wait(0.0)  # until the first wait the bus thread reads
-    subscription = transport.subscribe("/x", BYTES, RELIABLE, waker.set)
+    transport.wait(0.0)  # until the first wait the bus thread reads
+    subscription = transport.subscribe("/x", BYTES, RELIABLE, transport.set)
     publisher = bus.publisher("/x")
     wait_for(lambda: publisher.subscriber_count)
     sent = [b"%d" % number for number in range(20)]
     for payload in sent:
         publisher.send(payload)
     began = time.monotonic()
-    waker.wait(0.3)
+    transport.wait(0.3)
     assert time.monotonic() - began > 0.29
     assert [bytes(received.payload) for received in subscription.take()] == sent
-    waker.clear()
-    threading.Timer(0.05, waker.set).start()
-    waker.wait(3600.0)  # ended by the event
+    transport.clear()
+    threading.Timer(0.05, transport.set).start()
+    transport.wait(3600.0)  # ended by the event
 
 
 def test_a_topic_whose_empty_folder_was_swept_is_heard_and_holds_up_no_other(bus, caplog):

@@ -503,10 +503,10 @@ def test_vspace_and_battery_are_told(setup):
 def test_configuration_file_holds_the_defaults():
     from pathlib import Path
 
-    from instant_ic.bus.process import load_config
+    from instant_ic.config.params import configure, gather
 
     file = Path(__file__).resolve().parents[2] / "config" / "console.yaml"
-    assert load_config(ConsoleNode, "console", [file], [])[0] == ConsoleConfig()
+    assert configure(ConsoleConfig, gather("console", [file], []))[0] == ConsoleConfig()
 
 
 @pytest.mark.parametrize(("key", "value"), [("dissolve_ms", -1), ("map_rate_hz", -2)])

@@ -935,13 +935,13 @@ def _logs() -> list[bytes]:
 
 
 def _parse_log() -> Callable[[bytes], object]:
-    from instant_ic.slam.logs import read_log
+    from instant_ic.experiments.slam_logs import read_log
 
     return _by_file("log", lambda path: list(read_log(path)))
 
 
 def _log_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.slam.logs import LogError
+    from instant_ic.experiments.slam_logs import LogError
 
     return (LogError,)
 

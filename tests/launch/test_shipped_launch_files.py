@@ -6,11 +6,11 @@ import pytest
 import yaml
 
 from instant_ic import paths
-from instant_ic.bus.node_files import node_class
 from instant_ic.experiments.study.trial import ARBITERS
 from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
 from instant_ic.launch.parameters import check_parameters
 from instant_ic.launch.source import LaunchFileError
+from instant_ic.sim.real_time import SERIAL_LINK
 
 NAMES = sorted(file.stem for file in paths.share_dir("launch").glob("*.yaml"))
 NEEDED = {"replay": {"bag": "drive"}, "fleet_robot": {"robot_name": "robot4"}}
@@ -82,7 +82,7 @@ def test_simulated_devices_and_drivers_meet() -> None:
     assert "host:=127.0.0.1" in found["vlp16_driver"]
     assert "roboclaw.port:=/run/here/dev/roboclaw" in found["crawler_base"]
     assert "server.port:=9004" in found["console"]
-    assert node_class("simulator").config_class()().base.link == "roboclaw"
+    assert SERIAL_LINK == "roboclaw"
 
 
 def test_depth_is_taken_unchecked_only_where_it_is_asked_for() -> None:

@@ -92,7 +92,7 @@ def test_no_start_inside_a_wall(box_room: World) -> None:
         TrackedRobot(EXACT, box_room.occupied(0.03, 0.9, 0.01), (2.9, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(("key", "value"), [("slip", 0.6), ("contact_low", 1.0), ("motor_lag_s", -1.0)])
+@pytest.mark.parametrize(("key", "value"), [("slip", 0.6), ("motor_lag_s", -1.0)])
 def test_bad_parameters_are_named(key: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{key}.*got"):
         RobotConfig(**{key: value})

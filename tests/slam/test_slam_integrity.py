@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from instant_ic.experiments.slam_faults import evaluate_faults, kidnap
+from instant_ic.experiments.slam_logs import LogEntry
 from instant_ic.experiments.slam_sim import round_trip
 from instant_ic.sim.worlds import make_world
 from instant_ic.slam import GridSlam
@@ -19,7 +20,6 @@ from instant_ic.slam.integrity import (
     contradiction,
     mixture,
 )
-from instant_ic.slam.logs import LogEntry
 from instant_ic.slam.scan import ScanPoints
 
 KNOWN_FREE, WALL = -3.0, 3.0

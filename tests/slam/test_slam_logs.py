@@ -24,7 +24,7 @@ from instant_ic.experiments.slam import (
     relation_error,
     run_log,
 )
-from instant_ic.slam.logs import LogEntry, LogError, read_carmen, read_log, read_mines
+from instant_ic.experiments.slam_logs import LogEntry, LogError, read_carmen, read_log, read_mines
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "slam2d"
 real_data = [
@@ -129,7 +129,6 @@ def test_readings_that_pile_up_at_the_top_mean_nothing_was_met(tmp_path: Path) -
     # The same readings with a maximum that the log itself gives, and one that the caller gives.
     named = write(tmp_path / "b.log", "PARAM robot_front_laser_max 5.0 n 0 h 0\n" + "".join(lines))
     assert max(r for e in read_carmen(named) for r in e.scan.ranges if np.isfinite(r)) < 5.0
-    assert np.isfinite(next(iter(read_carmen(named, 20.0))).scan.ranges).all()
     # A wall at the far end of a room is no pile.
     wall = [6.0 + round(0.01 * (k % 3), 2) for k in range(20)]
     far = [flaser([3.0] * 160 + wall, [k, 0, 0], [k, 0, 0], float(k)) for k in range(200, 210)]

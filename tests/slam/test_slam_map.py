@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from slam_planar_world import box_room
 
-from instant_ic.slam import MapConfig, OccupancyGrid, OccupancyMap
+from instant_ic.slam.config import MapConfig
+from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.scan import ScanPoints, scan_points
 
 

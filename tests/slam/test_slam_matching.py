@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from slam_planar_world import PlanarWorld, box_room, corridor
 
-from instant_ic.slam import FieldConfig, MatchConfig
+from instant_ic.slam.config import MatchConfig
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.matcher import Window, match_scan
 from instant_ic.slam.scan import ScanPoints, scan_points, thin
@@ -21,7 +21,7 @@ def points_at(world: PlanarWorld, pose: list[float], noise_m: float = 0.0, stamp
 
 
 def field_of(world: PlanarWorld, *poses: list[float], noise_m: float = 0.0) -> LikelihoodField:
-    field = LikelihoodField(FieldConfig(), 1.7)
+    field = LikelihoodField(0.05, 25.0 + 1.7)
     surfaces = []
     for index, pose in enumerate(poses):
         points = points_at(world, pose, noise_m, stamp=index + 1)

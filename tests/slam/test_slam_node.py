@@ -144,7 +144,7 @@ def test_no_wheel_odometry_at_all_is_told_and_bridged() -> None:
     rig = Rig()
     rig.scan()
     rig.drive(0.3, 0.0, 5, wheels=False)
-    assert rig.bus.messages("/pose") == []  # within odom_startup_wait_s
+    assert rig.bus.messages("/pose") == []  # within STARTUP_WAIT_S
     rig.drive(0.3, 0.0, 15, wheels=False)
     assert len(rig.bus.messages("/pose")) == 21  # none of those that waited is lost
     assert len(rig.transforms("base_link")) == 21

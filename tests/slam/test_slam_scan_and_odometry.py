@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from instant_ic.geometry.poses import compose2, relative2
-from instant_ic.slam import FieldConfig, MapConfig, MatchConfig, OdometryNoise, Scan
+from instant_ic.slam import Scan
+from instant_ic.slam.config import FieldConfig, MapConfig, MatchConfig
 from instant_ic.slam.odometry import CorrectionLimiter, OdometryBuffer
 from instant_ic.slam.scan import scan_points, thin
 
@@ -86,9 +87,7 @@ def test_a_scan_that_makes_no_sense_is_refused(arguments: dict) -> None:
 @pytest.mark.parametrize(
     ("make", "key"),
     [
-        (lambda: OdometryNoise(translation_floor_m=0.0), "translation_floor_m"),
-        (lambda: FieldConfig(keyframes=0), "keyframes"),
-        (lambda: MatchConfig(min_score=0.9), "recovery_score"),
+        (lambda: FieldConfig(resolution_m=0.0), "resolution_m"),
         (lambda: MatchConfig(max_points=5), "max_points"),
         (lambda: MapConfig(max_size_m=10.0), "max_size_m"),
     ],
@@ -139,7 +138,7 @@ def test_two_halves_of_an_arc_make_the_whole(start: np.ndarray, step: np.ndarray
 
 
 def test_small_corrections_pass_and_large_ones_arrive_at_the_given_speed() -> None:
-    limiter = CorrectionLimiter(speed_mps=1.0, yaw_rate_radps=1.0)
+    limiter = CorrectionLimiter()
     base = np.array([5.0, 0.0, 0.0])
     assert np.allclose(limiter.follow(np.zeros(3), base, 0), 0)
     small = np.array([0.03, 0.0, 0.0])
@@ -152,14 +151,14 @@ def test_small_corrections_pass_and_large_ones_arrive_at_the_given_speed() -> No
 
 def test_a_robot_that_was_carried_off_is_where_it_is_at_once() -> None:
     for moved in ([0.6, 0.0, 0.0], [0.0, 0.0, 0.6]):
-        limiter = CorrectionLimiter(speed_mps=1.0, yaw_rate_radps=1.0)
+        limiter = CorrectionLimiter()
         limiter.follow(np.zeros(3), np.zeros(3), 0)
         assert np.allclose(limiter.follow(np.array(moved), np.zeros(3), 100_000_000), moved)
 
 
 def test_the_limit_of_a_turn_holds_at_the_robot_not_at_the_origin() -> None:
     # 0.004 rad about the origin moves a robot 100 m away by 0.4 m.
-    limiter = CorrectionLimiter(speed_mps=1.0, yaw_rate_radps=10.0)
+    limiter = CorrectionLimiter()
     base = np.array([100.0, 0.0, 0.0])
     limiter.follow(np.zeros(3), base, 0)
     limited = limiter.follow(np.array([0.0, 0.0, 0.004]), base, 100_000_000)

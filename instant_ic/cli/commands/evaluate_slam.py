@@ -15,7 +15,7 @@ from instant_ic.cli.progress import progress
 
 if TYPE_CHECKING:
     from instant_ic.experiments.slam import LogResult
-    from instant_ic.slam.logs import LogEntry
+    from instant_ic.experiments.slam_logs import LogEntry
 
 
 def add_kind(kinds: Any) -> None:
@@ -74,7 +74,7 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     )
     from instant_ic.experiments.slam_bag import is_bag, read_bag
     from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
-    from instant_ic.slam.logs import BadLines, LogError, read_log
+    from instant_ic.experiments.slam_logs import BadLines, LogError, read_log
 
     if args.stamps and not args.relations:
         raise UserError("--stamps selects relations: give --relations too", 2)

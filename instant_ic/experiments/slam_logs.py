@@ -118,7 +118,7 @@ def read_log(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry
         first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     fields = first.split()
     mines = len(fields) > _MINES_FIRST_RANGE and fields[0].lstrip("-").isdigit()
-    yield from read_mines(path, bad) if mines else read_carmen(path, bad=bad)
+    yield from read_mines(path, bad) if mines else read_carmen(path, bad)
 
 
 @dataclass(frozen=True)
@@ -141,25 +141,18 @@ _SICK_RANGE_MAX_M = 80.0
 _SURVEYED_SCANS = 400
 
 
-def read_carmen(path: str | Path, range_max: float | None = None, bad: BadLines | None = None) -> Iterator[LogEntry]:
+def read_carmen(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
     """Scans of a CARMEN log.
 
     ``FLASER n r0..rn-1 x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``, right to left, with
     the middle beam pointing forward. ``ROBOTLASER1`` lines hold their own angles and maximum range. Other messages are
     skipped. The laser's mounting pose is the difference between the two poses of a line, if it is the same on all
     lines. Otherwise the first pose is a corrected one, and the laser is assumed to be mounted at the robot's centre.
-    The odometry is the second pose, the first if the second never changes, or none if neither changes.
-
-    Args:
-        path: the log, gzip or not.
-        range_max: FLASER readings at or above it, in metres, mean "no return". None: the log's own ``PARAM``, or the
-            value at which readings pile up, or 80 m.
-        bad: as `read_log`.
-
-    Raises:
-        LogError: a line cannot be read, or the log has no scan.
+    The odometry is the second pose, the first if the second never changes, or none if neither changes. FLASER readings
+    mean "no return" from the log's own ``PARAM`` on, or from the value at which readings pile up, or from 80 m on.
+    Arguments and errors as of `read_log`.
     """
-    survey = _survey(path, range_max)
+    survey = _survey(path)
     scans = 0
     with open_log(path, bad) as lines:
         for number, line in enumerate(lines, start=1):
@@ -182,8 +175,9 @@ def _nothing(error: LogError, bad: BadLines | None) -> LogError:
     return LogError(f"{bad.errors[0]} (and no line can be read)") if bad and bad.errors else error
 
 
-def _survey(path: str | Path, range_max: float | None) -> _Survey:
+def _survey(path: str | Path) -> _Survey:
     """Read a whole CARMEN log once; malformed lines are skipped here and reported by the reader."""
+    range_max: float | None = None
     poses: list[FloatArray] = []
     readings: list[FloatArray] = []
     with open_log(path, BadLines()) as lines:
@@ -343,10 +337,8 @@ def read_mines(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEnt
 
     Columns: 0 is the time in µs, 2 and 3 the left and right ticks, from 24 on 682 ranges in mm over 240°, right to
     left. The outer 70 on each side are unusable. 0 and the sensor's small error codes are erroneous (NaN). The odometry
-    is integrated from the ticks with differential drive kinematics and starts at the origin. ``bad``: as `read_log`.
-
-    Raises:
-        LogError: a line cannot be read, or the log has no scan.
+    is integrated from the ticks with differential drive kinematics and starts at the origin. Arguments and errors as of
+    `read_log`.
     """
     increment = _MINES_FIELD_OF_VIEW / (_MINES_RANGES - 1)
     angle_min = -_MINES_FIELD_OF_VIEW / 2 + _MINES_MARGIN * increment
