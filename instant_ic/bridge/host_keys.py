@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
 
 from instant_ic.private import make_folder, open_file
 
@@ -195,14 +194,14 @@ class KeyStore:
         """Add a host to the list, or replace the one with the same name. Return what was done."""
         check_name(peer.name)
         with self._locked():
-            others = [other for other in self.peers() if other.name != peer.name]
-            for other in others:
+            others = {other.name: other for other in self.peers()}
+            before = others.pop(peer.name, None)
+            for other in others.values():
                 if other.public_key == peer.public_key:
                     raise KeyFileError(f"this key is already allowed as {other.name}: `ic keys revoke {other.name}`")
-            before = next((other for other in self.peers() if other.name == peer.name), None)
             if peer == before:
                 return "as before"
-            self._write_peers([*others, peer])
+            self._write_peers([*others.values(), peer])
             return "added" if before is None else "replaced"
 
     def revoke(self, name: str) -> Peer:
@@ -219,41 +218,37 @@ class KeyStore:
 
     def _write(self, path: Path, text: str) -> None:
         """Replace a file atomically; only its owner can ever read it."""
-        self._make_folder()
         scratch = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            scratch.unlink(missing_ok=True)
-            with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            scratch.replace(path)
-        except OSError as error:
-            self._cannot_write(path, error)
-        finally:
-            scratch.unlink(missing_ok=True)
-
-    def _make_folder(self) -> None:
-        try:
+        with _writing(path):
             make_folder(self.folder, exist_ok=True)
-        except OSError as error:
-            self._cannot_write(self.folder, error)
+            try:
+                scratch.unlink(missing_ok=True)
+                with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as file:
+                    file.write(text)
+                    file.flush()
+                    os.fsync(file.fileno())
+                scratch.replace(path)
+            finally:
+                scratch.unlink(missing_ok=True)
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
         """Lock the folder, so that concurrent commands do not lose each other's entry."""
-        self._make_folder()
-        try:
+        with _writing(self.folder):
+            make_folder(self.folder, exist_ok=True)
             fd = open_file(self.folder / ".lock", os.O_RDWR | os.O_CREAT)
-        except OSError as error:
-            self._cannot_write(self.folder, error)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX)
             yield
         finally:
             os.close(fd)
 
-    def _cannot_write(self, path: Path, error: OSError) -> NoReturn:
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
         raise KeyFileError(f"{path} cannot be written: {error.strerror}; give another folder with --dir") from error
 
 

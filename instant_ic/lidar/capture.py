@@ -6,7 +6,6 @@ Source: the pcap and pcapng drafts of the IETF opsawg (draft-ietf-opsawg-pcap, d
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,27 +34,18 @@ class Datagram(NamedTuple):
     payload: bytes
 
 
-@dataclass
-class CaptureCounters:
-    """Counts of a capture's contents.
-
-    Attributes:
-        datagrams: UDP payloads returned.
-        skipped: skipped frames by reason.
-    """
-
-    datagrams: int = 0
-    skipped: Counter[str] = field(default_factory=Counter)
-
-
 class CaptureReader:
     """Iterates over the UDP payloads of a capture file; other frames are counted by reason and raise no error.
 
     Example:
         >>> reader = CaptureReader("recording.pcap")        # doctest: +SKIP
         >>> for stamp_ns, port, payload in reader: ...      # doctest: +SKIP
-        >>> reader.counters.skipped                         # doctest: +SKIP
+        >>> reader.skipped                                  # doctest: +SKIP
         Counter({'not IP': 1, 'cut record': 1})
+
+    Attributes:
+        datagrams: UDP payloads returned.
+        skipped: skipped frames by reason.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -66,7 +56,8 @@ class CaptureReader:
             OSError: the file cannot be read.
         """
         self.path = Path(path)
-        self.counters = CaptureCounters()
+        self.datagrams = 0
+        self.skipped: Counter[str] = Counter()
         self._data = self.path.read_bytes()
         magic = self._data[:4]
         if magic not in _PCAP_MAGIC and magic != _PCAPNG_MAGIC:
@@ -77,15 +68,14 @@ class CaptureReader:
 
     def __iter__(self) -> Iterator[Datagram]:
         """Iterate over all UDP payloads in file order; the counters restart at zero."""
-        self.counters = CaptureCounters()
+        self.datagrams, self.skipped = 0, Counter()
         frames = self._pcapng() if self._data[:4] == _PCAPNG_MAGIC else self._pcap()
-        counters = self.counters
         for stamp_ns, link, start, end in frames:
             found = _udp(self._data, start, end, link)
             if isinstance(found, str):
-                counters.skipped[found] += 1
+                self.skipped[found] += 1
                 continue
-            counters.datagrams += 1
+            self.datagrams += 1
             port, start, end = found
             yield Datagram(stamp_ns, port, self._data[start:end])
 
@@ -94,7 +84,7 @@ class CaptureReader:
         data = self._data
         order, unit_ns = _PCAP_MAGIC[data[:4]]
         if len(data) < 24:
-            self.counters.skipped["cut file header"] += 1
+            self.skipped["cut file header"] += 1
             return
         link = struct.unpack_from(order + "I", data, 20)[0] & 0xFFFF
         record = struct.Struct(order + "IIII")
@@ -103,16 +93,16 @@ class CaptureReader:
             seconds, fraction, captured, original = record.unpack_from(data, at)
             at += 16
             if at + captured > size:
-                self.counters.skipped["cut record"] += 1
+                self.skipped["cut record"] += 1
                 return
             if captured < original:
                 # The snapshot length truncated this frame, so its payload is incomplete.
-                self.counters.skipped["cut frame"] += 1
+                self.skipped["cut frame"] += 1
             else:
                 yield seconds * 1_000_000_000 + fraction * unit_ns, link, at, at + captured
             at += captured
         if at < size:
-            self.counters.skipped["cut record"] += 1
+            self.skipped["cut record"] += 1
 
     def _pcapng(self) -> Iterator[tuple[int, int, int, int]]:
         """(stamp, link type, start, end) of each frame in the enhanced packet blocks."""
@@ -125,7 +115,7 @@ class CaptureReader:
                 interfaces = []
             kind, length = struct.unpack_from(order + "II", data, at)
             if length < 12 or length % 4 or at + length > size:
-                self.counters.skipped["cut record"] += 1
+                self.skipped["cut record"] += 1
                 return
             body, end = at + 8, at + length - 4
             at += length
@@ -135,18 +125,18 @@ class CaptureReader:
             elif kind == 6 and end - body >= 20:
                 interface, high, low, captured, original = struct.unpack_from(order + "IIIII", data, body)
                 if interface >= len(interfaces) or body + 20 + captured > end:
-                    self.counters.skipped["broken packet block"] += 1
+                    self.skipped["broken packet block"] += 1
                 elif captured < original:
-                    self.counters.skipped["cut frame"] += 1
+                    self.skipped["cut frame"] += 1
                 else:
                     link, tick_ns = interfaces[interface]
                     ticks = high << 32 | low
                     stamp_ns = ticks * int(tick_ns) if tick_ns >= 1.0 else round(ticks * tick_ns)
                     yield stamp_ns, link, body + 20, body + 20 + captured
             elif kind in (2, 3):
-                self.counters.skipped["packet block without a time"] += 1
+                self.skipped["packet block without a time"] += 1
         if at < size:
-            self.counters.skipped["cut record"] += 1
+            self.skipped["cut record"] += 1
 
 
 def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:

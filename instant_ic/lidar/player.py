@@ -27,7 +27,7 @@ class CapturePlayer:
         self._datagrams = iter(self._reader)
         self._next: Datagram | None = next(self._datagrams, None)
         if self._next is None:
-            raise CaptureError(f"{path}: holds no UDP datagram ({dict(self._reader.counters.skipped)})")
+            raise CaptureError(f"{path}: holds no UDP datagram ({dict(self._reader.skipped)})")
         self._rate = rate
         self._first_ns = self._next.stamp_ns
         self._start_ns, self._start_steady_ns = now_ns, steady_ns
@@ -48,7 +48,6 @@ class CapturePlayer:
 
     @property
     def diagnosis(self) -> Diagnosis:
-        counters = self._reader.counters
-        skipped = ", ".join(f"{count} x {reason}" for reason, count in counters.skipped.items())
-        text = f"{counters.datagrams} datagrams played" + (f"; left out: {skipped}" if skipped else "")
+        skipped = ", ".join(f"{count} x {reason}" for reason, count in self._reader.skipped.items())
+        text = f"{self._reader.datagrams} datagrams played" + (f"; left out: {skipped}" if skipped else "")
         return Diagnosis("capture", Level.WARN if skipped else Level.OK, text)

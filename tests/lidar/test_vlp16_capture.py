@@ -25,7 +25,7 @@ def read(tmp_path: Path, data: bytes) -> tuple[list[Datagram], CaptureReader]:
 def test_pcap_in_both_endiannesses_and_both_resolutions(tmp_path: Path, order: str, nano: bool, stamp: int) -> None:
     datagrams, reader = read(tmp_path, pcap(FRAMES, order, nano))
     assert datagrams == [(stamp, 2368, b"first"), (stamp + SECOND, 8308, b"second")]
-    assert reader.counters.datagrams == 2
+    assert reader.datagrams == 2
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -64,7 +64,7 @@ def test_what_is_no_datagram_is_counted_by_reason(tmp_path: Path) -> None:
     data = pcap(frames)
     datagrams, reader = read(tmp_path, data + b"\0" * 7)
     assert [datagram.payload for datagram in datagrams] == [b"payload"]
-    assert reader.counters.skipped == {
+    assert reader.skipped == {
         "not UDP": 1,
         "IP fragment": 1,
         "not IP": 2,
@@ -72,7 +72,7 @@ def test_what_is_no_datagram_is_counted_by_reason(tmp_path: Path) -> None:
         "cut record": 1,
     }
     assert [datagram.payload for datagram in reader] == [b"payload"]  # it can be read again
-    assert reader.counters.datagrams == 1
+    assert reader.datagrams == 1
 
 
 def test_file_that_is_no_capture_is_refused_in_words(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_damaged_captures_never_raise(tmp_path_factory: pytest.TempPathFactory, 
     path = tmp_path_factory.getbasetemp() / "damaged"
     path.write_bytes(bytes(data[: max(4, cut)]))
     reader = CaptureReader(path)
-    assert len(list(reader)) == reader.counters.datagrams
+    assert len(list(reader)) == reader.datagrams
 
 
 @pytest.mark.real_data
@@ -104,4 +104,4 @@ def test_malformed_capture_of_a_real_sensor() -> None:
     reader = CaptureReader(path)
     sizes = [len(datagram.payload) for datagram in reader]
     assert (sizes.count(1206), sizes.count(512)) == (41, 36)
-    assert reader.counters.skipped == {"not IP": 1, "cut record": 1}
+    assert reader.skipped == {"not IP": 1, "cut record": 1}
