@@ -14,7 +14,7 @@ from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import GridLayers
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import MOST_LAYERS, PageLayers
-from instant_ic.console.protocol import FrameKind
+from instant_ic.console.protocol import FrameKind, ProtocolError
 from instant_ic.console.scene import Newest, Scene
 from instant_ic.console.server import PLAIN_HTTP, ConsoleServer
 from instant_ic.console.view_requests import ViewRequests
@@ -133,9 +133,7 @@ class PageFeed:
         """What pages render of a version of the virtual space, or what is wrong with it. For a worker thread."""
         try:
             layers = layers_of(message)
-            made = PageLayers(layers.version, self._mount, self._meshes.layers(layers)[:MOST_LAYERS])
-            made.check()
-            return made
+            return PageLayers(layers.version, self._mount, self._meshes.layers(layers)[:MOST_LAYERS])
         except ValueError as error:
             return str(error)
 
@@ -144,7 +142,11 @@ class PageFeed:
         if isinstance(layers, str):
             self._diagnose("layers", ERROR, f"virtual space dropped: {layers}")
             return
-        self.server.send_layers(layers)
+        try:
+            self.server.send_layers(layers)
+        except ProtocolError as error:
+            self._diagnose("layers", ERROR, f"virtual space dropped: {error}")
+            return
         self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))
 
     def take_control(self, message: ControlState) -> None:
