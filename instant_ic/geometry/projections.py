@@ -30,7 +30,7 @@ def rays_of(size: tuple[int, int]) -> NDArray[np.float32]:
     return equirect_directions(size[1], size[0])
 
 
-def directions_at(azimuth: NDArray[np.float64], elevation: NDArray[np.float64]) -> NDArray[np.float32]:
+def directions_at(azimuth: Floats, elevation: Floats) -> NDArray[np.float32]:
     """Unit directions at all azimuths (W,) of all elevations (H,), radians, (H, W, 3)."""
     horizontal = np.cos(elevation)[:, None]
     directions = np.empty((len(elevation), len(azimuth), 3), np.float32)
