@@ -61,7 +61,6 @@ class Terminal:
         self._thread.start()
 
     def close(self) -> None:
-        """Restore the terminal."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(2.0)
