@@ -30,7 +30,6 @@ class BagPlayerNode(Node[BagPlayerConfig]):
     _next_base_s = 0.0
 
     def setup(self) -> None:
-        """Open the bag, create its topics, start the thread."""
         try:
             self.player = BagPlayer(Path(self.config.bag).expanduser(), self.config)
             self.check_base()
@@ -114,7 +113,6 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         super().reconfigure(config)
 
     def status(self) -> dict[str, Any]:
-        """The state that ``ic bag status`` shows."""
         assert self.player is not None
         return {"bag": self.config.bag, **self.player.status()}
 
@@ -134,7 +132,6 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             wait_for_readers(self.config.wait_for, self.run_dir, self._out, wait)
 
     def teardown(self) -> None:
-        """End the thread and close the bag."""
         if self.player is None:
             return
         if self._thread is not None:

@@ -29,7 +29,6 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     on_demand: OnDemand | None = None
 
     def setup(self) -> None:
-        """Create the bag and start discovery."""
         if self.run_dir is None:
             raise NodeError("the recorder needs the real bus; lockstep replay records by itself")
         self._live = LiveTopics(self.run_dir)

@@ -19,7 +19,6 @@ class TopicChoice:
     exclude: tuple[str, ...] = ()
 
     def takes(self, topic: str) -> bool:
-        """Whether a topic is wanted."""
         if any(fnmatch.fnmatchcase(topic, pattern) for pattern in self.exclude):
             return False
         return not self.topics or any(fnmatch.fnmatchcase(topic, pattern) for pattern in self.topics)

@@ -53,7 +53,6 @@ class Tolerance:
         return not (self.atol or self.rtol or self.fields or self.ignore)
 
     def ignores(self, topic: str, path: str) -> bool:
-        """Whether a field is excluded from the comparison."""
         return any(_matches(pattern, topic, path) for pattern in self.ignore)
 
     def of(self, topic: str, path: str) -> tuple[float, float]:

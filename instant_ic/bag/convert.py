@@ -98,8 +98,8 @@ def convert(
             writer.add_topic(options.remap.get(topic.topic, topic.topic), topic.type_name, topic.qos, topic.schema)
         if start_ns > begin_ns:
             for reader, topics in zip(filled, chosen, strict=True):
-                for value in _latched(reader, topics, start_ns):
-                    write(value, topics[value.topic, value.type_name], start_ns)
+                for held in _latched(reader, topics, start_ns):
+                    write(held, topics[held.topic, held.type_name], start_ns)
         streams = [
             ((m.stamp_ns, number, m) for m in reader.messages({t[0] for t in topics}, start_ns, stop_ns))
             for number, (reader, topics) in enumerate(zip(filled, chosen, strict=True))

@@ -18,7 +18,6 @@ class LatchedValues:
         self._values: dict[tuple[str, frozenset[str]], BagMessage] = {}
 
     def put(self, message: BagMessage) -> None:
-        """Store a newer value."""
         topic, names = message.topic, _names(message)
         self._values = {key: v for key, v in self._values.items() if not (key[0] == topic and key[1] <= names)}
         self._values[topic, names] = message

@@ -174,13 +174,11 @@ class BagPlayer:
         self._paused = True
 
     def resume(self) -> None:
-        """Continue from the current position."""
         with self._lock:
             self._anchor(self.position_ns)
             self._paused = False
 
     def toggle(self) -> None:
-        """Pause, or resume."""
         if self._paused:
             self.resume()
         else:
@@ -210,7 +208,6 @@ class BagPlayer:
         self._seek_ns = self.start_ns + int(offset_s * 1e9)
 
     def status(self) -> dict[str, Any]:
-        """State, position and rate, for display."""
         return {
             "state": "paused" if self.paused else "playing",
             "position_s": round((self.position_ns - self.start_ns) / 1e9, 3),

@@ -95,7 +95,6 @@ class BagRecorderConfig:
         check_ranges(self)
 
     def folder(self) -> Path:
-        """Folder of the bag."""
         if self.path:
             return Path(self.path).expanduser()
         return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
@@ -280,7 +279,6 @@ class Recorder:
             self.tick()
 
     def toggle(self) -> None:
-        """Pause, or resume."""
         if self.state == PAUSED:
             self.resume()
         else:

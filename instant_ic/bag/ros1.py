@@ -68,7 +68,6 @@ class Ros1Source:
 
     @property
     def start_time(self) -> int:
-        """First stamp."""
         return self._bag.start_time
 
     @property
@@ -78,7 +77,6 @@ class Ros1Source:
 
     @property
     def message_count(self) -> int:
-        """Messages in the bag."""
         return self._bag.message_count
 
     def messages(

@@ -91,7 +91,7 @@ class BagWriter(Closing):
 
     @property
     def parts(self) -> int:
-        """Files so far."""
+        """Number of files so far."""
         return len(self._done) + (self._part is not None)
 
     @property
@@ -157,7 +157,6 @@ class BagWriter(Closing):
             self._channel(self._part, (topic, type_name))
 
     def set_custom(self, key: str, value: str) -> None:
-        """Set text in the metadata (``custom_data``)."""
         self._custom[key] = value
 
     def keep_custom(self) -> None:

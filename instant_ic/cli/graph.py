@@ -36,7 +36,6 @@ class StackGraph:
     hidden: list[str] = field(default_factory=list)
 
     def readers(self, topic: str) -> list[str]:
-        """Nodes that subscribe to a topic."""
         return [node for name, node in self.subscribes if name == topic]
 
 

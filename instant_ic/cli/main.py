@@ -38,7 +38,6 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Build the parser with every verb."""
     parser = Parser(
         prog="ic", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -54,7 +53,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit status."""
     words = sys.argv[1:] if argv is None else argv
     launches = words[:1] == ["launch"]
 

@@ -58,7 +58,6 @@ class Observer(Closing):
         return self.transport.subscribe(topic, None, RELIABLE, self._ready.set)
 
     def close(self) -> None:
-        """Disconnect from the bus."""
         self.transport.close()
 
     def lost_by(self, topic: str) -> dict[str, int]:

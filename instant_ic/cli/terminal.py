@@ -10,13 +10,25 @@ import sys
 import termios
 import threading
 import tty
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from typing import Any, TextIO
 
 ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[C": "right", "\x1b[D": "left"}
 _KEY = re.compile(r"\x1b\[[0-9;]*[A-Za-z~]|.", re.DOTALL)
 _CLEAR_LINE = "\r\x1b[K"
 _PERIOD_S = 0.2
+
+
+@contextmanager
+def single_keys() -> Iterator[None]:
+    """Read keys without Enter and without echo inside the block; Ctrl-C remains a signal."""
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
 
 
 class Terminal:
@@ -32,34 +44,27 @@ class Terminal:
         self._line = line
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._before: list[Any] | None = None
-        self._streams: list[tuple[logging.StreamHandler[TextIO], TextIO]] = []
+        self._restore = ExitStack()
         self._lock = threading.Lock()
 
     def start(self) -> None:
         """Take over the terminal if stdin and stderr are terminals and this process is in the foreground."""
         if not (sys.stdin.isatty() and sys.stderr.isatty()) or not self._in_front():
             return
-        self._before = termios.tcgetattr(sys.stdin)
-        tty.setcbreak(sys.stdin)  # keys arrive without Enter; Ctrl-C remains a signal
+        self._restore.callback(sys.stderr.write, _CLEAR_LINE)
+        self._restore.enter_context(single_keys())
         for handler in logging.getLogger().handlers:
             if isinstance(handler, logging.StreamHandler) and handler.stream is sys.stderr:
-                self._streams.append((handler, handler.stream))
+                self._restore.callback(handler.setStream, handler.stream)
                 handler.setStream(_AboveTheLine(handler.stream, self._lock))
         self._thread = threading.Thread(target=self._run, name="terminal", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Restore the terminal."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(2.0)
-        if self._before is not None:
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
-            self._before = None
-            sys.stderr.write(_CLEAR_LINE)
-        for handler, stream in self._streams:
-            handler.setStream(stream)
+        self._restore.close()
 
     def _in_front(self) -> bool:
         try:

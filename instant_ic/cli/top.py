@@ -58,7 +58,6 @@ class NodeRow:
 
     @property
     def over_budget(self) -> bool:
-        """Whether the process uses more CPU than its budget."""
         return self.budget_percent is not None and self.cpu_percent > self.budget_percent
 
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 import os
 import select
 import sys
-import termios
 import time
-import tty
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from instant_ic.cli.terminal import single_keys
 from instant_ic.cli.top import HEADINGS, SORT_KEYS, NodeRow, TopicRow, cells, rate_words
 
 _STATE_COLOURS = {"running": "green", "starting": "yellow", "degraded": "dark_orange", "stopping": "dim"}
@@ -64,18 +62,6 @@ def _flows(rows: Sequence[TopicRow]) -> Text:
     return text
 
 
-@contextmanager
-def _single_keys() -> Iterator[None]:
-    """Read keys without Enter and without echo inside the block."""
-    descriptor = sys.stdin.fileno()
-    before = termios.tcgetattr(descriptor)
-    tty.setcbreak(descriptor)
-    try:
-        yield
-    finally:
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
-
-
 def run(rows: Callable[[float], list[NodeRow]], period_s: float, sort: str) -> int:
     """Show the table until ``q`` or Ctrl-C.
 
@@ -85,7 +71,7 @@ def run(rows: Callable[[float], list[NodeRow]], period_s: float, sort: str) -> i
     """
     inputs = False
     newest = rows(0.7)
-    with _single_keys(), Live(table(newest, sort), console=Console(), screen=True, auto_refresh=False) as live:
+    with single_keys(), Live(table(newest, sort), console=Console(), screen=True, auto_refresh=False) as live:
         next_s = 0.0
         while True:
             if time.monotonic() >= next_s:

@@ -43,7 +43,6 @@ class Rate:
         self._last_ns = received_ns
 
     def line(self, lost_by: Mapping[str, int]) -> str:
-        """One line of ``ic topic hz``."""
         if self.gaps.values:
             mean = fmean(self.gaps.values)
             rate = f"average rate: {1 / mean if mean > 0 else float('inf'):.3f}  {self.gaps.spread()}"

@@ -321,7 +321,6 @@ def _hints(config_class: type[Any]) -> dict[str, Any]:
 
 
 def _type_of(config_class: type[Any], key: str) -> Any:
-    """Declared type of a parameter."""
     group, names = config_class, key.split(".")
     for index, name in enumerate(names):
         hints, prefix = _hints(group), "".join(f"{part}." for part in names[:index])  # type: ignore[arg-type]
@@ -375,7 +374,6 @@ def field_default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _coerce(value: Any, hint: Any, key: str) -> Any:
-    """Convert a value to the declared type of its field."""
     origin = get_origin(hint)
     if origin is Annotated:
         plain = _coerce(value, get_args(hint)[0], key)

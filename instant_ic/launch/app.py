@@ -106,14 +106,12 @@ class _Output:
         return self._health
 
     def node_line(self, node: str, text: str) -> None:
-        """Show a line of a node's output."""
         if self._left_out and self._outlet.put(self._screen.event, f"{self._left_out} lines dropped: see the logs"):
             self._left_out = 0
         if not self._outlet.put(self._screen.node_line, node, text):
             self._left_out += 1
 
     def event(self, text: str, bad: bool = False) -> None:
-        """Show an event reported by the supervisor."""
         self._outlet.put(self._screen.event, text, bad, always=True)
 
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
@@ -127,7 +125,6 @@ class _Output:
             self._outlet.put(self._screen.refresh, self._view(processes))
 
     def stopping(self) -> None:
-        """Mark the beginning of the shutdown."""
         self._ending = True
         self._next_view_s = 0.0
 

@@ -78,7 +78,6 @@ class PaceChooser:
         self._fresh_s = -math.inf  # when no source was stale last
 
     def step(self, sample: Sample) -> float:
-        """Take a sample and return the pace."""
         now_s = sample.now_s
         if not sample.stale:
             self._fresh_s = now_s

@@ -111,7 +111,6 @@ def check_parameter_file(file: Path) -> list[str]:
 
 
 def _words(spec: NodeSpec) -> tuple[str, ...]:
-    """The node's own arguments."""
     return spec.command[spec.command.index(str(paths.node_file(spec.exec))) + 1 :]
 
 

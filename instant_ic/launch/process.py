@@ -149,7 +149,6 @@ class ManagedProcess:
 
     @property
     def ending(self) -> bool:
-        """Whether its end has begun."""
         return self._ending is not None
 
     def start(self) -> None:

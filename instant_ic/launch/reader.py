@@ -150,7 +150,6 @@ class _Actions:
         return self.scope.context
 
     def read(self, body: Value) -> None:
-        """Read all actions of a list."""
         for entry in body.items():
             fields = entry.fields()
             if entry.is_mapping and len(fields) != 1:

@@ -150,7 +150,6 @@ class Screen:
         self._console.print(Text.assemble(prefix, Text.from_ansi(text, style=style)))
 
     def event(self, text: str, bad: bool = False) -> None:
-        """Print an event reported by the supervisor."""
         self._console.print(Text(f"{'launch':>{self._width}} │ {text}", style="bold red" if bad else "bold"))
 
     def refresh(self, view: View) -> None:

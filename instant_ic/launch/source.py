@@ -57,7 +57,6 @@ class Value:
         return f"{_shorten(self.file)}:{self.line}"
 
     def problem(self, text: str) -> None:
-        """Note a mistake at this line."""
         self.problems.append(Problem(self.file, self.line, text))
 
     @property

@@ -38,7 +38,6 @@ def replaced(text: str, value: Value, context: Context) -> str | None:
 
 
 def flag_of(value: Value | None, context: Context, default: bool = False) -> bool:
-    """A boolean."""
     text = text_of(value, context)
     if value is None or text is None:
         return default
@@ -82,7 +81,6 @@ def integer_of(value: Value | None, context: Context, default: int) -> int:
 
 
 def words_of(value: Value | None, context: Context) -> list[str]:
-    """The arguments of a command line."""
     text = text_of(value, context)
     if value is None or not text:
         return []

@@ -14,7 +14,6 @@ from instant_ic.cli.evaluations import use_one_thread_for_matrices
 
 
 def add_parser(subparsers: Any) -> None:
-    """Add ``study`` to the ``ic`` command."""
     verbs = group(
         subparsers, "study", "run a blind user study in the operator's page (the paper's V.E with people)",
         "A laboratory in a box: counterbalanced drives with illusory control, stopping, shared control and a scanned "
