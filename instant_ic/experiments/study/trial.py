@@ -160,11 +160,16 @@ class Trial:
                 space = without_space or any(one.state == one.READY for one in spaces[-1:])
                 return self._end.is_set() or (space and bool(states) and states[-1].mode == ControlState.REAL)
 
+            def note(event: str) -> int:
+                """Publish an event with the newest state's stamp: the observer's clock knows no slow motion."""
+                at_ns = stamp_ns(states[-1]) if states else time.time_ns()
+                events.publish_bytes(serialize(String(data=event)), at_ns)
+                return at_ns
+
             stack.wait_for(ready, READY_S, "robot that is ready to drive")
             self.console = f"http://127.0.0.1:{arguments['console_port']}"
             self.status = "ready"
-            events.publish(String(data="begin"))
-            began_ns = stamp_ns(states[-1]) if states else 0
+            began_ns = note("begin")
             while not self._end.wait(0.01):
                 stack.observer.spin_once()
                 stack.check_alive("the end of the drive")
@@ -177,7 +182,7 @@ class Trial:
                 if passed_s - reached_s > 1.0:
                     self.end("arrived")
             self.status = "saving"
-            events.publish(String(data=self._why))
+            note(self._why)
             time.sleep(0.3)  # for the recorder to take the event
             stack.stop(STOP_S)
         self.result = {"end": self._why, "slowest_pace": slowest, "bag": self.bag.name}
