@@ -43,6 +43,9 @@ def test_a_simulated_participant_from_the_plan_to_the_report(
     assert 0.9 < drive["driven_m"] < 2.0 and 0.0 < drive["obedience"] <= 1.0
     with BagReader(folder / "participants/P01/drive1") as bag:
         topics = {one.topic for one in bag.topics}
+        begin_ns, end_ns = (one.stamp_ns for one in bag.messages({"/study/event"}))
+        states_ns = [one.stamp_ns for one in bag.messages({"/ic/state"})]
+    assert begin_ns < end_ns <= states_ns[-1]  # in slow motion too
     assert {
         "/study/event",
         "/study/answers",

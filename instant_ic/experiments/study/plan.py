@@ -247,18 +247,13 @@ def _check(study: Study, path: Path) -> None:
         raise StudyError(
             f"{path}: questionnaires: each needs an id of its own, not consent, practice, withdraw or drive..."
         )
-    wanted = set(_yaml_texts())
-    if missing := sorted(wanted - study.texts.keys()):
+    template = string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(seed=0, participants="  P01: []")
+    if missing := sorted(yaml.safe_load(template)["texts"].keys() - study.texts.keys()):
         raise StudyError(f"{path}: texts.{missing[0]} is missing; the template of `ic study new` has it")
     if taken := sorted(study.arguments.keys() & RESERVED):
         raise StudyError(f"{path}: arguments.{taken[0]} is set by the study itself")
     if study.starts_m[0] > study.starts_m[1]:
         raise StudyError(f"{path}: starts_m must be [lowest, highest] (got {list(study.starts_m)})")
-
-
-def _yaml_texts() -> dict[str, str]:
-    text = string.Template(TEMPLATE.read_text(encoding="utf-8")).substitute(seed=0, participants="  P01: []")
-    return dict(yaml.safe_load(text)["texts"])
 
 
 def _questionnaire(raw: Any, where: str) -> Questionnaire:

@@ -170,7 +170,7 @@ def _counts(found: Questionnaire, done: Sequence[Record]) -> list[Table]:
 def _measures(study: Study, drives: Sequence[dict[str, Any]], order: Sequence[str]) -> list[Part]:
     lines: list[list[Any]] = []
     tests: list[list[Any]] = []
-    plots = []
+    plots: list[str] = []
     for key, label in measured(study).items():
         _, values = values_of(drives, key, order)
         if not len(values):

@@ -149,37 +149,40 @@ class Trial:
 
     def _run(self, run_dir: Path) -> None:
         arguments = self.drive.arguments(self.bag, run_dir)
-        slowest, state, reached_s = math.inf, list[Any](), 0.0
+        slowest, reached_s = math.inf, 0.0
         with Stack("sim.yaml", run_dir, arguments, pace=None) as stack:
             events = stack.observer.publisher(EVENTS, String, qos=LATCHED)
             spaces = stack.collect("/vspace/status", VspaceStatus, LATCHED)
-            stack.observer.subscribe(
-                STATE, ControlState, lambda message: state.__setitem__(slice(None), [message]), RELIABLE
-            )
+            states = stack.collect(STATE, ControlState, RELIABLE)
             without_space = arguments.get("vspace") is False
 
             def ready() -> bool:
                 space = without_space or any(one.state == one.READY for one in spaces[-1:])
-                return self._end.is_set() or (space and bool(state) and state[0].mode == ControlState.REAL)
+                return self._end.is_set() or (space and bool(states) and states[-1].mode == ControlState.REAL)
+
+            def note(event: str) -> int:
+                """Publish an event with the newest state's stamp: the observer's clock knows no slow motion."""
+                at_ns = stamp_ns(states[-1]) if states else time.time_ns()
+                events.publish_bytes(serialize(String(data=event)), at_ns)
+                return at_ns
 
             stack.wait_for(ready, READY_S, "robot that is ready to drive")
             self.console = f"http://127.0.0.1:{arguments['console_port']}"
             self.status = "ready"
-            events.publish(String(data="begin"))
-            began_ns = stamp_ns(state[0]) if state else 0
+            began_ns = note("begin")
             while not self._end.wait(0.01):
                 stack.observer.spin_once()
                 stack.check_alive("the end of the drive")
                 self.pace = stack.pace
                 slowest = min(slowest, self.pace)
-                passed_s = (stamp_ns(state[0]) - began_ns) / 1e9
+                passed_s = (stamp_ns(states[-1]) - began_ns) / 1e9
                 if passed_s > self.drive.limit_s:
                     self.end("limit")
-                reached_s = passed_s if not self._arrived(state[0]) else reached_s
+                reached_s = passed_s if not self._arrived(states[-1]) else reached_s
                 if passed_s - reached_s > 1.0:
                     self.end("arrived")
             self.status = "saving"
-            events.publish(String(data=self._why))
+            note(self._why)
             time.sleep(0.3)  # for the recorder to take the event
             stack.stop(STOP_S)
         self.result = {"end": self._why, "slowest_pace": slowest, "bag": self.bag.name}
