@@ -122,7 +122,7 @@ def _people(
     if len(done) < least:
         parts.append(
             Text(f"Too few participants: with {len(done)}, no pair of conditions can differ significantly. At least "
-                 f"{least} are needed for that with {comparisons} pairs after Holm's correction, even if all agree. "
+                 f"{least} are needed for that after Holm's correction (pairs: {comparisons}), even if all agree. "
                  "The figures below describe these participants and no others.")
         )  # fmt: skip
     places = Counter((row["condition"], row["drive"]) for row in drives)
@@ -191,7 +191,7 @@ def _measures(study: Study, drives: Sequence[dict[str, Any]], order: Sequence[st
     columns = ("Friedman", "n", "χ²", "df", "p", "p by permutation", "Kendall's W [95 %]")
     return [
         Table("Mean [95 % interval]; participants with all conditions", ("value", "n", *order), lines),
-        Table("Differences between the conditions", columns, tests),
+        *([Table("Differences between the conditions", columns, tests)] if tests else []),
         Figure("Each line is a participant; the mean has its 95 % interval", "".join(plots)),
     ]
 
