@@ -221,7 +221,9 @@ def test_bad_words_are_told(tmp_path, capsys):
         main([*base, "--guess", "1,2,x"])
     assert "6 numbers" in capsys.readouterr().err
     assert main([*base, "-o", str(tmp_path / "no" / "mount.yaml")]) == 2
-    assert main([*base, "--frames", "0"]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        main([*base, "--frames", "0"])
+    assert "--frames: must be > 0" in capsys.readouterr().err
 
 
 def test_overlay_puts_points_where_they_belong():

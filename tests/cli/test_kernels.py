@@ -1,6 +1,7 @@
 """Kernels are compiled ahead: once, for one caller at a time, and noted beside numba's cache."""
 
 import fcntl
+import importlib
 import os
 import signal
 import subprocess
@@ -117,8 +118,9 @@ def test_without_a_folder_for_the_cache_the_nodes_compile_for_themselves(
 
 def test_what_the_first_drive_needs_is_compiled_ahead_in_one_variant() -> None:
     """A later variant, for a map that may not be written or arrays in another order, would hold up the robot."""
-    kernels._compile("slam")
-    kernels._compile("control")
+    for part in ("slam", "control"):
+        for module in kernels.PARTS[part]:
+            importlib.import_module(f"instant_ic.{part}.{module}").warm_up()
     assert loop_search.score_volume.signatures
     read_only = np.zeros((20, 20), np.int8)
     read_only.flags.writeable = False
