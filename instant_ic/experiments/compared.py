@@ -24,7 +24,7 @@ UNSHOWN = ("fill", "slam-pose", "still")
 LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
 _TILE_PX = 240
 _COST_S = {"survey": 16.0, "tripod": 12.0, "mobile": 5.0, "phone": 3.0}
-_TRAINED = ("field", "no-depth", "paper", "paper-no-scale")
+_TRAINED = ("no-depth", "paper", "paper-no-scale")
 _BASE_COST_S = 7.0
 
 

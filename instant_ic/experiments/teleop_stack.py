@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from instant_ic.bag.replay import make_node
 from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.console.server import ConsoleServer
 from instant_ic.experiments.pictures import jpeg
 from instant_ic.geometry.poses import (
     compose2,
@@ -168,6 +169,8 @@ class SilentPage:
 
     def __getattr__(self, name: str) -> Any:
         """Method that ignores what it is given; ``drawn_ms`` is None as it shows rendered views."""
+        if not hasattr(ConsoleServer, name):
+            raise AttributeError(f"the console's server has no {name}")
         return lambda *_: None
 
 

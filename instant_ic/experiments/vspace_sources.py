@@ -231,6 +231,8 @@ def base_of(source: str, method: str) -> str:
 
 def make_source(name: str, shots: list[Shot], settings: VspaceSettings, place: Place) -> tuple[Drawer, float]:
     """Prepare a source from keyframes, oldest first; return its renderer and the CPU seconds spent."""
+    if name not in SOURCES:
+        raise ValueError(f"unknown source {name!r}")
     from instant_ic.vspace.config import GeometryConfig
     from instant_ic.vspace.prior import prepare
     from instant_ic.vspace.warp import PanoramaWarp

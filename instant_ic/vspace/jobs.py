@@ -220,9 +220,10 @@ class SpaceWorker:
         return encoded
 
     def _yield_to_others(self) -> None:
-        """Lower this thread's priority (Linux has one per thread)."""
+        """Lower this thread's priority (Linux has one per thread); never raise it, which only root may."""
         if sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+            thread = threading.get_native_id()
+            os.setpriority(os.PRIO_PROCESS, thread, max(_NICE, os.getpriority(os.PRIO_PROCESS, thread)))
 
 
 def decode_panorama(data: NDArray[np.uint8]) -> NDArray[np.uint8]:

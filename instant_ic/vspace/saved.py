@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from instant_ic.limits import check_arrays
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import FieldParameters, Floats, Lattice
-from instant_ic.vspace.prior import PanoramaPrior
+from instant_ic.vspace.prior import MOVED, ROBOT, ROOM, SKY, PanoramaPrior
 
 FORMAT, VERSION = "instant_ic virtual space", 4
+_CONTENT_3 = np.array([ROOM, ROBOT, SKY, MOVED], np.uint8)  # codes of ``content`` in version 3
 FILE_NAME = "space.npz"
 """Name of the file in a folder."""
 
@@ -127,13 +128,16 @@ def read(path: str | Path) -> SavedSpace:
             raise SpaceFileError(f"{file}: not a saved virtual space (format {head['format']!r})")
         if head["version"] > VERSION:
             raise SpaceFileError(f"{file}: version {head['version']}, this program reads up to {VERSION}: update it")
-        if head["version"] < VERSION:
+        if head["version"] == 3:
+            for name in (f"prior.{number}.content" for number in range(head["keyframes"])):
+                arrays[name] = _CONTENT_3[arrays[name]]
+        elif head["version"] < VERSION:
             raise SpaceFileError(f"{file}: version {head['version']}, of an older program: train it again")
         priors = tuple(_group(PanoramaPrior, f"prior.{number}", arrays) for number in range(head["keyframes"]))
         if not priors:
             raise SpaceFileError(f"{file}: holds no keyframe")
         return SavedSpace(
-            _built(VirtualSpaceConfig, head["config"]),
+            _built(VirtualSpaceConfig, head["config"], known_only=head["version"] == 3),
             priors,
             arrays["gains"],
             _group(Lattice, "lattice", arrays),
@@ -142,7 +146,7 @@ def read(path: str | Path) -> SavedSpace:
         )
     except SpaceFileError:
         raise
-    except (KeyError, TypeError, ValueError) as error:
+    except (IndexError, KeyError, TypeError, ValueError) as error:
         raise SpaceFileError(f"{file}: does not fit this program: {error}") from error
 
 
@@ -162,9 +166,10 @@ def _group(kind: type[Any], group: str, arrays: dict[str, NDArray[Any]]) -> Any:
     return kind(**{name: value.item() if value.ndim == 0 else value for name, value in values.items()})
 
 
-def _built(kind: Any, value: Any) -> Any:
-    """A configuration from nested dictionaries; a key that it does not know is an error."""
+def _built(kind: Any, value: Any, known_only: bool = False) -> Any:
+    """A configuration from nested dictionaries; a key that it does not know is an error, or left out."""
     if dataclasses.is_dataclass(kind):
         hints = get_type_hints(kind)
-        return kind(**{key: _built(hints.get(key), part) for key, part in value.items()})  # type: ignore[operator]
+        parts = {key: part for key, part in value.items() if key in hints or not known_only}
+        return kind(**{key: _built(hints.get(key), part, known_only) for key, part in parts.items()})  # type: ignore[operator]
     return tuple(value) if isinstance(value, list) else value  # JSON knows no tuples
