@@ -108,7 +108,8 @@ class BagRecorderNode(Node[BagRecorderConfig]):
 
     def _on_request(self) -> OnDemand:
         if self.on_demand is None:
-            raise NodeError("this recorder records all the time; only one with snapshot: true records on request")
+            raise NodeError("this recorder records all the time, until it is shut down; one that is started with "
+                            "snapshot: true records on request")  # fmt: skip
         return self.on_demand
 
     def _status(self) -> dict[str, Any]:

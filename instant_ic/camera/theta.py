@@ -259,10 +259,10 @@ class ThetaCamera(Camera):
         self.client.close()
 
     def _end_preview(self) -> None:
-        for each in (self._response, self._session):
+        ended, self._response, self._session = (self._response, self._session), None, None
+        for each in ended:
             if each is not None:
                 each.close()
-        self._response = self._session = None
 
     def _ended(self, reason: str) -> CameraError:
         self._end_preview()
