@@ -143,7 +143,7 @@ def film() -> list[bytes]:
     return frames
 
 
-def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator) -> list[bytes]:
+def drive(stack: SimulatedStack, page: Any, shown: Page, operator: Operator) -> list[bytes]:
     """Wait until the virtual space is ready, hold W through the obstacle, release it behind the obstacle."""
     frames: list[bytes] = []
     steps = round(1.0 / FPS / STEP_S)
@@ -164,12 +164,12 @@ def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator) -> l
             ready_s = now if ready and drives else None
             continue
         frames.append(page.screenshot(type="png"))
-        print(f"\r{len(frames)} frames, {now - ready_s:.1f} s, {told.mode}   ", end="", file=sys.stderr)
+        print(f"\r{len(frames)} frames, {now - ready_s:.1f} s, {shown.mode}   ", end="", file=sys.stderr)
         if pressed_s is None and now > ready_s + 0.8:
             pressed_s = now
             page.keyboard.down("w")
-        was_virtual |= told.virtual
-        if was_virtual and not told.virtual and back_s is None:
+        was_virtual |= shown.virtual
+        if was_virtual and not shown.virtual and back_s is None:
             back_s = now
         if back_s is not None and now > back_s + AFTER_S:
             page.keyboard.up("w")
