@@ -71,12 +71,21 @@ def test_read_all_reads_more_sockets_than_one_wait_does(
             monkeypatch.setattr(f"instant_ic.bus.local_transport.{name}", 1000.0)
         transport._left_s = time.monotonic() + 1000.0  # the bus thread does not read
         wait_for(lambda: transport._next_look_s > time.monotonic() + 100)
-        for publisher in publishers:
-            for _ in range(3):
-                publisher.send(b"\0\1\0\0\1")
-        time.sleep(0.5)  # they are in the sockets
-        node.read_all()
-        assert len(heard) == 3 * len(topics)
+
+        sent, pause_s = 0, 0.0
+
+        def one_call_reads_all() -> bool:
+            nonlocal sent, pause_s
+            for publisher in publishers:
+                for _ in range(3):
+                    publisher.send(b"\0\1\0\0\1")
+                    sent += 1
+            pause_s += 0.1
+            time.sleep(pause_s)  # asking the sockets would take the event that read_all needs
+            node.read_all()
+            return len(heard) == sent
+
+        wait_for(one_call_reads_all)
     finally:
         node.close()
         sender.close()
