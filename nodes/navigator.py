@@ -9,7 +9,7 @@ import numpy as np
 
 from instant_ic import msg
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
-from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.config.ranges import Checked, Positive
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
@@ -21,7 +21,7 @@ from instant_ic.control.warmup import warm_up
 
 
 @dataclass(frozen=True)
-class NavigatorConfig:
+class NavigatorConfig(Checked):
     """Parameters of the node ``navigator``.
 
     Attributes:
@@ -41,9 +41,6 @@ class NavigatorConfig:
     footprint: Footprint = field(default_factory=Footprint)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     follower: FollowerConfig = field(default_factory=FollowerConfig)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 class NavigatorNode(Node[NavigatorConfig]):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from instant_ic import msg
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
-from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.config.ranges import Checked, Positive
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.states import VbotAction
@@ -17,7 +17,7 @@ from instant_ic.geometry.poses import matrix_from_pose2
 
 
 @dataclass(frozen=True)
-class VirtualRobotConfig:
+class VirtualRobotConfig(Checked):
     """Parameters of the node ``virtual_robot``.
 
     Attributes:
@@ -34,9 +34,6 @@ class VirtualRobotConfig:
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     vbot: VbotConfig = field(default_factory=VbotConfig)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 class VirtualRobotNode(Node[VirtualRobotConfig]):

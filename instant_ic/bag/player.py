@@ -18,7 +18,7 @@ from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.heartbeat import EVERY_NODES
-from instant_ic.config.ranges import NotNegative, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, Range
 
 NEVER_PLAYED = ("/clock", *EVERY_NODES)
 """The time itself, and what nodes report about themselves: the running nodes publish their own."""
@@ -31,7 +31,7 @@ RATES = (0.01, 100.0)
 
 
 @dataclass(frozen=True)
-class PlayOptions:
+class PlayOptions(Checked):
     """How a bag is played.
 
     Attributes:
@@ -51,9 +51,6 @@ class PlayOptions:
     start_paused: bool = False
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

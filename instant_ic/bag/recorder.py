@@ -28,7 +28,7 @@ from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Positive, PositiveInt, Range
 from instant_ic.diagnosis import Diagnosis, Level
 
 FOREIGN_CLOCK_NS = 10_000_000_000
@@ -52,7 +52,7 @@ Subscribe = Callable[[str, TakeMessage], Stats]
 
 
 @dataclass(frozen=True)
-class BagRecorderConfig:
+class BagRecorderConfig(Checked):
     """Parameters of ``bag_recorder``.
 
     Attributes:
@@ -90,9 +90,6 @@ class BagRecorderConfig:
     duration_s: NotNegative = 0.0
     start_paused: bool = False
     snapshot_after_s: NotNegative = 2.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def folder(self) -> Path:
         if self.path:

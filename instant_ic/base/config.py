@@ -4,12 +4,12 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from instant_ic.base.protocol import BAUD_RATES
-from instant_ic.config.ranges import NotNegativeInt, Positive, Range, check_ranges, require
+from instant_ic.config.ranges import Checked, NotNegativeInt, Positive, Range, check_ranges, require
 from instant_ic.config.robot import MotionLimits
 
 
 @dataclass(frozen=True)
-class SkidSteerConfig:
+class SkidSteerConfig(Checked):
     """Geometry of a skid-steer base, modelled by instantaneous centres of rotation (Martinez et al., 2005).
 
     Attributes:
@@ -30,9 +30,6 @@ class SkidSteerConfig:
     left_motor: Annotated[int, Range(1, 2)] = 1
     invert_left: bool = False
     invert_right: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     @property
     def effective_width(self) -> float:
@@ -83,7 +80,7 @@ class RoboclawConfig:
 
 
 @dataclass(frozen=True)
-class ControllerConfig:
+class ControllerConfig(Checked):
     """Parameters of the whole tracked base.
 
     Attributes:
@@ -100,9 +97,6 @@ class ControllerConfig:
     limits: LimitsConfig = field(default_factory=LimitsConfig)
     command_timeout_s: Annotated[float, Range(above=0, high=2)] = 0.25
     health_period_s: Positive = 0.25
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 _LEAST_PERIODS = 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.config.ranges import Checked, Positive
 
 
 class CommandRefused(ValueError):
@@ -13,7 +13,7 @@ class CommandRefused(ValueError):
 
 
 @dataclass(frozen=True)
-class CommandLimits:
+class CommandLimits(Checked):
     """Limits for commands from outside.
 
     Attributes:
@@ -27,9 +27,6 @@ class CommandLimits:
     lease_s: Positive = 2.0
     max_linear_mps: Positive = 2.0
     max_angular_rps: Positive = 4.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 class CommandGate:

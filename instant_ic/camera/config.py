@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Percent, Positive, PositiveInt, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Percent, Positive, PositiveInt, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
 
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
@@ -45,7 +45,7 @@ class ThetaConfig:
 
 
 @dataclass(frozen=True)
-class VideoConfig:
+class VideoConfig(Checked):
     """A video device or a network stream, read by OpenCV.
 
     Attributes:
@@ -62,12 +62,9 @@ class VideoConfig:
     width: NotNegativeInt = 0
     height: NotNegativeInt = 0
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
 
 @dataclass(frozen=True)
-class FilesConfig:
+class FilesConfig(Checked):
     """Equirectangular images from files.
 
     Attributes:
@@ -79,9 +76,6 @@ class FilesConfig:
     rate_hz: Positive = 5.0
     loop: bool = True
     quality: Percent = 90
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

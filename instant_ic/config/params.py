@@ -25,7 +25,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 
-from instant_ic.config.ranges import Range, check_ranges, range_of
+from instant_ic.config.ranges import Checked, Range, range_of
 from instant_ic.config.yaml_text import compose_yaml, construct, read_yaml
 
 ConfigT = TypeVar("ConfigT")
@@ -82,7 +82,7 @@ Values = dict[str, Value]
 
 
 @dataclass(frozen=True)
-class ProcessParameters:
+class ProcessParameters(Checked):
     """Parameters that every node has in addition to its own.
 
     Attributes:
@@ -92,9 +92,6 @@ class ProcessParameters:
 
     use_sim_time: bool = False
     nice: Annotated[int, Range(0, 19)] = 0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 PROCESS_KEYS = ("use_sim_time", "nice")

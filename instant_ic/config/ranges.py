@@ -119,6 +119,13 @@ def check_ranges(config: Any) -> None:
                 raise ValueError(f"{name} {bounds.words} (got {value})")
 
 
+class Checked:
+    """Base of a configuration (a dataclass) that has no other rules than the ranges of its fields."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
 def require(config: Any, name: str, condition: bool, rule: str) -> None:
     """Raise ValueError unless a condition between fields holds; for ``__post_init__`` after :func:`check_ranges`."""
     if not condition:

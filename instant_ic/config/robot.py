@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, Positive, Range
 from instant_ic.geometry.twists import clip_twist
 
 Metres = Annotated[float, Range(-100, 100)]
@@ -17,7 +17,7 @@ Degrees = Annotated[float, Range(-360, 360)]
 
 
 @dataclass(frozen=True)
-class Rectangle:
+class Rectangle(Checked):
     """The robot's outline, centred on base_link.
 
     Attributes:
@@ -28,12 +28,9 @@ class Rectangle:
     length_m: Positive = 0.60
     width_m: Positive = 0.50
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
 
 @dataclass(frozen=True)
-class MotionLimits:
+class MotionLimits(Checked):
     """Speed and acceleration limits of the robot.
 
     Attributes:
@@ -49,16 +46,13 @@ class MotionLimits:
     max_linear_accel_m_s2: Positive = 0.8
     max_angular_accel_rad_s2: Positive = 2.0
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
     def clip(self, linear: float, angular: float) -> tuple[float, float]:
         """The twist within the speed limits, with the same curvature; zero if it is not finite."""
         return clip_twist(linear, angular, self.max_linear_m_s, self.max_angular_rad_s)
 
 
 @dataclass(frozen=True)
-class Mount:
+class Mount(Checked):
     """Pose of a sensor on base_link, which is on the ground.
 
     Attributes:
@@ -68,9 +62,6 @@ class Mount:
 
     xyz: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     rpy_deg: tuple[Degrees, Degrees, Degrees] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     @property
     def pose(self) -> tuple[float, float, float, float, float, float]:

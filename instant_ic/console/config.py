@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, Positive, Range
 from instant_ic.config.robot import CAMERA_MOUNT, MotionLimits, Mount, Rectangle
 from instant_ic.console.server import ServerConfig
 from instant_ic.console.view import ViewConfig
 
 
 @dataclass(frozen=True)
-class ConsoleConfig:
+class ConsoleConfig(Checked):
     """Parameters.
 
     Attributes:
@@ -35,9 +35,6 @@ class ConsoleConfig:
     limits: MotionLimits = field(default_factory=MotionLimits)
     camera_mount: Mount = CAMERA_MOUNT
     recorder: str = "operator_recorder"
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def page(self) -> dict[str, Any]:
         """Return the values that the page gets in ``hello``."""

@@ -24,7 +24,7 @@ from urllib.parse import quote, urlsplit
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from instant_ic.config.ranges import Positive, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import Checked, Positive, PositiveInt, Range
 from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, tls_context
 from instant_ic.console.connections import (
     CLOSE_S,
@@ -106,7 +106,7 @@ class Backend(Protocol):
 
 
 @dataclass(frozen=True)
-class ServerConfig:
+class ServerConfig(Checked):
     """Address, limits and access of the server.
 
     Attributes:
@@ -131,9 +131,6 @@ class ServerConfig:
     background_picture_hz: Positive = 2.0  # images that are not shown (camera in the v-space)
     access: AccessConfig = field(default_factory=AccessConfig)
     drive: DriveConfig = field(default_factory=DriveConfig)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 class ConsoleServer:

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, Positive, Range
 from instant_ic.geometry.poses import pose_matrix
 
 MAX_FOV_RAD = math.radians(150)
@@ -24,7 +24,7 @@ PROBE_HZ = 1.0
 
 
 @dataclass(frozen=True)
-class ViewConfig:
+class ViewConfig(Checked):
     """Requests for rendered views.
 
     Attributes:
@@ -36,9 +36,6 @@ class ViewConfig:
     width: Annotated[int, Range(16, 4096)] = 320  # times height: pixels of a view; its shape is the window's
     height: Annotated[int, Range(16, 4096)] = 180
     virtual_rate_hz: Positive = 10.0  # while views are shown
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, Positive, Range, check_ranges
 from instant_ic.control.costmap import CostmapConfig
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.freshness import TimeoutConfig
@@ -20,7 +20,7 @@ _Probability: TypeAlias = Annotated[float, Range(above=0, high=1)]
 
 
 @dataclass(frozen=True)
-class SwitchConfig:
+class SwitchConfig(Checked):
     """Thresholds for switching between real and virtual.
 
     Attributes:
@@ -70,9 +70,6 @@ class SwitchConfig:
     ready_hold_s: NotNegative = 2.0
     require_view: bool = True
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
 
 @dataclass(frozen=True)
 class PoseTrustConfig:
@@ -100,7 +97,7 @@ class PoseTrustConfig:
 
 
 @dataclass(frozen=True)
-class ArbiterConfig:
+class ArbiterConfig(Checked):
     """Parameters of the node ``arbiter``.
 
     Attributes:
@@ -125,6 +122,3 @@ class ArbiterConfig:
     rate_hz: Positive = 20.0
     wall_min_length_m: Positive = 1.5
     costmap: CostmapConfig = field(default_factory=CostmapConfig)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)

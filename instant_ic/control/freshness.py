@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, Positive, Range
 
 _Timeout: TypeAlias = Annotated[float, Range(above=0, high=10)]
 """More than 10 s is no time-out: a robot must not drive on such old data or commands."""
@@ -22,7 +22,7 @@ _UNKNOWN_PERIOD_S = 0.5
 
 
 @dataclass(frozen=True)
-class TimeoutConfig:
+class TimeoutConfig(Checked):
     """Seconds of silence after which a source is stale and the command is zero.
 
     An image source (camera, view) has its own rate: it is stale ``late_s`` after its usual arrival, if that is later.
@@ -64,9 +64,6 @@ class TimeoutConfig:
     image_travel_m: Positive = 0.33
     stop_after_s: _Timeout = 1.5
     recover_s: _Timeout = 0.5
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def allowed_s(self, key: str, usual_s: float | None = None) -> float:
         """Allowed age of source ``key`` in seconds, if its usual age is ``usual_s`` when the next message arrives.

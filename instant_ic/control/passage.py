@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from instant_ic.config.ranges import NotNegative, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.planner import HybridPlanner, Plan
 from instant_ic.control.prediction import Prediction
@@ -18,7 +18,7 @@ from instant_ic.control.walls import WallMap
 
 
 @dataclass(frozen=True)
-class PassageConfig:
+class PassageConfig(Checked):
     """How soon free space must follow behind the obstacle, and how long the detour may be.
 
     Attributes:
@@ -28,9 +28,6 @@ class PassageConfig:
 
     max_pass_m: NotNegative = 3.0
     max_detour_m: NotNegative = 4.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 def find_passage(

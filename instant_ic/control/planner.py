@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, PositiveInt, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, PositiveInt
 from instant_ic.control.costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
 from instant_ic.control.footprint import Footprint
 
@@ -58,7 +58,7 @@ HURRY = 1.2
 
 
 @dataclass(frozen=True)
-class PlannerConfig:
+class PlannerConfig(Checked):
     """What the planner may cross; names of nav2's Smac planner.
 
     Attributes:
@@ -72,9 +72,6 @@ class PlannerConfig:
     allow_reverse_expansion: bool = True
     footprint_padding: NotNegative = 0.02
     max_iterations: PositiveInt = 5000
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

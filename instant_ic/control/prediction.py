@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
@@ -23,7 +23,7 @@ _STEP_S = 0.05
 
 
 @dataclass(frozen=True)
-class PredictionConfig:
+class PredictionConfig(Checked):
     """How far to look ahead.
 
     Attributes:
@@ -35,9 +35,6 @@ class PredictionConfig:
     latency_s: NotNegative = 0.2
     margin_m: NotNegative = 0.6
     padding_m: NotNegative = 0.03
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

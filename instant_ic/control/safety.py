@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, Positive, PositiveInt, Range, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.moving import MOST_SPEED_M_S, NOTHING_MOVES, MovingPoints
@@ -93,7 +93,7 @@ def parse_polygon(text: str) -> NDArray[np.float64]:
 
 
 @dataclass(frozen=True)
-class CollisionMonitorConfig:
+class CollisionMonitorConfig(Checked):
     """Polygons, of which the most restrictive wins, and the largest age of their points.
 
     Attributes:
@@ -115,9 +115,6 @@ class CollisionMonitorConfig:
         default_factory=lambda: PolygonConfig(enabled=False, action_type="limit", padding_m=0.30)
     )
     approach: PolygonConfig = field(default_factory=PolygonConfig)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def polygons(self) -> dict[str, PolygonConfig]:
         """The enabled polygons, by name."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative
 from instant_ic.control.costmap import UNKNOWN, Costmap
 from instant_ic.control.prediction import Prediction
 from instant_ic.control.walls import WallMap
@@ -22,7 +22,7 @@ _SEARCH_RADIUS_M = 1.5
 
 
 @dataclass(frozen=True)
-class SubgoalConfig:
+class SubgoalConfig(Checked):
     """Where to look for a free place.
 
     Attributes:
@@ -32,9 +32,6 @@ class SubgoalConfig:
 
     extend_m: NotNegative = 3.0
     anticipate: bool = True
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

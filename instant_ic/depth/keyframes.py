@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, Positive
 
 
 @dataclass(frozen=True)
-class KeyframeSelectionConfig:
+class KeyframeSelectionConfig(Checked):
     """When keyframes are taken.
 
     Attributes:
@@ -29,9 +29,6 @@ class KeyframeSelectionConfig:
     angle_deg: Positive = 45.0
     refresh_s: Positive = 30.0
     unfit_after_s: NotNegative = 5.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 class KeyframeSelector:

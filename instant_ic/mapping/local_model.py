@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, Positive, Range
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.projections import rays_of
 from instant_ic.jit import leave_out_blas
@@ -42,7 +42,7 @@ _PLATE_ABOVE_M = 0.3
 
 
 @dataclass(frozen=True)
-class LocalModelConfig:
+class LocalModelConfig(Checked):
     """Parameters of the local model.
 
     Attributes:
@@ -54,9 +54,6 @@ class LocalModelConfig:
     keep_m: Positive = 10.0
     height_m: Annotated[float, Range(2, 6)] = 4.0
     behind_m: NotNegative = 0.5
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.config.ranges import Checked, Positive
 from instant_ic.depth.deskew import Revolution, points_at
 from instant_ic.geometry.poses import Matrix, inverse
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
@@ -30,7 +30,7 @@ class CloudError(ValueError):
 
 
 @dataclass(frozen=True)
-class MapperConfig:
+class MapperConfig(Checked):
     """Parameters of the local 3D model.
 
     Attributes:
@@ -42,9 +42,6 @@ class MapperConfig:
     model: LocalModelConfig = field(default_factory=LocalModelConfig)
     every_m: Positive = 0.15
     every_s: Positive = 1.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 class LocalMapper:

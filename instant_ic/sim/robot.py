@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, Positive, Range
 from instant_ic.config.robot import Rectangle
 from instant_ic.sim.contact import OccupancyMask
 
@@ -22,7 +22,7 @@ _SLIP_TIME_S = 1.0
 
 
 @dataclass(frozen=True)
-class RobotConfig:
+class RobotConfig(Checked):
     """Parameters of the simulated robot.
 
     Attributes:
@@ -41,9 +41,6 @@ class RobotConfig:
     slip: Annotated[float, Range(0, below=0.5)] = 0.02
     turn_slip: Annotated[float, Range(0, below=0.5)] = 0.05
     encoder_noise_pulses: NotNegative = 2.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 class TrackedRobot:

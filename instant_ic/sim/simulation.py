@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instant_ic.base.config import SkidSteerConfig
-from instant_ic.config.ranges import NotNegativeInt, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegativeInt, Range, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, LIDAR_MOUNT, Mount, Rectangle
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer, Frame
@@ -29,7 +29,7 @@ BATTERY_V = 25.2
 
 
 @dataclass(frozen=True)
-class BaseConfig:
+class BaseConfig(Checked):
     """Parameters of the simulated motor controller.
 
     Attributes:
@@ -39,9 +39,6 @@ class BaseConfig:
 
     enabled: bool = True
     address: Annotated[int, Range(128, 135)] = 0x80
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic.config.ranges import NotNegative, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, PositiveInt, Range
 from instant_ic.config.robot import LIDAR_MOUNT, Mount
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar import packets as wire
@@ -31,7 +31,7 @@ PoseAt = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
-class Vlp16Config:
+class Vlp16Config(Checked):
     """Parameters of the simulated scanner.
 
     Attributes:
@@ -50,9 +50,6 @@ class Vlp16Config:
     range_noise: NotNegative = 0.01
     max_range: Annotated[float, Range(above=MIN_RANGE_M, high=131)] = 100.0
     burst: PositiveInt = 8
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, NotNegative, Positive, Range, check_ranges
 
 
 @dataclass(frozen=True)
-class FieldConfig:
+class FieldConfig(Checked):
     """Local map for scan matching: a likelihood field built from recent keyframes.
 
     Attributes:
@@ -26,12 +26,9 @@ class FieldConfig:
     resolution_m: Positive = 0.05
     max_range_m: Positive = 25.0
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
 
 @dataclass(frozen=True)
-class MatchConfig:
+class MatchConfig(Checked):
     """Search for the pose of a scan in the local map.
 
     Attributes:
@@ -43,9 +40,6 @@ class MatchConfig:
     max_points: Annotated[int, Range(low=20)] = 240
     free_motion_speed_mps: Positive = 1.0
     free_motion_yaw_rate_radps: Positive = 1.5
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -92,7 +86,7 @@ class SlamConfig:
 
 
 @dataclass(frozen=True)
-class QueueConfig:
+class QueueConfig(Checked):
     """Odometry and time of the scans.
 
     Attributes:
@@ -104,9 +98,6 @@ class QueueConfig:
     use_wheel_odom: bool = True
     odom_wait_s: NotNegative = 0.1
     max_scan_age_s: Positive = 1.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import Percent, Positive, PositiveInt, Range, Share, check_ranges, require
+from instant_ic.config.ranges import Checked, Percent, Positive, PositiveInt, Range, Share, check_ranges, require
 
 Coordinate: TypeAlias = Annotated[float, Range(-100_000, 100_000)]
 
@@ -62,7 +62,7 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
-class GeometryConfig:
+class GeometryConfig(Checked):
     """How the keyframe's depth shapes the field and the occupancy grid.
 
     Attributes:
@@ -75,12 +75,9 @@ class GeometryConfig:
     sky_share: Share = 0.05
     cell_m: Annotated[float, Range(above=0, high=1)] = 0.04
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
 
 @dataclass(frozen=True)
-class ReadinessConfig:
+class ReadinessConfig(Checked):
     """When the space is fit to show, and how far from the keyframe.
 
     Attributes:
@@ -95,12 +92,9 @@ class ReadinessConfig:
     plateau_db: Positive = 0.3
     max_radius_m: Positive = 3.0
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
 
 @dataclass(frozen=True)
-class PictureConfig:
+class PictureConfig(Checked):
     """Content of a view: the keyframe's panorama warped by its depth, or the field where it is measured to be better.
 
     Attributes:
@@ -113,9 +107,6 @@ class PictureConfig:
     field_gain_db: Annotated[float, Range(0, 20)] = 0.5
     field_alone: bool = False
     refresh_pictures: Annotated[int, Range(1, 60)] = 6
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -165,7 +156,7 @@ class VirtualSpaceConfig:
 
 
 @dataclass(frozen=True)
-class NerfConfig:
+class NerfConfig(Checked):
     """Parameters.
 
     Attributes:
@@ -185,6 +176,3 @@ class NerfConfig:
     jpeg_quality: Percent = 85
     robot_mask: str = ""
     space: VirtualSpaceConfig = dataclasses.field(default_factory=VirtualSpaceConfig)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)

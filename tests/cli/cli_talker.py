@@ -7,12 +7,12 @@ from typing import Annotated
 import numpy as np
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node, main
-from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, Positive, Range
 from instant_ic.msg import Bool, LaserScan, String, TwistStamped, scan_message, twist_stamped
 
 
 @dataclass(frozen=True)
-class Inner:
+class Inner(Checked):
     """Group.
 
     Attributes:
@@ -23,12 +23,9 @@ class Inner:
     depth: int = 3
     share: Annotated[float, Range(0, 1)] = 0.5
 
-    def __post_init__(self) -> None:
-        check_ranges(self)
-
 
 @dataclass(frozen=True)
-class TalkerConfig:
+class TalkerConfig(Checked):
     """Parameters.
 
     Attributes:
@@ -46,9 +43,6 @@ class TalkerConfig:
     drives: bool = False
     sleep_s: float = 3.0
     inner: Inner = field(default_factory=Inner)
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 class Talker(Node[TalkerConfig]):
