@@ -71,7 +71,7 @@ class Participant:
             step = server.record.step or "end"
             if self.page.locator("#study-bar").count():
                 self._drive(step, server)
-            elif (form := self.page.locator("form")).count():
+            elif (form := self.page.locator("form:has(button.main)")).count():  # the operator's page has others
                 self.on_page(self.page, step)
                 if self.page.locator("button[value=again]").count():
                     raise StudyError(f"{step} of {server.record.code} failed; the log says why")
