@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from reporting import parser_of, report
 
-from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+from instant_ic.depth.model import DEFAULT_COMPLETION, DEFAULT_MODEL, DepthModel
 from instant_ic.experiments.depth import DepthSettings, Evaluator, LidarSettings
 from instant_ic.experiments.depth_lidar import Errors, measure_world
 from instant_ic.experiments.depth_pictures import Sheets
@@ -56,17 +56,16 @@ class Remembered:
         return self._last[1].copy()
 
 
-def evaluators(
-    model: Remembered, share: float, method: str, completion: Remembered | None = None
-) -> dict[str, Evaluator]:
+def evaluators(model: Remembered, share: float, method: str, completion: Remembered) -> dict[str, Evaluator]:
     """One evaluator per source; the unscaled source uses no LiDAR and therefore has no outliers."""
     lidar = LidarSettings(outliers=share, height_m=LIDAR_HEIGHT_M)
     made = {
-        source: Evaluator(DepthSettings(source, lidar, method=method if source != "lidar" else ""), model)
-        for source in SOURCES[1:4]
-    }
-    if completion is not None:
-        made[SOURCES[4]] = Evaluator(DepthSettings(SOURCES[4], lidar, method=method), model, completion)
+        source: Evaluator(
+            DepthSettings(source, lidar, method=method if source != "lidar" else ""), model,
+            completion if source == "completed" else None,
+        )
+        for source in SOURCES[1:]
+    }  # fmt: skip
     return made if share else {SOURCES[0]: Evaluator(DepthSettings("network"), model), **made}
 
 
@@ -101,7 +100,7 @@ def score(scene: Scene, number: int, made: dict[str, Evaluator], share: float, s
     )  # fmt: skip
     for name, evaluator in made.items():
         scored = evaluator.score(scene.name, scene.rgb, scene.depth_m, points if evaluator.settings.lidar else None)
-        for sheet in sheets if name == "fused" and share else []:
+        for sheet in sheets if name == "completed" and share else []:
             sheet.add(scored)
         yield name, scored.as_dict()
 
@@ -124,20 +123,20 @@ def table(results: dict[str, Any]) -> str:
 
 
 def targets(results: dict[str, Any]) -> dict[str, dict[str, bool]]:
-    """Targets met by the fused source, for each set with 5 % outliers."""
+    """Targets met by the default source, for each set with 5 % outliers."""
     met = {}
     for kind, shares in results.items():
         sources = shares["5 %"]
-        fused = sources["fused"]
+        default = sources["completed"]
         met[kind] = {
-            "mre": fused["mre"] <= TARGET_MRE,
-            "delta1": fused["delta1"] >= TARGET_DELTA1,
+            "mre": default["mre"] <= TARGET_MRE,
+            "delta1": default["delta1"] >= TARGET_DELTA1,
             "better_than_either": all(
-                fused["mre"] < sources[s]["mre"] and fused["delta1"] > sources[s]["delta1"]
-                for s in ("network", "lidar")
+                default["mre"] < sources[s]["mre"] and default["delta1"] > sources[s]["delta1"]
+                for s in ("network", "lidar", "fused")
             ),
-            "scale_median": fused["scale_error_median"] <= TARGET_SCALE_MEDIAN,
-            "scale_p95": fused["scale_error_p95"] <= TARGET_SCALE_P95,
+            "scale_median": default["scale_error_median"] <= TARGET_SCALE_MEDIAN,
+            "scale_p95": default["scale_error_p95"] <= TARGET_SCALE_P95,
         }
     return met
 
@@ -148,19 +147,18 @@ def main() -> int:
     parser.add_argument("--kinds", default=",".join(KINDS), help="of worlds (default: %(default)s)")
     parser.add_argument("--mesh", type=Path, help="mesh file for the kind mesh; without one it is left out")
     parser.add_argument("--model", type=Path, help="ONNX file (default: the shipped one)")
-    parser.add_argument(
-        "--completion", type=Path, help="ONNX file of ic depth train: also measure the source completed"
-    )
+    parser.add_argument("--completion", type=Path, help="ONNX file of ic depth train (default: the shipped one)")
     parser.add_argument("--method", default="", help="of scaling (default: the scaler's)")
     parser.add_argument("--threads", type=int, default=2, help="of the model (default: %(default)s)")
     parser.add_argument(
-        "--sheets", type=Path, metavar="DIR", help="sheets of images of the fused source, 5 %% outliers"
+        "--sheets", type=Path, metavar="DIR", help="sheets of images of the default source, 5 %% outliers"
     )
     args = parser.parse_args()
     if args.sheets:
         args.sheets.mkdir(parents=True, exist_ok=True)
     model = Remembered(DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads))
-    completion = Remembered(DepthModel.load(args.completion, threads=args.threads)) if args.completion else None
+    found = args.completion or shipped_file("models", DEFAULT_COMPLETION)
+    completion = Remembered(DepthModel.load(found, threads=args.threads))
     results: dict[str, Any] = {}
     for kind in args.kinds.split(","):
         if kind == "mesh" and args.mesh is None:
@@ -185,7 +183,7 @@ def main() -> int:
         "completion": {
             "model": completion.manifest.name, "sha256": completion.manifest.sha256,
             "model_cpu_s": round(float(np.median(completion.cpu_s)), 4),
-        } if completion else None,
+        },
         "targets_met": targets(results), "results": results,
     }  # fmt: skip
     report(figures, args.json)

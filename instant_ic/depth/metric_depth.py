@@ -12,6 +12,7 @@ from instant_ic.config.ranges import Positive, PositiveInt, Range
 from instant_ic.depth.deskew import points_at
 from instant_ic.depth.inputs import MAX_CLOUD_AGE_S, RecentInputs
 from instant_ic.depth.keyframes import KeyframeSelectionConfig
+from instant_ic.depth.model import DEFAULT_COMPLETION
 from instant_ic.depth.sources import DepthResult, DepthSource, SourceConfig, without_body
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
@@ -35,7 +36,8 @@ class DepthScalerConfig(SourceConfig):
         base_frame: frame on the ground; reference of the camera's height.
     """
 
-    completion: str = ""
+    source: str = "completed"
+    completion: str = DEFAULT_COMPLETION
     provider: str = "auto"
     threads: PositiveInt = 1
     keyframes: KeyframeSelectionConfig = field(default_factory=KeyframeSelectionConfig)

@@ -17,6 +17,7 @@ from instant_ic.geometry.projections import equirect_directions
 from instant_ic.paths import shipped_file
 
 DEFAULT_MODEL = "slicenet_small.onnx"
+DEFAULT_COMPLETION = "completion.onnx"
 MAX_GAIN = 2.5
 """An image's brightness is changed by this factor at most, up or down."""
 INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +17,7 @@ from instant_ic.depth.manifest import InferenceError
 from instant_ic.depth.scaler import AGREEMENT, DepthScaler, ScaleFit, ScalerConfig
 from instant_ic.depth.visibility import nearest_points
 from instant_ic.geometry.projections import rays_of
+from instant_ic.mapping import kernels
 from instant_ic.mapping.mapper import LocalView
 
 Floats = NDArray[np.floating]
@@ -26,6 +28,12 @@ SOURCES = ("network", "lidar", "fused", "completed")
 _FLOOR_SIGMA = 0.02
 # A point nearer than the local model by this share is of something that has come since.
 _MOVED = 0.15
+# A completion's change counts from this share of the depth on, over an area of so many pixels each way: smaller ones
+# bend what is flat, narrower ones are its blur along edges.
+_LEAST_CHANGE, _LEAST_AREA = 0.1, 7
+# What the LiDAR has measured: upright surfaces with their continuation up and down, and a level ceiling.
+_MEASURED = (Origin.BEAM, Origin.BETWEEN, Origin.UP, Origin.DOWN, Origin.CEILING)
+_MEASURED_KINDS = (kernels.MEASURED, kernels.BETWEEN, kernels.UP, kernels.DOWN, kernels.CEILING)
 # Of the network where nothing was measured (benchmarks/depth_sigma.py).
 _NETWORK_SIGMA = np.float32(0.58)
 
@@ -58,7 +66,7 @@ class Prior:
     Attributes:
         channels: (6, H, W), see ``depth.completion.prior_channels``.
         free_m: (H, W) nothing stands nearer than this.
-        fixed: (H, W) pixels that keep their depth: the robot itself.
+        fixed: (H, W) pixels that keep their depth: what the LiDAR has measured, and the robot itself.
     """
 
     channels: NDArray[np.float32]
@@ -97,11 +105,14 @@ class DepthResult(ScaleFit):
 
 @dataclass(frozen=True)
 class _Built:
-    """Depth without a network, how far unknown pixels are free, the revolution's structure, the model's ceiling."""
+    """Depth without a network, how far unknown pixels are free, which are measured, the revolution's structure, the
+    model's ceiling.
+    """
 
     depth_m: NDArray[np.float32]
     sigma: NDArray[np.float32]
     free_m: NDArray[np.float32]
+    measured: NDArray[np.bool_]
     structure: LidarDepth
     ceiling_m: float | None
 
@@ -175,7 +186,7 @@ class DepthSource:
         if config.source == "completed":
             ranges = self.structure.ranges(points, depth.shape)
             channels = prior_channels(depth, sigma, ranges, up, camera_height_m, network.depth_m)
-            prior = Prior(channels, built.free_m, np.zeros(depth.shape, bool))
+            prior = Prior(channels, built.free_m, built.measured)
         return replace(
             result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source=config.source,
             prior=prior,
@@ -208,21 +219,23 @@ class DepthSource:
         seen = None if local is None else local.ceiling_m
         structure = self.structure.estimate(points, up, camera_height_m, size, top if seen is None else seen)
         depth, sigma, free = structure.depth_m, structure.sigma, np.zeros(size, np.float32)
+        measured = np.isin(structure.origin, _MEASURED)
         if local is not None and not structure.message:
             ceiling = structure.ceiling_height_m if structure.ceiling_height_m is not None else top
             if ceiling is None and camera_height_m is not None:
                 ceiling = self.config.lidar.ceiling_height_m - camera_height_m
             modelled = local.render(size, ceiling)
             # What this revolution measured plainly nearer has come since.
-            measured = (structure.origin == Origin.BEAM) | (structure.origin == Origin.BETWEEN)
-            come = measured & (depth < (1 - _MOVED) * modelled.depth_m)
+            hit = (structure.origin == Origin.BEAM) | (structure.origin == Origin.BETWEEN)
+            come = hit & (depth < (1 - _MOVED) * modelled.depth_m)
             known = (modelled.depth_m > 0) & ~come
             # A surface that the structure assumes in space that beams have passed is none.
-            refuted = ~known & ~measured & (depth < modelled.free_m)
+            refuted = ~known & ~hit & (depth < modelled.free_m)
             depth = np.where(known, modelled.depth_m, np.where(refuted, np.float32(0), depth))
             sigma = np.where(known, modelled.sigma, np.where(refuted, np.float32(np.inf), sigma))
             free = np.where(refuted, modelled.free_m, free)
-        return _Built(depth, sigma, free, structure, seen)
+            measured = np.where(known, np.isin(modelled.kind, _MEASURED_KINDS), measured & ~refuted)
+        return _Built(depth, sigma, free, measured, structure, seen)
 
     def _lidar(
         self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int], local: LocalView | None
@@ -247,9 +260,10 @@ class DepthSource:
 def complete(result: DepthResult, completion: Complete) -> DepthResult:
     """Correct a result of the source ``completed``; needs no other state, so that any thread may do it.
 
-    A pixel is never changed to nearer than free space. The prior's sigma decides nothing: under faults half of the
-    prior's error lies in pixels that it is sure of, and a completion that knows better there says a larger sigma.
-    Without a prior, and where the completion fails, the result stays as it is, and its message says why.
+    Floor and what is assumed or guessed are changed where the completion plainly contradicts them over an area, never
+    to nearer than free space. A completion places nothing better than the LiDAR that has measured it: it bends a
+    pillar and lowers a bare ceiling. Without a prior, and where the completion fails, the result stays as it is, and
+    its message says why.
     """
     prior = result.prior
     if prior is None:
@@ -262,10 +276,25 @@ def complete(result: DepthResult, completion: Complete) -> DepthResult:
     except (InferenceError, ValueError) as error:
         return replace(result, message=f"{result.message}; no completion ({error})")
     taken = np.isfinite(found_m) & (found_m > 0) & np.isfinite(found_sigma) & ~prior.fixed
+    taken = _areas(taken & _contradicts(found_m, prior.channels[0]))
     depth = np.where(taken, np.maximum(found_m, prior.free_m), result.depth_m).astype(np.float32)
     sigma = np.where(taken, found_sigma, result.sigma).astype(np.float32)
     message = f"{result.message}; completed"
     return replace(result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message)
+
+
+def _contradicts(found_m: Floats, prior_m: Floats) -> NDArray[np.bool_]:
+    """Where two depths (H, W) differ plainly, or there is no prior."""
+    known = (prior_m > 0) & (found_m > 0)
+    change = np.abs(np.log(np.where(known, found_m, 1) / np.where(known, prior_m, 1)))
+    return ~known | (change > _LEAST_CHANGE)
+
+
+def _areas(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The parts of a panorama's mask (H, W) that are not narrow."""
+    width = _LEAST_AREA
+    around = np.pad(mask.astype(np.uint8), ((0, 0), (width, width)), mode="wrap")
+    return cv2.morphologyEx(around, cv2.MORPH_OPEN, np.ones((width, width), np.uint8))[:, width:-width] > 0
 
 
 def without_body(result: DepthResult, up: Floats, camera_height_m: float | None, elevation_deg: float) -> DepthResult:
@@ -284,7 +313,7 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
     depth, sigma = result.depth_m.copy(), result.sigma.copy()
     depth[body] = 0 if camera_height_m is None else -camera_height_m / rise[body]
     sigma[body] = np.inf if camera_height_m is None else _FLOOR_SIGMA
-    prior = None if result.prior is None else replace(result.prior, fixed=body)
+    prior = None if result.prior is None else replace(result.prior, fixed=result.prior.fixed | body)
     return replace(result, depth_m=depth, sigma=sigma, prior=prior)
 
 

@@ -29,7 +29,7 @@ class TeleopSettings:
     seed: int = 0
     world: str = RANDOM_CORRIDORS
     methods: tuple[str, ...] = METHODS
-    depth: str = "fused"
+    depth: str = "completed"
     log: Path | None = None
     pictures: bool = True
     overrides: tuple[str, ...] = ()

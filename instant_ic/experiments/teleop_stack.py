@@ -77,7 +77,7 @@ class StackConfig:
 
     Attributes:
         method: of ``METHODS``.
-        depth: depth source, ``fused`` or ``lidar``.
+        depth: depth source, ``completed``, ``fused`` or ``lidar``.
         seed: of the robot's slip, the LiDAR's noise and the delays.
         camera_hz: images per second.
         camera_latency_s: from the exposure to the page, as for the simulated camera.
@@ -89,7 +89,7 @@ class StackConfig:
     """
 
     method: str = "ic"
-    depth: str = "fused"
+    depth: str = "completed"
     seed: int = 0
     camera_hz: float = 5.0
     camera_latency_s: float = 0.2
@@ -279,7 +279,7 @@ class SimulatedStack:
         ]
         names = list(NODES)
         if config.method == "ic":
-            names += [name for name in VSPACE_NODES if name != "depth_estimator" or config.depth == "fused"]
+            names += [name for name in VSPACE_NODES if name != "depth_estimator" or config.depth != "lidar"]
         pictures = {"/camera/image/compressed": "/camera/for_depth"}
         remaps = {
             "crawler_base": {"/cmd_vel": "/base/cmd_vel"},
@@ -297,7 +297,7 @@ class SimulatedStack:
                 node_class = type(node_class.__name__, (node_class,), {"worker_class": self._small_views()})
             self.nodes[name] = self.bus.add(node_class, node.config, name, remaps=remaps.get(name))
         if config.method == "ic":
-            looks = self.nodes["depth_estimator" if config.depth == "fused" else "depth_scaler"]
+            looks = self.nodes["depth_estimator" if config.depth != "lidar" else "depth_scaler"]
             self._depth_hz = float(looks.config.max_rate_hz)
         camera = make_node("theta_camera", None, words).config
         mount = pose_matrix(*camera.camera_mount.pose)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from instant_ic.experiments.scan import QUALITIES, ScanQuality, aged, scan_world
 
 if TYPE_CHECKING:
+    from instant_ic.depth.model import DepthModel
     from instant_ic.depth.sources import DepthResult
     from instant_ic.experiments.places import Walker
     from instant_ic.sim.render import EquirectRenderer
@@ -112,7 +114,7 @@ class Place:
 def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: VspaceSettings, model: Any) -> Shot:
     """Take a panorama from a pose with its depth: the model's, and the depth scaled by a simulated VLP-16."""
     from instant_ic.depth.scaler import ScalerConfig
-    from instant_ic.depth.sources import DepthSource, SourceConfig
+    from instant_ic.depth.sources import DepthSource, SourceConfig, complete
     from instant_ic.experiments.depth_lidar import Errors, measure_world
 
     width = settings.panorama_width
@@ -121,8 +123,9 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
     raw = model.estimate(rgb)
     points = measure_world(renderer, pose, LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, Errors(seed=settings.seed), True)
     scaler = ScalerConfig(output_kind=model.manifest.output_kind)
-    source = DepthSource(SourceConfig(scaler=scaler))
-    result = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M)
+    source = DepthSource(SourceConfig("completed", scaler))
+    fused = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M)
+    result = complete(fused, partial(_completion().complete, rgb))
     if not result.ok:
         raise ValueError(
             f"depth of the panorama at ({pose[0, 3]:.2f}, {pose[1, 3]:.2f}) cannot be scaled: {result.message}"
@@ -130,6 +133,13 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
     maxima = DepthSource(SourceConfig("network", replace(scaler, method="max_ratio")))
     paper = maxima.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M)
     return Shot(pose, rgb, true, raw, result, paper.depth_m)
+
+
+@lru_cache(maxsize=1)
+def _completion() -> DepthModel:
+    from instant_ic.depth.model import DEFAULT_COMPLETION, DepthModel
+
+    return DepthModel.find(DEFAULT_COMPLETION, threads=1)
 
 
 def train(space: Any, cpu_seconds: float) -> None:

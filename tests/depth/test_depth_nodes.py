@@ -205,7 +205,7 @@ def test_the_local_model_grows_is_published_on_demand_and_starts_again() -> None
 
 def test_scaler_scales_and_makes_keyframes() -> None:
     with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode)
+        node = bus.add(DepthScalerNode, DepthScalerConfig(source="fused"))
         drive(bus, 4.0)
         scaled, keyframes = bus.messages("/depth/scaled"), bus.messages("/keyframe")
         assert level(node, "scale")[0] == 0
@@ -259,27 +259,32 @@ def test_lidar_alone_needs_no_network() -> None:
 
 
 def completed_config(tmp_path: Path) -> DepthScalerConfig:
-    """With an untrained completion that is sure of itself: it leaves the depth and makes sigma smaller."""
+    """With a completion that puts everything at least an eighth farther, and is sure of it."""
     torch.manual_seed(0)
     model = CompletionNet(CompletionConfig(64, (8, 8, 8), 2))
+    torch.nn.init.constant_(model.head.bias[:16], 2.4)  # times a sigma of 0.05 or more
     torch.nn.init.constant_(model.head.bias[16:], -1.0)
     export_model(model.eval(), tmp_path / "c.onnx", "c", "Apache-2.0", 40.0)
     return DepthScalerConfig(source="completed", completion=str(tmp_path / "c.onnx"), provider="cpu")
 
 
 def test_completion_corrects_the_fused_depth(tmp_path: Path) -> None:
-    sigmas = {}
-    for config in (DepthScalerConfig(), completed_config(tmp_path)):
+    depths, sigmas = [], []
+    for config in (DepthScalerConfig(source="fused"), completed_config(tmp_path)):
         with LockstepBus(START) as bus:
             node = bus.add(DepthScalerNode, config)
             drive(bus, 2.5)
             scaled, keyframes = bus.messages("/depth/scaled"), bus.messages("/keyframe")
             severity, text = level(node, "scale")
         assert severity == 0 and text.endswith("; completed") == (config.source == "completed")
-        assert np.quantile(far_off(image_array(scaled[0]), stamp_ns(scaled[0])), 0.9) < 0.04
         assert keyframes[0].fit and keyframes[0].source == config.source
-        sigmas[config.source] = decode_sigma(image_array(keyframes[0].sigma))
-    assert 0.3 < np.median(sigmas["completed"] / sigmas["fused"]) < 1.0  # exp(-1) but at trusted points and the body
+        depths.append(image_array(scaled[0]))
+        sigmas.append(decode_sigma(image_array(keyframes[0].sigma)))
+    changed = depths[0] != depths[1]
+    assert 0.1 < changed.mean() < 0.7  # floor and guesses, not what the LiDAR has measured and the robot itself
+    assert np.log(depths[1] / depths[0])[changed].min() > 0.1
+    assert np.median((sigmas[1] / sigmas[0])[changed]) == pytest.approx(np.exp(-1), rel=0.05)
+    np.testing.assert_array_equal(sigmas[1][~changed], sigmas[0][~changed])
 
 
 def test_a_completion_that_fails_or_takes_too_long_leaves_the_fused_depth(tmp_path: Path) -> None:
@@ -328,9 +333,9 @@ def test_no_depth_is_requested_while_a_completion_runs(tmp_path: Path, monkeypat
 
 def test_completion_without_a_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="source completed needs a model"):
-        DepthScalerConfig(source="completed")
+        DepthScalerConfig(completion="")
     with LockstepBus(START) as bus, pytest.raises(NodeError, match=r"absent\.yaml: no manifest"):
-        bus.add(DepthScalerNode, DepthScalerConfig(source="completed", completion=str(tmp_path / "absent.onnx")))
+        bus.add(DepthScalerNode, DepthScalerConfig(completion=str(tmp_path / "absent.onnx")))
 
 
 def images(bus: LockstepBus, x_m: list[float], begin: int, cloud: np.ndarray | None = None) -> list[int]:

@@ -391,27 +391,48 @@ def test_prior_by_hand() -> None:
     assert not prior_channels(depth, sigma, ranges_m, UP, None, network)[4].any()
 
 
-def test_the_completion_is_taken_but_for_the_robot_itself_and_free_space() -> None:
+def test_where_a_completion_is_taken() -> None:
     result = with_prior()
-    assert result.prior is not None and not result.prior.fixed.any()
-    pixels = [(60, column) for column in range(5)]
-    result.sigma[60, :5] = 0.1
-    result.prior.free_m[60, 1], result.prior.fixed[60, 2] = 4.0, True
-    found, doubt = np.full(SIZE, np.nan), np.full(SIZE, np.inf)
-    found[60, :5] = 3.0, 3.0, 3.0, np.nan, 3.0
-    doubt[60, :5] = 0.05, 0.2, 0.01, 0.05, np.nan
+    assert result.prior is not None
+    result.prior.fixed[:], result.prior.free_m[:] = False, 0
+    result.sigma[:] = 0.1
+    old = result.depth_m.copy()
+    found, doubt = old.copy(), np.full(SIZE, 0.2)
+    rows = slice(40, 48)
+    wide, slight, narrow, fixed, passed, unknown, unsure = (slice(at, at + 8) for at in range(10, 150, 20))
+    narrow = slice(narrow.start, narrow.start + 6)
+    found[rows, wide] *= 1.2
+    found[rows, slight] *= 1.08
+    found[rows, narrow] *= 1.5
+    found[rows, fixed] *= 1.5
+    found[rows, passed] *= 0.5
+    found[rows, unknown] = np.nan
+    found[rows, unsure] *= 1.5
+    found[rows, -4:] *= 1.5  # over the seam
+    found[rows, :4] *= 1.5
+    doubt[rows, unsure] = np.nan
+    result.prior.fixed[rows, fixed] = True
+    result.prior.free_m[rows, passed] = 1.5 * old[rows, passed]
     got = complete(result, lambda channels: (found, doubt))
-    old = result.depth_m[60]
-    # Taken; taken, but beams have passed it up to 4 m; the robot itself; no depth; no sigma.
-    assert [float(got.depth_m[at]) for at in pixels] == [3.0, 4.0, old[2], old[3], old[4]]
-    np.testing.assert_allclose(got.sigma[60, :5], [0.05, 0.2, 0.1, 0.1, 0.1], rtol=1e-6)
-    np.testing.assert_array_equal(got.depth_m[:60], result.depth_m[:60])
+    change = np.ones(SIZE)
+    change[rows, wide], change[rows, passed], change[rows, -4:], change[rows, :4] = 1.2, 1.5, 1.5, 1.5
+    np.testing.assert_allclose(got.depth_m, change * old, rtol=1e-5)
+    np.testing.assert_allclose(got.sigma, np.where(change == 1, 0.1, 0.2), rtol=1e-6)
     assert got.prior is None and got.message.endswith("completed") and got.source == "completed"
 
 
+def test_what_the_lidar_has_measured_is_not_completed() -> None:
+    prior = with_prior().prior
+    assert prior is not None
+    rows, columns, _ = nearest_points(POINTS, SIZE[1], SIZE[0])
+    upright = rows < 50  # of points below, some are on the floor
+    assert prior.fixed[rows[upright], columns[upright]].all() and not prior.fixed[-1].any()
+
+
 def test_the_robot_itself_is_not_completed() -> None:
-    result = without_body(with_prior(), UP, CAMERA_M, -60.0)
-    assert result.prior is not None and result.prior.fixed[-1].all() and not result.prior.fixed[60].any()
+    before, result = with_prior(), without_body(with_prior(), UP, CAMERA_M, -60.0)
+    assert before.prior is not None and result.prior is not None and result.prior.fixed[-1].all()
+    np.testing.assert_array_equal(result.prior.fixed[:60], before.prior.fixed[:60])
 
 
 @pytest.mark.parametrize("error", [InferenceError("out of memory"), ValueError("no panorama")])

@@ -218,9 +218,10 @@ def test_completed_is_the_fused_depth_corrected():
     truth, model = box_room((128, 256)), KnownModel(box_room((128, 256)))
     completion = KnownModel(truth)
     completion.manifest.prior_input = "prior"
-    completion.complete = lambda rgb, prior: (truth, np.full(truth.shape, 1e-4, np.float32))
+    completion.complete = lambda rgb, prior: (2 * truth, np.full(truth.shape, 1e-4, np.float32))
     scored = Evaluator(DepthSettings("completed", LidarSettings()), model, completion).score("room", RGB, truth)
-    assert scored.after.mre < 1e-5 and scored.fit["message"].endswith("completed")
+    # An error of 1 where it is taken: floor and guesses, not the measured walls.
+    assert 0.1 < scored.after.mre < 0.9 and scored.fit["message"].endswith("completed")
 
 
 def test_what_cannot_be_scored_says_why():

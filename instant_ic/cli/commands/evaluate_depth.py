@@ -25,9 +25,9 @@ def add_kind(kinds: Any) -> None:
     text += "(key depth) or .exr in metres; 0 = unknown"
     add("--depth", type=Path, nargs="+", default=[], metavar="GT", help=text)
     add("--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)")
-    text = "ONNX file of ic depth train, for source completed"
+    text = "ONNX file of ic depth train, for source completed (default: the shipped one)"
     add("--completion", type=Path, metavar="M", help=text)
-    text = "depth source (default: fused with --lidar, else network)"
+    text = "depth source (default: completed with --lidar, else network)"
     add("--source", choices=("network", "lidar", "fused", "completed"), help=text)
     text = "scale the depth by a simulated VLP-16 that measures the true depth"
     add("--lidar", action="store_true", help=text)
@@ -52,7 +52,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     from instant_ic.cli.progress import progress
     from instant_ic.depth.files import DepthFileError, load_depth, load_picture
     from instant_ic.depth.manifest import InferenceError, ManifestError
-    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+    from instant_ic.depth.model import DEFAULT_COMPLETION, DEFAULT_MODEL, DepthModel
     from instant_ic.experiments.depth import DepthEvaluationError, DepthSettings, Evaluator, LidarSettings, report
     from instant_ic.experiments.depth_files import PairError, find_pictures, pair, unit_warning
     from instant_ic.experiments.depth_pictures import Sheets
@@ -68,13 +68,15 @@ def evaluate_depth(args: argparse.Namespace) -> int:
         raise UserError(f"--source {args.source} needs LiDAR points: give --depth and --lidar too", 2)
     try:
         lidar = LidarSettings(args.noise, args.outliers, args.seed, args.lidar_height) if args.lidar else None
-        source = args.source or ("fused" if lidar else "network")
+        source = args.source or ("completed" if lidar else "network")
         settings = DepthSettings(source, lidar, args.camera_height, args.method)
-        model = None
+        model = completion = None
         if source != "lidar":
             model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads)
-        completion = DepthModel.load(args.completion, threads=args.threads) if args.completion else None
-        evaluator = Evaluator(settings, model, completion if source == "completed" else None)
+        if source == "completed":
+            found = args.completion or shipped_file("models", DEFAULT_COMPLETION)
+            completion = DepthModel.load(found, threads=args.threads)
+        evaluator = Evaluator(settings, model, completion)
         pictures = find_pictures(args.images)
         pairs = pair(pictures, args.depth) if args.depth else [(picture, None) for picture in pictures]
     except (DepthEvaluationError, ManifestError, PairError, FileNotFoundError, ValueError) as error:

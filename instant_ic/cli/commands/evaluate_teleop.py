@@ -45,8 +45,8 @@ def add_kind(kinds: Any) -> None:
     add("--operator", choices=("scripted", "recorded"), default="scripted", help=text)
     text = "bag with /operator/cmd_vel, or CSV: time_s,linear_m_s,angular_rad_s"
     add("--log", type=Path, metavar="FILE", help=text)
-    text = "depth source of the virtual space: network and LiDAR, or LiDAR only (default: %(default)s)"
-    add("--depth", choices=("fused", "lidar"), default="fused", help=text)
+    text = "depth source of the virtual space (docs/depth.md; default: %(default)s)"
+    add("--depth", choices=("completed", "fused", "lidar"), default="completed", help=text)
     add("--resume", action="store_true", help="keep the drives in --json and run only the missing ones")
     text = "write a split-view video of the first course and method here"
     add("--video", type=Path, metavar="OUT.mp4", help=text)
