@@ -316,7 +316,7 @@ class _Building:
         gap = np.minimum(np.where(above < 0, height, index - above), np.where(below == height, height, below - index))
         wall, origin = self._walls(index)
         with np.errstate(divide="ignore", invalid="ignore"):
-            depth = np.where(wall > 0, wall / self.cos, np.inf)
+            depth = np.where(wall == 0, np.inf, wall / self.cos)
             self._plates(depth, origin)
             self._planes(depth, origin, wall)
         np.copyto(depth, self.measured, where=self.some)
@@ -339,7 +339,7 @@ class _Building:
         return depth.astype(np.float32), origin, (gap * (np.pi / height)).astype(np.float32)
 
     def _walls(self, index: Indices) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Horizontal range (0: none) of the upright surface that each pixel shows, and its origin.
+        """Horizontal range (0: none, NaN: unknown) of the upright surface that each pixel shows, and its origin.
 
         ``index``: the image's rows, (H, 1).
         """
@@ -363,7 +363,8 @@ class _Building:
             (wall_below & flat_above & (self.sin > 0), r_below, Origin.UP),
             # Something low with floor seen over it: its top is somewhere between.
             (wall_below & flat_above & (self.sin <= 0) & ~nearer_above, r_below, Origin.EDGE),
-            (wall_below & (above < 0) & (crown > 0), crown, Origin.UP),
+            # Without a crown nobody knows where it ends (a window, the sky): floor does not begin at its highest point.
+            (wall_below & (above < 0), np.where(crown > 0, crown, np.nan), Origin.UP),
         ):
             np.copyto(wall, value, where=where)
             np.copyto(origin, np.uint8(how), where=where)

@@ -83,9 +83,9 @@ class StackConfig:
         camera_latency_s: from the exposure to the page, as for the simulated camera.
         depth_latency_s: from the exposure to the keyframe.
         command_latency_s: minimum and maximum from the arbiter to the base; one value is drawn per stack.
-        panorama: width of the images for depth and virtual space, pixels.
         whole_views: render all views at full size, for a video; else only those on either side of a switch.
-        overrides: further parameters ``node.key:=value``.
+        overrides: further parameters ``node.key:=value``; the images for depth and virtual space have the size of
+            ``theta_camera.theta``.
     """
 
     method: str = "ic"
@@ -95,7 +95,6 @@ class StackConfig:
     camera_latency_s: float = 0.2
     depth_latency_s: float = 1.0
     command_latency_s: tuple[float, float] = (0.02, 0.08)
-    panorama: int = 1024
     whole_views: bool = False
     overrides: tuple[str, ...] = ()
 
@@ -103,8 +102,8 @@ class StackConfig:
         if self.method not in METHODS:
             raise ValueError(f"method must be one of {', '.join(METHODS)} (got {self.method!r})")
         for word in self.overrides:
-            if word.partition(".")[0] not in (*NODES, *VSPACE_NODES) or ":=" not in word:
-                names = ", ".join((*NODES, *VSPACE_NODES))
+            if word.partition(".")[0] not in (*NODES, *VSPACE_NODES, "theta_camera") or ":=" not in word:
+                names = ", ".join((*NODES, *VSPACE_NODES, "theta_camera"))
                 raise ValueError(f"parameter {word!r}: expected NODE.KEY:=VALUE with one of the nodes {names}")
 
 
@@ -300,6 +299,7 @@ class SimulatedStack:
             looks = self.nodes["depth_estimator" if config.depth != "lidar" else "depth_scaler"]
             self._depth_hz = float(looks.config.max_rate_hz)
         camera = make_node("theta_camera", None, words).config
+        self._preview = camera.theta
         mount = pose_matrix(*camera.camera_mount.pose)
         self.nodes["console"].tf_broadcast_static("base_link", "camera", mount)
         self.nodes["console"].feed.server = self.page
@@ -424,7 +424,7 @@ class SimulatedStack:
         return worth
 
     def _draw(self) -> bytes:
-        return jpeg(self.simulation.panorama(self.config.panorama, self.config.panorama // 2).rgb, 92)
+        return jpeg(self.simulation.panorama(self._preview.width, self._preview.height).rgb, 92)
 
     # -- time
 

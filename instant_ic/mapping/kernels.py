@@ -4,7 +4,7 @@
 a point or a beam reaches another cell with the same place modulo N, a power of two. ``odds`` (N, N, L) int8 is the log
 odds of each voxel, 0 where nothing was measured. ``sums`` (N, N, 6) float32 holds count, x, y, xx, xy and yy of a
 column's points, relative to its cell's centre. ``last`` (N, N) float32 is the age of the newest point, in the units of
-``now``.
+``now``. ``sight`` (N, N) float32 is the height up to which revolutions with points in a column looked there.
 """
 
 from __future__ import annotations
@@ -23,16 +23,21 @@ _GRAZING = 4.0  # beams along whose line the points around spread so much farthe
 _CROWDED_M = 1.2  # nearer, beams pass so close to each other that a quarter of them is enough
 _SHORT_OF_M = 0.12  # beams free space up to this distance before their end
 _THING_CELLS = 12  # sides of a thing take their height from columns so far away
+_HANGS_M = 1.5  # sills, shelves and table tops are lower, lintels are not
+_RINGS = math.radians(2.0)  # between two rings: where the uppermost alone passed, it may be lost
 _MOST_POINTS = 256.0  # a column's sums are halved from here on, so that they follow changes
 
 # How a voxel of a column is known to be solid.
 EMPTY, MEASURED, BETWEEN, UP, DOWN, BEHIND = 0, 1, 2, 3, 4, 5
 # What a ray ends on: one of the above on an upright surface, or:
 NOTHING, TOP, FLOOR, CEILING, ASSUMED = 0, 6, 7, 8, 9
+# As UP, but in doubt: beams there had no return (a window above this wall, or one behind this thing), or it stands on
+# nothing (a sill). A ray goes on through it as far as places are known.
+PANE = 10
 
 
 @njit(cache=True)
-def _take(key, odds, sums, last, ix, iy, now, keep):  # type: ignore[no-untyped-def]
+def _take(key, odds, sums, last, sight, ix, iy, now, keep):  # type: ignore[no-untyped-def]
     """Place of a cell's column; what another cell left there, or what is too old, is cleared."""
     n = key.shape[0]
     a, b = ix & (n - 1), iy & (n - 1)
@@ -41,11 +46,12 @@ def _take(key, odds, sums, last, ix, iy, now, keep):  # type: ignore[no-untyped-
         odds[a, b, :] = 0
         sums[a, b, :] = 0
         last[a, b] = now
+        sight[a, b] = -np.inf
     return a, b
 
 
 @njit(cache=True)
-def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
+def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
     """Free the voxels that beams passed, then add their ends. All in metres and in the model's frame.
 
     Args:
@@ -73,7 +79,7 @@ def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, 
         per_y = cell / abs(dy) if dy != 0 else np.inf
         while t < end:
             leave = min(next_x, next_y, end)
-            a, b = _take(key, odds, sums, last, ix, iy, now, keep)
+            a, b = _take(key, odds, sums, last, sight, ix, iy, now, keep)
             passes, takes = True, 1
             count = sums[a, b, 0]
             if count > 0:
@@ -94,14 +100,20 @@ def add_revolution(key, odds, sums, last, points, origin, cell, low, body, now, 
             else:
                 iy += step_y
                 next_y += per_y
+    steepest = -np.inf
+    for i in range(len(points)):
+        dx, dy = points[i, 0] - origin[0], points[i, 1] - origin[1]
+        steepest = max(steepest, (points[i, 2] - origin[2]) / max(math.sqrt(dx * dx + dy * dy), 1e-3))
+    slope = math.tan(math.atan(steepest) - _RINGS)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         dx, dy = x - origin[0], y - origin[1]
         if not dx * dx + dy * dy < reach * reach:
             continue
         ix, iy = math.floor(x / cell), math.floor(y / cell)
-        a, b = _take(key, odds, sums, last, ix, iy, now, keep)
+        a, b = _take(key, odds, sums, last, sight, ix, iy, now, keep)
         last[a, b] = now
+        sight[a, b] = max(sight[a, b], origin[2] + slope * math.sqrt(dx * dx + dy * dy))
         level = math.floor((z - low) / cell)
         if 0 <= level < levels:
             odds[a, b, level] = min(odds[a, b, level] + HIT, MOST)
@@ -153,7 +165,7 @@ def ceiling_levels(key, odds, last, now, keep, centre, within, first, under):  #
 
 
 @njit(cache=True)
-def solid_columns(key, odds, sums, last, now, keep, cell, ground, top, index):  # type: ignore[no-untyped-def]
+def solid_columns(key, odds, sums, last, sight, now, keep, cell, low, ground, top, index):  # type: ignore[no-untyped-def]
     """Solid voxels of every column with points, and its surface.
 
     Args:
@@ -225,9 +237,22 @@ def solid_columns(key, odds, sums, last, now, keep, cell, ground, top, index):  
             elif end < top:
                 # It ends somewhere between the highest point and the lowest beam above, as high as the thing around.
                 end = max((tops[at, 0] + end) // 2, highest[at])
-            codes[at, tops[at, 0] : end] = UP
+            height = low + tops[at, 0] * cell
+            doubtful = sight[a, b] > height or (height < _HANGS_M and _hangs(odds[a, b], ground))
+            codes[at, tops[at, 0] : end] = PANE if end == levels and doubtful else UP
     _bridge(key, index, faces, cell)
     return codes, faces
+
+
+@njit(cache=True)
+def _hangs(odds, ground):  # type: ignore[no-untyped-def]
+    """Whether beams have passed below the lowest solid voxel of a column."""
+    for level in range(ground, len(odds)):
+        if odds[level] >= OCCUPIED:
+            return False
+        if odds[level] <= FREE:
+            return True
+    return False
 
 
 @njit(cache=True)
@@ -432,19 +457,22 @@ def cast_rays(  # type: ignore[no-untyped-def]
         per_y = cell / abs(dy) if dy != 0 else np.inf
         t, missing = 0.0, 0.0
         pending, pending_kind = np.inf, NOTHING
+        pane, hidden = np.inf, False  # the last pane, and whether nobody has seen what lies behind it
         while t < end:
             leave = min(next_x, next_y, end)
             a, b = ix & (n - 1), iy & (n - 1)
             at = index[a, b]
             if at == UNSEEN:
                 missing += (leave - t) * flat
-                if missing > unseen:
+                hidden = pane < np.inf
+                if missing > unseen or hidden:
                     break
             elif at == OPEN:
                 missing = 0.0
             else:
                 missing = 0.0
                 if key[a, b, 0] != ix or key[a, b, 1] != iy:
+                    hidden = pane < np.inf
                     break
                 if at <= PLATE:
                     height = low + (PLATE - at) * cell
@@ -482,7 +510,9 @@ def cast_rays(  # type: ignore[no-untyped-def]
                                 pending, pending_kind = (height - origin[2]) / dz, TOP
                                 break
             if pending <= leave:
-                break
+                if pending_kind != PANE:
+                    break
+                pane, pending = pending, np.inf
             t = leave
             if next_x < next_y:
                 ix += step_x
@@ -490,6 +520,8 @@ def cast_rays(  # type: ignore[no-untyped-def]
             else:
                 iy += step_y
                 next_y += per_y
+        if hidden:
+            pending, pending_kind = pane, PANE
         if pending <= limit and pending < np.inf:
             depth[i], kind[i] = pending, pending_kind
         elif t >= limit - 1e-9:

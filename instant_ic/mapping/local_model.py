@@ -83,13 +83,14 @@ class LocalModel:
         self._odds = np.empty((_WINDOW, _WINDOW, self._levels), np.int8)
         self._sums = np.empty((_WINDOW, _WINDOW, 6), np.float32)
         self._last = np.empty((_WINDOW, _WINDOW), np.float32)
+        self._sight = np.empty((_WINDOW, _WINDOW), np.float32)
         self._index = np.empty((_WINDOW, _WINDOW), np.int32)
         self.clear()
 
     def clear(self) -> None:
         """Forget everything."""
         self._key[:] = np.iinfo(np.int32).min
-        self._odds[:], self._sums[:], self._last[:] = 0, 0, -np.inf
+        self._odds[:], self._sums[:], self._last[:], self._sight[:] = 0, 0, -np.inf, -np.inf
         self._path_m, self.revolutions = 0.0, 0
 
     def add(self, points: Floats, origin: Floats, advance_m: float = 0.0, stride: int = STRIDE) -> None:
@@ -114,7 +115,7 @@ class LocalModel:
         points = points[np.isfinite(points).all(axis=1)]
         self._path_m += advance_m
         kernels.add_revolution(
-            self._key, self._odds, self._sums, self._last, points, origin, _CELL_M, _LOW_M, _BODY_M,
+            self._key, self._odds, self._sums, self._last, self._sight, points, origin, _CELL_M, _LOW_M, _BODY_M,
             np.float32(self._path_m), np.float32(self.config.keep_m), self.revolutions % stride, stride, _REACH_M,
         )  # fmt: skip
         self.revolutions += 1
@@ -154,8 +155,8 @@ class LocalModel:
         ground = round((_FLOOR_M - _LOW_M) / cell)
         top = self._levels if ceiling == math.inf else min(int((ceiling - 0.08 - _LOW_M) / cell), self._levels)
         codes, faces = kernels.solid_columns(
-            self._key, self._odds, self._sums, self._last, np.float32(self._path_m), np.float32(config.keep_m), cell,
-            ground, top, self._index,
+            self._key, self._odds, self._sums, self._last, self._sight, np.float32(self._path_m),
+            np.float32(config.keep_m), cell, _LOW_M, ground, top, self._index,
         )  # fmt: skip
         if config.behind_m > 0:
             highest = int((origin[2] + _PLATE_ABOVE_M - _LOW_M) / cell)
@@ -184,7 +185,7 @@ _LEAST_CEILING_COLUMNS = 60
 
 #: Relative standard deviation of depth for each kind of pixel: 68 % of the errors are smaller in seven generated and
 #: scanned worlds (docs/depth.md).
-_SIGMA = np.array([np.inf, 0.012, 0.012, 0.015, 0.015, 0.1, 0.07, 0.005, 0.027, 0.13], np.float32)
+_SIGMA = np.array([np.inf, 0.012, 0.012, 0.015, 0.015, 0.1, 0.07, 0.005, 0.027, 0.13, 0.014], np.float32)
 
 
 def warm_up() -> None:

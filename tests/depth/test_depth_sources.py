@@ -168,6 +168,18 @@ def test_an_open_side_is_unknown_and_a_narrow_gap_is_bridged() -> None:
     assert bridged.depth_m[SIZE[0] // 2, SIZE[1] // 2] == pytest.approx(5.0, rel=0.03)
 
 
+def test_no_floor_begins_above_a_wall_of_unknown_height() -> None:
+    """All walls are glass from 0.8 m on, 0.4 m under the camera, and give no return there."""
+    built = STRUCTURE.estimate(POINTS[POINTS[:, 2] < -0.4], UP, CAMERA_M, SIZE)
+    true, rays = truth(), equirect_directions(SIZE[1], SIZE[0])
+    height = true * rays[..., 2]
+    wall, glass = (height > -1.0) & (height < -0.5), (height > -0.3) & (rays[..., 2] < 0)
+    assert (error(built.depth_m, true)[wall] < 0.05).mean() > 0.95
+    # Where the uppermost ring ends on the wall, the wall goes on; nothing lies behind it.
+    known = glass & (built.depth_m > 0)
+    assert (built.depth_m[known] < 1.1 * true[known]).all() and (built.origin[glass] != Origin.FLOOR).all()
+
+
 def test_what_is_not_to_be_trusted_says_why() -> None:
     assert "20 LiDAR points" in STRUCTURE.estimate(POINTS[:20], UP, CAMERA_M, SIZE).message
     azimuth = np.degrees(np.arctan2(POINTS[:, 1], POINTS[:, 0]))

@@ -530,6 +530,13 @@ def test_the_stack_refuses_what_it_cannot_run() -> None:
         StackConfig(method="magic")
 
 
+def test_the_camera_s_images_have_the_size_of_its_preview(short_course: teleop_worlds.Course) -> None:
+    words = ("theta_camera.theta.width:=640", "theta_camera.theta.height:=320", "theta_camera.theta.rate_hz:=8")
+    with SimulatedStack(short_course.world, StackConfig(overrides=words)) as stack:
+        image = cv2.imdecode(np.frombuffer(stack._draw(), np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (320, 640, 3)
+
+
 def test_at_a_switch_both_pictures_are_drawn_whole() -> None:
     stack = SimpleNamespace(log=Log())
     for k, virtual in enumerate([False, True, True, True, False]):

@@ -127,6 +127,25 @@ def test_a_side_is_as_high_as_the_rest_of_the_thing() -> None:
     assert 1.2 + 2.0 * np.tan(elevation[of_thing].max()) == pytest.approx(0.9, abs=0.06)  # a voxel is 0.05 m
 
 
+def test_a_wall_goes_on_over_a_window_and_the_sill_before_it_does_not() -> None:
+    """The left wall is glass from 0.9 m on, without returns; its sill reaches 0.14 m into the corridor.
+
+    Beside the robot the uppermost ring ends on the sill.
+    """
+    sill = (np.array([-3.0, 1.06, 0.85]), np.array([9.0, 1.2, 0.9]))
+    model = LocalModel()
+    for number, x in enumerate(np.arange(0.0, 3.01, 0.1)):
+        points, origin = measured(x, (sill,), number)
+        glass = (points[:, 1] > 1.15) & (points[:, 2] > 0.9) & (points[:, 2] < 2.65)
+        model.add(points[~glass], origin, advance_m=0.1)
+    true, found = truth(AT_3M, (sill,)), model.render(AT_3M, SIZE, 2.7)
+    rays = equirect_directions(SIZE[1], SIZE[0])
+    at = AT_3M[:3, 3] + true[..., None] * rays
+    pane = (at[..., 1] > 1.19) & (at[..., 2] > 0.95) & (at[..., 2] < 2.5) & (at[..., 0] > 2.5) & (at[..., 0] < 7.0)
+    assert pane.sum() > 300 and (found.kind[pane] == kernels.PANE).mean() > 0.8
+    assert np.quantile(np.abs(found.depth_m / true - 1)[pane], 0.9) < 0.03  # the sill's plane: 0.12
+
+
 def test_a_beam_along_a_surface_frees_nothing_and_one_across_it_does() -> None:
     """A side at y = -0.485 m, 1 m long, in 20 columns of 5 cm; voxels are solid from odds of 3 on, 12 at most."""
     model, x = LocalModel(LocalModelConfig(behind_m=0.0)), np.arange(2.005, 3.0, 0.01)
