@@ -142,7 +142,8 @@ class PathFollower:
         """Tracking law of Kanayama et al. (1990): the goal's own twist plus the error in the robot's frame."""
         linear, angular = goal_velocity
         v = linear * math.cos(turn) + TRACK_GAIN_X * ahead
-        w = angular + linear * (TRACK_GAIN_Y * left + TRACK_GAIN_YAW * math.sin(turn))
+        # The law is for forward motion: backwards, the term of the heading would turn the robot away.
+        w = angular + linear * TRACK_GAIN_Y * left + abs(linear) * TRACK_GAIN_YAW * math.sin(turn)
         most = self.config.desired_linear_vel
         return self.limits.clip(min(max(v, -most), most), w)
 

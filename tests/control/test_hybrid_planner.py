@@ -214,3 +214,10 @@ class TestFollowing:
         turn = self.follower.step(np.array([-0.48, 0.0, 0.6]), 0.0, path)
         assert turn.state in ("pursue", "rotate")
         assert turn.command[0] >= 0.0
+
+    def test_backwards_behind_a_v_bot_it_turns_towards_the_heading_of_the_v_bot(self) -> None:
+        path = Plan(np.array([[0.0, 0.0, 0.0], [-0.1, 0.0, 0.1]]), True, "", 0.1, np.array([False, True]))
+        self.follower.reset()
+        step = self.follower.step(np.zeros(3), -0.3, path, goal_velocity=(-0.3, 0.0))
+        assert step.state == "track"
+        assert step.command == pytest.approx((-0.3 * math.cos(0.1) - 1.5 * 0.1, 0.3 * 3.0 * math.sin(0.1)))
