@@ -4,13 +4,14 @@
     ic depth adapt drive --start models/completion.onnx -o mine.onnx
     python benchmarks/depth_adapt.py score drive models/completion.onnx mine.onnx
 
-``bag`` writes a drive between random places: a panorama every 0.3 m, a revolution (noise, outliers, glass) every 0.15 m,
-odometry that drifts, and the true depth beside the bag. ``score`` prints the mean relative error by solid angle of the
-prior and of each model: of the stretches that ``ic depth adapt`` trains on, and of those that it leaves out.
+``bag`` writes a drive between random places: a panorama every 0.3 m, a revolution (noise, outliers, glass) every
+0.15 m, odometry that drifts, and the true depth beside the bag. ``score`` prints the mean relative error by solid angle of
+the prior and of each model: of the stretches that ``ic depth adapt`` trains on, and of those that it leaves out.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ def route(world: World, metres: float, rng: np.random.Generator) -> np.ndarray:
     cost = np.where(free_m > 0.35, 1 + 1 / np.maximum(free_m, 0.1), 1e4)
     places = mask.index(world.sample_free_poses(rng, 40)[:, :2])
     xy, ahead = np.empty((0, 2)), 0.0
-    for start, goal in zip(places[:-1], places[1:], strict=True):
+    for start, goal in itertools.pairwise(places):
         cells, _ = route_through_array(cost, start, goal)
         xy = np.concatenate((xy, mask.centre(np.array(cells))))
         ahead = float(np.linalg.norm(np.diff(xy, axis=0), axis=1).sum())

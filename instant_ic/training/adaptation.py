@@ -1,7 +1,7 @@
 """Adapts a completion network to a building, by a drive through it, and says whether that made it better there.
 
-Some stretches of the drive and a sector of directions take no part in the training. The adapted network counts as better
-only if its error is smaller on both by more than the difference between stretches explains.
+Some stretches of the drive and a sector of directions take no part in the training. The adapted network counts as
+better only if its error is smaller on both by more than the difference between stretches explains.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from instant_ic.training.trainer import predict
 
 Floats = NDArray[np.floating]
 STRETCH_M, LEFT_OUT_M, MARGIN_M = 5.0, 1.5, 0.5
-"""Of each stretch of the path the last ``LEFT_OUT_M`` are left out; training keyframes are ``MARGIN_M`` away from them."""
+"""The last ``LEFT_OUT_M`` of each stretch of the path are left out; training keyframes are ``MARGIN_M`` away."""
 SECTOR_DEG = 60.0
 """Width of the sector around the map's x axis that is left out."""
 LEAST_STRETCHES = 3
