@@ -5,8 +5,8 @@
     python benchmarks/depth_adapt.py score drive models/completion.onnx mine.onnx
 
 ``bag`` writes a drive between random places: a panorama every 0.3 m, a revolution (noise, outliers, glass) every
-0.15 m, odometry that drifts, and the true depth beside the bag. ``score`` prints the mean relative error by solid angle of
-the prior and of each model: of the stretches that ``ic depth adapt`` trains on, and of those that it leaves out.
+0.15 m, odometry that drifts, and the true depth beside the bag. ``score`` prints the mean relative error by solid angle
+of the prior and of each model: of the stretches that ``ic depth adapt`` trains on, and of those that it leaves out.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from instant_ic.bag.files import BagReader
 from instant_ic.calibration.bag import read_clouds, read_images
@@ -39,6 +39,8 @@ LATER_M = 5.0
 _LEAST_LABEL = 0.01
 _SAME, _NEAR = 0.05, 9
 """Ranges that differ by a smaller share are one surface; side in pixels of the square in which the points decide."""
+_EDGE, _BESIDE = 0.1, 5
+"""Labels that differ by this share within a square of so many pixels are at a depth edge, which voxels blur."""
 
 
 class DriveError(ValueError):
@@ -171,7 +173,7 @@ class _Drive:
 
 
 def label_of(later: LocalDepth, free_m: Floats, ranges_m: Floats, fixed: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Depth (H, W) that is known from what the LiDAR measured later; 0 elsewhere.
+    """Depth (H, W) that is known from what the LiDAR measured later; 0 elsewhere and at depth edges.
 
     Args:
         later: the local model at a later time, from the keyframe's pose.
@@ -185,5 +187,8 @@ def label_of(later: LocalDepth, free_m: Floats, ranges_m: Floats, fixed: NDArray
     seen = (label > 0) & (ranges_m > 0)
     gone = seen & (ranges_m < (1 - _SAME) * label)
     votes = gone.astype(np.float32) - (seen & ~gone)
-    label[uniform_filter(votes, _NEAR, mode=("nearest", "wrap")) > 1e-6] = 0
+    around = ("nearest", "wrap")
+    label[uniform_filter(votes, _NEAR, mode=around) > 1e-6] = 0
+    nearest = minimum_filter(np.where(label > 0, label, np.inf), _BESIDE, mode=around)
+    label[maximum_filter(label, _BESIDE, mode=around) > (1 + _EDGE) * nearest] = 0
     return label
