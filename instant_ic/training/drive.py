@@ -28,7 +28,6 @@ from instant_ic.limits import decode_rgb
 from instant_ic.mapping.kernels import MEASURED
 from instant_ic.mapping.local_model import LocalDepth
 from instant_ic.msg import cloud_points, stamp_ns
-from instant_ic.training.slicenet import CheckpointError
 
 Floats = NDArray[np.floating]
 EVERY_M = 0.25
@@ -99,6 +98,8 @@ def read_drive(
                 drive.metric.mapper.revolution(revolution)
             except (TransformError, ValueError) as error:  # ValueError: other fields, or an empty cloud
                 drive.problem = str(error)
+                if drive.metric.mapper.model.revolutions == 0:  # time went back
+                    drive.waiting.clear()
                 continue
             while image is not None and stamp_ns(image) <= revolution.middle_ns:
                 drive.add(image)
@@ -113,10 +114,10 @@ class _Drive:
     def __init__(self, metric: MetricDepth, network: DepthModel, size: tuple[int, int]) -> None:
         self.metric, self.network, self.size = metric, network, size
         self.keyframes: list[Keyframe] = []
-        self._waiting: list[tuple[Keyframe, Callable[[LocalDepth], Floats]]] = []
+        self.waiting: list[tuple[Keyframe, Callable[[LocalDepth], Floats]]] = []
         self._every_m, self._path_m = EVERY_M, 0.0
         self._last: Matrix | None = None
-        self.images, self.problem = 0, "there is no LiDAR revolution after any image"
+        self.images, self.problem = 0, "none comes before a LiDAR revolution: are the clocks synchronised?"
 
     def add(self, image: Any) -> None:
         """Take a keyframe of an image (CompressedImage) if the robot has come far enough."""
@@ -137,8 +138,8 @@ class _Drive:
             self.problem = result.message
             return
         if result.prior.channels.shape[1:] != self.size:
-            raise CheckpointError(f"{self.network.manifest.name} gives {result.prior.channels.shape[1]} rows, but the "
-                                  f"completion takes {height}: give another --network")  # fmt: skip
+            raise DriveError(f"{self.network.manifest.name} gives {result.prior.channels.shape[1]} rows, but the "
+                             f"completion takes {height}: give another --network")  # fmt: skip
         if self._last is not None:
             self._path_m += moved_m
         self._last = pose
@@ -148,13 +149,13 @@ class _Drive:
         free_m = self.metric.mapper.model.render(pose, self.size).free_m.astype(np.float16)
         ranges_m = self.metric.source.structure.ranges(points, self.size).astype(np.float16)
         label = functools.partial(label_of, free_m=free_m, ranges_m=ranges_m, fixed=result.prior.fixed)
-        self._waiting.append((keyframe, label))
+        self.waiting.append((keyframe, label))
         self._finish(self._path_m - LATER_M)
 
     def _finish(self, until_m: float) -> None:
         """Label the waiting keyframes up to a place on the path."""
-        while self._waiting and self._waiting[0][0].path_m <= until_m:
-            keyframe, label = self._waiting.pop(0)
+        while self.waiting and self.waiting[0][0].path_m <= until_m:
+            keyframe, label = self.waiting.pop(0)
             later = self.metric.mapper.model.render(keyframe.model_from_camera, self.size)
             label_m = label(later).astype(np.float16)
             if (label_m > 0).mean() < _LEAST_LABEL:
