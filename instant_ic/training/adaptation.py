@@ -1,7 +1,7 @@
 """Adapts a completion network to a building, by a drive through it, and says whether that made it better there.
 
 Some stretches of the drive and a sector of directions take no part in the training. The adapted network counts as
-better only if its error is smaller on both by more than the difference between stretches explains.
+better only if its error is smaller on both, by a factor that the differences between stretches do not explain.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ SECTOR_DEG = 60.0
 """Width of the sector around the map's x axis that is left out."""
 LEAST_STRETCHES = 3
 CONFIDENCE = 0.95
+NOISE = 0.005
+"""Relative error that is the LiDAR's own: smaller ones do not count as different."""
 _ANCHORS = 1 / 16
 """Share of the pixels without a label that keep the start model's depth as label: labels outweigh them wherever more
 than a few percent of the pixels have one, and what the LiDAR never sees stays as it was."""
@@ -57,24 +59,26 @@ class Gain:
 
     Attributes:
         prior, start, adapted: of the fused depth, and of the two networks.
-        margin: half of the 90 % interval of ``start - adapted`` (Student's t over the stretches).
+        gain, margin: mean over stretches of log(start / adapted), each with ``NOISE`` added, and half of its 90 %
+            interval (Student's t).
         stretches, panoramas: their numbers.
     """
 
     prior: float
     start: float
     adapted: float
+    gain: float
     margin: float
     stretches: int
     panoramas: int
 
     @property
     def better(self) -> bool:
-        return self.start - self.adapted > self.margin
+        return self.gain > self.margin and self.adapted < self.start
 
     def __str__(self) -> str:
         return (f"prior {self.prior:.4f}, start {self.start:.4f}, adapted {self.adapted:.4f}, gain "
-                f"{self.start - self.adapted:+.4f} ± {self.margin:.4f} ({self.panoramas} panoramas, {self.stretches} "
+                f"{100 * self.gain:+.1f} ± {100 * self.margin:.1f} % ({self.panoramas} panoramas, {self.stretches} "
                 f"stretches)")  # fmt: skip
 
 
@@ -147,6 +151,7 @@ def gain(part: Sequence[Checked], prior: Floats, start: Floats, adapted: Floats)
     stretch = np.array([one.stretch for one in part])
     means = np.array([[values[stretch == number].mean() for number in np.unique(stretch)]
                       for values in (prior, start, adapted)])  # fmt: skip
-    count, change = means.shape[1], means[1] - means[2]
+    # Factors, because the stretches differ much more in their errors than in how much of them is corrected.
+    count, change = means.shape[1], np.log((means[1] + NOISE) / (means[2] + NOISE))
     margin = float(stdtrit(count - 1, CONFIDENCE) * change.std(ddof=1) / math.sqrt(count))
-    return Gain(*(float(one) for one in means.mean(axis=1)), margin, count, len(part))
+    return Gain(*(float(one) for one in means.mean(axis=1)), float(change.mean()), margin, count, len(part))
