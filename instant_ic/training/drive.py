@@ -35,7 +35,8 @@ MOST_KEYFRAMES = 400
 """A longer drive has them farther apart: 2.5 MB each."""
 LATER_M = 5.0
 """A keyframe gets its label when the robot has come so much farther: half of what the local model keeps."""
-_LEAST_LABEL = 0.01
+LEAST_LABEL = 0.01
+"""Share of the pixels that must have a label, of an image as of its part in the sector."""
 _SAME, _NEAR = 0.05, 9
 """Ranges that differ by a smaller share are one surface; side in pixels of the square in which the points decide."""
 _EDGE, _BESIDE = 0.1, 5
@@ -158,7 +159,7 @@ class _Drive:
             keyframe, label = self.waiting.pop(0)
             later = self.metric.mapper.model.render(keyframe.model_from_camera, self.size)
             label_m = label(later).astype(np.float16)
-            if (label_m > 0).mean() < _LEAST_LABEL:
+            if (label_m > 0).mean() <= LEAST_LABEL:
                 self.problem = "the LiDAR measured too little around the images"
                 continue
             self.keyframes.append(replace(keyframe, label_m=label_m))
