@@ -18,7 +18,7 @@ from instant_ic.depth.metrics import depth_metrics, solid_angle_weights
 from instant_ic.geometry.projections import rays_of
 from instant_ic.training.completion import CompletionNet
 from instant_ic.training.dataset import Sample
-from instant_ic.training.drive import LEAST_LABEL, DriveError, Keyframe
+from instant_ic.training.drive import DriveError, Keyframe
 from instant_ic.training.trainer import predict
 
 Floats = NDArray[np.floating]
@@ -97,7 +97,7 @@ def split(keyframes: Sequence[Keyframe]) -> Split:
         one = keyframes[number]
         label, inside = one.label_m.astype(np.float32), in_sector(one)
         training.append((one, np.where(inside, np.float32(0), label)))
-        if (label[inside] > 0).mean() > LEAST_LABEL:
+        if (label[inside] > 0).any():
             sector.append(Checked(one, np.where(inside, label, np.float32(0)), int(one.path_m // STRETCH_M)))
     checked = [
         Checked(keyframes[number], keyframes[number].label_m.astype(np.float32),

@@ -35,8 +35,7 @@ MOST_KEYFRAMES = 400
 """A longer drive has them farther apart: 2.5 MB each."""
 LATER_M = 5.0
 """A keyframe gets its label when the robot has come so much farther: half of what the local model keeps."""
-LEAST_LABEL = 0.01
-"""Share of the pixels that must have a label, of an image as of its part in the sector."""
+_LEAST_LABEL = 0.01
 _SAME, _NEAR = 0.05, 9
 """Ranges that differ by a smaller share are one surface; side in pixels of the square in which the points decide."""
 _EDGE, _BESIDE = 0.1, 5
@@ -159,7 +158,7 @@ class _Drive:
             keyframe, label = self.waiting.pop(0)
             later = self.metric.mapper.model.render(keyframe.model_from_camera, self.size)
             label_m = label(later).astype(np.float16)
-            if (label_m > 0).mean() <= LEAST_LABEL:
+            if (label_m > 0).mean() <= _LEAST_LABEL:
                 self.problem = "the LiDAR measured too little around the images"
                 continue
             self.keyframes.append(replace(keyframe, label_m=label_m))
