@@ -91,7 +91,7 @@ def split(keyframes: Sequence[Keyframe]) -> Split:
     left_out = np.array([one.path_m % STRETCH_M >= STRETCH_M - LEFT_OUT_M for one in keyframes])
     places = np.array([one.model_from_camera[:3, 3] for one in keyframes])
     training, sector = [], []
-    for number in np.flatnonzero(~left_out):
+    for number in np.flatnonzero(~left_out).tolist():
         if left_out.any() and np.linalg.norm(places[left_out] - places[number], axis=1).min() < MARGIN_M:
             continue
         one = keyframes[number]
@@ -102,7 +102,7 @@ def split(keyframes: Sequence[Keyframe]) -> Split:
     checked = [
         Checked(keyframes[number], keyframes[number].label_m.astype(np.float32),
                 int(keyframes[number].path_m // STRETCH_M))
-        for number in np.flatnonzero(left_out)
+        for number in np.flatnonzero(left_out).tolist()
     ]  # fmt: skip
     for part, what in ((checked, "stretches that are left out"), (sector, "stretches with the sector in view")):
         if (count := len({one.stretch for one in part})) < LEAST_STRETCHES:
@@ -154,4 +154,5 @@ def gain(part: Sequence[Checked], prior: Floats, start: Floats, adapted: Floats)
     # Factors, because the stretches differ much more in their errors than in how much of them is corrected.
     count, change = means.shape[1], np.log((means[1] + NOISE) / (means[2] + NOISE))
     margin = float(stdtrit(count - 1, CONFIDENCE) * change.std(ddof=1) / math.sqrt(count))
-    return Gain(*(float(one) for one in means.mean(axis=1)), float(change.mean()), margin, count, len(part))
+    errors_of = means.mean(axis=1).tolist()
+    return Gain(errors_of[0], errors_of[1], errors_of[2], float(change.mean()), margin, count, len(part))
