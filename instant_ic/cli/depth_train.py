@@ -117,7 +117,7 @@ def train(args: argparse.Namespace) -> int:
         with contextlib.ExitStack() as stack:
             trainer = _trainer(args, network, team, report)
             stack.callback(trainer.close)
-            stack.enter_context(_ends_early(trainer))
+            stack.enter_context(ends_early(trainer))
             if team.rank == 0:
                 trainer.bar = stack.enter_context(progress("training"))
             metrics = trainer.run()
@@ -256,7 +256,7 @@ def render(args: argparse.Namespace) -> int:
     return 0
 
 
-def _ends_early(trainer: Trainer) -> contextlib.AbstractContextManager[None]:
+def ends_early(trainer: Trainer) -> contextlib.AbstractContextManager[None]:
     """End the training cleanly on Ctrl-C or SIGTERM, as at the end of its schedule; a second signal aborts it."""
 
     def end(number: int, frame: FrameType | None) -> None:

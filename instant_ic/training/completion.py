@@ -35,6 +35,7 @@ _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80
 _STEM = 32
 _TAPS = {2: 24, 4: 40, 10: 112}
 """Blocks whose output the decoder reads, at 1/4, 1/8 and 1/16, with their channels."""
+NORM_EPS = 1e-3
 _IMAGE_MEAN, _IMAGE_STD = 127 / 255, 128 / 255
 _PUBLISHED_REST = ("_conv_head.", "_bn1.", "_fc.", *(f"_blocks.{number}." for number in range(11, 16)))
 
@@ -85,7 +86,7 @@ class Convolution(nn.Module):
         total = kernel - stride
         self.before, self.after = total // 2, total - total // 2
         self.conv = nn.Conv2d(inputs, outputs, kernel, stride, groups=groups, bias=False)
-        self.norm = nn.BatchNorm2d(outputs, eps=1e-3, momentum=0.03)
+        self.norm = nn.BatchNorm2d(outputs, eps=NORM_EPS, momentum=0.03)
         self.active = active
 
     def forward(self, x: Tensor) -> Tensor:

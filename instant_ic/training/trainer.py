@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -172,18 +173,26 @@ def to_tensors(batch: Batch, max_range_m: float, device: torch.device) -> tuple[
 
 
 @torch.inference_mode()
-def evaluate(model: CompletionNet, samples: Samples, max_range_m: float, brightness: float = 0.0) -> DepthMetrics:
-    """Mean metrics over panoramas, weighted by solid angle, without augmentation, in float32, on the model's device."""
+def predict(
+    model: CompletionNet, sample: Sample, max_range_m: float, brightness: float = 0.0, seed: int = 0
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth of a panorama as in inference, and its ground truth, 0 where unknown; (H, W) metres each.
+
+    Without augmentation, in float32, on the model's device. ``seed``: of the prior of a sample without one.
+    """
     model.eval()
-    device = next(model.parameters()).device
+    rgb, truth, prior = to_tensors(
+        stack([sample], np.random.default_rng(seed)), max_range_m, next(model.parameters()).device
+    )
+    depth = model(to_brightness(rgb, brightness), prior)[0][0].clamp(0.1, max_range_m)
+    return depth.cpu().numpy(), truth[0].cpu().numpy()
+
+
+def evaluate(model: CompletionNet, samples: Samples, max_range_m: float, brightness: float = 0.0) -> DepthMetrics:
+    """Mean metrics of :func:`predict` over panoramas, weighted by solid angle."""
     weights = solid_angle_weights(model.config.height)[:, None]
-    each = []
-    for index in range(len(samples)):
-        batch = stack([samples[index]], np.random.default_rng(index))
-        rgb, truth, prior = to_tensors(batch, max_range_m, device)
-        predicted = model(to_brightness(rgb, brightness), prior)[0][0].clamp(0.1, max_range_m)
-        each.append(depth_metrics(predicted.cpu().numpy(), truth[0].cpu().numpy(), weights=weights))
-    return mean_metrics(each)
+    each = (predict(model, samples[index], max_range_m, brightness, index) for index in range(len(samples)))
+    return mean_metrics([depth_metrics(depth, truth, weights=weights) for depth, truth in each])
 
 
 @dataclass

@@ -121,7 +121,7 @@ def test_render_writes_what_train_reads(tmp_path: Path, monkeypatch: pytest.Monk
 def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
     trainer = SimpleNamespace(stop=False)
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), depth_train._ends_early(trainer):
+    with pytest.raises(KeyboardInterrupt), depth_train.ends_early(trainer):
         signal.raise_signal(signal.SIGTERM)
         assert trainer.stop
         signal.raise_signal(signal.SIGINT)
