@@ -66,12 +66,14 @@ class Prior:
     Attributes:
         channels: (6, H, W), see ``depth.completion.prior_channels``.
         free_m: (H, W) nothing stands nearer than this.
-        fixed: (H, W) pixels that keep their depth: what the LiDAR has measured, and the robot itself.
+        measured: (H, W) pixels whose depth the LiDAR has measured.
+        robot: (H, W) pixels that show the robot itself.
     """
 
     channels: NDArray[np.float32]
     free_m: NDArray[np.float32]
-    fixed: NDArray[np.bool_]
+    measured: NDArray[np.bool_]
+    robot: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,7 @@ class DepthSource:
         if config.source == "completed":
             ranges = self.structure.ranges(points, depth.shape)
             channels = prior_channels(depth, sigma, ranges, up, camera_height_m, network.depth_m)
-            prior = Prior(channels, built.free_m, built.measured)
+            prior = Prior(channels, built.free_m, built.measured, np.zeros(depth.shape, bool))
         return replace(
             result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source=config.source,
             prior=prior,
@@ -275,7 +277,7 @@ def complete(result: DepthResult, completion: Complete) -> DepthResult:
             raise ValueError(f"it is {found_m.shape}, the depth {result.depth_m.shape}")
     except (InferenceError, ValueError) as error:
         return replace(result, message=f"{result.message}; no completion ({error})")
-    taken = np.isfinite(found_m) & (found_m > 0) & np.isfinite(found_sigma) & ~prior.fixed
+    taken = np.isfinite(found_m) & (found_m > 0) & np.isfinite(found_sigma) & ~prior.measured & ~prior.robot
     taken = _areas(taken & _contradicts(found_m, prior.channels[0]))
     depth = np.where(taken, np.maximum(found_m, prior.free_m), result.depth_m).astype(np.float32)
     sigma = np.where(taken, found_sigma, result.sigma).astype(np.float32)
@@ -313,7 +315,7 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
     depth, sigma = result.depth_m.copy(), result.sigma.copy()
     depth[body] = 0 if camera_height_m is None else -camera_height_m / rise[body]
     sigma[body] = np.inf if camera_height_m is None else _FLOOR_SIGMA
-    prior = None if result.prior is None else replace(result.prior, fixed=result.prior.fixed | body)
+    prior = None if result.prior is None else replace(result.prior, robot=body)
     return replace(result, depth_m=depth, sigma=sigma, prior=prior)
 
 

@@ -148,7 +148,7 @@ class _Drive:
         keyframe = Keyframe(rgb, prior, np.zeros(self.size, np.float16), pose, self._path_m, stamp)
         free_m = self.metric.mapper.model.render(pose, self.size).free_m.astype(np.float16)
         ranges_m = self.metric.source.structure.ranges(points, self.size).astype(np.float16)
-        label = functools.partial(label_of, free_m=free_m, ranges_m=ranges_m, fixed=result.prior.fixed)
+        label = functools.partial(label_of, free_m=free_m, ranges_m=ranges_m, robot=result.prior.robot)
         self.waiting.append((keyframe, label))
         self._finish(self._path_m - LATER_M)
 
@@ -173,7 +173,7 @@ class _Drive:
         return self.keyframes
 
 
-def label_of(later: LocalDepth, free_m: Floats, ranges_m: Floats, fixed: NDArray[np.bool_]) -> NDArray[np.float32]:
+def label_of(later: LocalDepth, free_m: Floats, ranges_m: Floats, robot: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Depth (H, W) that is known from what the LiDAR measured later; 0 elsewhere and at depth edges.
 
     Args:
@@ -181,9 +181,9 @@ def label_of(later: LocalDepth, free_m: Floats, ranges_m: Floats, fixed: NDArray
         free_m: (H, W) how far beams had come at the keyframe's time: what stands nearer has come since.
         ranges_m: (H, W) range of the point in each pixel at the keyframe's time, 0 without one. Where most points
             around a pixel are nearer than the label, something stood there that has gone.
-        fixed: (H, W) pixels that show the robot.
+        robot: (H, W) pixels that show the robot.
     """
-    label = np.where((later.kind == MEASURED) & ~fixed, later.depth_m, np.float32(0))
+    label = np.where((later.kind == MEASURED) & ~robot, later.depth_m, np.float32(0))
     label[label < (1 - _SAME) * free_m] = 0
     seen = (label > 0) & (ranges_m > 0)
     gone = seen & (ranges_m < (1 - _SAME) * label)

@@ -406,24 +406,26 @@ def test_prior_by_hand() -> None:
 def test_where_a_completion_is_taken() -> None:
     result = with_prior()
     assert result.prior is not None
-    result.prior.fixed[:], result.prior.free_m[:] = False, 0
+    result.prior.measured[:], result.prior.free_m[:] = False, 0
     result.sigma[:] = 0.1
     old = result.depth_m.copy()
     found, doubt = old.copy(), np.full(SIZE, 0.2)
     rows = slice(40, 48)
-    wide, slight, narrow, fixed, passed, unknown, unsure = (slice(at, at + 8) for at in range(10, 150, 20))
+    wide, slight, narrow, measured, robot, passed, unknown, unsure = (slice(at, at + 8) for at in range(10, 170, 20))
     narrow = slice(narrow.start, narrow.start + 6)
     found[rows, wide] *= 1.2
     found[rows, slight] *= 1.08
     found[rows, narrow] *= 1.5
-    found[rows, fixed] *= 1.5
+    found[rows, measured] *= 1.5
+    found[rows, robot] *= 1.5
     found[rows, passed] *= 0.5
     found[rows, unknown] = np.nan
     found[rows, unsure] *= 1.5
     found[rows, -4:] *= 1.5  # over the seam
     found[rows, :4] *= 1.5
     doubt[rows, unsure] = np.nan
-    result.prior.fixed[rows, fixed] = True
+    result.prior.measured[rows, measured] = True
+    result.prior.robot[rows, robot] = True
     result.prior.free_m[rows, passed] = 1.5 * old[rows, passed]
     got = complete(result, lambda channels: (found, doubt))
     change = np.ones(SIZE)
@@ -438,13 +440,12 @@ def test_what_the_lidar_has_measured_is_not_completed() -> None:
     assert prior is not None
     rows, columns, _ = nearest_points(POINTS, SIZE[1], SIZE[0])
     upright = rows < 50  # of points below, some are on the floor
-    assert prior.fixed[rows[upright], columns[upright]].all() and not prior.fixed[-1].any()
+    assert prior.measured[rows[upright], columns[upright]].all() and not prior.measured[-1].any()
 
 
 def test_the_robot_itself_is_not_completed() -> None:
-    before, result = with_prior(), without_body(with_prior(), UP, CAMERA_M, -60.0)
-    assert before.prior is not None and result.prior is not None and result.prior.fixed[-1].all()
-    np.testing.assert_array_equal(result.prior.fixed[:60], before.prior.fixed[:60])
+    result = without_body(with_prior(), UP, CAMERA_M, -60.0)
+    assert result.prior is not None and result.prior.robot[-1].all() and not result.prior.robot[60].any()
 
 
 @pytest.mark.parametrize("error", [InferenceError("out of memory"), ValueError("no panorama")])
