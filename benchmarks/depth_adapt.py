@@ -108,7 +108,7 @@ def make_bag(path: Path, world: World, metres: float, seed: int) -> int:
 
 def score(path: Path, models: list[str]) -> dict[str, Any]:
     """Mean relative errors by true depth, over training stretches and those left out."""
-    from instant_ic.training.adaptation import Checked, errors, gain, split
+    from instant_ic.training.adaptation import LeftOut, errors, gain, split
     from instant_ic.training.drive import read_drive
     from instant_ic.training.export import load_exported
 
@@ -122,7 +122,7 @@ def score(path: Path, models: list[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, chosen in (("training", [one for one, _ in parts.training]),
                          ("left out", [one.keyframe for one in parts.places])):  # fmt: skip
-        part = [Checked(one, truth[one.stamp_ns], int(one.path_m // STRETCH_M)) for one in chosen]
+        part = [LeftOut(one, truth[one.stamp_ns], int(one.path_m // STRETCH_M)) for one in chosen]
         prior, first, *others = (errors(part, model, *scale) for model in (None, *(model for model, _ in loaded)))
         found[name] = {"prior": round(float(prior.mean()), 4), models[0]: round(float(first.mean()), 4)}
         for other, values in zip(models[1:], others, strict=True):

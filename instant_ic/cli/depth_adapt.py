@@ -14,7 +14,6 @@ from typing import Any
 from instant_ic.cli.arguments import check_files, positive, positive_int, verb
 from instant_ic.cli.errors import UserError
 
-START = "completion.onnx"
 LEARNING_RATE, BATCH, MOST_EPOCHS = 2e-4, 4, 40
 
 
@@ -27,7 +26,7 @@ def add_parser(commands: Any) -> None:
         "on both by more than chance explains; else the exit status is 1. Ctrl-C ends the training early.",
     ).add_argument  # fmt: skip
     add("bag", type=Path, help="recording with panoramas, LiDAR, /tf and /tf_static; 15 m or more")
-    add("--start", default=START, metavar="ONNX", help="completion to start from (%(default)s)")
+    add("--start", type=Path, metavar="ONNX", help="completion to start from (default: the shipped one)")
     add("--network", metavar="ONNX", help="network of depth_estimator (default: the shipped one)")
     add("-o", "--output", type=Path, required=True, metavar="ONNX", help="model to write")
     add("--minutes", type=positive, default=5.0, help="training time (%(default)g)")
@@ -42,7 +41,7 @@ def adapt(args: argparse.Namespace) -> int:
 
     from instant_ic.cli.depth_train import ends_early
     from instant_ic.cli.progress import progress
-    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+    from instant_ic.depth.model import DEFAULT_COMPLETION, DEFAULT_MODEL, DepthModel
     from instant_ic.paths import shipped_file
     from instant_ic.training.adaptation import errors, gain, samples, split
     from instant_ic.training.drive import read_drive
@@ -51,8 +50,7 @@ def adapt(args: argparse.Namespace) -> int:
     from instant_ic.training.trainer import Team, Trainer, TrainingConfig
 
     torch.set_num_threads(args.threads)
-    bare = Path(args.start).name == args.start
-    start, manifest = load_exported(shipped_file("models", args.start) if bare else args.start)
+    start, manifest = load_exported(args.start or shipped_file("models", DEFAULT_COMPLETION))
     size = (manifest.input_height, manifest.input_width)
     network = DepthModel.find(args.network or DEFAULT_MODEL, args.threads, "cpu")
     if network.manifest.prior_input:
@@ -88,7 +86,7 @@ def adapt(args: argparse.Namespace) -> int:
     for name, found in gains.items():
         print(f"mean relative error, {name}: {found}", flush=True)
     if not all(found.better for found in gains.values()):
-        print(f"not better than {args.start} on both: {args.output} is not written", flush=True)
+        print(f"not better than {manifest.model} on both: {args.output} is not written", flush=True)
         return 1
     record = trainer.record() | {"check": {name: asdict(found) for name, found in gains.items()}}
     export_model(

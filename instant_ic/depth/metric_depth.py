@@ -27,7 +27,7 @@ class DepthScalerConfig(SourceConfig):
         completion: completion model for ``completed``: ONNX file; a bare name is searched for in ``models/``.
         provider, threads: execution provider and CPU threads of the completion.
         keyframes: selection of keyframes.
-        mapping: the local 3D model, from which the sources ``fused`` and ``lidar`` take depth first.
+        mapping: the local 3D model, from which all sources but ``network`` take depth first.
         max_rate_hz: highest rate of the source ``lidar``, by the images' stamps; that of the others is
             depth_estimator's.
         rows: height of the depth image of source ``lidar``; the others have the network's.

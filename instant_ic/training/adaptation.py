@@ -36,7 +36,7 @@ than a few percent of the pixels have one, and what the LiDAR never sees stays a
 
 
 @dataclass(frozen=True)
-class Checked:
+class LeftOut:
     """Pixels of a keyframe that take no part in the training, and the stretch of the path that it belongs to."""
 
     keyframe: Keyframe
@@ -49,8 +49,8 @@ class Split:
     """The drive's parts: keyframes for training with their labels, and what each part of the check sees."""
 
     training: list[tuple[Keyframe, Floats]]
-    places: list[Checked]
-    sector: list[Checked]
+    places: list[LeftOut]
+    sector: list[LeftOut]
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,9 @@ def split(keyframes: Sequence[Keyframe]) -> Split:
         label, inside = one.label_m.astype(np.float32), in_sector(one)
         training.append((one, np.where(inside, np.float32(0), label)))
         if (label[inside] > 0).any():
-            sector.append(Checked(one, np.where(inside, label, np.float32(0)), int(one.path_m // STRETCH_M)))
+            sector.append(LeftOut(one, np.where(inside, label, np.float32(0)), int(one.path_m // STRETCH_M)))
     checked = [
-        Checked(keyframes[number], keyframes[number].label_m.astype(np.float32),
+        LeftOut(keyframes[number], keyframes[number].label_m.astype(np.float32),
                 int(keyframes[number].path_m // STRETCH_M))
         for number in np.flatnonzero(left_out).tolist()
     ]  # fmt: skip
@@ -133,7 +133,7 @@ def samples(parts: Split, start: CompletionNet, max_range_m: float, brightness: 
     return found
 
 
-def errors(part: Sequence[Checked], model: CompletionNet | None, max_range_m: float, brightness: float) -> Floats:
+def errors(part: Sequence[LeftOut], model: CompletionNet | None, max_range_m: float, brightness: float) -> Floats:
     """Mean relative error of each keyframe, weighted by solid angle; of the prior without a model."""
     found = []
     for one in part:
@@ -146,7 +146,7 @@ def errors(part: Sequence[Checked], model: CompletionNet | None, max_range_m: fl
     return np.array(found)
 
 
-def gain(part: Sequence[Checked], prior: Floats, start: Floats, adapted: Floats) -> Gain:
+def gain(part: Sequence[LeftOut], prior: Floats, start: Floats, adapted: Floats) -> Gain:
     """Compare errors of the same keyframes (N,): neighbours see the same surfaces, so each stretch counts once."""
     stretch = np.array([one.stretch for one in part])
     means = np.array([[values[stretch == number].mean() for number in np.unique(stretch)]

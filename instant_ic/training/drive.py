@@ -86,7 +86,7 @@ def read_drive(
         transforms, clouds = read_clouds(bag)
         images = read_images(bag)
         scaler = ScalerConfig(output_kind=network.manifest.output_kind)
-        config = DepthScalerConfig(source="completed", completion="any", scaler=scaler)
+        config = DepthScalerConfig(scaler=scaler)
         drive = _Drive(MetricDepth(config, transforms, RecentInputs()), network, size)
         image = next(images, None)
         for cloud in clouds:

@@ -157,7 +157,7 @@ def test_a_drive_that_is_too_short_is_refused() -> None:
                                                ((-0.1, -0.1, -0.1), False)])  # fmt: skip
 def test_better_is_better_by_more_than_the_stretches_differ(gains: tuple[float, ...], better: bool) -> None:
     """Three stretches: the 95 % quantile of Student's t with 2 degrees of freedom is 2.920."""
-    part = [adaptation.Checked(keyframe(0.0), np.ones((8, 16)), number) for number in (0, 0, 1, 2)]
+    part = [adaptation.LeftOut(keyframe(0.0), np.ones((8, 16)), number) for number in (0, 0, 1, 2)]
     start, prior = np.full(4, 0.1), np.array([0.4, 0.2, 0.2, 0.1])
     adapted = (start + 0.005) * np.exp(-np.array([gains[0], gains[0], gains[1], gains[2]])) - 0.005
     found = gain(part, prior, start, adapted)
