@@ -6,9 +6,11 @@ import math
 import stat
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import aiohttp
 import numpy as np
+import playwright.sync_api as playwright
 import pytest
 import yaml
 from study_pages import FakeTrial, fake_console, filled, finished_study, served
@@ -21,6 +23,7 @@ from instant_ic.experiments.study.plan import CONDITIONS, Study, StudyError, bal
 from instant_ic.experiments.study.record import DONE, OPEN, WITHDRAWN, Record
 from instant_ic.experiments.study.report import rows, values_of
 from instant_ic.experiments.study.server import StudyServer, drive_page, from_page, to_page
+from instant_ic.experiments.study.simulate import Participant
 from instant_ic.experiments.study.trial import Drive, ahead_m, measures
 from instant_ic.msg import (
     Bool,
@@ -612,3 +615,34 @@ def test_a_taken_port_is_named(study):
         second = StudyServer(Record(study, "P02"), server.port)
         with pytest.raises(StudyError, match=f"cannot listen on 127.0.0.1:{server.port}"):
             second.start()
+
+
+class _Page:
+    """A page of Playwright whose drive ends as ``fault`` says while it is asked for its pose."""
+
+    keyboard = SimpleNamespace(down=lambda key: None, up=lambda key: None)
+
+    def __init__(self, record, fault):
+        self.record, self.fault = record, fault
+
+    def goto(self, url):
+        pass
+
+    def locator(self, selector):
+        return SimpleNamespace(count=lambda: 1)
+
+    def evaluate(self, script):
+        self.record.state = DONE
+        raise playwright.Error(self.fault)
+
+
+def test_a_simulated_participant_goes_on_when_the_page_does(study):
+    record = Record(study, "P01")
+    server = SimpleNamespace(record=record, url="http://127.0.0.1:9", pace=1.0)
+    gone = "Page.evaluate: Execution context was destroyed, most likely because of a navigation"
+    shown = []
+    Participant(_Page(record, gone), 1, 60.0, lambda page, step: shown.append(step)).take_part(server)
+    assert shown == ["end"]
+    record.state = OPEN
+    with pytest.raises(playwright.Error, match="closed"):
+        Participant(_Page(record, "Target page has been closed"), 1, 60.0).take_part(server)

@@ -65,22 +65,33 @@ class Participant:
         Raises:
             StudyError: it took longer than ``limit_s``, or a page reports a problem.
         """
+        from playwright.sync_api import Error
+
         self.page.goto(server.url)
         while server.record.state != DONE:
             self._check_time()
-            step = server.record.step or "end"
-            if self.page.locator("#study-bar").count():
-                self._drive(step, server)
-            elif (form := self.page.locator("form:has(button.main)")).count():  # the operator's page has others
-                self.on_page(self.page, step)
-                if self.page.locator("button[value=again]").count():
-                    raise StudyError(f"{step} of {server.record.code} failed; the log says why")
-                self._answer(form)
-                self.page.locator("button.main").click()
-            else:
-                self.page.wait_for_timeout(500)  # the page reloads itself
+            try:
+                self._act(server.record.step or "end", server)
+            except Error as error:
+                if "navigation" not in str(error):
+                    raise  # else the page went on by itself, as at the end of a drive: look at the new one
+            finally:
+                self.page.keyboard.up("w")
         self.page.goto(server.url)
         self.on_page(self.page, "end")
+
+    def _act(self, step: str, server: StudyServer) -> None:
+        """Do what the present page asks for."""
+        if self.page.locator("#study-bar").count():
+            self._drive(step, server)
+        elif (form := self.page.locator("form:has(button.main)")).count():  # the operator's page has others
+            self.on_page(self.page, step)
+            if self.page.locator("button[value=again]").count():
+                raise StudyError(f"{step} of {server.record.code} failed; the log says why")
+            self._answer(form)
+            self.page.locator("button.main").click()
+        else:
+            self.page.wait_for_timeout(500)  # the page reloads itself
 
     def _check_time(self) -> None:
         if time.monotonic() > self._deadline:
@@ -136,7 +147,6 @@ class Participant:
                         keys.up(key)
                 keys.down("w")
                 moved_at = time.monotonic()
-        keys.up("w")
         return None
 
     def _end(self) -> None:
@@ -161,6 +171,7 @@ def simulate(record: Record, limit_s: float, on_page: Callable[[Any, str], None]
     try:
         with chromium() as browser:
             page = browser.new_page(viewport={"width": 960, "height": 600})
+            page.set_default_timeout(120_000)  # a busy machine takes its time
             Participant(page, int(record.code[1:]), limit_s, on_page).take_part(server)
     finally:
         server.stop()
