@@ -11,6 +11,7 @@ import pytest
 from console_pages import (
     BROWSER_TEST,
     SETTLE_MS,
+    WAIT_MS,
     expect_body,
     likeness_of,
     moving,
@@ -230,11 +231,13 @@ def test_a_change_of_mode_is_said_once_and_shown_by_word_and_shape(driver, share
     driver.evaluate("import('/static/hud.js').then((hud) => { hud.announce('flicker'); hud.announce('holds'); })")
     driver.get_by_text("holds", exact=True).wait_for(state="attached")
     heard = driver.evaluate(
-        """() => new Promise((done) => { const seen = [];
-        new MutationObserver(() => seen.push(document.getElementById('announce').textContent))
-            .observe(document.getElementById('announce'), {childList: true, characterData: true, subtree: true});
+        """(limit) => new Promise((done) => { const seen = [];
+        new MutationObserver(() => {
+            if (seen.push(document.getElementById('announce').textContent) > 1 || seen[0] === 'lasts') done(seen);
+        }).observe(document.getElementById('announce'), {childList: true, characterData: true, subtree: true});
         import('/static/hud.js').then((hud) => { hud.announce('flicker'); hud.announce('lasts'); });
-        setTimeout(() => done(seen), 700); })"""
+        setTimeout(() => done(seen), limit); })""",
+        WAIT_MS,
     )
     assert heard == ["lasts"]
 
