@@ -325,8 +325,8 @@ class RollingCostmap:
         occupancy.flags.writeable = False  # numba would compile the kernel once more for a map that may be written
         return _join(
             self._observed,
-            self.heights.hits,
-            self.config.points.mark_threshold,
+            self.heights.occupied(),
+            self.heights.dismissed(),
             occupancy,
             float(shift[0]),
             float(shift[1]),
@@ -362,8 +362,8 @@ def inflated_cost(distance_m: float, config: CostmapConfig, footprint: Footprint
 @njit(cache=True)
 def _join(
     observed: NDArray[np.uint8],
-    hits: NDArray[np.uint8],
-    mark_threshold: int,
+    occupied: NDArray[np.bool_],
+    dismissed: NDArray[np.bool_],
     occupancy: NDArray[np.int8],
     shift_x: float,
     shift_y: float,
@@ -388,7 +388,9 @@ def _join(
                 known = occupancy[row, columns[c]]
             seen = observed[r, c]
             held = known >= lethal_threshold and through[r, c] < seen_through
-            if held or seen == 254 or hits[r, c] >= mark_threshold:
+            if seen == 254 and dismissed[r, c]:
+                seen = 0
+            if held or seen == 254 or occupied[r, c]:
                 master[r, c] = 254
             else:
                 master[r, c] = seen if known < 0 else 0
