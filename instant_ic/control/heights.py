@@ -25,8 +25,8 @@ ROW_RAD, ROWS = math.radians(2.0), 90
 """Angle between the sensor's rings; number of elevation bins of this size, from straight down to straight up."""
 CLEAR_MARGIN_M = 0.15
 """A beam must end this far behind a mark to clear it."""
-PASSED_RATE, MOSTLY_PASSED = 0.1, 0.8
-"""Weight of one sweep in the share of beams that pass a mark, and the share from which on the mark is dismissed."""
+INSIDE_WEIGHT, MOST_EVIDENCE = 4, 200
+"""A beam that ends in a mark counts as much as so many that end just behind it; bound of the sum."""
 FAST = {"contract", "arcp", "afn"}
 """Fast-math flags that keep nan and inf."""
 SCATTER_M = 0.01
@@ -121,8 +121,8 @@ class HeightLayer:
     A cell is marked once ``mark_threshold`` points have fallen into it; it keeps the lowest and highest of them. It is
     cleared when a beam at one of those heights ends well behind it and none ends in it.
 
-    Noise of ranges and poses also marks cells in front of a surface. A mark is dismissed while most of the beams at its
-    heights pass it and end just behind it.
+    Noise of ranges and poses also marks cells in front of a surface. A mark is dismissed while nearly all beams at its
+    heights end just behind it.
     """
 
     def __init__(self, config: HeightConfig, size: int, resolution: float) -> None:
@@ -133,8 +133,8 @@ class HeightLayer:
         """(H, W) number of points in a cell; occupied from ``mark_threshold`` on."""
         self.low = np.zeros((size, size), dtype=np.float32)
         self.high = np.zeros((size, size), dtype=np.float32)
-        self.passed = np.zeros((size, size), dtype=np.float32)
-        """(H, W) share of the beams that end just behind a mark, not in it; a moving average over the sweeps."""
+        self.evidence = np.zeros((size, size), dtype=np.int16)
+        """(H, W) beams that ended in a mark, weighted, less those that ended just behind it; below 0: dismissed."""
 
     def reset(self) -> None:
         """Forget all marks."""
@@ -145,7 +145,7 @@ class HeightLayer:
         self.hits = shifted(self.hits, columns, rows, 0)
         self.low = shifted(self.low, columns, rows, 0.0)
         self.high = shifted(self.high, columns, rows, 0.0)
-        self.passed = shifted(self.passed, columns, rows, 0.0)
+        self.evidence = shifted(self.evidence, columns, rows, 0)
 
     def update(self, sweep: SortedPoints, placed: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
         """Add a sweep whose frame has the pose ``placed`` (x, y, yaw) in the window's frame.
@@ -164,16 +164,16 @@ class HeightLayer:
             self.hits,
             self.low,
             self.high,
-            self.passed,
+            self.evidence,
         )
 
     def occupied(self) -> NDArray[np.bool_]:
         """Mask (H, W) of the cells that hold an obstacle."""
-        return (self.hits >= self.config.mark_threshold) & (self.passed < MOSTLY_PASSED)
+        return (self.hits >= self.config.mark_threshold) & (self.evidence >= 0)
 
     def dismissed(self) -> NDArray[np.bool_]:
-        """Mask (H, W) of the cells in which points fell, but which most beams pass."""
-        return (self.hits > 0) & (self.passed >= MOSTLY_PASSED)
+        """Mask (H, W) of the cells that hold points, but only noise of a surface behind them."""
+        return (self.hits > 0) & (self.evidence < 0)
 
 
 def shifted(array: NDArray[Cell], columns: int, rows: int, fill: float) -> NDArray[Cell]:
@@ -283,7 +283,7 @@ def _clear_and_mark(
     hits: NDArray[np.uint8],
     low: NDArray[np.float32],
     high: NDArray[np.float32],
-    passed_share: NDArray[np.float32],
+    evidence: NDArray[np.int16],
 ) -> None:
     """Clear the cells that beams pass through, then mark."""
     size_y, size_x = hits.shape
@@ -308,22 +308,29 @@ def _clear_and_mark(
             least = (_angle(low[r, c] + SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
             most = (_angle(high[r, c] - SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
             passed, stands = False, False
-            inside, behind = 0, 0
             for row in range(max(0, int(first)), min(ROWS - 1, int(last)) + 1):
                 end = ends[row, column]
                 if not np.isfinite(end):
                     continue
-                between = least <= row + 0.5 <= most
                 if abs(end - distance) <= CLEAR_MARGIN_M:
                     stands = True
-                    inside += abs(end - distance) <= 0.5 * resolution
-                    behind += between and end > distance + 0.5 * resolution
-                elif end > distance and between:
+                elif end > distance and least <= row + 0.5 <= most:
                     passed = True
             if passed and not stands:
                 hits[r, c] = 0
-            elif inside + behind > 0:
-                passed_share[r, c] += PASSED_RATE * (behind / (inside + behind) - passed_share[r, c])
+                continue
+            least = (_angle(low[r, c] - SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
+            most = (_angle(high[r, c] + SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
+            wide = int(0.5 * resolution / distance * AZIMUTHS / (2.0 * math.pi))
+            change = 0
+            for row in range(max(0, int(first)), min(ROWS - 1, int(last)) + 1):
+                for beside in range(column - wide, column + wide + 1):
+                    away = ends[row, beside % AZIMUTHS] - distance
+                    if abs(away) <= 0.5 * resolution:
+                        change += INSIDE_WEIGHT
+                    elif 0.0 < away <= CLEAR_MARGIN_M and least <= row + 0.5 <= most:
+                        change -= 1
+            evidence[r, c] = min(max(evidence[r, c] + change, -MOST_EVIDENCE), MOST_EVIDENCE)
     for i in range(obstacles.shape[0]):
         px, py, z = obstacles[i, 0], obstacles[i, 1], obstacles[i, 2]
         x, y = cos * px - sin * py + placed[0], sin * px + cos * py + placed[1]
@@ -332,7 +339,7 @@ def _clear_and_mark(
         c, r = math.floor((x - origin_x) / resolution), math.floor((y - origin_y) / resolution)
         if 0 <= r < size_y and 0 <= c < size_x:
             if hits[r, c] == 0:
-                low[r, c], high[r, c], passed_share[r, c] = z, z, 0.0
+                low[r, c], high[r, c], evidence[r, c] = z, z, 0
             else:
                 low[r, c], high[r, c] = min(low[r, c], z), max(high[r, c], z)
             hits[r, c] = min(hits[r, c] + 1, 250)
