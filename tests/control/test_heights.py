@@ -87,6 +87,19 @@ def test_fast_angle() -> None:
         assert _angle(y, x) == pytest.approx(math.atan2(y, x), abs=2e-5)
 
 
+FIVE_BINS = [0.25, 0.75, 1.25, 1.75, 2.25]
+"""Azimuths in degrees, one a bin, over the cell at (1.025, 0.025): its 5 cm are 2.8° wide."""
+
+
+def rings(x: float, azimuths_deg: list[float]) -> list[tuple[float, float, float]]:
+    """Where the beams of three rings meet a surface across the x axis, heights above the ground."""
+    return [
+        (x, x * math.tan(math.radians(azimuth)), LIDAR_M + x * math.tan(math.radians(elevation)))
+        for azimuth in azimuths_deg
+        for elevation in (-3, -1, 1)
+    ]
+
+
 class TestLayer:
     origin = np.array([-3.0, -3.0])
 
@@ -160,6 +173,26 @@ class TestLayer:
         self.seen(layer, (4.0, 0.0494, 0.58), *thing)
         assert (2.025, 0.025) in self.marked(layer)
 
+    def test_noise_before_a_surface_is_dismissed_and_a_thing_that_comes_there_is_not(self) -> None:
+        layer = self.layer()
+        # The surface is at 1.08 m, its marks at 1.075 m. A point of each ring strays into the mark at 1.025 m.
+        surface = rings(1.08, FIVE_BINS)
+        self.seen(layer, *rings(1.02, [0.25]), *surface)
+        assert (1.025, 0.025) in self.marked(layer)
+        self.seen(layer, *surface)
+        self.seen(layer, *surface)
+        assert (1.025, 0.025) not in self.marked(layer)
+        assert (1.075, 0.025) in self.marked(layer)
+        for _ in range(2):
+            self.seen(layer, *rings(1.02, FIVE_BINS))
+        assert (1.025, 0.025) in self.marked(layer)
+
+    def test_a_post_narrower_than_a_cell_is_not_taken_for_noise_of_the_wall_behind_it(self) -> None:
+        layer = self.layer()
+        for _ in range(40):
+            self.seen(layer, *rings(1.08, FIVE_BINS[1:]), *rings(1.02, FIVE_BINS[:1]))
+        assert (1.025, 0.025) in self.marked(layer)
+
     def test_marks_move_with_the_window(self) -> None:
         layer = self.layer()
         self.seen(layer, (2.01, 0.01, 0.1), (2.02, 0.01, 0.1))
@@ -189,6 +222,18 @@ def test_low_and_hanging_things_are_lethal_where_the_flat_scan_sees_free_ground(
     rolling.reset()
     assert rolling.update(np.zeros(3), None, wall).cost_at(np.array([1.0, 0.01])) == FREE
     assert len(rolling.update(np.zeros(3), None, wall).remembered) == 0
+
+
+def test_a_scan_hit_where_3d_points_show_noise_of_a_surface_is_no_obstacle() -> None:
+    rolling = RollingCostmap(CostmapConfig(width=6.0), Footprint())
+    surface = rings(1.08, FIVE_BINS)
+    stray = ScanRays(np.zeros(2), np.array([[1.02, 0.01]]), np.array([True]))
+    place = np.array([1.02, 0.01])
+    rolling.update(np.zeros(3), None, stray, sort(at(*rings(1.02, [0.25]), *surface)))
+    assert rolling.update(np.zeros(3), None, stray).cost_at(place) == LETHAL
+    for _ in range(2):
+        costmap = rolling.update(np.zeros(3), None, stray, sort(at(*surface)))
+    assert costmap.cost_at(place) < LETHAL
 
 
 def test_memory_near_the_robot_in_its_own_frame() -> None:
