@@ -319,17 +319,19 @@ def _clear_and_mark(
             if passed and not stands:
                 hits[r, c] = 0
                 continue
-            least = (_angle(low[r, c] - SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
-            most = (_angle(high[r, c] + SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
             wide = int(0.5 * resolution / distance * AZIMUTHS / (2.0 * math.pi))
             change = 0
-            for row in range(max(0, int(first)), min(ROWS - 1, int(last)) + 1):
+            for row in range(max(1, int(first)), min(ROWS - 2, int(last)) + 1):
                 for beside in range(column - wide, column + wide + 1):
-                    away = ends[row, beside % AZIMUTHS] - distance
-                    if abs(away) <= 0.5 * resolution:
+                    beam = beside % AZIMUTHS
+                    if abs(ends[row, beam] - distance) <= 0.5 * resolution:
                         change += INSIDE_WEIGHT
-                    elif 0.0 < away <= CLEAR_MARGIN_M and least <= row + 0.5 <= most:
-                        change -= 1
+                        continue
+                    # A single ring may end on the top of a low thing, or under a hanging one, whose edge is the mark.
+                    behind = True
+                    for ring in range(row - 1, row + 2):
+                        behind &= 0.5 * resolution < ends[ring, beam] - distance <= CLEAR_MARGIN_M
+                    change -= behind
             evidence[r, c] = min(max(evidence[r, c] + change, -MOST_EVIDENCE), MOST_EVIDENCE)
     for i in range(obstacles.shape[0]):
         px, py, z = obstacles[i, 0], obstacles[i, 1], obstacles[i, 2]
