@@ -193,6 +193,15 @@ class TestLayer:
             self.seen(layer, *rings(1.08, FIVE_BINS[1:]), *rings(1.02, FIVE_BINS[:1]))
         assert (1.025, 0.025) in self.marked(layer)
 
+    def test_a_ring_that_ends_on_the_top_of_a_low_thing_does_not_dismiss_its_edge(self) -> None:
+        layer = self.layer()
+        # Front at 1.56 m, top at 0.17 m. The lowest ring (-15°) passes 1 cm over the edge and ends on the top at 1.605 m.
+        edge = [1.56 * math.tan(math.radians(azimuth)) for azimuth in FIVE_BINS[:4]]
+        self.seen(layer, *[(1.56, y, z) for y in edge for z in (0.09, 0.17)])
+        for _ in range(40):
+            self.seen(layer, *[(1.605, 1.605 / 1.56 * y, 0.17) for y in edge])
+        assert (1.575, 0.025) in self.marked(layer)
+
     def test_marks_move_with_the_window(self) -> None:
         layer = self.layer()
         self.seen(layer, (2.01, 0.01, 0.1), (2.02, 0.01, 0.1))
