@@ -195,7 +195,7 @@ class TestLayer:
 
     def test_a_ring_that_ends_on_the_top_of_a_low_thing_does_not_dismiss_its_edge(self) -> None:
         layer = self.layer()
-        # Front at 1.56 m, top at 0.17 m. The lowest ring (-15°) passes 1 cm over the edge and ends on the top at 1.605 m.
+        # Front at 1.56 m, top at 0.17 m. The lowest ring (-15°) passes 1 cm over the edge and ends on top at 1.605 m.
         edge = [1.56 * math.tan(math.radians(azimuth)) for azimuth in FIVE_BINS[:4]]
         self.seen(layer, *[(1.56, y, z) for y in edge for z in (0.09, 0.17)])
         for _ in range(40):
