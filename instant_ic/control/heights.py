@@ -29,6 +29,9 @@ INSIDE_WEIGHT, MOST_EVIDENCE = 4, 200
 """A beam that ends in a mark counts as much as so many that end just behind it; bound of the sum."""
 FAST = {"contract", "arcp", "afn"}
 """Fast-math flags that keep nan and inf."""
+UNSEEN_EDGE_M, FAR_BEHIND_M = 0.1, 0.4
+"""A thing that only the lowest ring meets, from above, may begin so far before that point; the next ring then ends at
+least so far behind it."""
 SCATTER_M = 0.01
 """Metres by which the heights of points on one surface differ: noise of the ranges, pitch of the robot."""
 INSTANTS = 65
@@ -204,6 +207,12 @@ def _angle(y: float, x: float) -> float:
 
 
 @njit(cache=True, fastmath=FAST)
+def _bin(y: float, x: float) -> int:
+    """Bin of the azimuth of (x, y)."""
+    return min(int((_angle(y, x) + math.pi) * (AZIMUTHS / (2.0 * math.pi))), AZIMUTHS - 1)
+
+
+@njit(cache=True, fastmath=FAST)
 def _sort(
     points: NDArray[np.float32],
     time_s: NDArray[np.float32],
@@ -226,7 +235,7 @@ def _sort(
     near_m = np.full(AZIMUTHS, np.inf)
     near_at = np.full(AZIMUTHS, -1, dtype=np.int64)
     counts = np.zeros(4, dtype=np.int64)
-    per_radian, rows_per_radian = AZIMUTHS / (2.0 * math.pi), 1.0 / ROW_RAD
+    rows_per_radian = 1.0 / ROW_RAD
     kept = 0
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -246,7 +255,7 @@ def _sort(
         # Relative to the sensor's position at the end of the sweep.
         dx, dy, dz = x - sensor[0], y - sensor[1], z - sensor[2]
         distance = math.sqrt(dx * dx + dy * dy)
-        column = min(int((_angle(dy, dx) + math.pi) * per_radian), AZIMUTHS - 1)
+        column = _bin(dy, dx)
         row = min(int((_angle(dz, distance) + 0.5 * math.pi) * rows_per_radian), ROWS - 1)
         if distance < ends[row, column]:
             ends[row, column] = distance
@@ -299,8 +308,7 @@ def _clear_and_mark(
             distance = math.sqrt(dx * dx + dy * dy)
             if distance < resolution:
                 continue
-            azimuth = _angle(cos * dy - sin * dx, cos * dx + sin * dy)
-            column = min(int((azimuth + math.pi) * AZIMUTHS / (2.0 * math.pi)), AZIMUTHS - 1)
+            column = _bin(cos * dy - sin * dx, cos * dx + sin * dy)
             # A beam above a low thing or below a hanging one proves nothing, and from near no beam ever sees it again.
             # So a mark ends only with a beam well between its heights; a beam that ends there, or nearly so, keeps it.
             first = (_angle(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
@@ -333,15 +341,28 @@ def _clear_and_mark(
                         behind &= 0.5 * resolution < ends[ring, beam] - distance <= CLEAR_MARGIN_M
                     change -= behind
             evidence[r, c] = min(max(evidence[r, c] + change, -MOST_EVIDENCE), MOST_EVIDENCE)
+    lowest = 0
+    while lowest < ROWS - 2 and not np.isfinite(ends[lowest].min()):
+        lowest += 1
     for i in range(obstacles.shape[0]):
         px, py, z = obstacles[i, 0], obstacles[i, 1], obstacles[i, 2]
         x, y = cos * px - sin * py + placed[0], sin * px + cos * py + placed[1]
-        if (x - sensor_x) ** 2 + (y - sensor_y) ** 2 > range_max * range_max:
+        dx, dy = x - sensor_x, y - sensor_y
+        distance = math.sqrt(dx * dx + dy * dy)
+        if distance > range_max:
             continue
-        c, r = math.floor((x - origin_x) / resolution), math.floor((y - origin_y) / resolution)
-        if 0 <= r < size_y and 0 <= c < size_x:
-            if hits[r, c] == 0:
-                low[r, c], high[r, c], evidence[r, c] = z, z, 0
-            else:
-                low[r, c], high[r, c] = min(low[r, c], z), max(high[r, c], z)
-            hits[r, c] = min(hits[r, c] + 1, 250)
+        cells = 1
+        if (_angle(z - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD < lowest + 1:
+            column = _bin(py - sensor[1], px - sensor[0])
+            if np.isfinite(ends[lowest + 1, column]) and ends[lowest + 1, column] - distance > FAR_BEHIND_M:
+                cells += int(min(UNSEEN_EDGE_M, 0.5 * distance) / resolution)
+        for k in range(cells):
+            share = k * resolution / max(distance, resolution)
+            c = math.floor((x - share * dx - origin_x) / resolution)
+            r = math.floor((y - share * dy - origin_y) / resolution)
+            if 0 <= r < size_y and 0 <= c < size_x:
+                if hits[r, c] == 0:
+                    low[r, c], high[r, c], evidence[r, c] = z, z, 0
+                else:
+                    low[r, c], high[r, c] = min(low[r, c], z), max(high[r, c], z)
+                hits[r, c] = min(hits[r, c] + 1, 250)
