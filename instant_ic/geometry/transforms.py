@@ -18,6 +18,8 @@ class TransformError(LookupError):
 _TOLERANCE_NS = 200_000_000
 """How far beyond its newest value a look-up may reach; it then returns the newest value. Drivers stamp data a little
 later than the last odometry that arrived."""
+_BACK_NS = 1_000_000_000
+"""A value older than a moving frame's newest one by more than this: the clock was set back. SLAM has the same limit."""
 
 
 @dataclass
@@ -45,6 +47,9 @@ class TransformBuffer:
     def set(self, parent: str, child: str, stamp_ns: int, parent_from_child: Matrix, static: bool = False) -> None:
         """Add one value; an existing stamp is replaced, an older one is inserted in order.
 
+        If the clock was set back, the frame's values from before are dropped: they would count as the newest until the
+        clock has caught up, and the robot would seem to stand.
+
         Raises:
             TransformError: the matrix is not a finite (4, 4) array, or a frame would be its own ancestor.
         """
@@ -59,7 +64,8 @@ class TransformBuffer:
                 edge = self._edges.get(ancestor)
                 ancestor = edge.parent if edge else None
             edge = self._edges.get(child)
-            if edge is None or edge.parent != parent or edge.static != static or static:
+            other = edge is None or edge.parent != parent or edge.static != static or static
+            if edge is None or other or stamp_ns < edge.stamps_ns[-1] - _BACK_NS:
                 edge = self._edges[child] = _Edge(parent, static)
             if not edge.stamps_ns or stamp_ns > edge.stamps_ns[-1]:
                 edge.stamps_ns.append(stamp_ns)
