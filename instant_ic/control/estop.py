@@ -105,8 +105,8 @@ class KeptEstop(EstopLatch):
         self._run_dir = run_dir
         self._kept = None if run_dir is None else estop_state.read(run_dir)
         if self._kept is not None:
-            # Clamp to now, in case the clock was set since: any release from here on is newer.
-            self._kept = replace(self._kept, pressed_ns=min(self._kept.pressed_ns, now_ns))
+            # Only a release from here on counts. The clock may have been set: an old one may look newer than the press.
+            self._kept = replace(self._kept, pressed_ns=now_ns)
             self.hear(True, self._kept.publisher, self._kept.pressed_ns, now_ns)
 
     @property
