@@ -18,8 +18,6 @@ class TransformError(LookupError):
 _TOLERANCE_NS = 200_000_000
 """How far beyond its newest value a look-up may reach; it then returns the newest value. Drivers stamp data a little
 later than the last odometry that arrived."""
-_BACK_NS = 1_000_000_000
-"""A value older than a moving frame's newest one by more than this: the clock was set back. SLAM has the same limit."""
 
 
 @dataclass
@@ -44,11 +42,19 @@ class TransformBuffer:
         self._edges: dict[str, _Edge] = {}
         self._lock = threading.Lock()
 
-    def set(self, parent: str, child: str, stamp_ns: int, parent_from_child: Matrix, static: bool = False) -> None:
+    def set(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        parent_from_child: Matrix,
+        static: bool = False,
+        now_ns: int | None = None,
+    ) -> None:
         """Add one value; an existing stamp is replaced, an older one is inserted in order.
 
-        If the clock was set back, the frame's values from before are dropped: they would count as the newest until the
-        clock has caught up, and the robot would seem to stand.
+        With the present time ``now_ns`` a frame's values are dropped if the newest is ahead of it: the clock was set
+        back. It would count as the newest until the clock has caught up, and the robot would seem to stand.
 
         Raises:
             TransformError: the matrix is not a finite (4, 4) array, or a frame would be its own ancestor.
@@ -65,7 +71,8 @@ class TransformBuffer:
                 ancestor = edge.parent if edge else None
             edge = self._edges.get(child)
             other = edge is None or edge.parent != parent or edge.static != static or static
-            if edge is None or other or stamp_ns < edge.stamps_ns[-1] - _BACK_NS:
+            latest_ns = None if now_ns is None else max(now_ns, stamp_ns) + _TOLERANCE_NS
+            if edge is None or other or (latest_ns is not None and edge.stamps_ns[-1] > latest_ns):
                 edge = self._edges[child] = _Edge(parent, static)
             if not edge.stamps_ns or stamp_ns > edge.stamps_ns[-1]:
                 edge.stamps_ns.append(stamp_ns)
