@@ -212,7 +212,8 @@ def test_the_files_are_private_replaced_whole_and_a_damaged_one_means_stopped(tm
     estop_state.write(tmp_path, KeptStop("console", 5))
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estop.json"]
-    for damage in (b"", b"{", b"[]", b'{"publisher": 1}', b"\xff\xfe"):
+    endless = b'{"publisher": "console", "pressed_ns": 1e999, "why": ""}'
+    for damage in (b"", b"{", b"[]", b'{"publisher": 1}', b"\xff\xfe", endless, b"[" * 100_000):
         file.write_bytes(damage)
         kept = estop_state.read(tmp_path)
         assert kept is not None and "cannot be read" in kept.why
