@@ -1,9 +1,11 @@
 """Grid SLAM: accuracy and CPU time on the Intel log, in generated buildings and on the simulated crawler, as JSON.
 
 python benchmarks/slam.py [--data FOLDER] [--only NAME ...]
+python benchmarks/slam.py --only faults --log NAME [--first N] [--faults NAME ...] [--places N] [--noise-seeds N]
 
 Parts: ``box`` (720 beams in a room), ``long`` (the same for a long time, to see whether the cost per scan grows),
-``intel``, ``intel_seeds`` (five seeds of degraded odometry), ``intel_rbpf`` (the particle filter), ``worlds``, ``sim``.
+``intel``, ``intel_seeds`` (five seeds of degraded odometry), ``intel_rbpf`` (the particle filter), ``worlds``, ``sim``,
+``faults`` (faults put into one log, which may be a generated one; only if named).
 All use the default parameters. ``--data`` is the folder with intel.log.gz; default ../shared/data/slam2d.
 """
 
@@ -14,10 +16,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from reporting import parser_of, report
+from reporting import note, parser_of, report
 
 from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
+from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
 from instant_ic.experiments.slam_logs import LogEntry, read_log
 from instant_ic.experiments.slam_worlds import LASERS, cells, drive, office, ring, trajectory_errors
 from instant_ic.geometry.poses import compose2
@@ -120,14 +123,43 @@ def simulated() -> list[dict[str, object]]:
     ]
 
 
+def fault_log(name: str, data: Path) -> list[LogEntry]:
+    """The log of the faults: a real one in ``data``, the simulated crawler, or a drive through a generated building."""
+    from instant_ic.experiments.slam_sim import round_trip
+    from instant_ic.sim.worlds import make_world
+
+    kind, _, seed = name.partition(":")
+    if kind == "crawler":
+        return round_trip(make_world("corridor"), 0.2, int(seed or 0)).entries
+    if kind in ("office", "ring"):
+        made = (office if kind == "office" else ring)(int(seed or 0))
+        return drive(made[0], made[1], LASERS["sick180"], int(seed or 0)).entries
+    return list(read_log(data / name))
+
+
 def main() -> None:
     parts = ("box", "long", "intel", "intel_seeds", "intel_rbpf", "worlds", "sim")
     parser = parser_of(__doc__)
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"
     parser.add_argument("--data", type=Path, default=default)
-    parser.add_argument("--only", nargs="+", choices=parts, default=parts)
+    parser.add_argument("--only", nargs="+", choices=(*parts, "faults"), default=parts)
+    parser.add_argument(
+        "--log", metavar="NAME", help="of faults: a file in --data, crawler:SEED, office:SEED, ring:SEED"
+    )
+    parser.add_argument("--first", type=int, metavar="N", help="of faults: only the first N scans")
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS, metavar="NAME")
+    parser.add_argument("--places", type=int, default=6, metavar="N")
+    parser.add_argument("--noise-seeds", type=int, default=1, metavar="N")
+    parser.add_argument("--seed", type=int, default=0, metavar="N")
     args = parser.parse_args()
     result: dict[str, object] = {}
+    if "faults" in args.only:
+        if args.log is None:
+            parser.error("--only faults needs --log")
+        log = fault_log(args.log, args.data)[: args.first]
+        result[args.log] = evaluate_faults(
+            log, places=args.places, seed=args.seed, noise_seeds=args.noise_seeds, faults=args.faults, on_step=note
+        )
     if "box" in args.only:
         result["box"] = room_drive(600)[-1]
     if "long" in args.only:
