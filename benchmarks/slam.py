@@ -26,6 +26,7 @@ from instant_ic.experiments.slam_worlds import LASERS, cells, drive, office, rin
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.grid_slam import warm_up
+from instant_ic.slam.scan import FloatArray
 
 KEPT = (
     "translation_mean_m", "translation_median_m", "translation_max_m", "rotation_mean_deg", "relations",
@@ -123,18 +124,27 @@ def simulated() -> list[dict[str, object]]:
     ]
 
 
-def fault_log(name: str, data: Path) -> list[LogEntry]:
-    """The log of the faults: a real one in ``data``, the simulated crawler, or a drive through a generated building."""
+def fault_log(name: str, data: Path) -> tuple[list[LogEntry], FloatArray | None, Relations | None]:
+    """A log for faults, its ground truth and its relations.
+
+    A real log in ``data``, the simulated crawler, or a drive through a generated building.
+    """
     from instant_ic.experiments.slam_sim import round_trip
     from instant_ic.sim.worlds import make_world
 
     kind, _, seed = name.partition(":")
     if kind == "crawler":
-        return round_trip(make_world("corridor"), 0.2, int(seed or 0)).entries
+        trip = round_trip(make_world("corridor"), 0.2, int(seed or 0))
+        return trip.entries, trip.truth, None
     if kind in ("office", "ring"):
         made = (office if kind == "office" else ring)(int(seed or 0))
-        return drive(made[0], made[1], LASERS["sick180"], int(seed or 0)).entries
-    return list(read_log(data / name))
+        journey = drive(made[0], made[1], LASERS["sick180"], int(seed or 0))
+        return journey.entries, journey.truth, None
+    relations = None
+    if name.startswith("intel"):
+        stamps = read_stamps(data / "intel.exact_stamps")
+        relations = read_relations(data / "intel.relations").at_stamps(stamps, 0.006)
+    return list(read_log(data / name)), None, relations
 
 
 def main() -> None:
@@ -156,10 +166,11 @@ def main() -> None:
     if "faults" in args.only:
         if args.log is None:
             parser.error("--only faults needs --log")
-        log = fault_log(args.log, args.data)[: args.first]
+        log, truth, relations = fault_log(args.log, args.data)
         result[args.log] = evaluate_faults(
-            log, places=args.places, seed=args.seed, noise_seeds=args.noise_seeds, faults=args.faults, on_step=note
-        )
+            log[: args.first], places=args.places, seed=args.seed, noise_seeds=args.noise_seeds, faults=args.faults,
+            relations=relations, truth=None if truth is None else truth[: args.first], on_step=note,
+        )  # fmt: skip
     if "box" in args.only:
         result["box"] = room_drive(600)[-1]
     if "long" in args.only:

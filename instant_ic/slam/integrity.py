@@ -210,6 +210,7 @@ class IntegrityMonitor:
         usual = score if self._score_level is None else self._usual_score
         excess = min(max(contradicted - self._usual_contradiction, 0.0) / FULL_CONTRADICTION, 1.0)
         drop = min(max(usual - score, 0.0) / FULL_DROP, 1.0)
+        self._note_gap(elapsed_s)
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
         long_drop = min(max(usual - score, 0.0) / LONG_DROP, 1.0)
@@ -245,9 +246,14 @@ class IntegrityMonitor:
 
     def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:
         """Take in a scan without a match: one that fits nowhere near, or one without points."""
+        self._note_gap(elapsed_s)
         if fits_nowhere:
             self._weigh(EVIDENCE, elapsed_s)
         self._unseen(elapsed_s)
+
+    def _note_gap(self, elapsed_s: float) -> None:
+        """Note before any doubt by the scan itself that a doubt begins with a time without matched scans."""
+        self.after_gap = self.after_gap or (not self.doubts and self._unseen_s + elapsed_s > UNSEEN_S)
 
     def _unseen(self, elapsed_s: float) -> None:
         """Let the doubt grow with the time without a matched scan."""
@@ -255,7 +261,6 @@ class IntegrityMonitor:
         self._unseen_s += elapsed_s
         grown = UNSEEN_PER_S * (max(self._unseen_s - UNSEEN_S, 0.0) - before)
         if self._log_odds < UNSEEN_MOST:
-            self.after_gap = self.after_gap or (grown > 0.0 and not self.doubts)
             self._log_odds = min(self._log_odds + grown, UNSEEN_MOST)
 
     def integrity(self, covariance: FloatArray, localized: bool) -> Integrity:

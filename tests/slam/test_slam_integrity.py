@@ -151,6 +151,17 @@ def test_time_without_scans_raises_the_probability_up_to_a_limit() -> None:
     assert monitor.lost_probability == pytest.approx(1 / (1 + math.exp(1.0)))
 
 
+def test_a_scan_after_a_gap_that_fits_nowhere_is_after_a_gap() -> None:
+    # The robot is where odometry says, within its error, and is searched for there.
+    monitor = steady()
+    monitor.unmatched(True, 10.0)
+    assert monitor.after_gap and monitor.doubts
+    monitor = steady()
+    monitor.unmatched(True, 0.1)
+    monitor.unmatched(True, 0.1)
+    assert not monitor.after_gap and monitor.doubts
+
+
 def test_covariance_and_bounds_follow_the_probability() -> None:
     own = np.diag([0.01, 0.0004, 0.0001])
     np.testing.assert_allclose(mixture(own, 0.0), own)
