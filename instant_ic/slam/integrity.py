@@ -62,7 +62,8 @@ UNSEEN_S, UNSEEN_PERIODS, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 2.0, 0.6, -1.0
 """After a second without a matched scan, and this many times the usual period of the scans, the log-odds grow by this
 much a second, up to a limit."""
 NEW_VIEW_M = 0.5
-"""From this motion between two scans on a lower score is less evidence, from twice of it on none: the view is new."""
+"""From this motion since the last scan without a doubt on a lower score is less evidence, from twice of it on none: the
+view is new, and doubtful scans are not in the map."""
 LONGEST_DOUBT = 30
 """Scans after which a doubt that is less likely than not is dropped: the robot has driven on, and its map must grow."""
 UNTRUSTED = 0.5
@@ -178,6 +179,7 @@ class IntegrityMonitor:
         self._log_odds = self._provisional_log_odds = FLOOR
         self._suspicious = False  # the last scan, whatever the time since the one before
         self._unseen_s = 0.0
+        self._moved_m = 0.0
         self._period_s: float | None = None
         self._doubtful_scans = 0
         self._score_level: float | None = None
@@ -221,7 +223,8 @@ class IntegrityMonitor:
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
         long_drop = min(max(usual - score, 0.0) / LONG_DROP, 1.0)
-        long_drop *= min(max(2.0 - moved_m / NEW_VIEW_M, 0.0), 1.0)
+        self._moved_m += moved_m
+        long_drop *= min(max(2.0 - self._moved_m / NEW_VIEW_M, 0.0), 1.0)
         share = max(math.sqrt(excess * drop), LONG_DROP_SHARE * long_drop)
         evidence = EVIDENCE * (2.0 * share - 1.0)
         if recovered:
@@ -229,7 +232,7 @@ class IntegrityMonitor:
         else:
             self._weigh(evidence, elapsed_s)
         if self._score_level is None or not self.doubts:
-            self.after_gap = False
+            self.after_gap, self._moved_m = False, 0.0
             level = score if self._score_level is None else self._score_level
             self._score_level = level + LEVEL_SHARE * (score - level)
             self._usual_score = min(self._score_level, score)

@@ -169,6 +169,17 @@ def test_a_lower_score_is_no_sign_in_a_new_view(moved_m: float, sign: bool) -> N
     assert monitor.sign is sign
 
 
+def test_a_doubt_that_keeps_scans_out_of_the_map_makes_no_loss_by_itself() -> None:
+    # The score falls as the robot drives on, because the map does not grow; nothing contradicts the map.
+    monitor = steady()
+    monitor.matched(0.3, 0.6, 0.1)
+    assert monitor.doubts
+    for _ in range(30):
+        monitor.matched(0.02, 0.4, 1.0, moved_m=0.15)
+        assert not monitor.lost
+    assert not monitor.doubts
+
+
 def test_a_scan_every_five_seconds_makes_a_map(log: list[LogEntry]) -> None:
     # 2 m apart, each scan sees as much of the new as of the known.
     slam = GridSlam()
