@@ -1,9 +1,11 @@
 """Grid SLAM: accuracy and CPU time on the Intel log, in generated buildings and on the simulated crawler, as JSON.
 
 python benchmarks/slam.py [--data FOLDER] [--only NAME ...]
+python benchmarks/slam.py --only faults --log NAME [--first N] [--faults NAME ...] [--places N] [--noise-seeds N]
 
 Parts: ``box`` (720 beams in a room), ``long`` (the same for a long time, to see whether the cost per scan grows),
-``intel``, ``intel_seeds`` (five seeds of degraded odometry), ``intel_rbpf`` (the particle filter), ``worlds``, ``sim``.
+``intel``, ``intel_seeds`` (five seeds of degraded odometry), ``intel_rbpf`` (the particle filter), ``worlds``, ``sim``,
+``faults`` (faults put into one log, which may be a generated one; only if named).
 All use the default parameters. ``--data`` is the folder with intel.log.gz; default ../shared/data/slam2d.
 """
 
@@ -14,15 +16,17 @@ import time
 from pathlib import Path
 
 import numpy as np
-from reporting import parser_of, report
+from reporting import note, parser_of, report
 
 from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
+from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
 from instant_ic.experiments.slam_logs import LogEntry, read_log
 from instant_ic.experiments.slam_worlds import LASERS, cells, drive, office, ring, trajectory_errors
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.grid_slam import warm_up
+from instant_ic.slam.scan import FloatArray
 
 KEPT = (
     "translation_mean_m", "translation_median_m", "translation_max_m", "rotation_mean_deg", "relations",
@@ -120,14 +124,53 @@ def simulated() -> list[dict[str, object]]:
     ]
 
 
+def fault_log(name: str, data: Path) -> tuple[list[LogEntry], FloatArray | None, Relations | None]:
+    """A log for faults, its ground truth and its relations.
+
+    A real log in ``data``, the simulated crawler, or a drive through a generated building.
+    """
+    from instant_ic.experiments.slam_sim import round_trip
+    from instant_ic.sim.worlds import make_world
+
+    kind, _, seed = name.partition(":")
+    if kind == "crawler":
+        trip = round_trip(make_world("corridor"), 0.2, int(seed or 0))
+        return trip.entries, trip.truth, None
+    if kind in ("office", "ring"):
+        made = (office if kind == "office" else ring)(int(seed or 0))
+        journey = drive(made[0], made[1], LASERS["sick180"], int(seed or 0))
+        return journey.entries, journey.truth, None
+    relations = None
+    if name.startswith("intel"):
+        stamps = read_stamps(data / "intel.exact_stamps")
+        relations = read_relations(data / "intel.relations").at_stamps(stamps, 0.006)
+    return list(read_log(data / name)), None, relations
+
+
 def main() -> None:
     parts = ("box", "long", "intel", "intel_seeds", "intel_rbpf", "worlds", "sim")
     parser = parser_of(__doc__)
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"
     parser.add_argument("--data", type=Path, default=default)
-    parser.add_argument("--only", nargs="+", choices=parts, default=parts)
+    parser.add_argument("--only", nargs="+", choices=(*parts, "faults"), default=parts)
+    parser.add_argument(
+        "--log", metavar="NAME", help="of faults: a file in --data, crawler:SEED, office:SEED, ring:SEED"
+    )
+    parser.add_argument("--first", type=int, metavar="N", help="of faults: only the first N scans")
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS, metavar="NAME")
+    parser.add_argument("--places", type=int, default=6, metavar="N")
+    parser.add_argument("--noise-seeds", type=int, default=1, metavar="N")
+    parser.add_argument("--seed", type=int, default=0, metavar="N")
     args = parser.parse_args()
     result: dict[str, object] = {}
+    if "faults" in args.only:
+        if args.log is None:
+            parser.error("--only faults needs --log")
+        log, truth, relations = fault_log(args.log, args.data)
+        result[args.log] = evaluate_faults(
+            log[: args.first], places=args.places, seed=args.seed, noise_seeds=args.noise_seeds, faults=args.faults,
+            relations=relations, truth=None if truth is None else truth[: args.first], on_step=note,
+        )  # fmt: skip
     if "box" in args.only:
         result["box"] = room_drive(600)[-1]
     if "long" in args.only:

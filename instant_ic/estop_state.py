@@ -62,7 +62,7 @@ def read(run_dir: Path) -> KeptStop | None:
         return KeptStop(str(fields["publisher"]), int(fields["pressed_ns"]), str(fields["why"]))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         why = f"The emergency stop's last state cannot be read ({file}: {error}). {RELEASE}"
         return KeptStop("arbiter", pace.current().now_ns(), why)
 

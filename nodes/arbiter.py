@@ -70,8 +70,8 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.timer(1.0 / c.rate_hz, self.on_timer)
 
     def reconfigure(self, config: ArbiterConfig) -> None:
-        super().reconfigure(config)
         self.arbiter.reconfigure(config)
+        super().reconfigure(config)
 
     def teardown(self) -> None:
         if hasattr(self, "cmd_vel"):
@@ -93,8 +93,10 @@ class ArbiterNode(Node[ArbiterConfig]):
 
     def step_and_save(self) -> None:
         """Step at once, then save the emergency stop, so that no restart of a node or of the machine ends it."""
-        self.tick()
-        self.diagnose_all(self.latch.save())
+        try:
+            self.tick()
+        finally:  # whatever input the step fails at
+            self.diagnose_all(self.latch.save())
 
     def on_command(self, message: msg.TwistStamped) -> None:
         if self.times.command_steps(msg.twist_values(message)):

@@ -21,6 +21,7 @@ _COMMAND = "/cmd_vel"
 _ACTED_ON = (
     *("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom"),
     *("/view/shown", "/vspace/status"),  # whether the operator sees recent images
+    *("/initialpose", "/slam/*"),  # where the robot is, and whether that is trusted
 )
 """Topics that a robot's nodes act on, in the namespace of its base."""
 _HARMLESS = {"/clock", *EVERY_NODES}

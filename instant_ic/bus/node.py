@@ -527,6 +527,7 @@ class Node(Generic[ConfigT]):
                     stamp_ns(transform),
                     transform_matrix(transform),
                     static,
+                    self.clock.now_ns(),
                 )
             except (TransformError, MessageError) as error:
                 self.diagnose("tf", ERROR, str(error))

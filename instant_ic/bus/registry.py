@@ -18,6 +18,7 @@ import json
 import os
 import re
 import stat
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -189,6 +190,7 @@ class Claim:
         self._what = what
         self.json_path = stem.with_name(stem.name + ".json")
         self._lock_path = stem.with_name(stem.name + ".lock")
+        self._writing = threading.Lock()
         deadline = time.monotonic() + _PREDECESSOR_S
         while not self._lock():
             if time.monotonic() > deadline:
@@ -213,19 +215,22 @@ class Claim:
         return False
 
     def write(self, content: dict[str, Any]) -> None:
-        """Replace the JSON file atomically.
+        """Replace the JSON file atomically; may be called from any thread.
 
         Raises:
             RegistryError: the disk is full, or the run directory is gone.
         """
         scratch = self.json_path.with_suffix(".tmp")
-        try:
-            with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8") as file:
-                file.write(json.dumps(content, default=str))
-            scratch.replace(self.json_path)
-        except OSError as error:
-            scratch.unlink(missing_ok=True)
-            raise RegistryError(f"{self._what} cannot be registered: {error}") from error
+        with self._writing:
+            try:
+                with os.fdopen(
+                    open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8"
+                ) as file:
+                    file.write(json.dumps(content, default=str))
+                scratch.replace(self.json_path)
+            except OSError as error:
+                scratch.unlink(missing_ok=True)
+                raise RegistryError(f"{self._what} cannot be registered: {error}") from error
 
     def release(self) -> None:
         """Remove the JSON file and the lock; a second call does nothing."""

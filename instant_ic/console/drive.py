@@ -126,6 +126,8 @@ class DriveGate:
         was_there = self.driver_alive(now)
         self._driver_seen = now
         self._driver_beat = -math.inf if away else now  # absent at once, without the time-out
+        if away:
+            self.stop(now)
         return was_there == away
 
     def driver_alive(self, now: float) -> bool:

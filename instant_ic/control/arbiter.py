@@ -108,9 +108,9 @@ class Arbiter:
 
     def reconfigure(self, config: ArbiterConfig) -> None:
         """Apply other parameters from the next step on; mode and history stay."""
-        self.config = config
-        self.predictor = Predictor(config.prediction, config.limits, config.footprint)
-        self.rules = CommandRules(config)
+        predictor, rules = Predictor(config.prediction, config.limits, config.footprint), CommandRules(config)
+        # Nothing changes before this line: the values may be unusable.
+        self.config, self.predictor, self.rules = config, predictor, rules
         self._sources = SourceMonitor(config)
         self._planner = HybridPlanner(config.planner, config.footprint)
 

@@ -10,6 +10,8 @@ from instant_ic.diagnosis import Diagnosis, Level
 
 FUTURE_NS = 500_000_000
 """A release stamped farther ahead than this was published before the clock was set back."""
+OLD_NS = 3_000_000_000
+"""An older message is a latched value that comes again, as after a restart of a bridge: nobody acts now."""
 
 
 @dataclass
@@ -23,12 +25,14 @@ class EstopLatch:
         pressed: a press has not been released yet.
         publisher: name of the node that pressed last.
         pressed_ns: publication time of that press, nanoseconds since the epoch.
+        again: the press was a latched value that came again; then such a release, if it is newer, ends it.
         buttons: names of the nodes that report a pressed button on the robot.
     """
 
     pressed: bool = False
     publisher: str = ""
     pressed_ns: int = 0
+    again: bool = False
     buttons: set[str] = field(default_factory=set)
 
     @property
@@ -61,19 +65,23 @@ class EstopLatch:
         Returns:
             Why a release is refused; empty if the message was obeyed.
         """
+        old = received_ns - publish_ns > OLD_NS
         if pressed:
+            self.again = old and (self.again or not self.pressed)
             self._press(publisher, publish_ns)
             return ""
         if not self.stopped:
             return ""
         if self.button:
             return "the button on the robot is pressed. Release the button, then release the stop again."
-        again = "If a clock was set, press stop and release again."
+        advice = "If a clock was set, press stop and release again."
         if publish_ns > received_ns + FUTURE_NS:
             ahead_s = (publish_ns - received_ns) / 1e9
-            return f"the release by {publisher} is stamped {ahead_s:.1f} s ahead. {again}"
+            return f"the release by {publisher} is stamped {ahead_s:.1f} s ahead. {advice}"
         if publish_ns < self.pressed_ns:
-            return f"the release by {publisher} is older than the stop by {self.publisher}. {again}"
+            return f"the release by {publisher} is older than the stop by {self.publisher}. {advice}"
+        if old and not self.again:
+            return f"the release by {publisher} is {(received_ns - publish_ns) / 1e9:.1f} s old. Release again."
         self.pressed = False
         return ""
 
@@ -81,6 +89,7 @@ class EstopLatch:
         """Take a message of ``/robot/estop``: a press latches, releasing the button ends nothing by itself."""
         if pressed:
             self.buttons.add(publisher)
+            self.again = False
             self._press(publisher, publish_ns)
         else:
             self.buttons.discard(publisher)
@@ -105,8 +114,8 @@ class KeptEstop(EstopLatch):
         self._run_dir = run_dir
         self._kept = None if run_dir is None else estop_state.read(run_dir)
         if self._kept is not None:
-            # Clamp to now, in case the clock was set since: any release from here on is newer.
-            self._kept = replace(self._kept, pressed_ns=min(self._kept.pressed_ns, now_ns))
+            # Only a release from here on counts. The clock may have been set: an old one may look newer than the press.
+            self._kept = replace(self._kept, pressed_ns=now_ns)
             self.hear(True, self._kept.publisher, self._kept.pressed_ns, now_ns)
 
     @property

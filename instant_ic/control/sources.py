@@ -30,7 +30,9 @@ class SourceMonitor:
             if source.optional and source.key not in inputs.ages:
                 continue
             age_s = _age_s(source, inputs, in_mode_s)
-            if age_s > self._allowed_s(source, inputs) or (source.key == "command" and inputs.operator_gone):
+            # An age that is no number proves no freshness.
+            fresh = age_s <= self._allowed_s(source, inputs)
+            if not fresh or (source.key == "command" and inputs.operator_gone):
                 found.append(Stale(source, age_s))
         return tuple(found)
 

@@ -282,6 +282,7 @@ def evaluate_faults(
     seed: int = 0,
     noise_seeds: int = 1,
     relations: Relations | None = None,
+    truth: FloatArray | None = None,
     faults: Sequence[str] = FAULTS,
     on_step: Callable[[str], None] | None = None,
 ) -> dict[str, object]:
@@ -293,6 +294,7 @@ def evaluate_faults(
         noise_seeds: runs of each fault that lasts the whole log; the first has the log's own odometry, the others noise
             (`perturb_odometry`).
         relations: for the accuracy of the runs over the whole log.
+        truth: poses (n, 3) of a generated log in the frame of the first one, for the same; None: unknown.
         on_step: called with the name of what runs next.
 
     Raises:
@@ -350,37 +352,61 @@ def evaluate_faults(
     makers = whole_log_faults(entries, rng)
     for name in [name for name in faults if name in makers]:
         announce(name)
-        report[name] = _whole_log(makers[name](), config, clean, noise_seeds, relations)
+        accuracy = None if truth is None and relations is None else _Accuracy(truth, relations)
+        report[name] = _whole_log(makers[name](), config, clean, noise_seeds, accuracy)
     if RELOCALIZATION in faults:
         announce(RELOCALIZATION)
         report[RELOCALIZATION] = relocalizations(entries, config, places, rng)
     return report
 
 
+@dataclass(frozen=True)
+class _Accuracy:
+    """What the accuracy of a run is measured against: ground truth (n, 3) of the clean log, or relations."""
+
+    truth: FloatArray | None
+    relations: Relations | None
+
+    def error_m(self, entries: Sequence[LogEntry], poses: FloatArray, source: NDArray[np.intp]) -> float | None:
+        """Mean error of ``poses`` (n, 3); None if no relation lies between them."""
+        if self.truth is not None:
+            origin = relative2(self.truth[source[0]], np.zeros(3))
+            there = np.array([compose2(poses[0], compose2(origin, pose)) for pose in self.truth[source]])
+            return float(np.hypot(*(poses - there)[:, :2].T).mean())
+        assert self.relations is not None
+        try:
+            return float(log_error(entries, poses, self.relations)["translation_mean_m"])
+        except ValueError:
+            return None
+
+
 def _whole_log(
-    faulted: Faulted, config: SlamConfig | None, clean: CleanRun, noise_seeds: int, relations: Relations | None
+    faulted: Faulted, config: SlamConfig | None, clean: CleanRun, noise_seeds: int, accuracy: _Accuracy | None
 ) -> dict[str, object]:
     """Figures of a fault that lasts the whole log, over seeds of odometry noise."""
+    source = faulted.source
     runs: list[dict[str, float | int]] = []
     for noise in range(noise_seeds):
         entries = faulted.entries if noise == 0 else list(perturb_odometry(faulted.entries, noise))
         run, _ = _clean_run(entries, config, [])
-        online = clean.errors(run.online, faulted.source, None)
+        online = clean.errors(run.online, source, None)
         wrong = online > WRONG_M
         figures: dict[str, float | int] = {
-            "final_error_mean_m": float(np.hypot(*(run.final - clean.final[faulted.source])[:, :2].T).mean()),
+            "final_error_mean_m": float(np.hypot(*(run.final - clean.final[source])[:, :2].T).mean()),
             "online_error_mean_m": float(online.mean()),
             "online_error_max_m": float(online.max()),
             "wrong_scans": int(wrong.sum()),
             "trusted_wrong_scans": int((wrong & run.trusted).sum()),
         }
-        if relations is not None:
-            error = log_error(entries, run.final, relations)
-            figures.update({key: error[key] for key in ("translation_mean_m", "rotation_mean_deg")})
+        error = None if accuracy is None else accuracy.error_m(entries, run.final, source)
+        if error is not None:
+            figures["accuracy_m"] = error
         runs.append(figures)
-    key = "final_error_mean_m" if relations is None else "translation_mean_m"
+    key = "accuracy_m" if all("accuracy_m" in run for run in runs) else "final_error_mean_m"
     errors = np.array([run[key] for run in runs])
     return {
+        "error": key,
+        "clean_m": None if accuracy is None else accuracy.error_m(faulted.entries, clean.final[source], source),
         "median_m": float(np.median(errors)),
         "max_m": float(errors.max()),
         "over_twice_median": int((errors > 2 * np.median(errors)).sum()),

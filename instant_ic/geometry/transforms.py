@@ -42,8 +42,19 @@ class TransformBuffer:
         self._edges: dict[str, _Edge] = {}
         self._lock = threading.Lock()
 
-    def set(self, parent: str, child: str, stamp_ns: int, parent_from_child: Matrix, static: bool = False) -> None:
+    def set(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        parent_from_child: Matrix,
+        static: bool = False,
+        now_ns: int | None = None,
+    ) -> None:
         """Add one value; an existing stamp is replaced, an older one is inserted in order.
+
+        With the present time ``now_ns`` a frame's values are dropped if the newest is ahead of it: the clock was set
+        back. It would count as the newest until the clock has caught up, and the robot would seem to stand.
 
         Raises:
             TransformError: the matrix is not a finite (4, 4) array, or a frame would be its own ancestor.
@@ -59,7 +70,9 @@ class TransformBuffer:
                 edge = self._edges.get(ancestor)
                 ancestor = edge.parent if edge else None
             edge = self._edges.get(child)
-            if edge is None or edge.parent != parent or edge.static != static or static:
+            other = edge is None or edge.parent != parent or edge.static != static or static
+            latest_ns = None if now_ns is None else max(now_ns, stamp_ns) + _TOLERANCE_NS
+            if edge is None or other or (latest_ns is not None and edge.stamps_ns[-1] > latest_ns):
                 edge = self._edges[child] = _Edge(parent, static)
             if not edge.stamps_ns or stamp_ns > edge.stamps_ns[-1]:
                 edge.stamps_ns.append(stamp_ns)

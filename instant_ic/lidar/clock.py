@@ -63,6 +63,10 @@ class DeviceClock:
         self._offset_ns = min(sample_ns, self._offset_ns + drift_ns)
         return self._device_us
 
+    def shift(self, ns: int) -> None:
+        """Follow the host's clock, which was set forward."""
+        self._offset_ns += ns
+
     def restart(self) -> None:
         """Reset the estimate, for example after a restart of the sensor."""
         self._device_us = None

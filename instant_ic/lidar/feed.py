@@ -7,6 +7,9 @@ from instant_ic.lidar.packets import DATA_PACKET_BYTES
 from instant_ic.lidar.sources import SourceGuard
 from instant_ic.lidar.stream import PacketStream, Revolution
 
+_SET_NS, _SET_BACK_NS = 20_000_000, -500_000_000
+"""Changes of the host's clock relative to its steady one, at a packet, that mean that it was set."""
+
 Packets = list[tuple[bytes, int]]
 """Payloads with their stamps."""
 
@@ -26,10 +29,12 @@ class PacketFeed:
         self.last_ns = steady_ns
         self._doubtful = False
         self._packets: Packets = []
+        self._ahead_ns: int | None = None  # largest difference of a packet's stamp and the steady clock
 
     def take(self, payload: bytes, stamp_ns: int, steady_ns: int) -> tuple[Revolution, Packets] | None:
         """Add one data packet; return the revolution that it ends, if any."""
         self.last_ns = steady_ns
+        self._follow_host(stamp_ns - steady_ns)
         counters = self.stream.counters
         taken, late = counters.packets, counters.late + counters.clock_resets
         revolution = self.stream.feed(payload, stamp_ns)
@@ -42,6 +47,14 @@ class PacketFeed:
         if len(payload) == DATA_PACKET_BYTES:
             self._packets.append((payload, stamp_ns))
         return self._with_packets(revolution)
+
+    def _follow_host(self, ahead_ns: int) -> None:
+        """Notice a host's clock that was set forward; waits on the way only lower ``ahead_ns``."""
+        raised_ns = 0 if self._ahead_ns is None else ahead_ns - self._ahead_ns
+        if raised_ns > _SET_NS:
+            self.stream.clock.shift(raised_ns)
+        if self._ahead_ns is None or raised_ns > 0 or raised_ns < _SET_BACK_NS:
+            self._ahead_ns = ahead_ns
 
     def finish(self) -> tuple[Revolution, Packets] | None:
         return self._with_packets(self.stream.finish())

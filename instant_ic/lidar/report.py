@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.lidar.feed import PacketFeed
 from instant_ic.lidar.flatscan import coverage
-from instant_ic.lidar.packets import PacketError, decode_position_packet
+from instant_ic.lidar.packets import LASERS, PacketError, decode_position_packet
 from instant_ic.lidar.stream import Revolution
 
 _SILENT = {
@@ -17,6 +17,8 @@ _SILENT = {
     "host in its network (factory: 192.168.1.201), does a firewall block it, is net.ipv4.conf.*.rp_filter 0?",
 }
 """What to check when no packets arrive, by source."""
+_LEAST_RETURNS = 0.01
+"""Share of the rays with a return below which the sensor is covered or broken: the ground alone gives more."""
 _PPS = ("absent", "synchronising", "locked", "error")
 
 
@@ -27,10 +29,12 @@ class LidarReport:
         skipped: revolutions that the node had no time for.
         partial: incomplete revolutions, which gave no scan.
         withheld: revolutions that could not be trusted.
+        blind: whether the newest revolution measured almost nothing.
     """
 
     def __init__(self, feed: PacketFeed) -> None:
         self.skipped = self.partial = self.withheld = 0
+        self.blind = False
         self._feed = feed
         self._reported = (0, 0, 0)
         self._partial_reported = 0
@@ -43,11 +47,13 @@ class LidarReport:
         return trusted
 
     def covers(self, revolution: Revolution, min_coverage: float) -> bool:
-        """Whether a revolution gives a scan; an incomplete one counts as partial."""
+        """Whether a revolution gives a scan: not an incomplete one, which counts as partial, nor a blind one."""
         # Half blind: it would mislead map matching, and the scan itself does not show the fault to other nodes.
         covered = coverage(revolution) >= min_coverage
         self.partial += not covered
-        return covered
+        # Without a return nothing would seem to be in the way.
+        self.blind = len(revolution.points) < _LEAST_RETURNS * LASERS * len(revolution.firing_azimuth)
+        return covered and not self.blind
 
     def position(self, payload: bytes) -> Diagnosis:
         """State of the sensor's clock from a position packet."""
@@ -94,6 +100,8 @@ class LidarReport:
             level, text = Level.ERROR, _SILENT[source].format(where=where, silent_s=silent_s)
         elif not counters.packets:
             level, text = Level.WARN, "no packet yet"
+        elif self.blind:
+            level, text = Level.ERROR, "the sensor measures almost nothing: is it covered? No scan, the robot stands"
         elif any(new):
             level = Level.WARN
             text = (

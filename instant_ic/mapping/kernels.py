@@ -230,15 +230,17 @@ def solid_columns(key, odds, sums, last, sight, now, keep, cell, low, ground, to
                         else:
                             ends += 1
             end = tops[at, 1]
+            height = low + tops[at, 0] * cell
+            hangs = height < _HANGS_M and _hangs(odds[a, b], ground)
             if end < top and open_above > 2 * ends:
                 end = levels
             elif end >= top and ends > 2 * open_above:
                 end = tops[at, 0]
             elif end < top:
-                # It ends somewhere between the highest point and the lowest beam above, as high as the thing around.
-                end = max((tops[at, 0] + end) // 2, highest[at])
-            height = low + tops[at, 0] * cell
-            doubtful = sight[a, b] > height or (height < _HANGS_M and _hangs(odds[a, b], ground))
+                # It ends somewhere between the highest point and the lowest beam above, as high as the thing around. A
+                # sill, a shelf or a table top is thin: half way to the next beam it would hide the wall behind it.
+                end = max(tops[at, 0] if hangs else (tops[at, 0] + end) // 2, highest[at])
+            doubtful = sight[a, b] > height or hangs
             codes[at, tops[at, 0] : end] = PANE if end == levels and doubtful else UP
     _bridge(key, index, faces, cell)
     return codes, faces

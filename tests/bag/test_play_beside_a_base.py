@@ -22,6 +22,8 @@ DANGEROUS = (
     "/robot/estop",
     "/ic/state",
     "/vbot/odom",
+    "/initialpose",
+    "/slam/integrity",
 )
 
 

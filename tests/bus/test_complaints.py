@@ -354,7 +354,7 @@ def test_dora_515_a_publisher_that_ends_tells_that_its_readers_were_too_slow(
             out.send(numbered(k, 50_000))
         started = time.monotonic()
         bus.node("sender").close()
-        assert time.monotonic() - started < 5.0
+        assert time.monotonic() - started < 20.0
     assert "sender closed: its last messages are lost, a reader was too slow to take them" in caplog.text
 
 

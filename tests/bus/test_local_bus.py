@@ -190,6 +190,16 @@ def test_a_name_that_passes_on_is_locked_in_the_file_that_its_path_names(run_dir
         assert list(run_dir.glob("nodes/*")) == []
 
 
+def test_two_threads_of_a_node_may_register_at_once(run_dir):
+    """The base's serial thread makes its first publisher while the node's thread registers the node."""
+    registry.prepare(run_dir)
+    claim = registry.Claim(run_dir / "nodes" / "crawler_base", "node crawler_base")
+    with ThreadPoolExecutor() as pool:
+        for done in [pool.submit(lambda: [claim.write({"words": "x" * 2000}) for _ in range(300)]) for _ in range(2)]:
+            done.result()
+    claim.release()
+
+
 def test_second_node_of_a_name_is_refused(talker, run_dir):
     talker()
     wait_for(lambda: registry.list_nodes(run_dir))

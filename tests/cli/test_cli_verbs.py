@@ -273,7 +273,7 @@ def test_launch_in_a_process_ends_in_time_and_leaves_nothing(
         began_s = time.monotonic()
         process.send_signal(signal.SIGINT)
         rest, _ = process.communicate(timeout=30)
-        assert time.monotonic() - began_s < 10  # 5 s, and the patience of a busy machine
+        assert time.monotonic() - began_s < 25  # 5 s, and the patience of a busy machine
     finally:
         process.kill()
     assert process.returncode == 0, "".join(lines) + rest

@@ -147,6 +147,13 @@ def test_a_zero_of_a_hidden_page_does_not_make_it_seen():
     assert not gate.driver_alive(0.11)
 
 
+def test_a_hidden_page_stops_the_robot_even_if_it_sends_no_zero():
+    gate = driving_gate()
+    assert gate.touch(1, 0.01, away=True)
+    assert run(gate, 0.01, 0.5) == [(0.01, (0.0, 0.0))]  # each later command would end the loss again
+    assert not gate.driver_alive(0.01)
+
+
 @pytest.mark.parametrize("leave", ["leave", "forget"])
 def test_an_idle_driver_that_goes_leaves_silence(leave):
     gate = DriveGate(CONFIG)

@@ -55,6 +55,15 @@ CONFIG = Path(__file__).resolve().parents[2] / "config" / "control.yaml"
 STEP_NS = 50_000_000
 
 
+def test_parameters_that_cannot_be_used_change_nothing() -> None:
+    arbiter = LockstepBus().add(ArbiterNode)
+    before = arbiter.config
+    with pytest.raises(MemoryError):
+        arbiter.set_parameters({"limits.max_linear_m_s": 5.0, "prediction.padding_m": 1e15})
+    assert arbiter.config is before and arbiter.arbiter.config is before
+    assert arbiter.set_parameters({"switch.min_real_s": 2.0}) == {"switch.min_real_s": 2.0}
+
+
 @pytest.mark.parametrize(
     ("name", "config_class"),
     [("arbiter", ArbiterConfig), ("virtual_robot", VirtualRobotConfig), ("navigator", NavigatorConfig)],

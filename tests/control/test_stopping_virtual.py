@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -9,6 +10,10 @@ from control_world import rectangle
 from test_control_nodes import Stack
 
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.control.arbiter_config import ArbiterConfig
+from instant_ic.control.snapshot import ArbiterInputs
+from instant_ic.control.sources import SourceMonitor
+from instant_ic.control.states import SOURCES, Mode
 from instant_ic.msg import HARD_STOP, ControlState, twist_values
 from nodes.navigator import NavigatorNode
 from nodes.virtual_robot import VirtualRobotNode
@@ -66,3 +71,9 @@ def test_what_waited_while_a_node_was_busy_is_as_old_as_its_stamp(late_s: float,
         bus.advance(0.06)
         assert bool(bus.messages("/nav/cmd_vel")) is drives
         assert (nodes[0].diagnoses()["state"][1] == "the arbiter is silent: the v-bot stands still") is not drives
+
+
+def test_a_page_that_reports_no_number_as_the_age_of_its_view_shows_none() -> None:
+    ages = dict.fromkeys([source.key for source in SOURCES if not source.optional], 0.0) | {"view": math.nan}
+    stale = SourceMonitor(ArbiterConfig()).stale(ArbiterInputs(ages=ages), Mode.VIRTUAL, in_mode_s=10.0)
+    assert [one.source.key for one in stale] == ["view"]

@@ -45,6 +45,24 @@ def test_values_out_of_order_and_twice(buffer):
     assert buffer.lookup("odom", "base_link", 11 * S)[0, 3] == 1
 
 
+def test_a_clock_that_was_set_back_freezes_no_frame(buffer):
+    buffer.set("odom", "base_link", 9 * S, pose_matrix(x=3), now_ns=9 * S)  # newest so far: x=2 at 12 s
+    assert buffer.lookup("odom", "base_link")[0, 3] == 3
+    with pytest.raises(TransformError, match="after the newest"):
+        buffer.lookup("odom", "base_link", 11 * S)
+    assert buffer.lookup("map", "odom")[1, 3] == 5  # each frame by its own stamps
+    # A message from before the setting arrives after it.
+    buffer.set("odom", "base_link", 12 * S, pose_matrix(x=2), now_ns=9 * S)
+    buffer.set("odom", "base_link", 10 * S, pose_matrix(x=4), now_ns=10 * S)
+    assert buffer.lookup("odom", "base_link")[0, 3] == 4
+
+
+def test_old_values_of_another_sender_drop_nothing(buffer):
+    buffer.set("odom", "base_link", 1 * S, pose_matrix(x=3), now_ns=12 * S)
+    assert buffer.lookup("odom", "base_link")[0, 3] == 2
+    assert buffer.lookup("odom", "base_link", 11 * S)[0, 3] == pytest.approx(1)
+
+
 def test_outside_what_is_held(buffer):
     with pytest.raises(TransformError, match=r"odom → base_link: asked for 3\.000 s after the newest"):
         buffer.lookup("odom", "base_link", 15 * S)

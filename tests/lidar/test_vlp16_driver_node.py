@@ -122,6 +122,22 @@ def test_revolutions_that_are_cut_short_give_no_scan(tmp_path: Path, min_coverag
     assert node.report.partial == clouds - scans
 
 
+def test_a_covered_sensor_gives_no_scan_so_that_the_robot_stops(tmp_path: Path) -> None:
+    stamps = [RECORDED + round((index + 1) * PACKET_PERIOD_US * 1000.0) for index in range(600)]
+    stream = wall_stream(302, 5.0) + wall_stream(298, 0.0, round(302 * PACKET_PERIOD_US), 18283)  # turning on evenly
+    path = tmp_path / "covered.pcap"
+    path.write_bytes(pcap([(s, udp_frame(p)) for s, p in zip(stamps, stream, strict=True)], nano=True))
+    bus, node = played(path)
+    bus.advance(0.35)
+    seeing = len(bus.messages("/scan"))
+    assert seeing == 3
+    bus.advance(0.5)
+    assert len(bus.messages("/scan")) <= seeing + 1  # the revolution in which it was covered
+    node.check()
+    level, text, _ = node.diagnoses()["packets"]
+    assert level == ERROR and "is it covered?" in text
+
+
 def test_scan_is_motion_compensated_by_odometry(capture: Path) -> None:
     bus, node = played(capture)
     # 0.5 m/s ahead, told each 33 ms; the wall is round in the sensor's own view, so compensation dents it.

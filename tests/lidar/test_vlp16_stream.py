@@ -8,6 +8,7 @@ from lidar_streams import DATA, SECOND, random_stream, wall_stream
 
 from instant_ic.lidar.clock import DeviceClock
 from instant_ic.lidar.config import DecoderConfig
+from instant_ic.lidar.feed import PacketFeed
 from instant_ic.lidar.packets import HOUR_US, PACKET_PERIOD_US
 from instant_ic.lidar.stream import PacketStream, Revolution
 
@@ -166,6 +167,21 @@ def test_clock_follows_drift_and_jumps_of_the_host() -> None:
         unrolled = clock.take(device_us, host_ns)
     assert clock.resets == 1
     assert abs(clock.host_ns(unrolled) - host_ns) < 1000
+
+
+@pytest.mark.parametrize("set_ms", [150, 300, 450, 3_600_000, -300])
+def test_stamps_follow_a_host_whose_clock_is_set(set_ms: int) -> None:
+    """By less than 0.5 s too: stamps that lag misplace the scan as the robot turns, or let it count as stale."""
+    found = PacketFeed(DecoderConfig(), "", 0)
+    done = []
+    for index, payload in enumerate(wall_stream(400, 5.0)):
+        steady_ns = received(index)
+        host_ns = steady_ns + (set_ms * 1_000_000 if index >= 150 else 0)
+        waited_ns = 150_000_000 if 250 <= index < 260 else 0  # until this process takes it: no setting
+        done.append(found.take(payload, host_ns, steady_ns + waited_ns))
+    revolutions = [one[0] for one in done if one is not None]
+    assert revolutions[-1].end_ns == pytest.approx(received(375) + set_ms * 1_000_000, abs=0.1 * SECOND)
+    assert revolutions[-1].end_ns - revolutions[-2].end_ns == pytest.approx(0.1 * SECOND, rel=0.01)
 
 
 @pytest.mark.real_data

@@ -112,6 +112,20 @@ def test_a_thing_ends_half_way_between_its_highest_point_and_the_lowest_beam_abo
     assert 1.2 + 2.0 * np.tan(elevation[of_thing].max()) == pytest.approx(0.8, abs=0.06)  # a voxel is 0.05 m
 
 
+def test_what_hangs_ends_at_its_highest_point() -> None:
+    """A shelf measured from 0.5 to 0.6 m; beams pass below it at 0.3 to 0.4 m, and above it at 1 m and more."""
+    model, origin = LocalModel(LocalModelConfig(behind_m=0.0)), np.array([0.0, 0.0, 0.6])
+    y = np.arange(-0.5, 0.5, 0.02)
+    on = np.stack(np.meshgrid([2.0], y, np.arange(0.5, 0.6, 0.02)), -1).reshape(-1, 3)
+    behind = np.stack(np.meshgrid([4.0], 2 * y, [*np.arange(0.02, 0.2, 0.02), *np.arange(1.4, 2.0, 0.02)]), -1)
+    for _ in range(4):
+        model.add(np.vstack([on, behind.reshape(-1, 3)]), origin, stride=1)
+    depth = model.render(pose_matrix(0.0, 0.0, 1.2), (512, 1024)).depth_m[:, 512]
+    elevation = np.pi / 2 - (np.arange(512) + 0.5) * np.pi / 512
+    of_thing = np.abs(depth * np.cos(elevation) - 2.0) < 0.05
+    assert 1.2 + 2.0 * np.tan(elevation[of_thing].max()) == pytest.approx(0.6, abs=0.06)  # half way: 0.8
+
+
 def test_a_side_is_as_high_as_the_rest_of_the_thing() -> None:
     """Right of y = 0 measured up to 0.9 m, left of it up to 0.6 m; beams pass at 1 m and more above both."""
     model, origin = LocalModel(LocalModelConfig(behind_m=0.0)), np.array([0.0, 0.0, 0.6])

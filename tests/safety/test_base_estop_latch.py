@@ -34,6 +34,26 @@ def test_a_release_from_before_the_clock_was_set_back_ends_nothing() -> None:
     assert not latch.stopped
 
 
+def test_a_release_that_comes_again_later_ends_nothing() -> None:
+    """Released at 100 s, clock set back, button pressed at 50 s; a bridge restarts at 105 s and sends it again."""
+    latch = EstopLatch()
+    latch.hear_button(True, "crawler_base", 50 * S)
+    latch.hear_button(False, "crawler_base", 51 * S)
+    assert "5.0 s old" in latch.hear(False, "host_bridge", 100 * S, 105 * S)
+    assert latch.stopped
+    assert latch.hear(True, "console", 49 * S, 106 * S) == ""  # comes again too, and changes nothing
+    assert "6.0 s old" in latch.hear(False, "host_bridge", 100 * S, 106 * S)
+    assert latch.hear(False, "host_bridge", 106 * S, 107 * S) == ""
+
+
+def test_a_restarted_node_stays_released_if_the_last_release_is_newer_than_the_last_press() -> None:
+    latch = EstopLatch()
+    latch.hear(True, "foxglove_bridge", 105 * S, 200 * S)
+    assert latch.stopped
+    assert latch.hear(False, "console", 110 * S, 200 * S) == ""
+    assert not latch.stopped
+
+
 def test_stop_and_release_of_one_publisher_go_together_after_its_clock_was_set_back() -> None:
     latch = EstopLatch()
     latch.hear(True, "console", 100 * S, 100 * S)

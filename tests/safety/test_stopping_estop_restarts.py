@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from itertools import permutations
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from instant_ic import estop_state
@@ -16,7 +17,16 @@ from instant_ic.bus import LATCHED
 from instant_ic.bus.lockstep import LockstepBus, _Transport
 from instant_ic.console import ConsoleServer
 from instant_ic.estop_state import EstopStateError, KeptStop, RunMark
-from instant_ic.msg import Bool, ControlState, serialize, twist_stamped, twist_values, type_name
+from instant_ic.msg import (
+    Bool,
+    ControlState,
+    MessageError,
+    odometry_message,
+    serialize,
+    twist_stamped,
+    twist_values,
+    type_name,
+)
 from nodes.arbiter import ArbiterNode
 from nodes.console import ConsoleNode
 
@@ -117,6 +127,31 @@ def test_a_console_that_starts_with_a_latched_release_ends_no_stop(robot: Robot)
     assert robot.stopped()
 
 
+def test_a_release_from_before_the_clock_was_set_back_ends_no_stop_after_a_restart(run_dir: Path) -> None:
+    """The press is stamped 990 s, since the clock was set back before it; the release before that is stamped 995 s."""
+    estop_state.write(run_dir, KeptStop("crawler_base", 990 * S))
+    robot = Robot()
+    release = bytes(serialize(Bool(data=False)))
+    robot.bus.route("/operator/estop", type_name(Bool), release, "console", LATCHED, 995 * S)
+    robot.bus.advance(0.1)
+    assert robot.stopped()
+    robot.console.on_estop(False)
+    robot.bus.advance(0.1)
+    assert not robot.bus.last("/ic/state").estop
+    robot.bus.close()
+
+
+def test_a_press_is_kept_even_if_the_arbiter_cannot_step(robot: Robot, run_dir: Path) -> None:
+    vbot = odometry_message(np.eye(4), 0.0, 0.0, "map", "vbot_base_link", robot.bus.clock.now_ns())
+    vbot.pose.pose.orientation.w = 0.0  # no rotation
+    with pytest.raises(MessageError):
+        robot.bus.publish("/vbot/odom", vbot)
+        robot.bus.advance(0.2)
+    with pytest.raises(MessageError):
+        robot.bus.publish("/operator/estop", Bool(data=True), publisher="console")
+    assert estop_state.read(run_dir) is not None
+
+
 def test_the_robots_own_button_stays_latched_over_a_restart_of_the_arbiter(robot: Robot) -> None:
     robot.bus.publish("/robot/estop", Bool(data=True), publisher="crawler_base")
     robot.bus.publish("/robot/estop", Bool(data=False), publisher="crawler_base")
@@ -177,7 +212,8 @@ def test_the_files_are_private_replaced_whole_and_a_damaged_one_means_stopped(tm
     estop_state.write(tmp_path, KeptStop("console", 5))
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estop.json"]
-    for damage in (b"", b"{", b"[]", b'{"publisher": 1}', b"\xff\xfe"):
+    endless = b'{"publisher": "console", "pressed_ns": 1e999, "why": ""}'
+    for damage in (b"", b"{", b"[]", b'{"publisher": 1}', b"\xff\xfe", endless, b"[" * 100_000):
         file.write_bytes(damage)
         kept = estop_state.read(tmp_path)
         assert kept is not None and "cannot be read" in kept.why

@@ -151,6 +151,54 @@ def test_time_without_scans_raises_the_probability_up_to_a_limit() -> None:
     assert monitor.lost_probability == pytest.approx(1 / (1 + math.exp(1.0)))
 
 
+def test_scans_at_a_low_rate_that_fit_raise_no_doubt() -> None:
+    # Every scan comes after 5 s: that is the usual period, no time without scans.
+    monitor = steady(0)
+    for _ in range(10):
+        monitor.matched(0.02, 0.9, 5.0)
+        assert not monitor.doubts and not monitor.after_gap
+    monitor.unmatched(False, 30.0)
+    assert monitor.doubts and monitor.after_gap
+
+
+@pytest.mark.parametrize(("moved_m", "sign"), [(0.1, True), (0.5, True), (1.0, False)])
+def test_a_lower_score_is_no_sign_in_a_new_view(moved_m: float, sign: bool) -> None:
+    # A drop of 0.4 alone is evidence of 0.4.
+    monitor = steady()
+    monitor.matched(0.02, 0.5, 0.1, moved_m=moved_m)
+    assert monitor.sign is sign
+
+
+def test_a_doubt_that_keeps_scans_out_of_the_map_makes_no_loss_by_itself() -> None:
+    # The score falls as the robot drives on, because the map does not grow; nothing contradicts the map.
+    monitor = steady()
+    monitor.matched(0.3, 0.6, 0.1)
+    assert monitor.doubts
+    for _ in range(30):
+        monitor.matched(0.02, 0.4, 1.0, moved_m=0.15)
+        assert not monitor.lost
+    assert not monitor.doubts
+
+
+def test_a_scan_every_five_seconds_makes_a_map(log: list[LogEntry]) -> None:
+    # 2 m apart, each scan sees as much of the new as of the known.
+    slam = GridSlam()
+    results = [slam.process(entry.scan, entry.odom_pose) for entry in log[::50]]
+    assert len(slam.front_end.trajectory) > len(results) // 2
+    assert all(result.trusted for result in results)
+
+
+def test_a_scan_after_a_gap_that_fits_nowhere_is_after_a_gap() -> None:
+    # The robot is where odometry says, within its error, and is searched for there.
+    monitor = steady()
+    monitor.unmatched(True, 10.0)
+    assert monitor.after_gap and monitor.doubts
+    monitor = steady()
+    monitor.unmatched(True, 0.1)
+    monitor.unmatched(True, 0.1)
+    assert not monitor.after_gap and monitor.doubts
+
+
 def test_covariance_and_bounds_follow_the_probability() -> None:
     own = np.diag([0.01, 0.0004, 0.0001])
     np.testing.assert_allclose(mixture(own, 0.0), own)

@@ -249,7 +249,10 @@ def test_a_bound_is_at_least_the_score_of_every_pose_of_its_node() -> None:
     field = np.where(rng.random((64, 64)) < 0.1, rng.random((64, 64)), 0.0).astype(np.float32)
     points = rng.uniform(-15.0, 15.0, (20, 2))
     nodes = np.array([[r, j, i] for r in range(4) for j in range(0, 16, 3) for i in range(0, 16, 3)], dtype=np.int32)
-    bounds = bound_nodes(pool(field, 4), np.zeros(2), 4.0, points, nodes, 0.0, math.pi / 2)
+    sums, counts = unbounded(len(nodes))
+    bound_nodes(pool(field, 4), np.zeros(2), 4.0, points, nodes, sums, counts, 0.0, math.pi / 2)
+    assert (counts == len(points)).all()
+    bounds = sums / len(points)
     for (r, j, i), bound in zip(nodes, bounds, strict=True):
         cos, sin = math.cos(r * math.pi / 2), math.sin(r * math.pi / 2)
         for place in rng.uniform(0.0, 4.0, (10, 2)) + 4.0 * np.array([i, j]):
@@ -261,8 +264,32 @@ def test_a_bound_is_at_least_the_score_of_every_pose_of_its_node() -> None:
     one[5, 7] = 1.0
     two = np.array([[2.0, 0.0], [0.0, 30.0]])
     node = np.array([[0, 1, 1]], dtype=np.int32)
-    assert bound_nodes(pool(one, 4), np.zeros(2), 4.0, two, node, 0.0, 1.0).tolist() == [0.5]
-    assert bound_nodes(pool(one, 4), np.zeros(2), 4.0, two, node, 0.6, 1.0).tolist() == [0.0]
+    sums, counts = unbounded(1)
+    for floor, sum_, count in ((0.6, 1.0, 2), (0.4, 1.0, 2)):
+        bound_nodes(pool(one, 4), np.zeros(2), 4.0, two, node, sums, counts, floor, 1.0)
+        assert (sums.tolist(), counts.tolist()) == ([sum_], [count])
+
+
+def unbounded(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sums and counts of nodes of which no bound has been computed."""
+    return np.zeros(count, dtype=np.float32), np.zeros(count, dtype=np.int32)
+
+
+def test_a_lower_floor_continues_the_sums_of_a_higher_one() -> None:
+    rng = np.random.default_rng(1)
+    field = pool(rng.random((64, 64)).astype(np.float32), 4)
+    points = rng.uniform(0.0, 40.0, (30, 2))
+    nodes = np.array([[0, j, i] for j in range(16) for i in range(16)], dtype=np.int32)
+    sums, counts = unbounded(len(nodes))
+    before = counts.copy()
+    for floor in (0.95, 0.9, 0.8, 0.0):
+        bound_nodes(field, np.zeros(2), 4.0, points, nodes, sums, counts, floor, 1.0)
+        assert (counts >= before).all()
+        assert ((sums + len(points) - counts < floor * len(points)) == (counts < len(points))).all()
+        before = counts.copy()
+    at_once, _ = whole = unbounded(len(nodes))
+    bound_nodes(field, np.zeros(2), 4.0, points, nodes, *whole, 0.0, 1.0)
+    np.testing.assert_array_equal(sums, at_once)
 
 
 def test_a_place_needs_a_second_scan_and_an_ambiguous_one_is_named(made: tuple[Path, GridSlam], tmp_path: Path) -> None:

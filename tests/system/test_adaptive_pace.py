@@ -24,6 +24,7 @@ def busy_loops():
     yield
     for loop in loops:
         loop.kill()
+        loop.wait(30)
 
 
 def test_a_busy_machine_slows_a_simulated_stack_and_stops_nothing(busy_loops):
