@@ -124,8 +124,8 @@ def simulated() -> list[dict[str, object]]:
     ]
 
 
-def fault_log(name: str, data: Path) -> tuple[list[LogEntry], FloatArray | None, Relations | None]:
-    """A log for faults, its ground truth and its relations.
+def named_log(name: str, data: Path) -> tuple[list[LogEntry], FloatArray | None, Relations | None]:
+    """A log with its ground truth and its relations, each None where there is none.
 
     A real log in ``data``, the simulated crawler, or a drive through a generated building.
     """
@@ -166,7 +166,7 @@ def main() -> None:
     if "faults" in args.only:
         if args.log is None:
             parser.error("--only faults needs --log")
-        log, truth, relations = fault_log(args.log, args.data)
+        log, truth, relations = named_log(args.log, args.data)
         result[args.log] = evaluate_faults(
             log[: args.first], places=args.places, seed=args.seed, noise_seeds=args.noise_seeds, faults=args.faults,
             relations=relations, truth=None if truth is None else truth[: args.first], on_step=note,
@@ -177,9 +177,8 @@ def main() -> None:
         result["long"] = room_drive(12000)
     if any(name.startswith("intel") for name in args.only):
         if (args.data / "intel.log.gz").is_file():
-            entries = list(read_log(args.data / "intel.log.gz"))
-            stamps = read_stamps(args.data / "intel.exact_stamps")
-            relations = read_relations(args.data / "intel.relations").at_stamps(stamps, 0.006)
+            entries, _, relations = named_log("intel.log.gz", args.data)
+            assert relations is not None
             if "intel" in args.only:
                 result["intel"] = intel(entries, relations)
             if "intel_seeds" in args.only:

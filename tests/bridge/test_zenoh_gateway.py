@@ -640,7 +640,7 @@ def test_rate_limit_thins_and_counts_what_it_leaves_out(world):
         time.sleep(0.025)
     took_s = time.monotonic() - started
     wait_for(lambda: samples.count("all") == 40, "everything of the other topic")
-    assert 1 <= samples.count("fast") <= 5 * took_s + 1.5  # fewer where a busy machine takes many at once
+    assert samples.count("fast") == pytest.approx(5 * took_s, abs=1.5)
     assert gateway.node.outgoing.thinned >= 40 - samples.count("fast")
 
 
