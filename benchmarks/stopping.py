@@ -13,7 +13,9 @@ motion:
                 falls by a tenth
     stand_s     to a true speed that stays below 0.01 m/s
     distance_m  from the position at the loss to the stopping position
-    after_m     motion in the second after it has stopped: must be zero
+    after_m     motion in the second after it has stopped: zero, unless what was lost is back before the arbiter has
+                gone to STOPPED (``timeouts.stop_after_s``), as a camera driver that starts fast: the key is still held
+    again_s     to that motion
 
 All times are seconds of the stack, which runs at the pace of the machine (``--pace``, 1.0 on one that is fast enough).
 """
@@ -448,6 +450,7 @@ def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
         "stand_s": None,
         "distance_m": None,
         "after_m": None,
+        "again_s": None,
     }
     if stand_ns is not None:
         end = next(row for row in rows if row.at_ns == stand_ns)
@@ -455,6 +458,8 @@ def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
         found["stand_s"] = round((stand_ns - lost_ns) / 1e9, 3)
         found["distance_m"] = round(math.dist(start[1:3], end[1:3]) - gap_s * cruise, 3)
         found["after_m"] = round(max((math.dist(end[1:3], row[1:3]) for row in later), default=0.0), 3)
+        again_ns = next((row.at_ns for row in later if row.speed >= STANDS_M_S), None)
+        found["again_s"] = None if again_ns is None else round((again_ns - lost_ns) / 1e9, 3)
     return found
 
 

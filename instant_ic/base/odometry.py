@@ -10,6 +10,10 @@ from instant_ic.base.kinematics import SkidSteer
 from instant_ic.geometry.poses import planar_covariance
 
 _MAX_TRACK_SPEED = 3.0  # m/s; a reading that implies more is rejected
+_JITTER_M = 0.05
+"""A smaller step is no jump, however short its time seems: on a busy machine a reading may come late and the next soon.
+The speed between them means nothing; the next reading has the motion.
+"""
 UNMEASURED_VARIANCE = 1e6
 """Variance of z, roll and pitch, which encoders do not measure."""
 
@@ -69,18 +73,20 @@ class WheelOdometry:
             stamp_ns: when they were read.
 
         Returns:
-            The new estimate; None for the first reading, a reading that is not newer, and a rejected reading.
+            The new estimate; None for the first reading, one that is not newer or too soon, and a rejected one.
         """
         counts = np.asarray(encoders, np.int64)
         last, self._last = self._last, (counts, stamp_ns)
         if last is None:
             return None
         dt_s = (stamp_ns - last[1]) * 1e-9
-        if dt_s <= 0.0:
+        tracks = self.kinematics.tracks_from_motors(unwrap_counts(last[0], counts))
+        furthest = np.abs(tracks).max()
+        too_fast = furthest > _MAX_TRACK_SPEED * dt_s
+        if dt_s <= 0.0 or (too_fast and furthest < _JITTER_M):
             self._last = last
             return None
-        tracks = self.kinematics.tracks_from_motors(unwrap_counts(last[0], counts))
-        if np.abs(tracks).max() > _MAX_TRACK_SPEED * dt_s:
+        if too_fast:
             self.rejected += 1
             return None
         step = self.kinematics.twist_from_tracks(tracks)

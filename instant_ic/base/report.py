@@ -54,7 +54,7 @@ class BaseReport:
         self._jumps.add(rejected - self._rejected, steady_ns)
         self._rejected = rejected
         jumps = self._jumps.count(steady_ns)
-        text = f"{jumps} readings of {recent} were impossible jumps and left out" if jumps else "plausible"
+        text = f"impossible jumps of {recent}, left out: {jumps}" if jumps else "plausible"
         yield Diagnosis("encoders", Level.WARN if jumps else Level.OK, text, {"rejected": rejected})
 
     def health(self, health: Health) -> Iterator[Diagnosis]:

@@ -41,6 +41,7 @@ class CommandGate:
         self.refused: dict[str, int] = {}
         self._driver: str | None = None
         self._driver_ns = 0
+        self._held: dict[str, int] = {}  # sender → time of its last motion that was refused because another drove
 
     def check_age(self, source_ns: int, now_ns: int) -> None:
         """Refuse an old command, or one from the future, whose age is unknown."""
@@ -53,15 +54,26 @@ class CommandGate:
     def check_drive(self, sender: str, v: float, w: float, steady_ns: int) -> None:
         """Refuse implausible values (m/s, rad/s), and a second driver.
 
-        ``steady_ns`` comes from a clock that is never set, since it measures the lease.
+        A second driver that takes over must let go first: send zero, or nothing for ``lease_s``. Else the robot would
+        start under a key that was held in vain until then. ``steady_ns`` comes from a clock that is never set, since
+        it measures the lease.
         """
         if not (math.isfinite(v) and math.isfinite(w)):
             raise self.refuse("not finite", f"v {v}, w {w}: not finite")
         if abs(v) > self.limits.max_linear_mps or abs(w) > self.limits.max_angular_rps:
             limits = f"{self.limits.max_linear_mps:g} m/s, {self.limits.max_angular_rps:g} rad/s"
             raise self.refuse("too fast", f"{v:g} m/s, {w:g} rad/s: beyond {limits}")
-        if self._driver not in (None, sender) and steady_ns - self._driver_ns <= self.limits.lease_s * 1e9:
+        since_ns, moves = steady_ns - int(self.limits.lease_s * 1e9), (v, w) != (0.0, 0.0)
+        self._held = {other: held_ns for other, held_ns in self._held.items() if held_ns >= since_ns}
+        if not moves:
+            self._held.pop(sender, None)
+        second = self._driver not in (None, sender) and self._driver_ns >= since_ns
+        if moves and (second or sender in self._held):
+            self._held[sender] = steady_ns
+        if second:
             raise self.refuse("second driver", f"{sender} may not drive while {self._driver} does")
+        if sender in self._held:
+            raise self.refuse("held", f"{sender} must let go of the controls once before it drives")
         self._driver, self._driver_ns = sender, steady_ns
 
     def check_release(self, sender: str, steady_ns: int) -> None:

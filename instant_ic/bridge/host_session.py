@@ -30,7 +30,7 @@ from instant_ic.bridge.host_protocol import (
     Welcome,
     decode,
 )
-from instant_ic.bridge.host_topics import TopicCounts, TopicRule, releases
+from instant_ic.bridge.host_topics import TopicCounts, TopicRule, moves, releases
 from instant_ic.config.ranges import Range, check_ranges
 
 MAX_MESSAGE = 64 << 20
@@ -44,6 +44,8 @@ MAX_NOTICES = 16
 _NAME = re.compile(rf"[A-Za-z0-9_/.:-]{{1,{MAX_NAME}}}\Z")
 _MAX_TEXT = 300
 
+_LET_GO_S = 1.0
+"""Silence that counts as letting go of the controls."""
 _FIRST_PINGS = 8
 _FIRST_PING_S = 0.02
 _CLOCK_STEP_NS = 20_000_000
@@ -232,6 +234,7 @@ class Session:
         self._partial: dict[int, tuple[Data, bytearray]] = {}
         self._early: list[tuple[_Incoming, Data, bytes | bytearray]] = []
         self._early_bytes = 0
+        self._held_ns: dict[tuple[str, str], int] = {}  # (topic, publisher) → its last command to move, if dropped
         self._replies: deque[Message] = deque()
         self._taken = [0] * len(LANES)
         self._ack: int | None = None
@@ -315,6 +318,8 @@ class Session:
         self.drives = drives
         if not drives:
             return []
+        if self._held_ns:
+            self.notify("held", f"let go of the controls once: {self.side.name} does not start under a held key")
         events: list[Event] = []
         for incoming in self._incoming.values():
             if incoming.kept is not None:
@@ -513,11 +518,31 @@ class Session:
         arrived = Arrived(announce, payload, publish_ns, born_ns)
         if not self.drives and (not rule.shared or releases(announce.type_name, payload)):
             counts.not_driving += 1
+            if moves(announce.type_name, payload):
+                self._held_ns[announce.topic, announce.origin] = now
+            else:
+                self._held_ns.pop((announce.topic, announce.origin), None)
             # A refused release is gone: the lease must not end an emergency stop when it is handed over.
             if announce.qos == "latched" and not rule.shared:
                 incoming.kept = arrived, data.born_ns
             return []
+        if self._is_held(announce, payload, now):
+            counts.not_driving += 1
+            return []
         return self._deliver(incoming, arrived, data.born_ns)
+
+    def _is_held(self, announce: Announce, payload: bytes | bytearray, now: int) -> bool:
+        """Whether a command comes from controls held since before this host drove: no robot starts under a held key."""
+        who = announce.topic, announce.origin
+        last_ns = self._held_ns.get(who)
+        if last_ns is None:
+            return False
+        if moves(announce.type_name, payload) and now - last_ns <= _LET_GO_S * 1e9:
+            self._held_ns[who] = now
+            return True
+        del self._held_ns[who]
+        self.notify("held", "")
+        return False
 
     def _deliver(self, incoming: _Incoming, arrived: Arrived, born_ns: int) -> list[Event]:
         announce, counts = incoming.announce, incoming.counts

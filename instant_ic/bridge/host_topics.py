@@ -8,8 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 from instant_ic.bridge.host_protocol import LANES
-from instant_ic.msg import MessageError, deserialize
+from instant_ic.msg import MessageError, deserialize, twist_values
 
+_COMMANDS = ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
 
 
@@ -18,6 +19,14 @@ def releases(type_name: str, payload: bytes | bytearray) -> bool:
     try:
         return type_name == "std_msgs/msg/Bool" and not deserialize(payload, type_name).data
     except MessageError:  # not a readable message; the subscriber refuses and reports it
+        return False
+
+
+def moves(type_name: str, payload: bytes | bytearray) -> bool:
+    """Whether a message is a command to move."""
+    try:
+        return type_name in _COMMANDS and any(twist_values(deserialize(payload, type_name)))
+    except MessageError:
         return False
 
 
@@ -108,7 +117,7 @@ class TopicCounts:
         expired: older than ``max_age_s``.
         overflowed: dropped from the full queue of a reliable topic.
         lost: gaps in the sequence, on the receiving side.
-        not_driving: from a host that does not drive.
+        not_driving: from a host that does not drive, or that must let go of the controls first.
     """
 
     messages: int = 0

@@ -108,6 +108,17 @@ def test_impossible_jump_is_left_out_and_counted() -> None:
     assert odometry.update([400, 400], 3 * SECOND) is None  # no time has passed
 
 
+def test_reading_that_follows_a_late_one_too_soon_is_no_jump_and_the_next_has_its_motion() -> None:
+    odometry = WheelOdometry(GEOMETRY)
+    odometry.update([0, 0], SECOND)
+    assert odometry.update([80, 80], SECOND + SECOND // 200) is None  # 2 cm, 4 m/s by the times
+    assert odometry.rejected == 0
+    estimate = odometry.update([160, 160], SECOND + SECOND // 10)
+    assert estimate is not None
+    np.testing.assert_allclose(estimate.pose, [0.04, 0.0, 0.0])
+    np.testing.assert_allclose(estimate.twist, [0.4, 0.0, 0.0])
+
+
 def test_limiter_ramps_as_worked_out_by_hand() -> None:
     limiter = TwistLimiter(LimitsConfig(0.5, 1.0, 0.8, 2.0))
     assert limiter.step(0.5, 0.0, 0.1) == pytest.approx((0.08, 0.0))

@@ -9,6 +9,7 @@ from instant_ic.bridge.host_session import Arrived, LinkTimes, Memory, Session, 
 from instant_ic.bridge.host_topics import TopicRule
 
 DIGEST = "0011223344556677"
+STRING = "std_msgs/msg/String"
 MS = 1_000_000
 
 
@@ -73,12 +74,12 @@ class World:
             self.sessions[name] = Session(side, connecting, self.memories[name], self.clocks[name], self.times)
         self.sessions["robot"].drives = True
 
-    def publish(self, who, topic, payload, latched=False, queued=False, origin="node", publish_ns=None):
+    def publish(self, who, topic, payload, latched=False, queued=False, origin="node", publish_ns=None, kind=STRING):
         channel = self.channels.get((topic, origin))
         if channel is None:
             qos = "latched" if latched else "reliable" if queued else "sensor"
             rule = self.rules[who].get(topic, TopicRule(topic))
-            channel = Channel(next(self.numbers), rule, origin, "std_msgs/msg/String", DIGEST, qos, latched, queued)
+            channel = Channel(next(self.numbers), rule, origin, kind, DIGEST, qos, latched, queued)
             self.channels[topic, origin] = channel
         channel.sequence += 1
         stamp = self.clocks[who].wall_ns() if publish_ns is None else publish_ns

@@ -366,8 +366,11 @@ def test_robot_is_told_to_stand_when_its_driver_leaves_and_a_second_one_waits(dr
         client.close()
     listener.wait(lambda: last_drive(drives) == (0.0, 0.0), "a zero command")
     second.publish(b'{"linear": {"x": -0.2}, "angular": {"z": 0}}')
+    second.until(lambda: bridge.gate.refused == {"second driver": 1, "held": 1}, "the refusal of a held key")
+    assert last_drive(drives) == (0.0, 0.0)
+    second.publish(b'{"linear": {"x": 0}, "angular": {"z": 0}}')
+    second.publish(b'{"linear": {"x": -0.2}, "angular": {"z": 0}}')
     listener.wait(lambda: last_drive(drives) == (-0.2, 0.0), "the second driver's command")
-    assert bridge.gate.refused == {"second driver": 1}
 
 
 # -- start -------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from simulated_link import DIGEST, MS, Way, World
 from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Notice, Ping, decode
 from instant_ic.bridge.host_session import ClockStepped, Ended, LinkTimes, Refused, Up
 from instant_ic.bridge.host_topics import TopicRule
-from instant_ic.msg import Bool, serialize
+from instant_ic.msg import Bool, deserialize, serialize, twist_stamped, twist_values
 
 COMMAND = TopicRule("/operator/cmd_vel", lane="command", max_age_s=0.25)
 PICTURE = TopicRule("/camera/image/compressed", lane="bulk")
@@ -439,6 +439,57 @@ def test_only_the_driving_host_is_taken_in_and_its_latched_values_come_with_the_
     events = world.sessions["robot"].set_drives(True)
     assert [e.announce.topic for e in events] == [status.topic]
     assert world.sessions["robot"].set_drives(True) == []
+
+
+class Station:
+    """A station that does not drive yet, at a robot's session: each command is a new one."""
+
+    def __init__(self, kind):
+        self.world, self.kind = World([], [COMMAND]), kind
+        self.robot = self.world.sessions["robot"]
+        self.robot.drives = False
+        self.world.run(0.1)
+
+    def command(self, v):
+        """Sends a command; returns the speeds that the robot accepts."""
+        message, before = twist_stamped(v, 0.0, self.world.now), len(self.world.arrived("robot"))
+        payload = bytes(serialize(message if self.kind == "TwistStamped" else message.twist))
+        self.world.publish("station", COMMAND.topic, payload, kind=f"geometry_msgs/msg/{self.kind}")
+        self.world.run(0.02)
+        events = [event for _, event in self.world.arrived("robot")[before:]]
+        return [twist_values(deserialize(bytes(event.payload), event.announce.type_name))[0] for event in events]
+
+    def told(self):
+        return self.world.sessions["station"].notices.get("held", "")
+
+
+@pytest.mark.parametrize("kind", ["TwistStamped", "Twist"])
+def test_fault_a_held_key_drives_when_the_other_stations_link_ends(kind):
+    station = Station(kind)
+    assert station.command(0.2) == [] and station.told() == ""
+    station.robot.set_drives(True)
+    for _ in range(30):
+        station.world.run(0.1)
+        assert station.command(0.2) == []
+    assert station.told() == "let go of the controls once: robot does not start under a held key"
+    assert station.command(0.0) == [0.0] and station.told() == ""
+    assert station.command(0.2) == [0.2]
+
+
+def test_station_drives_at_once_unless_it_has_just_commanded_in_vain():
+    station = Station("TwistStamped")
+    assert station.command(0.0) == []
+    station.robot.set_drives(True)
+    assert station.command(0.2) == [0.2]
+    station.robot.set_drives(False)
+    assert station.command(0.2) == [] and station.command(0.0) == []  # let go in vain too
+    station.robot.set_drives(True)
+    assert station.command(0.2) == [0.2]
+    station.robot.set_drives(False)
+    assert station.command(0.2) == []
+    station.robot.set_drives(True)
+    station.world.run(1.1)
+    assert station.command(0.2) == [0.2] and station.told() == ""
 
 
 def test_every_drivers_host_sets_the_emergency_stop_and_only_the_driving_one_releases_it():

