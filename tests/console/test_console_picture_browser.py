@@ -81,7 +81,7 @@ def pass_to(page, demo, mode):
 
 @pytest.mark.parametrize("viewer", ["webgl", "canvas"])
 def test_a_tinted_view_has_the_cameras_colours_at_the_switch_and_the_camera_the_views(open_page, passages, viewer):
-    demo = passages()
+    demo = passages(colour_release_s=3600)  # not let go of, however long a busy machine takes for a picture
     demo.tint = TINT
     page = open_page(f"?viewer={viewer}", at=demo, bypass_csp=True)
     expect_body(page, "viewer", viewer)
