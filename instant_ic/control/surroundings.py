@@ -47,6 +47,12 @@ class Scan:
         """Arguments of ``scan_points`` and ``scan_rays``."""
         return self.ranges, self.angle_min, self.angle_increment, self.range_min, self.range_max
 
+    @property
+    def usable(self) -> bool:
+        """Whether its geometry is known, and a beam has measured a range or that nothing is within range."""
+        known = math.isfinite(self.angle_min + self.angle_increment) and self.range_min < self.range_max
+        return known and bool((np.asarray(self.ranges) >= self.range_min).any())
+
 
 @dataclass(frozen=True)
 class Cloud:
@@ -149,7 +155,7 @@ class Surroundings:
         """Add the newest scan and 3D points to the costmap; return it, None if nothing is new or known."""
         points_ns = -1 if cloud is None else self._take(cloud)
         pose = self.robot_pose()
-        if pose is None or scan is None:
+        if pose is None or scan is None or not scan.usable:
             missing = "no pose" if pose is None else "no LiDAR scan"
             self._find("costmap", self.costmap is None, f"costmap is not updated: {missing}")
             return None
@@ -187,6 +193,9 @@ class Surroundings:
         self.findings[name] = Diagnosis(name, Level.OK if ok else Level.WARN, text, values)
 
     def _place(self, scan: Scan) -> None:
+        if not scan.usable:
+            self._find("scan", False, "scan cannot be used: no beam has measured anything")
+            return
         try:
             odom_from_lidar = self._tf.lookup("odom", scan.frame, scan.stamp_ns)
         except TransformError as error:
