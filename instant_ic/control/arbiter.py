@@ -80,6 +80,7 @@ class Arbiter:
         self.mode = Mode.STOPPED
         self.transitions = 0
         self._since_ns: int | None = None  # start of the present mode
+        self._shown_since_ns: int | None = None  # start of showing the v-bot
         self._returned_ns: int | None = None  # last return or abandoned entry
         self._fresh_since_ns: int | None = None
         self._agree_since_ns: int | None = None
@@ -158,12 +159,14 @@ class Arbiter:
 
         A step at that moment sends the zero command on time, not up to a period later.
         """
-        return self._sources.stale_in_s(inputs, self.mode, self._since_s(self._since_ns, now_ns, 0.0))
+        return self._sources.stale_in_s(inputs, self.mode, *self._durations_s(now_ns))
 
     # -- transitions
 
     def _take(self, row: Transition, snapshot: Snapshot, now_ns: int) -> None:
         self._actions[row.action](snapshot, now_ns)
+        if not row.source.shows_vbot:
+            self._shown_since_ns = now_ns
         self.mode = row.target
         self.transitions += 1
         self._since_ns = now_ns
@@ -199,7 +202,7 @@ class Arbiter:
         last_command, driven_ns = self._driven or (NO_MOTION, self._since_ns)
         if inputs.vspace.ready:
             self._ready = (inputs.vspace, now_ns)
-        stale = self._sources.stale(inputs, self.mode, in_mode_s)
+        stale = self._sources.stale(inputs, self.mode, *self._durations_s(now_ns))
         stale_in_real = self._sources.stale(inputs, Mode.REAL, in_mode_s)
         self._fresh_since_ns = None if stale_in_real else _kept(self._fresh_since_ns, now_ns)
         target = _target(inputs)
@@ -273,6 +276,10 @@ class Arbiter:
             moved_m <= trust.jump_m + limits.max_linear_m_s * elapsed_s
             and turned_rad <= math.radians(trust.jump_deg) + limits.max_angular_rad_s * elapsed_s
         )
+
+    def _durations_s(self, now_ns: int) -> tuple[float, float]:
+        """Seconds since the last change of mode, and since the v-bot has been shown."""
+        return self._since_s(self._since_ns, now_ns, 0.0), self._since_s(self._shown_since_ns, now_ns, 0.0)
 
     @staticmethod
     def _since_s(since_ns: int | None, now_ns: int, otherwise_s: float) -> float:

@@ -75,7 +75,13 @@ def way_free(s: Snapshot) -> bool:
 def view_fits(s: Snapshot) -> bool:
     switch = s.config.switch
     vbot_placed = s.inputs.age("vbot") < s.in_mode_s
-    return vbot_placed and hold(s) is None and images_agree(s, switch.picture_position_m, switch.picture_yaw_deg)
+    # Without an operator nobody drives the v-bot that the r-bot would follow.
+    return (
+        vbot_placed
+        and s.fresh
+        and hold(s) is None
+        and images_agree(s, switch.picture_position_m, switch.picture_yaw_deg)
+    )
 
 
 def rejoined(s: Snapshot) -> bool:

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, rectangle
+from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Loop, World, corridor, draw_map, rectangle
 from test_control_nodes import Stack
 
 from instant_ic.console.drive import DriveConfig, DriveGate
+from instant_ic.control.states import Mode
 from instant_ic.msg import Bool, ControlState, odometry_message, scan_message, twist_stamped, twist_values
 from nodes.virtual_robot import VirtualRobotNode
 
@@ -103,3 +104,38 @@ def test_fault_a_scan_that_says_nothing_counts_as_free_space(field: str, value: 
         stack.step(FORWARD)
     assert twist_values(stack.bus.last("/cmd_vel")) == NOTHING
     assert stack.bus.last("/ic/state").reason_code == ControlState.REASON_SCAN_STALE
+
+
+def test_fault_the_robot_follows_a_v_bot_that_nobody_drives() -> None:
+    """The operator's link is lost while the arbiter waits for a view: that was forgotten at the switch."""
+    stack = Stack(BOX)
+    stack.drive(1.5, None)
+    stack.silent.add("views")
+    while stack.step(FORWARD).mode != ControlState.ENTERING:
+        pass
+    stack.drive(0.5, None)
+    stack.silent.clear()
+    assert {state.mode for state in stack.drive(0.5, None)} == {ControlState.ENTERING}
+    assert twist_values(stack.bus.last("/cmd_vel")) == NOTHING
+    assert stack.drive(0.5, FORWARD)[-1].mode == ControlState.VIRTUAL
+
+
+def passage(lost: str = "", from_s: float = math.inf) -> Loop:
+    """A drive through the box, in which a source falls silent."""
+    walls = corridor()
+    made = Loop(World(np.concatenate([walls, BOX])), draw_map(walls, (-2, -1.2, 14, 1.2)))
+    made.start()
+    while made.modes()[-3:] != ["VIRTUAL", "RETURNING", "REAL"] and made.k * made.dt < from_s + 0.35:
+        if made.k * made.dt > from_s:
+            made.ages[lost] = made.k * made.dt - from_s
+        made.step(FORWARD)
+    return made
+
+
+@pytest.mark.parametrize("lost", ["view", "vbot"])
+def test_fault_a_switch_renews_the_age_of_a_source_that_was_needed_before_it(lost: str) -> None:
+    whole = passage()
+    returning_s = next(frame.t for frame in whole.frames if frame.decision.mode == Mode.RETURNING)
+    made = passage(lost, returning_s - 0.2)
+    assert made.modes()[-1] == "RETURNING"
+    assert made.frames[-1].command == NOTHING
