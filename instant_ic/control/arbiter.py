@@ -80,6 +80,7 @@ class Arbiter:
         self.mode = Mode.STOPPED
         self.transitions = 0
         self._since_ns: int | None = None  # start of the present mode
+        self._shown_since_ns: int | None = None  # start of showing the v-bot
         self._returned_ns: int | None = None  # last return or abandoned entry
         self._fresh_since_ns: int | None = None
         self._agree_since_ns: int | None = None
@@ -91,7 +92,7 @@ class Arbiter:
         self._hard = False  # the last command was a hard stop
         self._yaw_gap_before = 0.0  # in the previous step
         self._stopped_for_pose = False  # since the pose was last trusted
-        self._pose_before: tuple[NDArray[np.float64], int] | None = None  # the r-bot's, and when: the previous step
+        self._poses_before: dict[str, tuple[NDArray[np.float64], int]] = {}  # by robot, and when: the previous step
         self._stopped_by = Notice(Reason.STARTING, "waiting for the sensors")
         self._awaits_operator = False  # STOPPED because the operator's link was lost
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
@@ -158,12 +159,14 @@ class Arbiter:
 
         A step at that moment sends the zero command on time, not up to a period later.
         """
-        return self._sources.stale_in_s(inputs, self.mode, self._since_s(self._since_ns, now_ns, 0.0))
+        return self._sources.stale_in_s(inputs, self.mode, *self._durations_s(now_ns))
 
     # -- transitions
 
     def _take(self, row: Transition, snapshot: Snapshot, now_ns: int) -> None:
         self._actions[row.action](snapshot, now_ns)
+        if not row.source.shows_vbot:
+            self._shown_since_ns = now_ns
         self.mode = row.target
         self.transitions += 1
         self._since_ns = now_ns
@@ -199,7 +202,7 @@ class Arbiter:
         last_command, driven_ns = self._driven or (NO_MOTION, self._since_ns)
         if inputs.vspace.ready:
             self._ready = (inputs.vspace, now_ns)
-        stale = self._sources.stale(inputs, self.mode, in_mode_s)
+        stale = self._sources.stale(inputs, self.mode, *self._durations_s(now_ns))
         stale_in_real = self._sources.stale(inputs, Mode.REAL, in_mode_s)
         self._fresh_since_ns = None if stale_in_real else _kept(self._fresh_since_ns, now_ns)
         target = _target(inputs)
@@ -240,7 +243,8 @@ class Arbiter:
             awaits_operator=self._awaits_operator,
             slow_s=self._since_s(self._slow_since_ns, now_ns, 0.0),
             pose_lost=lost >= trust.stop and not self._stopped_for_pose,
-            pose_jumped=self._pose_jumps(inputs.robot_pose, now_ns),
+            pose_jumped=self._jumps("r-bot", inputs.robot_pose, now_ns),
+            vbot_jumped=self._vbot_jumps(vbot, now_ns),
         )
         self._no_view_fits = self._no_view_fits and not _may_enter_again(snapshot)
         self._leading_back = self._leads_back(snapshot)
@@ -252,21 +256,30 @@ class Arbiter:
         )
         return replace(snapshot, against_switch=self._against_switch(snapshot, now_ns))
 
-    def _pose_jumps(self, pose: NDArray[np.float64] | None, now_ns: int) -> bool:
-        """Whether the r-bot's pose has moved farther since the previous step than the robot can have driven."""
+    def _vbot_jumps(self, pose: NDArray[np.float64], now_ns: int) -> bool:
+        """As ``_jumps``, while the r-bot follows the v-bot."""
+        if not self.mode.shows_vbot:
+            self._poses_before.pop("v-bot", None)
+            return False
+        return self._jumps("v-bot", pose, now_ns)
+
+    def _jumps(self, robot: str, pose: NDArray[np.float64] | None, now_ns: int) -> bool:
+        """Whether a robot's pose is no number, or farther from the previous step's than the robot can have driven."""
         if pose is None:
             return False
-        before, self._pose_before = self._pose_before, (pose, now_ns)
-        if before is None:
-            return False
+        before, self._poses_before[robot] = self._poses_before.get(robot, (pose, now_ns)), (pose, now_ns)
         trust, limits = self.config.pose_trust, self.config.limits
         elapsed_s = max(0, now_ns - before[1]) / 1e9
         moved_m = math.dist(pose[:2], before[0][:2])
         turned_rad = abs(wrap_angle(float(pose[2] - before[0][2])))
-        return (
-            moved_m > trust.jump_m + limits.max_linear_m_s * elapsed_s
-            or turned_rad > math.radians(trust.jump_deg) + limits.max_angular_rad_s * elapsed_s
+        return not (
+            moved_m <= trust.jump_m + limits.max_linear_m_s * elapsed_s
+            and turned_rad <= math.radians(trust.jump_deg) + limits.max_angular_rad_s * elapsed_s
         )
+
+    def _durations_s(self, now_ns: int) -> tuple[float, float]:
+        """Seconds since the last change of mode, and since the v-bot has been shown."""
+        return self._since_s(self._since_ns, now_ns, 0.0), self._since_s(self._shown_since_ns, now_ns, 0.0)
 
     @staticmethod
     def _since_s(since_ns: int | None, now_ns: int, otherwise_s: float) -> float:

@@ -250,6 +250,27 @@ class RollingCostmap:
         self._through.fill(0)
         self.heights.reset()
 
+    def carry(self, moved: NDArray[np.float64]) -> None:
+        """Move all observations by ``moved`` (x, y, yaw), as after a correction of the map."""
+        if self._corner is None:
+            return
+        corner, c, s = np.array(self._corner), math.cos(moved[2]), math.sin(moved[2])
+
+        def carried(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+            """Rows and columns (2, N) of the cells in ``mask``, and where they go."""
+            cells = np.argwhere(mask)
+            places = (cells[:, ::-1] + corner + 0.5) @ np.array([[c, s], [-s, c]]) + moved[:2] / self.config.resolution
+            goals = np.floor(places).astype(np.intp)[:, ::-1] - corner[::-1]
+            inside = ((goals >= 0) & (goals < self.size)).all(axis=1)
+            return cells[inside].T, goals[inside].T
+
+        free, lethal = (carried(self._observed == value)[1] for value in (FREE, LETHAL))
+        self._observed.fill(UNKNOWN)
+        self._observed[free[0], free[1]] = FREE
+        self._observed[lethal[0], lethal[1]] = LETHAL
+        self._through.fill(0)
+        self.heights.carry(*carried(self.heights.hits > 0))
+
     def update(
         self,
         robot_pose: NDArray[np.float64],

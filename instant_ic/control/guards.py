@@ -17,6 +17,9 @@ MIN_SWITCH_SPEED_M_S = 0.03
 """Forward speed below which the robot counts as turning."""
 RETURN_SIDE_M = 0.12
 """Width beside the footprint, on each side, that must be free for a return."""
+_LET_GO_S, _SILENT_S = 0.1, 1.0
+"""Hands are off after such a time of zeros, or of silence: a link that pauses says nothing about a held key, and the
+console's last zero is followed at once by its report of the loss."""
 
 
 def estop_pressed(s: Snapshot) -> bool:
@@ -28,7 +31,7 @@ def source_lost(s: Snapshot) -> bool:
 
 
 def pose_lost(s: Snapshot) -> bool:
-    return s.pose_lost or s.pose_jumped
+    return s.pose_lost or s.pose_jumped or s.vbot_jumped
 
 
 def vspace_lost(s: Snapshot) -> bool:
@@ -72,7 +75,13 @@ def way_free(s: Snapshot) -> bool:
 def view_fits(s: Snapshot) -> bool:
     switch = s.config.switch
     vbot_placed = s.inputs.age("vbot") < s.in_mode_s
-    return vbot_placed and hold(s) is None and images_agree(s, switch.picture_position_m, switch.picture_yaw_deg)
+    # Without an operator nobody drives the v-bot that the r-bot would follow.
+    return (
+        vbot_placed
+        and s.fresh
+        and hold(s) is None
+        and images_agree(s, switch.picture_position_m, switch.picture_yaw_deg)
+    )
 
 
 def rejoined(s: Snapshot) -> bool:
@@ -110,6 +119,8 @@ def may_resume(s: Snapshot) -> bool:
     if estop_pressed(s) or s.command != NO_MOTION or s.inputs.robot_pose is None:
         return False
     if (s.awaits_operator and not s.fresh) or images_too_rare(s.inputs, s.config):
+        return False
+    if s.idle_s < (_LET_GO_S if s.fresh else _SILENT_S):
         return False
     return s.fresh_s >= s.config.timeouts.recover_s
 
@@ -196,6 +207,8 @@ def stop_notice(s: Snapshot) -> Notice:
         return Notice(Reason.POSE_LOST, "the robot has lost its place")
     if s.pose_jumped:
         return Notice(Reason.POSE_LOST, "the robot's place on the map has jumped; check where it stands")
+    if s.vbot_jumped:
+        return Notice(Reason.VBOT_STALE, "the v-bot's place on the map has jumped")
     if s.inputs.vspace.failed:
         return Notice(Reason.VSPACE_FAILED, f"the virtual space failed: {s.inputs.vspace.message}")
     return Notice(Reason.VSPACE_LOST, "the virtual space is silent")

@@ -150,6 +150,15 @@ class HeightLayer:
         self.high = shifted(self.high, columns, rows, 0.0)
         self.evidence = shifted(self.evidence, columns, rows, 0)
 
+    def carry(self, cells: NDArray[np.intp], goals: NDArray[np.intp]) -> None:
+        """Move marks from ``cells`` to ``goals``, rows and columns (2, N); all others are forgotten."""
+        order = np.argsort(self.hits[cells[0], cells[1]])  # of two in one cell, the one with more points stays
+        (rows, columns), (to_rows, to_columns) = cells[:, order], goals[:, order]
+        for layer in (self.hits, self.low, self.high, self.evidence):
+            kept = layer[rows, columns]
+            layer.fill(0)
+            layer[to_rows, to_columns] = kept
+
     def update(self, sweep: SortedPoints, placed: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
         """Add a sweep whose frame has the pose ``placed`` (x, y, yaw) in the window's frame.
 

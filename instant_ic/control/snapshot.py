@@ -139,6 +139,8 @@ class Snapshot:
     """The SLAM is lost, and the robot has not been stopped for it yet."""
     pose_jumped: bool = False
     """The r-bot's pose has jumped since the previous step."""
+    vbot_jumped: bool = False
+    """As ``pose_jumped``: the r-bot would follow the v-bot to a place where nobody drove it."""
     no_view_fits: bool = False
     """An entry was abandoned, and neither has a view fitted since nor has the operator let go."""
     leading_back: bool = False

@@ -23,13 +23,18 @@ class SourceMonitor:
 
     config: ArbiterConfig
 
-    def stale(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float) -> tuple[Stale, ...]:
-        """Stale sources that ``mode`` needs, with their ages, ``in_mode_s`` after the last change of mode."""
+    def stale(
+        self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float, shown_s: float = math.inf
+    ) -> tuple[Stale, ...]:
+        """Stale sources that ``mode`` needs, with their ages, ``in_mode_s`` after the last change of mode.
+
+        The v-bot has been shown for ``shown_s``.
+        """
         found = []
         for source in self._required(mode):
             if source.optional and source.key not in inputs.ages:
                 continue
-            age_s = _age_s(source, inputs, in_mode_s)
+            age_s = _age_s(source, inputs, in_mode_s, shown_s)
             # An age that is no number proves no freshness.
             fresh = age_s <= self._allowed_s(source, inputs)
             if not fresh or (source.key == "command" and inputs.operator_gone):
@@ -45,10 +50,10 @@ class SourceMonitor:
         """Whether the operator's command counts: young enough, and its client is still there."""
         return inputs.age("command") <= self._command_s and not inputs.operator_gone
 
-    def stale_in_s(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float) -> float:
+    def stale_in_s(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float, shown_s: float = math.inf) -> float:
         """Seconds until the first fresh source becomes stale; inf for none."""
         left = [
-            self._allowed_s(source, inputs) - _age_s(source, inputs, in_mode_s)
+            self._allowed_s(source, inputs) - _age_s(source, inputs, in_mode_s, shown_s)
             for source in SOURCES
             if mode in source.modes
         ]
@@ -106,7 +111,7 @@ def _usual_s(source: Source, inputs: ArbiterInputs) -> float | None:
     return inputs.usual.get(source.key) if source.steady else None
 
 
-def _age_s(source: Source, inputs: ArbiterInputs, in_mode_s: float) -> float:
-    # A source that REAL does not need may be silent before the change: its age counts from the change.
-    age_s = inputs.age(source.key)
-    return min(age_s, in_mode_s) if Mode.REAL not in source.modes else age_s
+def _age_s(source: Source, inputs: ArbiterInputs, in_mode_s: float, shown_s: float) -> float:
+    # A source that nothing needed before the change may have been silent: its age counts from the change.
+    since_s = {"nav": in_mode_s, "view": shown_s, "vbot": shown_s}.get(source.key, math.inf)
+    return min(inputs.age(source.key), since_s)

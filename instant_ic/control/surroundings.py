@@ -16,15 +16,19 @@ from instant_ic.control.heights import SortedPoints, sort_points
 from instant_ic.control.moving import NOTHING_MOVES, MovingPoints, MovingThings
 from instant_ic.control.static_map import StaticMap
 from instant_ic.diagnosis import Diagnosis, Level
-from instant_ic.geometry.poses import Matrix, pose2_from_matrix, relative2
+from instant_ic.geometry.poses import Matrix, inverse, pose2_from_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 
 log = logging.getLogger(__name__)
 
 _MOTION_SAMPLES = 9
 """Poses of the sensor over a sweep of points; between them its motion counts as even."""
-_JUMP_M, _JUMP_RAD = 0.3, math.radians(5.0)
-"""Motion of map → odom between two updates above which the map has jumped: the costmap forgets its marks."""
+_CORRECTED_M, _CORRECTED_RAD = 0.05, math.radians(2.0)
+"""Motion of the robot in the map beyond that of odometry, between two updates, above which the map was corrected. The
+costmap's marks then move with the robot, since from near no sensor may see them again. Less is slip of the tracks."""
+_JUMP_M, _JUMP_RAD = 0.5, 0.5
+"""The same, above which the robot was carried off: the costmap forgets its marks. The arbiter stops the robot before
+(``pose_trust``)."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,12 @@ class Scan:
     def beams(self) -> tuple[NDArray[np.floating], float, float, float, float]:
         """Arguments of ``scan_points`` and ``scan_rays``."""
         return self.ranges, self.angle_min, self.angle_increment, self.range_min, self.range_max
+
+    @property
+    def usable(self) -> bool:
+        """Whether its geometry is known, and a beam has measured a range or that nothing is within range."""
+        known = math.isfinite(self.angle_min + self.angle_increment) and self.range_min < self.range_max
+        return known and bool((np.asarray(self.ranges) >= self.range_min).any())
 
 
 @dataclass(frozen=True)
@@ -149,7 +159,7 @@ class Surroundings:
         """Add the newest scan and 3D points to the costmap; return it, None if nothing is new or known."""
         points_ns = -1 if cloud is None else self._take(cloud)
         pose = self.robot_pose()
-        if pose is None or scan is None:
+        if pose is None or scan is None or not scan.usable:
             missing = "no pose" if pose is None else "no LiDAR scan"
             self._find("costmap", self.costmap is None, f"costmap is not updated: {missing}")
             return None
@@ -162,10 +172,7 @@ class Surroundings:
         except TransformError as error:
             self._find("costmap", False, f"costmap is not updated: {error}")
             return None
-        if self._map_from_odom is not None and _jumped(self._map_from_odom, map_from_odom):
-            log.info("the map has jumped: the marks of scans are cleared from the costmap")
-            self._rolling.reset()
-        self._map_from_odom = map_from_odom
+        self._correct(map_from_odom)
         rays = scan_rays(*scan.beams, map_from_lidar, self.config)
         new_points = self._sweep if points_ns not in (-1, self._in_costmap[1]) else None
         self.costmap = self._rolling.update(pose, static, rays, new_points, pose2_from_matrix(map_from_odom))
@@ -183,10 +190,31 @@ class Surroundings:
         self._published_ns = steady_ns
         return True
 
+    def _correct(self, map_from_odom: Matrix) -> None:
+        """Let the costmap's marks follow a correction of the map."""
+        before, self._map_from_odom = self._map_from_odom, map_from_odom
+        if before is None:
+            return
+        # Compared once per costmap period, which is shorter than SLAM's: a correction arrives in one piece. Compared at
+        # the robot: far from the origin of odom, a turn by a degree moves that origin by decimetres.
+        odom_from_base = self._tf.lookup("odom", "base_link")
+        x, y, yaw = relative2(
+            pose2_from_matrix(before @ odom_from_base), pose2_from_matrix(map_from_odom @ odom_from_base)
+        )
+        moved_m, turned_rad = math.hypot(x, y), abs(yaw)
+        if moved_m > _JUMP_M or turned_rad > _JUMP_RAD:
+            log.info("the map has jumped: the marks of scans are cleared from the costmap")
+            self._rolling.reset()
+        elif moved_m > _CORRECTED_M or turned_rad > _CORRECTED_RAD:
+            self._rolling.carry(pose2_from_matrix(map_from_odom @ inverse(before)))
+
     def _find(self, name: str, ok: bool, text: str, **values: Any) -> None:
         self.findings[name] = Diagnosis(name, Level.OK if ok else Level.WARN, text, values)
 
     def _place(self, scan: Scan) -> None:
+        if not scan.usable:
+            self._find("scan", False, "scan cannot be used: no beam has measured anything")
+            return
         try:
             odom_from_lidar = self._tf.lookup("odom", scan.frame, scan.stamp_ns)
         except TransformError as error:
@@ -227,9 +255,3 @@ class Surroundings:
         poses = np.stack([self._tf.lookup("odom", cloud.frame, ns) for ns in instants])
         xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
         return sort_points(xyz, time_s, poses, duration_s, self.config.points)
-
-
-def _jumped(before: Matrix, after: Matrix) -> bool:
-    # Compared once per costmap period, which is shorter than SLAM's: a correction arrives in one piece.
-    x, y, yaw = relative2(pose2_from_matrix(before), pose2_from_matrix(after))
-    return math.hypot(float(x), float(y)) > _JUMP_M or abs(float(yaw)) > _JUMP_RAD
