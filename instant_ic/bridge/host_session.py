@@ -314,11 +314,12 @@ class Session:
         self._replies.append(Notice(name, text))
 
     def set_drives(self, drives: bool) -> list[Event]:
-        """Set whether the other host's commands are accepted; if so, return its latched values held back so far."""
+        """Set whether the other host's commands are accepted; if so, return its topics and latched values so far."""
         self.drives = drives
         if not drives:
             return []
-        events: list[Event] = []
+        taken = [each for each in self._incoming.values() if not (each.refused or each.rule.shared)]
+        events: list[Event] = [Announced(incoming.announce) for incoming in taken]
         for incoming in self._incoming.values():
             if incoming.kept is not None:
                 events += self._deliver(incoming, *incoming.kept)
@@ -444,9 +445,10 @@ class Session:
         topic = announce.topic
         counts = self.memory.counts_in.setdefault(topic, TopicCounts()) if rule is not None else TopicCounts()
         self._incoming[announce.channel] = _Incoming(announce, rule or TopicRule("/none"), counts, reason)
-        if not reason:
-            return [Announced(announce)]
-        return self.refuse(announce, reason)
+        if reason:
+            return self.refuse(announce, reason)
+        # A host that does not drive gives no topic its type.
+        return [Announced(announce)] if self.drives or rule is None or rule.shared else []
 
     def refuse(self, announce: Announce, reason: str) -> list[Event]:
         """Report to the other host that one of its topics is refused."""

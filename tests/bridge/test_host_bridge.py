@@ -311,28 +311,32 @@ def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_
     assert bus.records("/operator/estop")[-1].payload == b"\x00"
 
 
-def test_fault_a_host_that_does_not_drive_gives_the_emergency_stop_another_type():
-    """The first type that was announced would hold until the bridge restarts, and refuse every other host's stop."""
+@pytest.mark.parametrize("topic", ["/operator/estop", "/view/shown"])
+def test_fault_a_host_that_does_not_drive_gives_a_topic_another_type(topic):
+    """The first type would hold until the bridge restarts, and refuse every other host's messages."""
     bus = LockstepBus()
+    rule = TopicRule(topic, shared=topic == "/operator/estop")
     importer = bus.add(Importer)
+    importer.incoming._rules[topic] = rule
 
-    def station(kind, payload):
-        world = World(to_robot=[TopicRule("/operator/estop", lane="command", shared=True)])
-        world.sessions["robot"].drives = False
-        world.publish("station", "/operator/estop", payload, latched=True, kind=kind)
+    def station(drives, kind, payload):
+        world = World(to_robot=[rule])
+        robot = world.sessions["robot"]
+        robot.drives = False
         world.run(0.1)
-        world.publish("station", "/operator/estop", payload, latched=True, kind=kind)
+        world.publish("station", topic, payload, latched=True, kind=kind)
         world.run(0.1)
-        for _, event in world.events["robot"]:
+        arrived = [event for _, event in world.events["robot"]]
+        for event in [*arrived, *(robot.set_drives(True) if drives else ())]:
             if isinstance(event, Announced):
                 importer.incoming.open(event.announce)
             elif isinstance(event, Arrived):
                 importer.incoming.take(event)
         bus.advance(0.1)
 
-    station(String.__msgtype__, bytes(serialize(String(data="x"))))
-    station(Bool.__msgtype__, bytes(serialize(Bool(data=True))))
-    assert bus.last("/operator/estop").data is True
+    station(False, String.__msgtype__, bytes(serialize(String(data="x"))))
+    station(True, Bool.__msgtype__, bytes(serialize(Bool(data=True))))
+    assert bus.last(topic).data is True
 
 
 def test_fault_a_hosts_outdated_stops_fill_the_log(caplog):

@@ -7,7 +7,7 @@ import pytest
 from simulated_link import DIGEST, MS, Way, World
 
 from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Notice, Ping, decode
-from instant_ic.bridge.host_session import ClockStepped, Ended, LinkTimes, Refused, Up
+from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, Ended, LinkTimes, Refused, Up
 from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.msg import Bool, deserialize, serialize, twist_stamped, twist_values
 
@@ -440,8 +440,9 @@ def test_only_the_driving_host_is_taken_in_and_its_latched_values_come_with_the_
     assert [e.announce.topic for _, e in world.arrived("robot")] == [estop.topic]
     assert world.memories["robot"].counts_in[COMMAND.topic].not_driving == 1
     events = world.sessions["robot"].set_drives(True)
-    assert [e.announce.topic for e in events] == [status.topic]
-    assert world.sessions["robot"].set_drives(True) == []
+    assert [e.announce.topic for e in events if isinstance(e, Announced)] == [COMMAND.topic, status.topic]
+    assert [e.announce.topic for e in events if isinstance(e, Arrived)] == [status.topic]
+    assert not any(isinstance(e, Arrived) for e in world.sessions["robot"].set_drives(True))
 
 
 class Station:
