@@ -9,6 +9,7 @@ import sys
 import textwrap
 import threading
 from collections import Counter
+from types import SimpleNamespace
 
 import aiohttp
 import pytest
@@ -20,6 +21,7 @@ from instant_ic.console import connections as connections_module
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.connections import AddressBuckets, network_of
 from instant_ic.console.drive import DriveConfig
+from instant_ic.console.faults import MOST_NAMES, FaultList
 from instant_ic.console.log_rate import LogRate
 from instant_ic.console.server import WATCHER_SHARE
 from instant_ic.console.session import MAX_REPLIES
@@ -380,6 +382,21 @@ def test_fault_maps_are_packed_for_clients_that_have_left(serve):
     while packing.acquire(blocking=False):
         packed += 1
     assert packed == 2  # the one that had begun, and the client that waited
+
+
+def test_fault_another_machines_reports_grow_the_consoles_memory():
+    """Each under a new name: they come over the bridge, also from a host that does not drive."""
+    faults, most = FaultList(), MOST_NAMES
+    for number in range(3 * most):
+        name = f"node{number}"
+        status = SimpleNamespace(name=f"{name}: link", level=2, message="lost")
+        faults.take_diagnoses(SimpleNamespace(status=[status]), now_s=0.001 * number)
+        faults.take_heartbeat(SimpleNamespace(node=name, state=2, cpu_percent=1.0), now_s=0.001 * number)
+    assert len(faults._diagnoses) == len(faults._heartbeats) == len(faults._cpu_percent) == most
+    assert faults.worst(now_s=1.0)[0]["text"] == "lost"
+    late = SimpleNamespace(name="arbiter: control", level=2, message="stopped")
+    faults.take_diagnoses(SimpleNamespace(status=[late]), now_s=100.0)
+    assert faults._diagnoses.keys() == {"arbiter: control"}  # what nobody has reported for long makes room
 
 
 def test_networks_of_addresses():
