@@ -33,12 +33,16 @@ from instant_ic.bridge.host_protocol import (
 )
 from instant_ic.bridge.host_topics import TopicCounts, TopicRule, moves, releases
 from instant_ic.config.ranges import Range, check_ranges
+from instant_ic.web_access import TokenBucket
 
 MAX_MESSAGE = 64 << 20
 """Largest message that is reassembled, in bytes."""
 
 MAX_CHANNELS = 1024
 """Most channels that the other host may announce on one link; a robot has some hundred."""
+
+SHARED_BYTES_PER_S, SHARED_BURST = 512 << 10, 2 << 20
+"""Bytes of shared topics from a host that does not drive, apart from stops; ten nodes' reports are some 20 kB/s."""
 
 MAX_NAME = 128
 MAX_NOTICES = 16
@@ -235,6 +239,7 @@ class Session:
         self._partial: dict[int, tuple[Data, bytearray]] = {}
         self._early: list[tuple[_Incoming, Data, bytes | bytearray]] = []
         self._early_bytes = 0
+        self._shared = TokenBucket(SHARED_BYTES_PER_S, SHARED_BURST)
         self._replies: deque[Message] = deque()
         self._taken = [0] * len(LANES)
         self._ack: int | None = None
@@ -522,13 +527,23 @@ class Session:
         if not 0 <= publish_ns < 1 << 63:
             raise ProtocolError(f"{announce.topic}: time of publication {publish_ns} ns is impossible")
         arrived = Arrived(announce, payload, publish_ns, born_ns)
-        if held or (not self.drives and (not rule.shared or releases(announce.type_name, payload))):
+        if held or (not self.drives and not self._shares(arrived, rule, now)):
             counts.not_driving += 1
             # A refused release is gone: the lease must not end an emergency stop when it is handed over.
             if announce.qos == "latched" and not rule.shared and not held:
                 incoming.kept = arrived, data.born_ns
+                kept = sum(len(each.kept[0].payload) for each in self._incoming.values() if each.kept is not None)
+                if kept > MAX_MESSAGE:
+                    raise ProtocolError(f"{kept} bytes of latched values before this host drives")
             return []
         return self._deliver(incoming, arrived, data.born_ns)
+
+    def _shares(self, arrived: Arrived, rule: TopicRule, now: int) -> bool:
+        """Whether a message is taken from a host that does not drive: a shared topic, no release, and no flood."""
+        announce, payload = arrived.announce, arrived.payload
+        if not rule.shared or releases(announce.type_name, payload):
+            return False
+        return announce.topic in COMMANDS or self._shared.take(now / 1e9, len(payload) + DATA_OVERHEAD)
 
     def _is_held(self, key: tuple[str, str, str], announce: Announce, payload: bytes | bytearray, now: int) -> bool:
         """Whether a command comes from controls held since before this host drove: no robot starts under a held key.

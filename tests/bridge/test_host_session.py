@@ -7,7 +7,7 @@ import pytest
 from simulated_link import DIGEST, MS, Way, World
 
 from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Notice, Ping, decode
-from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, Ended, LinkTimes, Refused, Up
+from instant_ic.bridge.host_session import SHARED_BURST, Announced, Arrived, ClockStepped, Ended, LinkTimes, Refused, Up
 from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.msg import Bool, deserialize, serialize, twist_stamped, twist_values
 
@@ -647,6 +647,35 @@ def test_fault_a_host_that_does_not_drive_grows_the_memory_by_ever_new_publisher
         robot.receive(announce(1, COMMAND.topic, f"node{number}", kind, "sensor"))
         robot.receive(Data(1, 1, 0, world.now, world.now, len(payload), 0, payload).encode())
     assert robot.ended is None and len(robot.memory.held) == 10
+
+
+def test_fault_a_host_that_does_not_drive_floods_the_shared_topics_and_its_stop_still_counts():
+    beats, estop = TopicRule("/heartbeat", shared=True), TopicRule("/operator/estop", lane="command", shared=True)
+    world, robot = linked([beats, estop])
+    robot.drives = False
+    robot.receive(announce(1, beats.topic, qos="reliable"))
+    robot.receive(announce(2, estop.topic, type_name="std_msgs/msg/Bool"))
+
+    def send(channel, number, payload):
+        born_ns = world.now + number
+        return robot.receive(Data(channel, number, 0, born_ns, born_ns, len(payload), 0, payload).encode())
+
+    taken = sum(len(event.payload) for number in range(1, 1001) for event in send(1, number, bytes(60_000)))
+    assert SHARED_BURST - 60_000 <= taken <= SHARED_BURST  # all at once; each would cost its readers milliseconds
+    assert len(send(2, 1, bytes(serialize(Bool(data=True))))) == 1
+    world.now += 10_000_000_000
+    assert len(send(1, 2000, bytes(60_000))) == 1
+    assert robot.up and robot.memory.counts_in[beats.topic].not_driving > 900
+
+
+def test_fault_latched_values_of_a_host_that_does_not_drive_fill_the_memory(monkeypatch):
+    monkeypatch.setattr("instant_ic.bridge.host_session.MAX_MESSAGE", 200_000)
+    world, robot = linked()
+    robot.drives = False
+    for number in range(1, 100):
+        robot.receive(announce(number, origin=f"node{number}"))
+        robot.receive(Data(number, 1, 0, world.now, world.now, 50_000, 0, bytes(50_000)).encode())
+    assert "250000 bytes of latched values before this host drives" in robot.ended.reason
 
 
 @pytest.mark.parametrize("rate", [5e-324, 1e-300, -1.0, float("nan"), float("inf"), True, "x", None])
