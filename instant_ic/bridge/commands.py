@@ -7,6 +7,10 @@ from dataclasses import dataclass
 
 from instant_ic.config.ranges import Checked, Positive
 
+STOP = "/operator/estop"
+COMMANDS = {"/operator/cmd_vel": "geometry_msgs/msg/TwistStamped", STOP: "std_msgs/msg/Bool"}
+"""Topics that a remote operator may send, with their types."""
+
 
 class CommandRefused(ValueError):
     """A command that must not reach the robot; the message says why."""
@@ -51,8 +55,8 @@ class CommandGate:
         if age_s < -self.limits.max_age_s:
             raise self.refuse("future", f"stamped {-age_s:.2f} s ahead of this machine's clock: set both by NTP")
 
-    def check_drive(self, sender: str, v: float, w: float, steady_ns: int) -> None:
-        """Refuse implausible values (m/s, rad/s), and a second driver.
+    def check_drive(self, sender: str, v: float, w: float, steady_ns: int, sent: tuple[int, int] | None = None) -> None:
+        """Refuse implausible values (m/s, rad/s), a second driver, and by ``sent`` an old command (:meth:`check_age`).
 
         A second driver that takes over must let go first: send zero, or nothing for ``lease_s``. Else the robot would
         start under a key that was held in vain until then. ``steady_ns`` comes from a clock that is never set, since
@@ -70,6 +74,8 @@ class CommandGate:
         second = self._driver not in (None, sender) and self._driver_ns >= since_ns
         if moves and (second or sender in self._held):
             self._held[sender] = steady_ns
+        if sent is not None:  # only now: an old command too shows that a key is held
+            self.check_age(*sent)
         if second:
             raise self.refuse("second driver", f"{sender} may not drive while {self._driver} does")
         if sender in self._held:

@@ -91,9 +91,8 @@ class Commands:
             v, w = float(twist["linear"]["x"]), float(twist["angular"]["z"])
             stamp = content.get("header", {}).get("stamp", {})
             sent_ns = int(stamp.get("sec", 0)) * 1_000_000_000 + int(stamp.get("nanosec", stamp.get("nsec", 0)))
-        if sent_ns:  # Foxglove's Teleop panel has no clock and sends no stamp: the time of arrival counts
-            self._gate.check_age(sent_ns, now_ns)
-        self._gate.check_drive(_name(client), v, w, time.monotonic_ns())
+        # Foxglove's Teleop panel has no clock and sends no stamp: the time of arrival counts
+        self._gate.check_drive(_name(client), v, w, time.monotonic_ns(), (sent_ns, now_ns) if sent_ns else None)
         self._drive.publish(twist_stamped(v, w, sent_ns or now_ns))
         if self._told.pop(client, None) is not None:
             self._node.call_soon(self._node.diagnose, "commands", OK, "commands are accepted")

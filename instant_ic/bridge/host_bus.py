@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -105,6 +106,7 @@ class ImportedTopics:
     def __init__(self, node: Node[Any], rules: dict[str, TopicRule], on_trouble: Callable[[str, str], None]) -> None:
         self._node, self._rules, self._on_trouble = node, rules, on_trouble
         self._topics: dict[str, _Imported] = {}
+        self._next_outdated_s = 0.0
 
     def open(self, announce: Announce) -> _Imported:
         """Create the publisher, so that subscribers find it before the first message; called on the link's thread."""
@@ -131,7 +133,9 @@ class ImportedTopics:
                 if self._rules[announce.topic].shared:  # one state set by several hosts: only the latest message counts
                     grace_ns = 0 if releases(announce.type_name, arrived.payload) else OLD_NEWS_NS
                     if arrived.born_ns < topic.newest_ns - grace_ns:
-                        self._node.log.warning("dropped %s of %s: outdated", announce.topic, announce.origin)
+                        if time.monotonic() >= self._next_outdated_s:  # a peer must not fill the disk
+                            self._next_outdated_s = time.monotonic() + 1.0
+                            self._node.log.warning("dropped %s of %s: outdated", announce.topic, announce.origin)
                         return
                     topic.last.clear()
                 topic.newest_ns = max(arrived.born_ns, topic.newest_ns)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+from instant_ic.bridge.commands import COMMANDS
 from instant_ic.bridge.host_clock import ClockFilter
 from instant_ic.bridge.host_flow import Channel, Item, Outbox, Window
 from instant_ic.bridge.host_protocol import (
@@ -32,6 +33,7 @@ from instant_ic.bridge.host_protocol import (
 )
 from instant_ic.bridge.host_topics import TopicCounts, TopicRule, moves, releases
 from instant_ic.config.ranges import Range, check_ranges
+from instant_ic.web_access import TokenBucket
 
 MAX_MESSAGE = 64 << 20
 """Largest message that is reassembled, in bytes."""
@@ -39,13 +41,14 @@ MAX_MESSAGE = 64 << 20
 MAX_CHANNELS = 1024
 """Most channels that the other host may announce on one link; a robot has some hundred."""
 
+SHARED_BYTES_PER_S, SHARED_BURST = 512 << 10, 2 << 20
+"""Bytes of shared topics from a host that does not drive, apart from stops; ten nodes' reports are some 20 kB/s."""
+
 MAX_NAME = 128
 MAX_NOTICES = 16
 _NAME = re.compile(rf"[A-Za-z0-9_/.:-]{{1,{MAX_NAME}}}\Z")
 _MAX_TEXT = 300
 
-_LET_GO_S = 1.0
-"""Silence that counts as letting go of the controls."""
 _FIRST_PINGS = 8
 _FIRST_PING_S = 0.02
 _CLOCK_STEP_NS = 20_000_000
@@ -173,12 +176,14 @@ class Memory:
         received: (the other host's instance, topic, publisher) → number of the last message received.
         latched: (the other host's instance, topic, publisher) → ``born_ns`` of the last latched value passed on, since
             a new link sends it again.
+        held: (the other host's instance, topic, publisher) → time of its last command to move, if that was dropped.
         counts_out, counts_in: counts by topic, over all links with this host.
     """
 
     sent: dict[int, int] = field(default_factory=dict)
     received: dict[tuple[str, str, str], int] = field(default_factory=dict)
     latched: dict[tuple[str, str, str], int] = field(default_factory=dict)
+    held: dict[tuple[str, str, str], int] = field(default_factory=dict)
     counts_out: dict[str, TopicCounts] = field(default_factory=dict)
     counts_in: dict[str, TopicCounts] = field(default_factory=dict)
 
@@ -234,7 +239,7 @@ class Session:
         self._partial: dict[int, tuple[Data, bytearray]] = {}
         self._early: list[tuple[_Incoming, Data, bytes | bytearray]] = []
         self._early_bytes = 0
-        self._held_ns: dict[tuple[str, str], int] = {}  # (topic, publisher) → its last command to move, if dropped
+        self._shared = TokenBucket(SHARED_BYTES_PER_S, SHARED_BURST)
         self._replies: deque[Message] = deque()
         self._taken = [0] * len(LANES)
         self._ack: int | None = None
@@ -299,7 +304,7 @@ class Session:
         """End the link from this side; ``inform`` sends the reason to the other host."""
         if self.ended is not None:
             return []
-        self.up = False
+        self.up, reason = False, _text(reason)  # it may quote the other host
         self._replies.clear()
         if inform:
             self._replies.append(Bye(code, reason))
@@ -314,13 +319,12 @@ class Session:
         self._replies.append(Notice(name, text))
 
     def set_drives(self, drives: bool) -> list[Event]:
-        """Set whether the other host's commands are accepted; if so, return its latched values held back so far."""
+        """Set whether the other host's commands are accepted; if so, return its topics and latched values so far."""
         self.drives = drives
         if not drives:
             return []
-        if self._held_ns:
-            self.notify("held", f"let go of the controls once: {self.side.name} does not start under a held key")
-        events: list[Event] = []
+        taken = [each for each in self._incoming.values() if not (each.refused or each.rule.shared)]
+        events: list[Event] = [Announced(incoming.announce) for incoming in taken]
         for incoming in self._incoming.values():
             if incoming.kept is not None:
                 events += self._deliver(incoming, *incoming.kept)
@@ -405,7 +409,8 @@ class Session:
             self._replies.append(Welcome(VERSION, self.side.name, self.side.instance, self._wants()))
         wants = message.wants
         for topic, rate in wants.items():
-            if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:
+            # The period of a tiny rate is no number of nanoseconds.
+            if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not (rate == 0 or 1e-6 < rate < 1e6):
                 raise ProtocolError(f"{type(message).__name__}: rate of {topic} must be a number >= 0 (got {rate!r})")
         self.peer_name, self.peer_instance = _text(message.name)[:64], message.instance[:64]
         self.outbox.wants = {topic: float(rate) for topic, rate in wants.items()}
@@ -414,7 +419,7 @@ class Session:
             self.notify("role", f"this host may only watch {self.side.name} (role viewer)")
         self._next_ping_ns = self.up_ns
         # Drop entries of the other host's earlier instances: their numbers mean nothing now.
-        for known in (self.memory.received, self.memory.latched):
+        for known in (self.memory.received, self.memory.latched, self.memory.held):
             for key in [key for key in known if key[0] != self.peer_instance]:
                 del known[key]
         return [Up(self.peer_name)]
@@ -430,6 +435,9 @@ class Session:
             reason = f"{announce.topic} is not on the topic list of {self.side.name}"
         elif not self.may_send:
             reason = f"{self.peer_name} may only watch {self.side.name} (role viewer)"
+        elif announce.type_name != (wanted := COMMANDS.get(announce.topic, announce.type_name)):
+            # The first host that announces a topic gives it its type: it must not keep others from stopping the robot.
+            reason = f"{announce.topic} must be {wanted} (got {announce.type_name})"
         else:
             try:
                 if self.side.digest(announce.type_name) != announce.digest:
@@ -442,9 +450,10 @@ class Session:
         topic = announce.topic
         counts = self.memory.counts_in.setdefault(topic, TopicCounts()) if rule is not None else TopicCounts()
         self._incoming[announce.channel] = _Incoming(announce, rule or TopicRule("/none"), counts, reason)
-        if not reason:
-            return [Announced(announce)]
-        return self.refuse(announce, reason)
+        if reason:
+            return self.refuse(announce, reason)
+        # A host that does not drive gives no topic its type.
+        return [Announced(announce)] if self.drives or rule is None or rule.shared else []
 
     def refuse(self, announce: Announce, reason: str) -> list[Event]:
         """Report to the other host that one of its topics is refused."""
@@ -507,6 +516,8 @@ class Session:
         _remember(self.memory.received, key, data.sequence)
         born_ns = min(data.born_ns - self.clock.offset_ns, now)  # by our monotonic clock
         rule = incoming.rule
+        # Before its age is judged: an old command too shows what the operator does.
+        held = not rule.shared and self._is_held(key, announce, payload, now)
         if rule.max_age_s and now - born_ns > rule.max_age_s * 1e9:
             counts.expired += 1
             return []
@@ -516,32 +527,41 @@ class Session:
         if not 0 <= publish_ns < 1 << 63:
             raise ProtocolError(f"{announce.topic}: time of publication {publish_ns} ns is impossible")
         arrived = Arrived(announce, payload, publish_ns, born_ns)
-        if not self.drives and (not rule.shared or releases(announce.type_name, payload)):
+        if held or (not self.drives and not self._shares(arrived, rule, now)):
             counts.not_driving += 1
-            if moves(announce.type_name, payload):
-                self._held_ns[announce.topic, announce.origin] = now
-            else:
-                self._held_ns.pop((announce.topic, announce.origin), None)
             # A refused release is gone: the lease must not end an emergency stop when it is handed over.
-            if announce.qos == "latched" and not rule.shared:
+            if announce.qos == "latched" and not rule.shared and not held:
                 incoming.kept = arrived, data.born_ns
-            return []
-        if self._is_held(announce, payload, now):
-            counts.not_driving += 1
+                kept = sum(len(each.kept[0].payload) for each in self._incoming.values() if each.kept is not None)
+                if kept > MAX_MESSAGE:
+                    raise ProtocolError(f"{kept} bytes of latched values before this host drives")
             return []
         return self._deliver(incoming, arrived, data.born_ns)
 
-    def _is_held(self, announce: Announce, payload: bytes | bytearray, now: int) -> bool:
-        """Whether a command comes from controls held since before this host drove: no robot starts under a held key."""
-        who = announce.topic, announce.origin
-        last_ns = self._held_ns.get(who)
-        if last_ns is None:
+    def _shares(self, arrived: Arrived, rule: TopicRule, now: int) -> bool:
+        """Whether a message is taken from a host that does not drive: a shared topic, no release, and no flood."""
+        announce, payload = arrived.announce, arrived.payload
+        if not rule.shared or releases(announce.type_name, payload):
             return False
-        if moves(announce.type_name, payload) and now - last_ns <= _LET_GO_S * 1e9:
-            self._held_ns[who] = now
+        return announce.topic in COMMANDS or self._shared.take(now / 1e9, len(payload) + DATA_OVERHEAD)
+
+    def _is_held(self, key: tuple[str, str, str], announce: Announce, payload: bytes | bytearray, now: int) -> bool:
+        """Whether a command comes from controls held since before this host drove: no robot starts under a held key.
+
+        Letting go is a zero, or a silence that no link outlives: a shorter one may be a stall of the network.
+        """
+        held, last_ns = self.memory.held, self.memory.held.get(key)
+        if self.drives and last_ns is None:
+            return False
+        moving = moves(announce.type_name, payload)
+        silent_ns = now - max(last_ns or 0, self.up_ns)
+        if moving and (not self.drives or silent_ns <= 2e9 * self.times.timeout_s):
+            _remember(held, key, now)
+            if self.drives:
+                self.notify("held", f"let go of the controls once: {self.side.name} does not start under a held key")
             return True
-        del self._held_ns[who]
-        self.notify("held", "")
+        if held.pop(key, None) is not None:
+            self.notify("held", "")
         return False
 
     def _deliver(self, incoming: _Incoming, arrived: Arrived, born_ns: int) -> list[Event]:

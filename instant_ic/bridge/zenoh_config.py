@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from instant_ic.bridge.commands import CommandLimits
-from instant_ic.bridge.zenoh_topics import COMMANDS, Namespace, parse_publish
+from instant_ic.bridge.commands import COMMANDS, CommandLimits
+from instant_ic.bridge.zenoh_topics import Namespace, parse_publish
 from instant_ic.bus import registry
 from instant_ic.config.ranges import Range, check_ranges
 

@@ -8,15 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from instant_ic.bridge.commands import CommandGate, CommandRefused
+from instant_ic.bridge.commands import COMMANDS, STOP, CommandGate, CommandRefused
 from instant_ic.bridge.zenoh_format import Attachment, Token, TopicQoS
 from instant_ic.bridge.zenoh_outgoing import Outgoing
 from instant_ic.bridge.zenoh_session import RosNode, RosSubscription
 from instant_ic.bridge.zenoh_topics import (
     ACTED_ON,
-    COMMANDS,
     GRACE_S,
-    STOP,
     Namespace,
     bus_qos,
     known_hash,
@@ -243,8 +241,8 @@ class Incoming:
             return
         if not entry.sources:
             raise self._gate.refuse("no sender", "the ROS graph has no publisher of this topic")
-        self._gate.check_age(attachment.source_ns, now_ns)
-        self._gate.check_drive(attachment.sender, *twist_values(message), time.monotonic_ns())
+        sent = attachment.source_ns, now_ns
+        self._gate.check_drive(attachment.sender, *twist_values(message), time.monotonic_ns(), sent)
 
     def _tell(self, topic: str, level: int, words: str) -> None:
         self._node.call_soon(self._node.diagnose, f"in {topic}", level, words)

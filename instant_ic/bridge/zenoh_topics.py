@@ -12,10 +12,6 @@ from instant_ic.bus import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.bus.registry import RegistryError, check_topic
 from instant_ic.msg import MessageError, message_type, type_hash
 
-STOP = "/operator/estop"
-COMMANDS = {"/operator/cmd_vel": "geometry_msgs/msg/TwistStamped", STOP: "std_msgs/msg/Bool"}
-"""Topics that a remote operator may send, with their types."""
-
 ACTED_ON = ("*/operator/*", "*/cmd_vel", "*/robot/estop", "*/parameter_events")
 """Topics that move a robot, in any namespace, and parameter events: never imported by `subscribe`."""
 

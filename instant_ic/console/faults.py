@@ -9,6 +9,7 @@ from instant_ic.msg import DiagnosticArray, NodeStatus
 
 TIMEOUT_S = 3.0
 MAX_FAULTS = 4
+MOST_NAMES = 500  # of nodes, and of diagnoses: those of other machines come too
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 
 
@@ -31,10 +32,16 @@ class FaultList:
     def take_diagnoses(self, message: DiagnosticArray, now_s: float) -> None:
         """Store the newest diagnosis of each name."""
         for status in message.status:
+            if status.name not in self._diagnoses and len(self._diagnoses) >= MOST_NAMES:
+                self._diagnoses = {n: found for n, found in self._diagnoses.items() if now_s - found[2] < TIMEOUT_S}
+                if len(self._diagnoses) >= MOST_NAMES:
+                    return
             self._diagnoses[status.name] = (int(status.level), status.message, now_s)
 
     def take_heartbeat(self, message: NodeStatus, now_s: float) -> None:
         """Note a node's heartbeat. A node that announced its shutdown does not count as missing."""
+        if message.node not in self._heartbeats and len(self._heartbeats) >= MOST_NAMES:
+            return
         self._heartbeats[message.node] = (now_s, int(message.state) == NodeStatus.STOPPING)
         self._cpu_percent[message.node] = float(message.cpu_percent)
 

@@ -350,6 +350,7 @@ class ConsoleServer:
         bucket = buckets.of(network_of(request.remote or ""))
         while not bucket.take(time.monotonic()):
             await asyncio.sleep(bucket.wait_s())
+            _end_if_left(request)
 
     async def _role(self, request: web.Request) -> Role | None:
         """Return the role of a request: programs send a token in the header, pages the cookie of their sign-in."""
@@ -444,6 +445,7 @@ class ConsoleServer:
     async def _export_map(self, request: web.Request) -> web.StreamResponse:
         # One at a time, and not on this thread: packing would delay the driver's commands.
         async with self._exporting:
+            _end_if_left(request)
             files = await asyncio.to_thread(self.backend.export_map)
             if not files:
                 raise web.HTTPNotFound(text="there is no map yet\n")
@@ -829,6 +831,12 @@ def zip_of(files: dict[str, bytes]) -> bytes:
         for name, content in files.items():
             archive.writestr(name, content)
     return packed.getvalue()
+
+
+def _end_if_left(request: web.Request) -> None:
+    """End a request whose client has closed its connection: no limit counts it any more."""
+    if request.transport is None:
+        raise web.HTTPRequestTimeout
 
 
 def _download(content: bytes, stem: str, ending: str, content_type: str) -> web.Response:

@@ -103,9 +103,10 @@ class HealthMonitor:
         for transport in self._transports.values():
             transport.wait(0.0)
         for group, subscription in self._beats:
-            for message in _taken([subscription]):
+            for publisher, message in _published([subscription]):
                 beat = from_message(message)
-                self.nodes[f"{group}/{beat.node}" if group else beat.node] = beat
+                if beat.node == publisher:  # a bridge's may come from a node of this name on another machine
+                    self.nodes[f"{group}/{beat.node}" if group else beat.node] = beat
         for label, subscription in self._vspace:
             for status in _taken([subscription]):
                 self._vspace_text[label] = status.message
@@ -227,12 +228,17 @@ class HealthMonitor:
             transport.close()
 
 
-def _taken(subscriptions: Iterable[Any]) -> Iterable[Any]:
-    """The messages that have arrived. One that cannot be read must not end the stack: its node counts as silent."""
+def _published(subscriptions: Iterable[Any]) -> Iterable[tuple[str, Any]]:
+    """Publishers and messages that have arrived. A message that cannot be read must not end the stack."""
     for subscription in subscriptions:
         for received in subscription.take():
-            with suppress(MessageError):
-                yield deserialize(received.payload, received.type_name)
+            with suppress(MessageError):  # its node counts as silent
+                yield received.publisher, deserialize(received.payload, received.type_name)
+
+
+def _taken(subscriptions: Iterable[Any]) -> Iterable[Any]:
+    """The messages that have arrived."""
+    return (message for _, message in _published(subscriptions))
 
 
 def _labelled(spec: NodeSpec, word: str) -> str:

@@ -4,6 +4,7 @@ import heapq
 import itertools
 import random
 
+from instant_ic.bridge.commands import COMMANDS
 from instant_ic.bridge.host_flow import Channel, Item
 from instant_ic.bridge.host_session import Arrived, LinkTimes, Memory, Session, Side
 from instant_ic.bridge.host_topics import TopicRule
@@ -74,11 +75,12 @@ class World:
             self.sessions[name] = Session(side, connecting, self.memories[name], self.clocks[name], self.times)
         self.sessions["robot"].drives = True
 
-    def publish(self, who, topic, payload, latched=False, queued=False, origin="node", publish_ns=None, kind=STRING):
+    def publish(self, who, topic, payload, latched=False, queued=False, origin="node", publish_ns=None, kind=None):
         channel = self.channels.get((topic, origin))
         if channel is None:
             qos = "latched" if latched else "reliable" if queued else "sensor"
             rule = self.rules[who].get(topic, TopicRule(topic))
+            kind = kind or COMMANDS.get(topic, STRING)
             channel = Channel(next(self.numbers), rule, origin, kind, DIGEST, qos, latched, queued)
             self.channels[topic, origin] = channel
         channel.sequence += 1

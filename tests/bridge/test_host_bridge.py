@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 
 import pytest
 from live_nodes import LiveNode, Neighbour, wait_for
+from simulated_link import World
 
 from instant_ic.bridge import host_listener
 from instant_ic.bridge.host_bus import ImportedTopics
 from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_protocol import Announce
 from instant_ic.bridge.host_report import judge_clock
-from instant_ic.bridge.host_session import Arrived, ClockStepped, LinkTimes
+from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, LinkTimes
 from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, ParameterError, registry
 from instant_ic.bus.lockstep import LockstepBus
@@ -308,6 +309,45 @@ def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_
     assert bus.last("/operator/estop").data is False  # the latest word
     importer.incoming.take(replace(words[2], born_ns=1_000_000_002))  # as it came: whoever reads it tells
     assert bus.records("/operator/estop")[-1].payload == b"\x00"
+
+
+@pytest.mark.parametrize("topic", ["/operator/estop", "/view/shown"])
+def test_fault_a_host_that_does_not_drive_gives_a_topic_another_type(topic):
+    """The first type would hold until the bridge restarts, and refuse every other host's messages."""
+    bus = LockstepBus()
+    rule = TopicRule(topic, shared=topic == "/operator/estop")
+    importer = bus.add(Importer)
+    importer.incoming._rules[topic] = rule
+
+    def station(drives, kind, payload):
+        world = World(to_robot=[rule])
+        robot = world.sessions["robot"]
+        robot.drives = False
+        world.run(0.1)
+        world.publish("station", topic, payload, latched=True, kind=kind)
+        world.run(0.1)
+        arrived = [event for _, event in world.events["robot"]]
+        for event in [*arrived, *(robot.set_drives(True) if drives else ())]:
+            if isinstance(event, Announced):
+                importer.incoming.open(event.announce)
+            elif isinstance(event, Arrived):
+                importer.incoming.take(event)
+        bus.advance(0.1)
+
+    station(False, String.__msgtype__, bytes(serialize(String(data="x"))))
+    station(True, Bool.__msgtype__, bytes(serialize(Bool(data=True))))
+    assert bus.last(topic).data is True
+
+
+def test_fault_a_hosts_outdated_stops_fill_the_log(caplog):
+    bus = LockstepBus()
+    importer = bus.add(Importer)
+    began_s = time.monotonic()
+    for number in range(1000):
+        word = Announce(1, "/operator/estop", "node", Bool.__msgtype__, "", "latched")
+        born_ns = 10_000_000_000 if number == 0 else number
+        importer.incoming.take(Arrived(word, bytes(serialize(Bool(data=True))), born_ns, born_ns))
+    assert 1 <= caplog.text.count("outdated") <= 1 + (time.monotonic() - began_s)
 
 
 class Collector(Node[NoConfig]):

@@ -10,6 +10,7 @@ import time
 import pytest
 import zmq
 
+from instant_ic.bridge.commands import COMMANDS
 from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_link import Failed, LinkError, Problem, Stranger, check_endpoint
@@ -59,7 +60,7 @@ class End:
         return [bytes(e.payload) for e in self.of(Arrived) if e.announce.topic == topic]
 
     def send(self, topic, payload, qos=SENSOR, origin="node"):
-        self.link.offer(topic, origin, "std_msgs/msg/String", qos, payload, time.time_ns())
+        self.link.offer(topic, origin, COMMANDS.get(topic, "std_msgs/msg/String"), qos, payload, time.time_ns())
 
     def said(self, words):
         return any(words in problem.text for problem in self.of(Problem))
@@ -347,9 +348,9 @@ def test_command_that_was_old_before_it_reached_the_bridge_is_dropped(ends, keys
     a = robot(ends, keys)
     b = station(ends, keys, a.link.port)
     linked(a, b)
-    b.link.offer(COMMAND.topic, "late", "std_msgs/msg/String", SENSOR, b"old", time.time_ns() - 400_000_000)
+    b.link.offer(COMMAND.topic, "late", COMMANDS[COMMAND.topic], SENSOR, b"old", time.time_ns() - 400_000_000)
     wait_for(lambda: b.link.counts()[0].get(COMMAND.topic) and b.link.counts()[0][COMMAND.topic].expired, "count")
-    b.link.offer(COMMAND.topic, "simulated", "std_msgs/msg/String", SENSOR, b"new", 5_000_000_000, wall_time=False)
+    b.link.offer(COMMAND.topic, "simulated", COMMANDS[COMMAND.topic], SENSOR, b"new", 5_000_000_000, wall_time=False)
     wait_for(lambda: a.payloads(COMMAND.topic), "command by a simulated clock")
     assert a.payloads(COMMAND.topic) == [b"new"]
     assert a.of(Arrived)[-1].publish_ns == 5_000_000_000

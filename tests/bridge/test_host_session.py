@@ -1,10 +1,13 @@
 """The link's state machine over simulated links."""
 
+import json
+from dataclasses import replace
+
 import pytest
 from simulated_link import DIGEST, MS, Way, World
 
 from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Notice, Ping, decode
-from instant_ic.bridge.host_session import ClockStepped, Ended, LinkTimes, Refused, Up
+from instant_ic.bridge.host_session import SHARED_BURST, Announced, Arrived, ClockStepped, Ended, LinkTimes, Refused, Up
 from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.msg import Bool, deserialize, serialize, twist_stamped, twist_values
 
@@ -437,15 +440,17 @@ def test_only_the_driving_host_is_taken_in_and_its_latched_values_come_with_the_
     assert [e.announce.topic for _, e in world.arrived("robot")] == [estop.topic]
     assert world.memories["robot"].counts_in[COMMAND.topic].not_driving == 1
     events = world.sessions["robot"].set_drives(True)
-    assert [e.announce.topic for e in events] == [status.topic]
-    assert world.sessions["robot"].set_drives(True) == []
+    assert [e.announce.topic for e in events if isinstance(e, Announced)] == [COMMAND.topic, status.topic]
+    assert [e.announce.topic for e in events if isinstance(e, Arrived)] == [status.topic]
+    assert not any(isinstance(e, Arrived) for e in world.sessions["robot"].set_drives(True))
 
 
 class Station:
     """A station that does not drive yet, at a robot's session: each command is a new one."""
 
     def __init__(self, kind):
-        self.world, self.kind = World([], [COMMAND]), kind
+        self.rule = COMMAND if kind == "TwistStamped" else replace(COMMAND, topic="/drive")
+        self.world, self.kind = World([], [self.rule]), kind
         self.robot = self.world.sessions["robot"]
         self.robot.drives = False
         self.world.run(0.1)
@@ -454,7 +459,7 @@ class Station:
         """Sends a command; returns the speeds that the robot accepts."""
         message, before = twist_stamped(v, 0.0, self.world.now), len(self.world.arrived("robot"))
         payload = bytes(serialize(message if self.kind == "TwistStamped" else message.twist))
-        self.world.publish("station", COMMAND.topic, payload, kind=f"geometry_msgs/msg/{self.kind}")
+        self.world.publish("station", self.rule.topic, payload, kind=f"geometry_msgs/msg/{self.kind}")
         self.world.run(0.02)
         events = [event for _, event in self.world.arrived("robot")[before:]]
         return [twist_values(deserialize(bytes(event.payload), event.announce.type_name))[0] for event in events]
@@ -488,8 +493,33 @@ def test_station_drives_at_once_unless_it_has_just_commanded_in_vain():
     station.robot.set_drives(False)
     assert station.command(0.2) == []
     station.robot.set_drives(True)
-    station.world.run(1.1)
+    station.world.run(2.1)
     assert station.command(0.2) == [0.2] and station.told() == ""
+
+
+def test_fault_a_key_held_through_a_slow_network_drives_once_the_network_is_fast_again():
+    station = Station("TwistStamped")
+    assert station.command(0.2) == []
+    station.world.ways["station"].delay_ns = 400 * MS  # every command is too old; the link stays up
+    for _ in range(30):
+        station.world.run(0.1)
+        assert station.command(0.2) == []
+    station.robot.set_drives(True)
+    station.world.ways["station"].delay_ns = 0
+    station.world.run(0.5)
+    for _ in range(5):
+        assert station.command(0.2) == []
+    assert station.command(0.0) == [0.0] and station.command(0.2) == [0.2]
+
+
+def test_fault_a_key_held_in_vain_drives_after_a_new_link_of_its_station():
+    station = Station("TwistStamped")
+    assert station.command(0.2) == []
+    station.world.run(5.0)
+    station.world.connect()  # whose host drives: the other one has left
+    station.world.run(1.0)
+    assert station.command(0.2) == [] and station.told().startswith("let go of the controls once")
+    assert station.command(0.0) == [0.0] and station.command(0.2) == [0.2]
 
 
 def test_every_drivers_host_sets_the_emergency_stop_and_only_the_driving_one_releases_it():
@@ -606,6 +636,65 @@ def test_publishers_that_are_remembered_over_many_links_are_limited(monkeypatch)
     memory = world.memories["robot"]
     assert len(memory.received) == len(memory.latched) == 10
     assert ("station-1", STATE.topic, "node4_7") in memory.received  # the newest are kept
+
+
+def test_fault_a_host_that_does_not_drive_grows_the_memory_by_ever_new_publishers(monkeypatch):
+    monkeypatch.setattr("instant_ic.bridge.host_session.MAX_CHANNELS", 10)
+    world, robot = linked([COMMAND])
+    robot.set_drives(False)
+    payload, kind = bytes(serialize(twist_stamped(0.2, 0.0, 0))), "geometry_msgs/msg/TwistStamped"
+    for number in range(100):  # the same channel again and again
+        robot.receive(announce(1, COMMAND.topic, f"node{number}", kind, "sensor"))
+        robot.receive(Data(1, 1, 0, world.now, world.now, len(payload), 0, payload).encode())
+    assert robot.ended is None and len(robot.memory.held) == 10
+
+
+def test_fault_a_host_that_does_not_drive_floods_the_shared_topics_and_its_stop_still_counts():
+    beats, estop = TopicRule("/heartbeat", shared=True), TopicRule("/operator/estop", lane="command", shared=True)
+    world, robot = linked([beats, estop])
+    robot.drives = False
+    robot.receive(announce(1, beats.topic, qos="reliable"))
+    robot.receive(announce(2, estop.topic, type_name="std_msgs/msg/Bool"))
+
+    def send(channel, number, payload):
+        born_ns = world.now + number
+        return robot.receive(Data(channel, number, 0, born_ns, born_ns, len(payload), 0, payload).encode())
+
+    taken = sum(len(event.payload) for number in range(1, 1001) for event in send(1, number, bytes(60_000)))
+    assert SHARED_BURST - 60_000 <= taken <= SHARED_BURST  # all at once; each would cost its readers milliseconds
+    assert len(send(2, 1, bytes(serialize(Bool(data=True))))) == 1
+    world.now += 10_000_000_000
+    assert len(send(1, 2000, bytes(60_000))) == 1
+    assert robot.up and robot.memory.counts_in[beats.topic].not_driving > 900
+
+
+def test_fault_latched_values_of_a_host_that_does_not_drive_fill_the_memory(monkeypatch):
+    monkeypatch.setattr("instant_ic.bridge.host_session.MAX_MESSAGE", 200_000)
+    world, robot = linked()
+    robot.drives = False
+    for number in range(1, 100):
+        robot.receive(announce(number, origin=f"node{number}"))
+        robot.receive(Data(number, 1, 0, world.now, world.now, 50_000, 0, bytes(50_000)).encode())
+    assert "250000 bytes of latched values before this host drives" in robot.ended.reason
+
+
+@pytest.mark.parametrize("rate", [5e-324, 1e-300, -1.0, float("nan"), float("inf"), True, "x", None])
+def test_fault_a_viewers_rate_ends_the_thread_of_the_link(rate):
+    world = World([STATE])
+    robot = world.sessions["robot"]
+    robot.receive(Hello(VERSION, "viewer", "v", {STATE.topic: rate}).encode())
+    world.publish("robot", STATE.topic, b"x", latched=True)  # raised OverflowError
+    assert robot.ended.code == "protocol" and "must be a number >= 0" in robot.ended.reason
+
+
+@pytest.mark.parametrize(
+    "hello", [Hello(VERSION + 1, "é" * 30_000, "v", {}), Hello(VERSION, "v", "v", {"t": "é" * 30_000})]
+)
+def test_fault_a_viewers_long_words_end_the_thread_of_the_link(hello):
+    robot = World([STATE]).sessions["robot"]
+    (ended,) = robot.receive(bytes([Hello.KIND]) + json.dumps(vars(hello), ensure_ascii=False).encode())
+    (goodbye,) = robot.outgoing()  # raised ProtocolError: quoted in full, and longer in ASCII
+    assert decode(goodbye).reason == ended.reason and len(ended.reason) <= 300
 
 
 def test_notices_are_limited_in_number_and_length():

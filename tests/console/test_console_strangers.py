@@ -9,6 +9,7 @@ import sys
 import textwrap
 import threading
 from collections import Counter
+from types import SimpleNamespace
 
 import aiohttp
 import pytest
@@ -20,6 +21,7 @@ from instant_ic.console import connections as connections_module
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.connections import AddressBuckets, network_of
 from instant_ic.console.drive import DriveConfig
+from instant_ic.console.faults import MOST_NAMES, FaultList
 from instant_ic.console.log_rate import LogRate
 from instant_ic.console.server import WATCHER_SHARE
 from instant_ic.console.session import MAX_REPLIES
@@ -308,6 +310,93 @@ def test_what_changes_nothing_is_not_sent_to_all(serve):
 
 
 # ---- connections -------------------------------------------------------------------------------------
+
+
+async def ask_and_leave(server, path, begun):
+    """Sends a request and closes the connection as soon as the server works on it, without an answer."""
+    _, writer = await asyncio.open_connection("127.0.0.1", server.port)
+    writer.write(
+        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n".encode()
+    )
+    await until(begun)
+    writer.close()
+
+
+def test_fault_requests_whose_clients_have_left_wait_for_ever(serve):
+    """The limits count connections; a client that opens and closes them could leave any number of waiting requests."""
+    server = serve()
+    asked = Counter()
+
+    class Full:
+        def take(self, now):
+            asked["waiting"] += 1
+            return False
+
+        def wait_s(self):
+            return 0.01
+
+    server._sockets._buckets["127.0.0.1"] = Full()
+
+    async def scenario():
+        for _ in range(10):
+            before = asked["waiting"]
+            await ask_and_leave(server, "/ws", lambda before=before: asked["waiting"] > before)
+        before = -1
+        while asked["waiting"] > before:  # nobody asks any more
+            before = asked["waiting"]
+            await asyncio.sleep(1.0)
+
+    run(scenario)
+
+
+def test_fault_maps_are_packed_for_clients_that_have_left(serve):
+    server = serve()
+    packing, go = threading.Semaphore(0), threading.Event()
+    waiting = Counter()
+
+    def export_map():
+        packing.release()
+        assert go.wait(WAIT_S)
+        return {}
+
+    server.backend.export_map = export_map
+
+    class Counted(asyncio.Lock):
+        async def acquire(self):
+            waiting["exports"] += 1
+            return await super().acquire()
+
+    server._exporting = Counted()
+
+    async def scenario():
+        for number in range(1, 11):
+            await ask_and_leave(server, "/export/map.zip", lambda number=number: waiting["exports"] >= number)
+        await until(lambda: not server._listener._connections)
+        go.set()
+        async with aiohttp.ClientSession() as http, http.get(server.url + "export/map.zip") as response:
+            assert response.status == 404  # it waits until the others have had their turn
+
+    run(scenario)
+    packed = 0
+    while packing.acquire(blocking=False):
+        packed += 1
+    assert packed == 2  # the one that had begun, and the client that waited
+
+
+def test_fault_another_machines_reports_grow_the_consoles_memory():
+    """Each under a new name: they come over the bridge, also from a host that does not drive."""
+    faults, most = FaultList(), MOST_NAMES
+    for number in range(3 * most):
+        name = f"node{number}"
+        status = SimpleNamespace(name=f"{name}: link", level=2, message="lost")
+        faults.take_diagnoses(SimpleNamespace(status=[status]), now_s=0.001 * number)
+        faults.take_heartbeat(SimpleNamespace(node=name, state=2, cpu_percent=1.0), now_s=0.001 * number)
+    assert len(faults._diagnoses) == len(faults._heartbeats) == len(faults._cpu_percent) == most
+    assert faults.worst(now_s=1.0)[0]["text"] == "lost"
+    late = SimpleNamespace(name="arbiter: control", level=2, message="stopped")
+    faults.take_diagnoses(SimpleNamespace(status=[late]), now_s=100.0)
+    assert faults._diagnoses.keys() == {"arbiter: control"}  # what nobody has reported for long makes room
 
 
 def test_networks_of_addresses():

@@ -255,6 +255,28 @@ def test_a_silent_operator_is_harmless_in_real_mode_and_counts_as_hands_off() ->
     assert made.frames[-1].decision.mode == Mode.REAL
 
 
+@pytest.mark.parametrize("cause", ["camera", "estop"])
+def test_fault_a_gap_in_the_commands_of_a_held_key_starts_a_stopped_robot(cause: str) -> None:
+    made = loop(None)
+    drive(made, 1.0, FORWARD)
+    if cause == "estop":
+        made.estop = True
+    made.ages["camera"] = 1.6
+    assert made.step(FORWARD).decision.mode == Mode.STOPPED
+    made.ages["camera"], made.estop = 0.0, False
+    drive(made, 1.0, FORWARD)  # held: it stays stopped
+    for _ in range(3):
+        made.ages["command"] = 0.4
+        drive(made, 0.5, FORWARD)
+        made.ages["command"] = 0.0
+        drive(made, 0.5, FORWARD)
+        assert made.frames[-1].decision.mode == Mode.STOPPED
+        assert made.frames[-1].command == NOTHING
+    made.step(NOTHING)
+    drive(made, 1.0, FORWARD)
+    assert made.frames[-1].decision.mode == Mode.REAL
+
+
 def test_the_reason_of_a_stop_is_told_once_and_what_to_do_first() -> None:
     made = loop(None)
     drive(made, 1.0, FORWARD)

@@ -155,7 +155,7 @@ def beat(node: str, state: int = 1, pid: int = 1, rate_hz: float = 10.0, age_s: 
 
 def test_heartbeats_become_health(tmp_path: Path) -> None:
     nodes = [NodeSpec("my_slam", "grid_slam", ()), NodeSpec("other", "navigator", ())]
-    transport = LocalTransport(tmp_path, "test", lambda: 1)
+    transport = LocalTransport(tmp_path, "my_slam", lambda: 1)
     monitor = HealthMonitor(nodes, tmp_path)
     try:
         assert monitor.nodes_missing() == ["my_slam", "other"] and monitor.waiting_for() == ["map"]
@@ -179,7 +179,7 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
 
 
 def test_a_wrong_heartbeat_does_not_end_the_launcher(tmp_path: Path) -> None:
-    transport = LocalTransport(tmp_path, "test", lambda: 1)
+    transport = LocalTransport(tmp_path, "my_slam", lambda: 1)
     monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
     wrong = beat("my_slam")
     wrong.outputs = [*wrong.outputs, "/more"]
@@ -196,6 +196,35 @@ def test_a_wrong_heartbeat_does_not_end_the_launcher(tmp_path: Path) -> None:
     finally:
         monitor.close()
         transport.close()
+
+
+def test_fault_a_bridged_heartbeat_hides_that_a_node_hangs(tmp_path: Path) -> None:
+    """A station's heartbeats come by the bridge: under a robot's name, and under ever new ones."""
+    bridge, own = LocalTransport(tmp_path, "host_bridge", lambda: 1), LocalTransport(tmp_path, "my_slam", lambda: 1)
+    spec = NodeSpec("my_slam", "grid_slam", ())
+    monitor = HealthMonitor([spec], tmp_path)
+    try:
+        publishers = [t.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE) for t in (bridge, own)]
+        for count in range(2000):  # until the subscriptions are connected
+            for name in ("my_slam", "host_bridge", f"stranger{count}"):
+                publishers[0].send(serialize(beat(name, pid=5)))
+            publishers[1].send(serialize(beat("my_slam", pid=77)))
+            monitor.poll()
+            if {"my_slam", "host_bridge"} <= monitor.nodes.keys():
+                break
+            time.sleep(0.01)
+        publishers[0].send(serialize(beat("my_slam", pid=5)))
+        publishers[0].send(serialize(beat("host_bridge", pid=6)))
+        for _ in range(2000):
+            monitor.poll()
+            if monitor.nodes["host_bridge"].pid == 6:
+                break
+            time.sleep(0.01)
+        assert monitor.beat_s(spec, 77) is not None
+        assert monitor.nodes.keys() == {"my_slam", "host_bridge"}
+    finally:
+        for each in (monitor, bridge, own):
+            each.close()
 
 
 def test_one_message_reaches_a_milestone(tmp_path: Path) -> None:

@@ -220,7 +220,9 @@ drive.addEventListener("change", () => {
   showCommand();
   wake();
 });
-onDetail(drive, "stop", (/** @type {string} */ why) => hud.toast(`Stopped: ${why}`));
+onDetail(drive, "stop", (/** @type {string} */ why) => {
+  if (why) hud.toast(`Stopped: ${why}`);
+});
 
 const keyCaps = [...document.querySelectorAll("#keys kbd")].filter((cap) => cap instanceof HTMLElement);
 

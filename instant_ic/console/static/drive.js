@@ -25,7 +25,7 @@ export function isDriveKey(event) {
   return event.code in KEYS && !slider;
 }
 
-/** Events: "change" when keys, stick or command may have changed; "stop" (detail: reason) when anything but a released key or stick ends a drive. */
+/** Events: "change" when keys, stick or command may have changed; "stop" (detail: reason or "") when anything but a released key or stick ends a drive. */
 export class Drive extends EventTarget {
   /** @param {Link} link */
   constructor(link) {
@@ -57,7 +57,7 @@ export class Drive extends EventTarget {
     this._held.clear();
     this._stick = [0, 0];
     this._update();
-    if (moving && why) this.dispatchEvent(new CustomEvent("stop", { detail: why }));
+    if (moving) this.dispatchEvent(new CustomEvent("stop", { detail: why }));
   }
 
   /** Whether a key of this direction is held. @param {string} code KeyW, KeyA, KeyS or KeyD */
@@ -160,7 +160,7 @@ export function attachStick(element, drive) {
     drive.setStick(deadZone(-y / radius), deadZone(-x / radius));
   };
   element.addEventListener("pointerdown", (event) => {
-    if (pointer !== null) return;
+    if (pointer !== null || !drive.enabled) return; // a touch that began in vain never drives
     pointer = event.pointerId;
     element.setPointerCapture(event.pointerId);
     event.preventDefault();

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { beforeEach, mock, test } from "node:test";
 import { fire, Time } from "./page.js";
 
-const { deadZone, Drive, isDriveKey, isTyping } = await import("../../../instant_ic/console/static/drive.js");
+const { attachStick, deadZone, Drive, isDriveKey, isTyping } = await import("../../../instant_ic/console/static/drive.js");
 
 let time, link, drive;
 
@@ -106,6 +106,47 @@ test("losing the lease releases a held key", () => {
   press("KeyW");
   drive.setEnabled(false);
   drive.setEnabled(true);
+  assert.deepEqual(drive.command, [0, 0]);
+});
+
+/** A stick of 144 px; `touch` puts a finger on it, `pull` moves the finger by these pixels to the top. */
+function stick() {
+  const element = Object.assign(new EventTarget(), {
+    knob: { style: {} },
+    querySelector: () => element.knob,
+    setPointerCapture() {},
+    getBoundingClientRect: () => ({ left: 0, top: 0, width: 144, height: 144 }),
+  });
+  attachStick(element, drive);
+  const finger = (name, up = 0) => fire(element, name, { pointerId: 1, clientX: 72, clientY: 72 - up });
+  return { touch: () => finger("pointerdown"), pull: (up) => finger("pointermove", up), let_go: () => finger("pointerup") };
+}
+
+for (const [name, stop] of [["an emergency stop", () => drive.stop()], ["the loss of the lease", () => {}]]) {
+  test(`fault: a stick held through ${name} drives once the page may drive again`, () => {
+    driver();
+    const { touch, pull, let_go } = stick();
+    touch();
+    pull(50);
+    assert.deepEqual(drive.command, [0.4, 0]);
+    stop();
+    drive.setEnabled(false);
+    drive.setEnabled(true);
+    pull(49); // a finger never stands still
+    assert.deepEqual(drive.command, [0, 0]);
+    let_go();
+    touch();
+    pull(50);
+    assert.deepEqual(drive.command, [0.4, 0]);
+  });
+}
+
+test("fault: a stick that was touched in vain drives once the page may drive", () => {
+  driver().setEnabled(false);
+  const { touch, pull } = stick();
+  touch();
+  drive.setEnabled(true);
+  pull(50);
   assert.deepEqual(drive.command, [0, 0]);
 });
 
