@@ -15,8 +15,6 @@ from instant_ic.control.states import GUARDS, Reason
 
 MIN_SWITCH_SPEED_M_S = 0.03
 """Forward speed below which the robot counts as turning."""
-LET_GO_S = 1.0
-"""Silence after a command to move that counts as letting go; the page drops its keys as soon."""
 RETURN_SIDE_M = 0.12
 """Width beside the footprint, on each side, that must be free for a return."""
 _LET_GO_S, _SILENT_S = 0.1, 1.0
@@ -120,9 +118,7 @@ def image_fits(s: Snapshot) -> bool:
 def may_resume(s: Snapshot) -> bool:
     if estop_pressed(s) or s.command != NO_MOTION or s.inputs.robot_pose is None:
         return False
-    # A short silence may be a gap in the commands of a held key.
-    gap = s.last_command != NO_MOTION and s.idle_s < LET_GO_S
-    if (not s.fresh and (s.awaits_operator or gap)) or images_too_rare(s.inputs, s.config):
+    if (s.awaits_operator and not s.fresh) or images_too_rare(s.inputs, s.config):
         return False
     if s.idle_s < (_LET_GO_S if s.fresh else _SILENT_S):
         return False

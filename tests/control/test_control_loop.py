@@ -272,7 +272,7 @@ def test_fault_a_gap_in_the_commands_of_a_held_key_starts_a_stopped_robot(cause:
         drive(made, 0.5, FORWARD)
         assert made.frames[-1].decision.mode == Mode.STOPPED
         assert made.frames[-1].command == NOTHING
-    made.step(NOTHING)
+    drive(made, 0.2, NOTHING)
     drive(made, 1.0, FORWARD)
     assert made.frames[-1].decision.mode == Mode.REAL
 
