@@ -115,7 +115,7 @@ def test_fault_dead_man_release_sends_no_zero_by_gamepad(pad, shared_demo):
 
 def test_gamepads_right_stick_looks_and_an_unknown_layout_is_told(pad, shared_demo):
     pad.evaluate("plug('')")
-    pad.get_by_text("the browser does not know its layout").wait_for()
+    pad.get_by_text("the browser does not know its layout").wait_for(state="attached")
     pad.evaluate("plug('standard'); pad.axes = [0, 0, 1, 0]")
     wait_until(lambda: shared_demo.look.yaw < -0.2, pad, "the look turns right")
     assert not moving(shared_demo)
@@ -133,7 +133,7 @@ def test_fault_any_client_drives_and_idle_zeros_fight_the_drivers_commands(drive
     start_driving(driver, shared_demo)
     since = len(shared_demo.commands)
     watcher.keyboard.down("s")
-    watcher.get_by_text("Another operator is driving. Press Take over to drive.").wait_for()
+    watcher.get_by_text("Another operator is driving. Press Take over to drive.").wait_for(state="attached")
     watcher.keyboard.up("s")  # sends its zero
     watcher.wait_for_timeout(SETTLE_MS)
     wait_until(lambda: len(shared_demo.commands) > since + 2, driver, "the driver's commands")

@@ -60,7 +60,7 @@ def test_a_full_disk_and_a_missing_recorder_are_told_in_plain_words(driver, shar
 
 def test_bookmarks_by_key_and_by_name_and_the_robot_is_held_while_one_is_typed(driver, shared_demo):
     driver.keyboard.press("b")
-    driver.get_by_text("Bookmark set: Mark 1 (not recording)").wait_for()
+    driver.get_by_text("Bookmark set: Mark 1 (not recording)").wait_for(state="attached")
     start_driving(driver, shared_demo)
     driver.locator("#more-open").focus()
     driver.keyboard.press("Enter")
@@ -106,7 +106,7 @@ def test_the_last_minute_is_kept(driver, shared_demo):
     driver.locator("#more-open").click()
     driver.get_by_role("button", name="Save the last minute").click()
     wait_until(lambda: shared_demo.recorder.snapshots, driver, "the snapshot")
-    driver.get_by_text("Saving the last minute").wait_for()
+    driver.get_by_text("Saving the last minute").wait_for(state="attached")
     assert driver.locator("#more").is_hidden()
 
 
@@ -144,7 +144,7 @@ def test_what_cannot_be_saved_is_told(driver, shared_demo, monkeypatch):
     monkeypatch.setattr(shared_demo, "export_map", dict)
     driver.locator("#more-open").click()
     driver.get_by_role("button", name="Save the map").click()
-    driver.get_by_text("Not saved: there is no map yet").wait_for()
+    driver.get_by_text("Not saved: there is no map yet").wait_for(state="attached")
     assert any("404" in fault for fault in driver.faults)
     driver.faults.clear()  # the browser reports the answer
 
