@@ -162,9 +162,9 @@ GUARDS: dict[str, str] = {
     "estop_pressed": "the emergency stop is latched",
     "source_lost": "a source that this state needs has been silent for stop_after_s (camera, views: for twice their "
     "time-out, if that is longer)",
-    "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more, or the pose has jumped by "
-    "pose_trust.jump_m or jump_deg; once the operator has let go, the r-bot may drive, slowly until its place is "
-    "recognized",
+    "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more, or the pose (or the shown v-bot's) "
+    "has jumped by pose_trust.jump_m or jump_deg; once the operator has let go, the r-bot may drive, slowly until its "
+    "place is recognized",
     "vspace_lost": "the virtual space has failed, or its node is silent",
     "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, the r-bot has a way "
     "round; after an abandoned entry, also: a view fits, or the operator let go",
@@ -172,7 +172,7 @@ GUARDS: dict[str, str] = {
     "no_view_in_time": "no view fits after enter_timeout_s plus the delay of an image and a view",
     "way_free": "the command is safe for the r-bot as in `rejoined`",
     "view_fits": "the places of the newest view and the newest camera image agree within picture_position_m and "
-    "picture_yaw_deg",
+    "picture_yaw_deg, and an operator is there",
     "rejoined": "r-bot and v-bot agree for return_dwell_s, to within return_near_m or for return_patience_s; the "
     "command is safe for the r-bot over the prediction horizon and over a longer and wider one",
     "unsafe_again": "the command leads the r-bot into an obstacle again",
@@ -180,7 +180,8 @@ GUARDS: dict[str, str] = {
     "faster than return_turn_rad_s, and view and image agree as closely (after return_timeout_s the first is enough, "
     "after twice that nothing is required)",
     "may_resume": "the emergency stop is released, every source has been fresh for recover_s, images arrive at least "
-    "every slowest_image_s, the command is zero or silent, and a lost operator's link that caused the stop is back",
+    "every slowest_image_s, the command has been zero for 0.1 s or silent for 1 s, and a lost operator's link that "
+    "caused the stop is back",
 }
 
 ACTIONS: dict[str, str] = {
