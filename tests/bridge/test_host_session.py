@@ -464,20 +464,20 @@ class Station:
         events = [event for _, event in self.world.arrived("robot")[before:]]
         return [twist_values(deserialize(bytes(event.payload), event.announce.type_name))[0] for event in events]
 
-    def told(self):
+    def notice(self):
         return self.world.sessions["station"].notices.get("held", "")
 
 
 @pytest.mark.parametrize("kind", ["TwistStamped", "Twist"])
 def test_fault_a_held_key_drives_when_the_other_stations_link_ends(kind):
     station = Station(kind)
-    assert station.command(0.2) == [] and station.told() == ""
+    assert station.command(0.2) == [] and station.notice() == ""
     station.robot.set_drives(True)
     for _ in range(30):
         station.world.run(0.1)
         assert station.command(0.2) == []
-    assert station.told() == "let go of the controls once: robot does not start under a held key"
-    assert station.command(0.0) == [0.0] and station.told() == ""
+    assert station.notice() == "let go of the controls once: robot does not start under a held key"
+    assert station.command(0.0) == [0.0] and station.notice() == ""
     assert station.command(0.2) == [0.2]
 
 
@@ -494,7 +494,7 @@ def test_station_drives_at_once_unless_it_has_just_commanded_in_vain():
     assert station.command(0.2) == []
     station.robot.set_drives(True)
     station.world.run(2.1)
-    assert station.command(0.2) == [0.2] and station.told() == ""
+    assert station.command(0.2) == [0.2] and station.notice() == ""
 
 
 def test_fault_a_key_held_through_a_slow_network_drives_once_the_network_is_fast_again():
@@ -518,7 +518,7 @@ def test_fault_a_key_held_in_vain_drives_after_a_new_link_of_its_station():
     station.world.run(5.0)
     station.world.connect()  # whose host drives: the other one has left
     station.world.run(1.0)
-    assert station.command(0.2) == [] and station.told().startswith("let go of the controls once")
+    assert station.command(0.2) == [] and station.notice().startswith("let go of the controls once")
     assert station.command(0.0) == [0.0] and station.command(0.2) == [0.2]
 
 
