@@ -41,7 +41,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
         self.diagnose("link", WARN, f"connecting to {config.roboclaw.port}")
-        self.diagnose_all(self.latch.diagnosis, self.gate.publishers)
+        self.diagnose_all(self.latch.diagnosis, self.gate.publishers, self.report.tracks())
         self.timer(1.0, self.watch)
         loop_class = SteppedController if self.lockstep else ControllerThread
         self.loop = loop_class(self.controller, config.rate_hz, self.on_step, self.on_end)
@@ -88,6 +88,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.controller.emergency_stop(self.latch.stopped)
         if self.latch.stopped:
             self.loop.hurry()
+        else:
+            self.diagnose_all(self.report.tracks())
         self.diagnose_all(self.latch.diagnosis)
 
     def on_step(self, state: BaseState) -> None:
@@ -97,7 +99,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.odometry.publish(message)
             matrix, stamp = matrix_from_pose2(state.odometry.pose), state.odometry.stamp_ns
             self.tf_broadcast(self.config.odom_frame, self.config.base_frame, matrix, stamp)
-        if state.link or state.health is not None:
+        if state.link or state.fault or state.health is not None:
             self.call_soon(self.on_state, state)
 
     def on_state(self, state: BaseState) -> None:
@@ -105,13 +107,21 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.diagnose_all(self.report.link(state.connected, state.link, self.clock.steady_ns()))
         if state.health is not None:
             self.publish_health(state.health)
+        if state.fault:
+            self.press(True)
+            found = self.report.tracks(state.fault)
+            self.log.error("%s", found.text)
+            self.diagnose_all(found)
 
     def publish_health(self, health: Health) -> None:
         """Publish the battery message, the controller's faults and its emergency stop input."""
         charge = self.report.charge(health)
         self.battery.publish(battery_message(health.battery_v, charge, self.config.base_frame, health.stamp_ns))
         self.diagnose_all(*self.report.health(health))
-        pressed = health.status.estop
+        self.press(health.status.estop)
+
+    def press(self, pressed: bool) -> None:
+        """Report the robot's emergency stop button; a faulty track presses it until the next health."""
         if pressed != self.button:
             self.button = pressed
             self.button_out.publish(Bool(data=pressed))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.base.config import ControllerConfig, RoboclawConfig
+from instant_ic.base.following import TrackWatch
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_counts
 from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
@@ -40,6 +41,7 @@ class BaseState:
     Attributes:
         connected: whether the controller answers.
         link: text of the link event in this step; empty without one.
+        fault: which track does not follow its command, so that the base has stopped; empty otherwise.
         odometry: new estimate, if any.
         health: battery and status, if they were read in this step.
         command_fresh: whether a command within the time-out was available.
@@ -49,6 +51,7 @@ class BaseState:
 
     connected: bool
     link: str = ""
+    fault: str = ""
     odometry: OdometryEstimate | None = None
     health: Health | None = None
     command_fresh: bool = False
@@ -96,6 +99,8 @@ class BaseController:
         self._command: _Command | None = None
         self._stopped = False
         self._encoders: NDArray[np.int64] | None = None
+        self._watch = TrackWatch()
+        self._watched: tuple[NDArray[np.int64], int] | None = None  # counts at a time
         self._last_step_ns: int | None = None
         self._placed_ns: int | None = None  # the last reading that the odometry took
         self._next_health_ns = 0
@@ -133,7 +138,7 @@ class BaseController:
         self._last_step_ns = now_ns
         if dt_s > self.config.roboclaw.watchdog_s:
             # The controller's watchdog has stopped the motors in the meantime.
-            self.limiter.reset()
+            self._forget_motion()
             dt_s = 0.0
         command = self._fresh_command()
         stops, health = self.roboclaw.counters.stops, None
@@ -147,9 +152,10 @@ class BaseController:
                 self.roboclaw.check_watchdog()
                 health = Health(self._now_ns(), self.roboclaw.battery_v(), self.roboclaw.status())
                 self._next_health_ns = now_ns + int(self.config.health_period_s * 1e9)
-            rejected, estimate = self.odometry.rejected, None
+            rejected, estimate, fault = self.odometry.rejected, None, ""
             if self._sure(asked_ns, encoders_ns):
                 estimate = self.odometry.update(encoders, encoders_ns)
+                fault = self._check_tracks(v, w, encoders, encoders_ns)
             if self.odometry.rejected != rejected and self._near_zero(encoders):
                 raise ControllerRestarted(f"{self.config.roboclaw.port}: the encoder counts jumped to {encoders}")
         except LinkError as error:
@@ -160,9 +166,10 @@ class BaseController:
             self._lost(now_ns, 0.0 if restarted else wait_s)
             return BaseState(connected=False, link=str(error))
         if self.roboclaw.counters.stops != stops:
-            self.limiter.reset()  # a reply was missing, so the motors were stopped
+            self._forget_motion()  # a reply was missing, so the motors were stopped
         return BaseState(
             connected=True,
+            fault=fault,
             # Speeds use the steady clock, the stamp uses the system clock.
             odometry=None if estimate is None else replace(estimate, stamp_ns=stamp_ns),
             health=health,
@@ -193,7 +200,7 @@ class BaseController:
     def _drive(self, command: _Command | None, dt_s: float) -> tuple[float, float]:
         limits, geometry, kinematics = self.config.limits, self.config.geometry, self.odometry.kinematics
         if self._stopped:
-            self.limiter.reset()
+            self._forget_motion()
             self.roboclaw.stop()
             return 0.0, 0.0
         half_width = 0.5 * geometry.effective_width
@@ -207,6 +214,25 @@ class BaseController:
         speeds = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
         self.roboclaw.drive(speeds.tolist(), geometry.pulses_per_metre * ramp)
         return v, w
+
+    def _forget_motion(self) -> None:
+        """Start again from standing: something else has stopped the motors."""
+        self.limiter.reset()
+        self._watch.reset()
+        self._watched = None
+
+    def _check_tracks(self, v: float, w: float, encoders: NDArray[np.int64], read_ns: int) -> str:
+        """Stop as in an emergency if a track does not follow; returns why, or an empty text."""
+        last, self._watched = self._watched, (encoders, read_ns)
+        if last is None:
+            return ""
+        kinematics = self.odometry.kinematics
+        moved = kinematics.tracks_from_motors(unwrap_counts(last[0], encoders))
+        fault = self._watch.update(kinematics.tracks_from_twist(v, w), moved, max(0.0, (read_ns - last[1]) * 1e-9))
+        if fault:
+            self.emergency_stop(True)
+            self.roboclaw.stop()
+        return fault
 
     def _check_counts(self, encoders: NDArray[np.int64]) -> None:
         """Check the watchdog when both counts jump to zero: the controller may have restarted."""
@@ -234,7 +260,7 @@ class BaseController:
             return str(error)
         finally:
             self.roboclaw.close()
-            self.limiter.reset()
+            self._forget_motion()
         return ""
 
     def _connect(self, now_ns: int) -> BaseState:
@@ -254,7 +280,7 @@ class BaseController:
 
     def _lost(self, now_ns: int, wait_s: float) -> None:
         self.roboclaw.close()
-        self.limiter.reset()
+        self._forget_motion()
         self._next_connect_ns = now_ns + int(wait_s * 1e9)
 
 

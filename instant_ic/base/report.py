@@ -57,6 +57,11 @@ class BaseReport:
         text = f"impossible jumps of {recent}, left out: {jumps}" if jumps else "plausible"
         yield Diagnosis("encoders", Level.WARN if jumps else Level.OK, text, {"rejected": rejected})
 
+    def tracks(self, fault: str = "") -> Diagnosis:
+        """Whether both tracks follow their commands; after a fault until the stop is released."""
+        stopped = f"{fault}. The robot has stopped; release the emergency stop to try again"
+        return Diagnosis("tracks", Level.ERROR if fault else Level.OK, stopped if fault else "both follow")
+
     def health(self, health: Health) -> Iterator[Diagnosis]:
         empty_v = self.config.battery_empty_v
         low = health.battery_v < empty_v

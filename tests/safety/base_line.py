@@ -19,7 +19,7 @@ from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.msg import Bool, twist_stamped
 from instant_ic.sim.contact import OccupancyMask
-from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
+from instant_ic.sim.roboclaw_emulator import MAX_SPEED_PPS, RoboclawEmulator
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 from nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 
@@ -36,6 +36,8 @@ class Line:
         opened: how often the port was opened.
         moved_s: when the tracks moved last, seconds.
         written: every frame and when it was written, seconds.
+        encoders: what each encoder counts of its motor's motion, (2,): 0 when dead, -1 when reversed.
+        stalled: whether the motors are held fast.
     """
 
     def __init__(self, config: RoboclawConfig, ideal_motors: bool = False) -> None:
@@ -52,7 +54,8 @@ class Line:
         self.opened = 0
         self.closed = True
         self.written: list[tuple[float, bytes]] = []
-        self.lost_counts = np.zeros(2)
+        self.encoders = np.ones(2)
+        self.stalled = False
         self._received = bytearray()
 
     @property
@@ -74,8 +77,12 @@ class Line:
         for _ in range(max(1, round(seconds / TICK_S))):
             self.emulator.advance(TICK_S)
             if not self.ideal_motors:
-                self.robot.step(self.emulator.setpoint_pps, TICK_S)
-                self.emulator.encoder[:] = self.robot.encoder_pulses - self.lost_counts
+                # The speed loop of a motor whose encoder does not count drives it as fast as it can.
+                wanted = self.emulator.setpoint_pps
+                wanted = np.where(self.encoders > 0, wanted, np.sign(wanted) * MAX_SPEED_PPS)
+                before = self.robot.encoder_pulses
+                self.robot.step(np.zeros(2) if self.stalled else wanted, TICK_S)
+                self.emulator.encoder += self.encoders * (self.robot.encoder_pulses - before)
                 self.emulator.speed_pps[:] = self.robot.motor_speed_pps
             self.ticks += 1
             if self.speed > 0.0:
@@ -83,7 +90,6 @@ class Line:
 
     def brown_out(self) -> None:
         """The controller restarts: motors off, counts and watchdog gone."""
-        self.lost_counts = self.robot.encoder_pulses.copy()
         self.emulator.encoder[:] = 0.0
         self.emulator.target_speed_pps[:] = 0.0
         self.emulator.setpoint_pps[:] = 0.0

@@ -65,7 +65,7 @@ def test_counts_that_jump_to_zero_force_a_reconnect_at_once(driven_s: float) -> 
 def test_counts_of_zero_on_the_way_are_no_restart() -> None:
     base = Base()
     base.run(0.2)
-    base.line.lost_counts = np.array([400.0, 400.0])  # the counts begin at -400 and pass zero
+    base.line.emulator.encoder -= 300.0  # the counts begin at -300 and pass zero
     base.run(0.2)
     base.run(2.0, 0.4)
     assert base.line.opened == 1

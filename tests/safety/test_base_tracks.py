@@ -1,0 +1,95 @@
+"""A track that does not follow its command: dead or reversed encoder, stalled motor."""
+
+import numpy as np
+import pytest
+from base_line import Base, NodeBench
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from instant_ic.base.config import RoboclawConfig
+from instant_ic.base.controller import ControllerConfig
+from instant_ic.base.following import TrackWatch
+from instant_ic.base.limits import TwistLimiter
+from instant_ic.bus import ERROR, OK
+
+
+@pytest.mark.parametrize("counts", [0.0, -1.0], ids=["dead", "reversed"])
+@pytest.mark.parametrize("motor", [0, 1])
+@pytest.mark.parametrize("speed", [0.1, 0.4])
+def test_a_motor_without_counts_does_not_run_on_at_full_speed(counts: float, motor: int, speed: float) -> None:
+    base = Base()
+    base.run(2.0, speed)
+    assert not any(state.fault for state in base.states)
+    base.line.encoders[motor] = counts
+    took_s, _ = base.until_standing(speed)
+    assert took_s <= 0.1 / speed + 0.5
+    faults = [state.fault for state in base.states if state.fault]
+    assert (
+        len(faults) == 1
+        and f"the {('left', 'right')[motor]} track does not follow its command of {speed:.2f} m/s" in faults[0]
+    )
+    assert "check its encoder" in faults[0]
+
+
+def test_a_dead_encoder_is_found_while_the_robot_starts_or_turns() -> None:
+    for v, w in ((0.4, 0.0), (-0.3, 0.0), (0.0, 0.6), (0.0, -0.6)):
+        base = Base()
+        base.run(1.0, 0.0)
+        base.line.encoders[0] = 0.0
+        base.run(3.0, v, w)
+        assert base.line.speed == 0.0 and sum(bool(state.fault) for state in base.states) == 1
+
+
+def test_two_dead_encoders_or_stalled_motors_stop_the_base_too() -> None:
+    for stalled in (False, True):
+        base = Base()
+        base.run(2.0, 0.4)
+        base.line.stalled, base.line.encoders[:] = stalled, 0.0
+        base.run(2.0, 0.4)
+        assert sum(bool(state.fault) for state in base.states) == 1
+        assert base.states[-1].v == 0.0 and not base.line.emulator.target_speed_pps.any()
+
+
+def test_the_stop_is_an_emergency_stop_that_the_operator_releases() -> None:
+    bench = NodeBench()
+    bench.run(1.0, 0.3)
+    assert bench.diagnosis("tracks") == (OK, "both follow")
+    bench.line.encoders[1] = 0.0
+    bench.run(2.0, 0.3)
+    assert bench.line.speed == 0.0
+    level, text = bench.diagnosis("tracks")
+    assert level == ERROR and "right track" in text and "release the emergency stop" in text
+    pressed = [message.data for message in bench.bus.messages("/robot/estop")]
+    assert pressed == [False, True, False], "pressed for the arbiter too, and let go so that it can be released"
+    assert bench.node.latch.stopped
+    bench.line.encoders[1] = 1.0
+    bench.estop(False)
+    bench.run(1.0, 0.3)
+    assert bench.line.speed > 0.2
+    assert bench.diagnosis("tracks") == (OK, "both follow")
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    lag_s=st.floats(0.02, 0.2),
+    acceleration=st.floats(1.0, 3.0),
+    late=st.floats(0.0, 0.3),
+)
+def test_sound_tracks_are_never_stopped(seed: int, lag_s: float, acceleration: float, late: float) -> None:
+    """Any commands, motors of any lag and strength, readings of a busy machine."""
+    rng = np.random.default_rng(seed)
+    config = ControllerConfig(roboclaw=RoboclawConfig(port="memory"))
+    limiter, watch, kinematics = TwistLimiter(config.limits), TrackWatch(), Base().controller.odometry.kinematics
+    tracks = np.zeros(2)
+    for _ in range(40):
+        v, w = rng.uniform(-1, 1, 2) * rng.choice([0.0, 1.0, 3.0], 2)
+        for _ in range(rng.integers(1, 40)):
+            dt_s = 1 / 30 + (rng.uniform(0.0, 0.25) if rng.random() < late else 0.0)
+            speeds = kinematics.tracks_from_twist(*limiter.step(v, w, dt_s))
+            moved = np.zeros(2)
+            for _ in range(5):
+                change = (speeds - tracks) * (1 - np.exp(-0.2 * dt_s / lag_s))
+                tracks = tracks + np.clip(change, -0.2 * acceleration * dt_s, 0.2 * acceleration * dt_s)
+                moved += 0.2 * tracks * dt_s
+            assert watch.update(speeds, moved, dt_s) == ""
