@@ -47,6 +47,7 @@ import numpy as np
 from reporting import parser_of, report
 
 from instant_ic import pace
+from instant_ic.base.protocol import Command, encode_reply, read_request
 from instant_ic.bus import LATCHED, registry
 from instant_ic.closing import Closing
 from instant_ic.console.client import ConsoleClient
@@ -139,6 +140,9 @@ class SerialRelay(Closing):
     def __init__(self, link: Path, controller: Path) -> None:
         self.mute = False
         """True: the controller's replies are dropped."""
+        self.dead = False
+        """True: the left motor's count stays as it is."""
+        self._request, self._count = b"", bytes(4)
         self.speeds: list[tuple[int, float]] = []
         """Each request that changes the commanded speed: machine time in ns, encoder counts per second."""
         self._listener = RoboclawEmulator()
@@ -191,12 +195,21 @@ class SerialRelay(Closing):
         if self._master in ready:
             data = os.read(self._master, 4096)
             self._listen(data)
+            self._request = data
             if self._far >= 0:
                 os.write(self._far, data)
         if self._far in ready:
             data = os.read(self._far, 4096)
+            if self._request == read_request(self._listener.address, Command.READ_ENCODERS) and len(data) == 10:
+                data = self._with_count(data)
             if self._master >= 0 and not self.mute:
                 os.write(self._master, data)
+
+    def _with_count(self, reply: bytes) -> bytes:
+        """Reply of both counts, with the left one as it was when its encoder died."""
+        if not self.dead:
+            self._count = reply[:4]
+        return encode_reply(self._listener.address, Command.READ_ENCODERS, self._count + reply[4:8])
 
     def _listen(self, data: bytes) -> None:
         self._listener.feed(data)
@@ -301,6 +314,11 @@ async def release_estop(rig: Rig, page: ConsoleClient) -> None:
     await page.release_estop()
 
 
+async def mend_encoder(rig: Rig, page: ConsoleClient) -> None:
+    rig.serial.dead = False
+    await release_estop(rig, page)
+
+
 def silence_page(rig: Rig, page: ConsoleClient) -> None:
     for task in page._tasks:
         task.cancel()
@@ -317,6 +335,7 @@ LINKS: dict[str, tuple[Callable[[Rig], None], Callable[[Rig], None]]] = {
 FAULTS = [
     *(fault for node in PROCESSES for fault in process_faults(node)),
     Fault("emergency stop pressed", lambda rig, page: page.estop(), release_estop),
+    Fault("encoder of a track dead", lambda rig, page: setattr(rig.serial, "dead", True), mend_encoder),
     Fault("key let go (no loss; soft ramp)", lambda rig, page: page.stop()),
     Fault("page closed", lambda rig, page: page.close()),
     Fault("page silent", silence_page),
@@ -340,7 +359,7 @@ def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
         serial = ends.enter_context(SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw"))
         launch.write_text(text.format(**ports, camera_link=camera_link.port, folder=share_dir("launch")))
         stack = ends.enter_context(Stack(str(launch), run_dir, {}, log, pace=factor))
-        stack.wait_for(lambda: registry.list_nodes(run_dir), 60, "first node")
+        stack.wait_for(lambda: registry.list_nodes(run_dir), 600, "first node")  # it may compile the kernels
         made = Rig(stack, run_dir, page_link, camera_link, packets, serial, pace.read(run_dir))
         pace.use(made.pace)
         made.watch()

@@ -9,10 +9,10 @@ _LAG_S = 0.1
 """Usual time from a set point to the track's motion."""
 _LEAST_SHARE = 0.25
 """Share of the commanded motion that a sound track does, whatever its load."""
-_SURE_M = 0.1
-"""Commanded motion without a measured one that is a fault, while the other track follows."""
-_DOUBT_M = 0.4
-"""The same, if no other track shows that the counts are up to date: a late machine looks alike."""
+_MISSING_M, _MISSING_S = 0.03, 0.15
+"""Distance, and time at the commanded speed, that the counts of a track at fault lack; of a sound one at most half."""
+_DOUBT = 2.0
+"""Factor on both if no other track shows that the counts are up to date: a late simulation looks alike."""
 _MOVING_M_S = 0.02
 """The other track shows it when commanded to be faster than this."""
 
@@ -21,7 +21,7 @@ class TrackWatch:
     """Compares the commanded motion of both tracks with their counts.
 
     The controller regulates the speed by the encoders: without counts it speeds the track up as far as it can, whatever
-    the command. The check is by distance, so that it holds at every speed.
+    the command.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,8 @@ class TrackWatch:
         done = np.maximum(0.0, moved * np.sign(due))
         self._missing_m = np.maximum(0.0, self._missing_m + np.abs(due) - done / _LEAST_SHARE)
         follows = (self._missing_m == 0.0) & (np.abs(self._speeds) > _MOVING_M_S)
-        for track in np.flatnonzero(self._missing_m > np.where(follows[::-1], _SURE_M, _DOUBT_M)):
+        allowed_m = (_MISSING_M + _MISSING_S * np.abs(self._speeds)) * np.where(follows[::-1], 1.0, _DOUBT)
+        for track in np.flatnonzero(self._missing_m > allowed_m):
             return (
                 f"the {('left', 'right')[track]} track does not follow its command of {speeds[track]:.2f} m/s: check "
                 "its encoder, the encoder's cable and direction, and whether the track is blocked"
