@@ -75,7 +75,7 @@ class _Silence:
 
     def busy(self, pid: int) -> bool:
         """Whether the process has computed, or waited for a CPU, for most of the silence."""
-        return _active_s(pid) - self._active_s > _BUSY_SHARE * self.lasts_s
+        return _is_runnable(pid) or _active_s(pid) - self._active_s > _BUSY_SHARE * self.lasts_s
 
 
 class Supervisor:
@@ -352,6 +352,14 @@ def _active_s(pid: int) -> float:
     except OSError:
         return 0.0
     return (int(computed) + int(waited)) / 1e9
+
+
+def _is_runnable(pid: int) -> bool:
+    """Whether a process's first thread computes or waits for a CPU now; the kernel counts a wait only at its end."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].startswith("R")
+    except OSError:
+        return False
 
 
 def _is_traced(pid: int) -> bool:

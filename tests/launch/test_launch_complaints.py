@@ -270,6 +270,23 @@ def test_a_node_that_computes_is_given_more_time(run_dir: Path) -> None:
     assert "hangs: no heartbeat for 3 s" in output.events[1] and time.monotonic() - started_s > 3.0
 
 
+def test_a_node_that_waits_for_a_cpu_is_busy_before_the_kernel_has_counted_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel adds a wait when it ends: on a loaded machine a starved node was killed as one that hangs."""
+    monkeypatch.setattr(supervision, "_active_s", lambda pid: 0.0)
+    silence = supervision._Silence()
+    silence.look(1.0, os.getpid(), 0.1)
+    silence.look(1.0, os.getpid(), 0.5)
+    assert silence.busy(os.getpid())
+    with subprocess.Popen(["sleep", "60"]) as sleeper:
+        try:
+            deadline_s = time.monotonic() + 60
+            while silence.busy(sleeper.pid):  # it is still starting
+                assert time.monotonic() < deadline_s
+                time.sleep(0.01)
+        finally:
+            sleeper.kill()
+
+
 def test_a_launcher_that_was_held_up_itself_does_not_blame_the_nodes() -> None:
     silence = supervision._Silence()
     silence.look(1.0, os.getpid(), 0.1)
