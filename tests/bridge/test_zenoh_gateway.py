@@ -631,19 +631,26 @@ def test_rate_limit_thins_and_counts_what_it_leaves_out(world):
     talker = world.neighbour("robot")
     fast, all_of_it = talker.publisher("/fast", String), talker.publisher("/all", String)
     samples = []
-    world.session().zenoh.declare_subscriber("0/*/**", lambda s: samples.append(str(s.key_expr).split("/")[1]))
-    publish_until(fast, String("x"), lambda: samples, "the link")
-    time.sleep(0.3)
-    samples.clear()
+
+    def heard(sample):
+        if b"burst" in sample.payload.to_bytes():
+            samples.append(str(sample.key_expr).split("/")[1])
+        else:
+            linked.set()
+
+    linked = threading.Event()
+    world.session().zenoh.declare_subscriber("0/*/**", heard)
+    publish_until(fast, String("x"), linked.is_set, "the link")
     started = time.monotonic()
     for _ in range(40):
-        fast.publish(String("x"))
-        all_of_it.publish(String("x"))
+        fast.publish(String("burst"))
+        all_of_it.publish(String("burst"))
         time.sleep(0.025)
-    took_s = time.monotonic() - started
     wait_for(lambda: samples.count("all") == 40, "everything of the other topic")
-    assert samples.count("fast") == pytest.approx(5 * took_s, abs=1.5)
-    assert gateway.node.outgoing.thinned >= 40 - samples.count("fast")
+    passed, took_s = samples.count("fast"), time.monotonic() - started
+    # However late the machine is: one for each period, one for the first and one that came late in its period.
+    assert 1 <= passed <= 5 * took_s + 2
+    assert gateway.node.outgoing.thinned >= 40 - passed
 
 
 def test_reliable_topics_lose_nothing_on_the_way_through_two_gateways(world):
