@@ -44,8 +44,9 @@ def test_two_dead_encoders_or_stalled_motors_stop_the_base_too() -> None:
     for stalled in (False, True):
         base = Base()
         base.run(2.0, 0.4)
-        base.line.stalled, base.line.encoders[:] = stalled, 0.0
-        base.run(2.0, 0.4)
+        base.line.stalled, base.line.encoders[:] = stalled, float(stalled)
+        took_s, _ = base.until_standing(0.4)
+        assert took_s <= 1.0
         assert sum(bool(state.fault) for state in base.states) == 1
         assert base.states[-1].v == 0.0 and not base.line.emulator.target_speed_pps.any()
 
