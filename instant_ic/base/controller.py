@@ -99,8 +99,9 @@ class BaseController:
         self._command: _Command | None = None
         self._stopped = False
         self._encoders: NDArray[np.int64] | None = None
-        self._watch = TrackWatch()
-        self._watched: tuple[NDArray[np.int64], int] | None = None  # counts at a time
+        self._watch = TrackWatch(simulated=not current().real)
+        self._watched: NDArray[np.int64] | None = None  # the last counts that it judged
+        self._sent: tuple[NDArray[np.float64], int] | None = None  # speeds of the tracks, and until when it has them
         self._last_step_ns: int | None = None
         self._placed_ns: int | None = None  # the last reading that the odometry took
         self._next_health_ns = 0
@@ -147,6 +148,7 @@ class BaseController:
             asked_ns = self._steady_ns()
             encoders = self.roboclaw.encoders()
             encoders_ns, stamp_ns = self._steady_ns(), self._now_ns()
+            self._note_speeds(v, w, asked_ns, encoders_ns)
             self._check_counts(encoders)
             if now_ns >= self._next_health_ns:
                 self.roboclaw.check_watchdog()
@@ -155,7 +157,7 @@ class BaseController:
             rejected, estimate, fault = self.odometry.rejected, None, ""
             if self._sure(asked_ns, encoders_ns):
                 estimate = self.odometry.update(encoders, encoders_ns)
-                fault = self._check_tracks(v, w, encoders, encoders_ns)
+                fault = self._check_tracks(encoders)
             if self.odometry.rejected != rejected and self._near_zero(encoders):
                 raise ControllerRestarted(f"{self.config.roboclaw.port}: the encoder counts jumped to {encoders}")
         except LinkError as error:
@@ -219,16 +221,23 @@ class BaseController:
         """Start again from standing: something else has stopped the motors."""
         self.limiter.reset()
         self._watch.reset()
-        self._watched = None
+        self._watched = self._sent = None
 
-    def _check_tracks(self, v: float, w: float, encoders: NDArray[np.int64], read_ns: int) -> str:
+    def _note_speeds(self, v: float, w: float, sent_ns: int, now_ns: int) -> None:
+        """Tell the watch what the tracks were commanded until ``now_ns``; ``v`` and ``w`` since ``sent_ns`` only."""
+        speeds = self.odometry.kinematics.tracks_from_twist(v, w)
+        if self._sent is not None:
+            before, since_ns = self._sent
+            self._watch.commanded(before, (sent_ns - since_ns) * 1e-9)
+            self._watch.commanded(speeds, (now_ns - sent_ns) * 1e-9)
+        self._sent = speeds, now_ns
+
+    def _check_tracks(self, encoders: NDArray[np.int64]) -> str:
         """Stop as in an emergency if a track does not follow; returns why, or an empty text."""
-        last, self._watched = self._watched, (encoders, read_ns)
+        last, self._watched = self._watched, encoders
         if last is None:
             return ""
-        kinematics = self.odometry.kinematics
-        moved = kinematics.tracks_from_motors(unwrap_counts(last[0], encoders))
-        fault = self._watch.update(kinematics.tracks_from_twist(v, w), moved, max(0.0, (read_ns - last[1]) * 1e-9))
+        fault = self._watch.counted(self.odometry.kinematics.tracks_from_motors(unwrap_counts(last, encoders)))
         if fault:
             self.emergency_stop(True)
             self.roboclaw.stop()
