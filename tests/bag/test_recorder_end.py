@@ -67,9 +67,9 @@ def test_read_all_reads_more_sockets_than_one_wait_does(
         for topic in topics:
             node.subscribe(topic, Bool, heard.append, RELIABLE)
         wait_for(lambda: all(publisher.subscriber_count for publisher in publishers))
+        transport._left_s = time.monotonic() + 1000.0  # the bus thread does not read
         for name in ("_LOOK_S", "_IDLE_S"):
             monkeypatch.setattr(f"instant_ic.bus.local_transport.{name}", 1000.0)
-        transport._left_s = time.monotonic() + 1000.0  # the bus thread does not read
         wait_for(lambda: transport._next_look_s > time.monotonic() + 100)
 
         sent, pause_s = 0, 0.0

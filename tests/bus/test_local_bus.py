@@ -409,9 +409,9 @@ def test_a_wait_that_read_one_of_two_messages_leaves_the_other_to_the_bus_thread
         publisher = out.advertise("/x", "std_msgs/msg/String", RELIABLE)
         subscription = reader.subscribe("/x", "std_msgs/msg/String", RELIABLE, lambda: None)
         wait_for(lambda: publisher.subscriber_count)
+        reader._left_s = time.monotonic() + 1000.0  # the bus thread does not read yet
         for name in ("_LOOK_S", "_IDLE_S"):
             monkeypatch.setattr(f"instant_ic.bus.local_transport.{name}", 1000.0)
-        reader._left_s = time.monotonic() + 1000.0  # the bus thread does not read yet
         wait_for(lambda: reader._next_look_s > time.monotonic() + 100)
         for text in ("first", "second"):
             publisher.send(serialize(String(text)))
@@ -432,9 +432,9 @@ def test_the_second_of_two_messages_ends_the_next_wait(run_dir: Path, monkeypatc
         publisher = out.advertise("/x", "std_msgs/msg/String", RELIABLE)
         subscription = reader.subscribe("/x", "std_msgs/msg/String", RELIABLE, reader.set)
         wait_for(lambda: publisher.subscriber_count)
+        reader._left_s = time.monotonic() + 1000.0  # the bus thread does not read, from its next look on
         for name in ("_LOOK_S", "_IDLE_S"):
             monkeypatch.setattr(f"instant_ic.bus.local_transport.{name}", 1000.0)
-        reader._left_s = time.monotonic() + 1000.0  # the bus thread does not read
         wait_for(lambda: reader._next_look_s > time.monotonic() + 100)
         for text in ("first", "second"):
             publisher.send(serialize(String(text)))
