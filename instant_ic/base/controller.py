@@ -224,7 +224,7 @@ class BaseController:
         self._watched = self._sent = None
 
     def _note_speeds(self, v: float, w: float, sent_ns: int, now_ns: int) -> None:
-        """Tell the watch what the tracks were commanded until ``now_ns``; ``v`` and ``w`` since ``sent_ns`` only."""
+        """Report to the watch the speeds commanded until ``now_ns``; ``v`` and ``w`` since ``sent_ns`` only."""
         speeds = self.odometry.kinematics.tracks_from_twist(v, w)
         if self._sent is not None:
             before, since_ns = self._sent
