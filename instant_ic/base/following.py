@@ -18,7 +18,8 @@ _DOUBT = 2.0
 _MOVING_M_S = 0.02
 """The other track shows it when commanded to be faster than this."""
 _SILENCE_S = 0.1
-"""If neither track has counted for longer, the counts were late: a track that counts again is sound."""
+"""If readings show that neither track has counted for longer, the counts were late: a track that counts again is sound.
+Readings that are late themselves show nothing."""
 _SIMULATED = 2.0
 """Factor on what may lack while neither track counts, in a simulation, which pauses on a busy machine."""
 
@@ -43,7 +44,7 @@ class TrackWatch:
         self._recent = np.zeros(2)  # largest of the last time
         self._due_m = np.zeros(2)  # since the last counts
         self._missing_m = np.zeros(2)  # before that
-        self._silent_s = 0.0
+        self._since_s = self._silent_s = 0.0  # since the last counts: now, and at the last reading without counts
 
     def commanded(self, speeds: NDArray[np.float64], dt_s: float) -> None:
         """Note that the tracks, left and right, were commanded ``speeds`` (2,), m/s, for the last ``dt_s`` seconds."""
@@ -52,7 +53,7 @@ class TrackWatch:
         self._due_m = self._due_m + speeds * dt_s + (self._speeds - speeds) * _LAG_S * (1.0 - decay)
         self._speeds = speeds + (self._speeds - speeds) * decay
         self._recent = np.maximum(np.abs(self._speeds), self._recent * math.exp(-dt_s / _RECENT_S))
-        self._silent_s += dt_s
+        self._since_s += dt_s
 
     def counted(self, moved: NDArray[np.float64]) -> str:
         """Judge both tracks by their motion (2,), m, since the last call.
@@ -65,9 +66,11 @@ class TrackWatch:
             done = np.maximum(0.0, moved * np.sign(self._due_m))
             missing = np.maximum(0.0, self._missing_m + np.abs(self._due_m) - done / _LEAST_SHARE)
             self._missing_m = np.where((self._silent_s > _SILENCE_S) & (moved != 0.0), 0.0, missing)
-            self._due_m, self._silent_s = np.zeros(2), 0.0
+            self._due_m, self._since_s, self._silent_s = np.zeros(2), 0.0, 0.0
             follows = (self._missing_m == 0.0) & (np.abs(self._speeds) > _MOVING_M_S)
             doubt = np.where(follows[::-1], 1.0, _DOUBT)
+        else:
+            self._silent_s = self._since_s
         missing = self._missing_m + np.abs(self._due_m)
         for track in np.flatnonzero(missing > doubt * (_MISSING_M + _MISSING_S * self._recent)):
             return (

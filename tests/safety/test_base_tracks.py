@@ -83,6 +83,18 @@ def test_a_loop_that_comes_late_makes_no_fault(seed: int) -> None:
             assert base.step().fault == ""
 
 
+@pytest.mark.parametrize("counts", [0.0, -1.0], ids=["dead", "reversed"])
+def test_a_loop_that_comes_late_still_finds_a_fault(counts: float) -> None:
+    base = Base()
+    base.run(2.0, 0.4)
+    base.line.encoders[0] = counts
+    for _ in range(5):
+        base.line.advance(0.15)
+        base.controller.command(0.4, 0.0, base.steady_ns())
+        base.step()
+    assert sum(bool(state.fault) for state in base.states) == 1
+
+
 @settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
