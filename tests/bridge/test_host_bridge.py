@@ -116,8 +116,8 @@ def test_type_qos_and_publication_time_travel_with_a_topic(hosts):
     outs["/picture"].publish(String(data="p" * 700_000))
     far.wait(lambda: got["/picture"] and len(got["/queue"]) == 500, "messages")
     assert texts(got["/queue"]) == [str(index) for index in range(500)]
-    # One machine has one clock; half of a round trip over loopback is what may be wrong.
-    assert all(abs(m.publish_ns - stamp - i) < 5_000_000 for i, m in enumerate(got["/queue"]))
+    # Not the time of arrival, 300 ms later. One machine has one clock: half of a round trip may be wrong.
+    assert all(abs(m.publish_ns - stamp - i) < 100_000_000 for i, m in enumerate(got["/queue"]))
     assert {m.publisher for m in got["/queue"]} == {"host_bridge"}
     topics = {info.topic: info for info in registry.list_topics(hosts.folder / "s")}
     told = {name: (topics[name].type_name, topics[name].publishers[0].qos) for name in outs}
@@ -247,7 +247,8 @@ def test_diagnoses_tell_link_clock_topics_and_door(hosts):
     a, b = pair(hosts, max_offset_ms=0.0001)
     wait_for(lambda: "of this one" in b.told("clock of robot") or "this one" in b.told("clock of robot"), "clock")
     _, _, values = b.node.diagnoses()["clock of robot"]
-    assert set(values) == {"offset_ms", "rtt_ms", "jitter_ms"} and abs(values["offset_ms"]) < 5
+    assert set(values) == {"offset_ms", "rtt_ms", "jitter_ms"}
+    assert abs(values["offset_ms"]) <= values["rtt_ms"] / 2 + 1  # one machine, one clock
     assert a.told("link").startswith("linked with station (127.0.0.1, ") and a.told("link").endswith("; station drives")
     assert a.told("door") == "no host refused recently"
     hand = hosts.neighbour("station", "hand")
