@@ -342,6 +342,7 @@ class Recorder:
             "queued_bytes": self._queue.bytes,
             "lost": self.lost_by(),
             "overflow": dict(self.dropped.overflow),
+            "paused": dict(self.dropped.paused),
         }
         if writer is not None:
             status |= {"bytes": writer.bytes, "files": writer.parts}

@@ -130,6 +130,7 @@ def test_pause_keeps_latched_values_for_its_end(tmp_path: Path) -> None:
     recorder.take("/scan", BOOL, b"2", 2 * S)
     recorder.take("/estop", BOOL, NO, 2 * S)
     recorder.take("/estop", BOOL, YES, 3 * S)
+    assert recorder.status()["paused"] == {"/scan": 1, "/estop": 2}
     recorder.resume()
     recorder.take("/scan", BOOL, b"4", 4 * S)
     recorder.close()
