@@ -75,7 +75,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
     def on_event(self, peer: str, event: LinkEvent) -> None:
         """Publish arriving messages at once, on the link's thread; pass all other events to the node's thread."""
         if isinstance(event, Arrived):
-            self.incoming.take(event)
+            self.incoming.take(peer, event)
         elif isinstance(event, Announced):
             self.incoming.open(event.announce)
         else:

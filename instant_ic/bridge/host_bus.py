@@ -23,7 +23,7 @@ BRIDGES = ("host_bridge", "zenoh_gateway")
 
 OLD_NEWS_NS = 1_000_000_000
 """A message on a shared state that is older than the latest by more than this is dropped; clock errors are smaller. A
-false Bool gets no such tolerance: the order of a release and a stop is then uncertain, and the stop must hold.
+false Bool must be newer by this than every stop of another publisher: else their order is uncertain, and a stop holds.
 """
 
 MAX_LATCHED = 64
@@ -93,6 +93,7 @@ class _Imported:
     last: dict[str, Arrived] = field(default_factory=dict)
     readers: int = 0
     newest_ns: int = 0
+    stops: dict[tuple[str, str], int] = field(default_factory=dict)  # (host, node) → born_ns of its stop
 
 
 class ImportedTopics:
@@ -117,8 +118,8 @@ class ImportedTopics:
             self._node.call_soon(self._advertise, announce.topic, topic)
         return topic
 
-    def take(self, arrived: Arrived) -> None:
-        """Publish a message; called on the link's thread, so that commands do not wait for the node's thread."""
+    def take(self, peer: str, arrived: Arrived) -> None:
+        """Publish a message of a host; called on the link's thread: commands do not wait for the node's thread."""
         announce = arrived.announce
         topic = self.open(announce)
         if topic.type_name != announce.type_name:
@@ -131,11 +132,10 @@ class ImportedTopics:
         with topic.lock:
             if topic.qos.latched:
                 if self._rules[announce.topic].shared:  # one state set by several hosts: only the latest message counts
-                    grace_ns = 0 if releases(announce.type_name, arrived.payload) else OLD_NEWS_NS
-                    if arrived.born_ns < topic.newest_ns - grace_ns:
+                    if _is_outdated(topic, (peer, announce.origin), arrived):
                         if time.monotonic() >= self._next_outdated_s:  # a peer must not fill the disk
                             self._next_outdated_s = time.monotonic() + 1.0
-                            self._node.log.warning("dropped %s of %s: outdated", announce.topic, announce.origin)
+                            self._node.log.warning("dropped %s of %s: outdated", announce.topic, peer)
                         return
                     topic.last.clear()
                 topic.newest_ns = max(arrived.born_ns, topic.newest_ns)
@@ -184,3 +184,16 @@ class ImportedTopics:
             publisher.publish_bytes(arrived.payload, arrived.publish_ns)
         except (TransportError, OSError) as error:  # a message that this bus cannot carry must not end the link
             self._on_trouble(arrived.announce.topic, str(error))
+
+
+def _is_outdated(topic: _Imported, source: tuple[str, str], arrived: Arrived) -> bool:
+    """Whether a message on a shared state comes too late; notes the stops, which a release of the same source ends."""
+    if releases(topic.type_name, arrived.payload):
+        if any(arrived.born_ns < at_ns + OLD_NEWS_NS for other, at_ns in topic.stops.items() if other != source):
+            return True
+        topic.stops.clear()
+        return False
+    if arrived.born_ns < topic.newest_ns - OLD_NEWS_NS:
+        return True
+    topic.stops[source] = arrived.born_ns
+    return False

@@ -286,7 +286,7 @@ class Importer(Node[NoConfig]):
         self.incoming = ImportedTopics(self, rules, lambda topic, text: pytest.fail(text))
 
 
-@pytest.mark.parametrize("release_ms", [100, 999, 1000])
+@pytest.mark.parametrize("release_ms", [100, 999, 1000, 1999])
 @pytest.mark.parametrize("stop_first", [True, False])
 def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_first, release_ms):
     """A restarted bridge hears the latched values of all stations in any order; the stop is of 1000 ms."""
@@ -296,20 +296,40 @@ def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_
         Arrived(Announce(1, "/operator/estop", origin, Bool.__msgtype__, "", "latched"), payload, born_ns, born_ns)
         for origin, payload, born_ns in (
             ("tablet", bytes(serialize(Bool(data=True))), 1_000_000_000),
-            ("station", bytes(serialize(Bool(data=False))), release_ms * 1_000_000 - 1),
+            ("station", bytes(serialize(Bool(data=False))), release_ms * 1_000_000),
             ("broken", b"\x00", 1_000_000_000),
         )
     ]
     importer.incoming.open(words[0].announce)
     bus.advance(0.1)
     for word in words[:2] if stop_first else words[1::-1]:
-        importer.incoming.take(word)
+        importer.incoming.take(word.announce.origin, word)
     assert bus.last("/operator/estop").data is True
-    later = replace(words[1], born_ns=1_000_000_001)
-    importer.incoming.take(later)
+    importer.incoming.take("station", replace(words[1], born_ns=2_000_000_000))
     assert bus.last("/operator/estop").data is False  # the latest word
-    importer.incoming.take(replace(words[2], born_ns=1_000_000_002))  # as it came: whoever reads it tells
+    importer.incoming.take("broken", replace(words[2], born_ns=2_000_000_001))  # as it came: whoever reads it tells
     assert bus.records("/operator/estop")[-1].payload == b"\x00"
+
+
+def test_a_hosts_own_stop_is_released_at_once_and_another_hosts_only_a_second_later():
+    bus = LockstepBus()
+    importer = bus.add(Importer)
+
+    def hear(host, pressed, at_ms):
+        """Two hosts whose nodes have one name."""
+        word = Announce(1, "/operator/estop", "console", Bool.__msgtype__, "", "latched")
+        born_ns = at_ms * 1_000_000
+        importer.incoming.take(host, Arrived(word, bytes(serialize(Bool(data=pressed))), born_ns, born_ns))
+        bus.advance(0.1)
+        return bus.last("/operator/estop").data
+
+    assert hear("station", True, 10_000) is True
+    assert hear("station", False, 10_001) is False
+    assert hear("tablet", True, 20_000) is True
+    assert hear("station", True, 20_500) is True
+    assert hear("station", False, 20_999) is True  # the tablet's stop holds
+    assert hear("station", False, 21_000) is False
+    assert hear("tablet", True, 19_999) is False  # and comes again too late
 
 
 @pytest.mark.parametrize("topic", ["/operator/estop", "/view/shown"])
@@ -332,7 +352,7 @@ def test_fault_a_host_that_does_not_drive_gives_a_topic_another_type(topic):
             if isinstance(event, Announced):
                 importer.incoming.open(event.announce)
             elif isinstance(event, Arrived):
-                importer.incoming.take(event)
+                importer.incoming.take("station", event)
         bus.advance(0.1)
 
     station(False, String.__msgtype__, bytes(serialize(String(data="x"))))
@@ -347,7 +367,7 @@ def test_fault_a_hosts_outdated_stops_fill_the_log(caplog):
     for number in range(1000):
         word = Announce(1, "/operator/estop", "node", Bool.__msgtype__, "", "latched")
         born_ns = 10_000_000_000 if number == 0 else number
-        importer.incoming.take(Arrived(word, bytes(serialize(Bool(data=True))), born_ns, born_ns))
+        importer.incoming.take("tablet", Arrived(word, bytes(serialize(Bool(data=True))), born_ns, born_ns))
     assert 1 <= caplog.text.count("outdated") <= 1 + (time.monotonic() - began_s)
 
 
@@ -365,7 +385,7 @@ def test_latched_values_that_a_peer_makes_are_limited_with_a_clear_error():
     collector = bus.add(Collector)
     for number in range(100):
         announce = Announce(number, "/state", f"node{number}", Bool.__msgtype__, "", "latched")
-        collector.incoming.take(Arrived(announce, bytes(serialize(Bool(data=True))), number, number))
+        collector.incoming.take("robot", Arrived(announce, bytes(serialize(Bool(data=True))), number, number))
     last = collector.incoming._topics["/state"].last
     assert list(last) == [f"node{number}" for number in range(36, 100)]  # the newest 64
     assert collector.troubles[0] == ("/state", "more than 64 nodes publish it: the value of node0 was dropped")
