@@ -153,10 +153,16 @@ class ImportedTopics:
                 self._publish(topic.publisher, arrived)
 
     def _advertise(self, name: str, topic: _Imported) -> None:
-        try:
-            publisher = self._node.publisher_raw(name, topic.type_name, topic.qos)
-        except RegistryError as error:
-            self._on_trouble(name, str(error))
+        # The bridge itself publishes /diagnostics and the like; the other hosts' messages share that publisher.
+        publisher = next((p for p in self._node.publishers if p.topic == self._node.resolve(name)), None)
+        if publisher is None:
+            try:
+                publisher = self._node.publisher_raw(name, topic.type_name, topic.qos)
+            except RegistryError as error:
+                self._on_trouble(name, str(error))
+                return
+        elif publisher.raw.type_name != topic.type_name:
+            self._on_trouble(name, f"the other host sends {topic.type_name}, not {publisher.raw.type_name}: refused")
             return
         with topic.lock:
             for arrived in topic.waiting if topic.qos.depth > 1 else list(topic.waiting)[-1:]:

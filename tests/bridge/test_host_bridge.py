@@ -17,7 +17,19 @@ from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, ParameterError, registry
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.config import params
-from instant_ic.msg import Bool, String, TFMessage, TwistStamped, deserialize, serialize, twist_stamped
+from instant_ic.msg import (
+    Bool,
+    DiagnosticArray,
+    DiagnosticStatus,
+    Log,
+    String,
+    TFMessage,
+    TwistStamped,
+    deserialize,
+    header,
+    serialize,
+    twist_stamped,
+)
 from nodes.host_bridge import HostBridgeConfig, HostBridgeNode
 
 TO_STATION = ("/picture lane=bulk", "/state", "/tf_static", "/log shared=true", "/queue")
@@ -391,6 +403,17 @@ def test_latched_values_that_a_peer_makes_are_limited_with_a_clear_error():
     assert collector.troubles[0] == ("/state", "more than 64 nodes publish it: the value of node0 was dropped")
 
 
+def test_another_type_on_a_topic_of_the_bridge_itself_is_refused():
+    bus = LockstepBus()
+    collector = bus.add(Collector)
+    collector.publisher("/own", Bool)
+    announce = Announce(1, "/own", "arbiter", String.__msgtype__, "", "reliable")
+    collector.incoming.take("robot", Arrived(announce, bytes(serialize(String(data="x"))), 1, 1))
+    bus.advance(0.1)
+    assert collector.troubles == [("/own", "the other host sends std_msgs/msg/String, not std_msgs/msg/Bool: refused")]
+    assert bus.last("/own") is None
+
+
 def test_topics_of_no_list_that_a_peer_names_share_one_diagnosis(hosts):
     hosts.host("robot")
     robot = hosts.bridge("robot").node
@@ -458,6 +481,29 @@ def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
     ear.wait(lambda: len(stops()) > 3 and stops()[-1], "stop from the new bridge")
     ear.spin(0.5)
     assert stops()[-1] is True
+
+
+def test_fault_a_robots_diagnostics_and_log_do_not_reach_the_station(hosts):
+    """The bridge publishes on these topics itself, and a node has one publisher a topic."""
+    topics = {"/diagnostics": DiagnosticArray, "/rosout": Log}
+    hosts.host("robot")
+    hosts.host("station")
+    hosts.bridge("robot", to_station=tuple(topics))
+    hosts.bridge("station", to_station=tuple(topics))
+    near, far = hosts.neighbour("robot", "arbiter"), hosts.neighbour("station", "page")
+    outs = {topic: near.publisher(topic, kind) for topic, kind in topics.items()}
+    heard = {topic: far.listen(topic) for topic in topics}
+    messages = {
+        "/diagnostics": DiagnosticArray(header("", 1), [DiagnosticStatus(0, "arbiter: all", "well", "", [])]),
+        "/rosout": Log(header("", 1).stamp, 20, "arbiter", "well", "", "", 0),
+    }
+
+    def arrived():
+        for topic, out in outs.items():
+            out.publish(messages[topic])
+        return all(any(m.payload == bytes(serialize(messages[t])) for m in heard[t]) for t in topics)
+
+    far.wait(arrived, "the robot's words")
 
 
 def test_driver_is_handed_over_by_a_live_parameter(hosts):

@@ -38,6 +38,8 @@ def test_the_operator_drives_a_robot_on_another_machine_and_a_cut_cable_stops_it
         shutil.rmtree(folder, ignore_errors=True)
     assert nodes == {"console", "host_bridge", "operator_recorder"} and left == []
     assert [log[log.index("Traceback") :][:3000] for log in logs if "Traceback" in log] == []
+    lines = [line for log in logs for line in log.splitlines()]
+    assert [line for line in lines if "host_bridge: topic /" in line] == []  # every topic of the list comes over
     assert result.picture_age_s < 5.0  # a picture of now; a busy machine makes one a second
     assert result.driven_m > 0.3
     assert result.stop_s < 5.0  # 0.3 s and 0.5 s of braking on a free machine
