@@ -93,7 +93,7 @@ class _Imported:
     last: dict[str, Arrived] = field(default_factory=dict)
     readers: int = 0
     newest_ns: int = 0
-    stops: dict[tuple[str, str], int] = field(default_factory=dict)  # (host, node) → born_ns of its stop
+    stops: dict[tuple[str, str], int] = field(default_factory=dict)  # (host, node) → born_ns; the two newest
 
 
 class ImportedTopics:
@@ -132,11 +132,13 @@ class ImportedTopics:
         with topic.lock:
             if topic.qos.latched:
                 if self._rules[announce.topic].shared:  # one state set by several hosts: only the latest message counts
-                    if _is_outdated(topic, (peer, announce.origin), arrived):
+                    source, release = (peer, announce.origin), releases(announce.type_name, arrived.payload)
+                    if why := _outdated(topic, source, release, arrived.born_ns):
                         if time.monotonic() >= self._next_outdated_s:  # a peer must not fill the disk
                             self._next_outdated_s = time.monotonic() + 1.0
-                            self._node.log.warning("dropped %s of %s: outdated", announce.topic, peer)
+                            self._node.log.warning("dropped %s of %s: %s", announce.topic, peer, why)
                         return
+                    _note_stop(topic, source, release, arrived.born_ns)
                     topic.last.clear()
                 topic.newest_ns = max(arrived.born_ns, topic.newest_ns)
                 topic.last.pop(announce.origin, None)
@@ -192,14 +194,19 @@ class ImportedTopics:
             self._on_trouble(arrived.announce.topic, str(error))
 
 
-def _is_outdated(topic: _Imported, source: tuple[str, str], arrived: Arrived) -> bool:
-    """Whether a message on a shared state comes too late; notes the stops, which a release of the same source ends."""
-    if releases(topic.type_name, arrived.payload):
-        if any(arrived.born_ns < at_ns + OLD_NEWS_NS for other, at_ns in topic.stops.items() if other != source):
-            return True
+def _outdated(topic: _Imported, source: tuple[str, str], release: bool, born_ns: int) -> str:
+    """Why a message on a shared state comes too late; empty if it does not."""
+    if not release:
+        return "outdated" if born_ns < topic.newest_ns - OLD_NEWS_NS else ""
+    if any(born_ns < at_ns + OLD_NEWS_NS for other, at_ns in topic.stops.items() if other != source):
+        return "a release must be 1 s newer than another publisher's stop; release again"
+    return ""
+
+
+def _note_stop(topic: _Imported, source: tuple[str, str], release: bool, born_ns: int) -> None:
+    if release:
         topic.stops.clear()
-        return False
-    if arrived.born_ns < topic.newest_ns - OLD_NEWS_NS:
-        return True
-    topic.stops[source] = arrived.born_ns
-    return False
+        return
+    topic.stops[source] = born_ns
+    if len(topic.stops) > 2:  # the newest stop of another publisher than the one that releases is among them
+        del topic.stops[min(topic.stops, key=lambda each: topic.stops[each])]

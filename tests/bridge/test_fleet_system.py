@@ -68,7 +68,7 @@ def drive_robot2(stack, station, robots):
 
     stack.wait_for(driven, 90, "0.4 m of robot2")
     # Now silence, as when the station's machine loses power: no zero command is sent.
-    stack.wait_for(lambda: spin() and abs(truth["robot2"][-1].twist.twist.linear.x) < 0.01, 60, "robot2's stop")
+    stack.wait_for(lambda: spin() and abs(truth["robot2"][-1].twist.twist.linear.x) < 0.01, 10, "robot2's stop")
     return {name: float(np.linalg.norm(place(name) - start[name])) for name in ROBOTS}
 
 

@@ -319,7 +319,7 @@ def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_
     assert bus.last("/operator/estop").data is True
     importer.incoming.take("station", replace(words[1], born_ns=2_000_000_000))
     assert bus.last("/operator/estop").data is False  # the latest word
-    importer.incoming.take("broken", replace(words[2], born_ns=2_000_000_001))  # as it came: whoever reads it tells
+    importer.incoming.take("broken", replace(words[2], born_ns=2_000_000_001))  # unreadable: the subscriber reports it
     assert bus.records("/operator/estop")[-1].payload == b"\x00"
 
 
@@ -342,6 +342,12 @@ def test_a_hosts_own_stop_is_released_at_once_and_another_hosts_only_a_second_la
     assert hear("station", False, 20_999) is True  # the tablet's stop holds
     assert hear("station", False, 21_000) is False
     assert hear("tablet", True, 19_999) is False  # and comes again too late
+    for number in range(100):
+        hear(f"host {number}", True, 30_000 + number)
+    assert len(importer.incoming._topics["/operator/estop"].stops) == 2
+    assert hear("host 99", False, 31_097) is True  # the stop of host 98 holds
+    assert hear("host 98", False, 31_098) is True  # that of host 99
+    assert hear("host 99", False, 31_098) is False
 
 
 @pytest.mark.parametrize("topic", ["/operator/estop", "/view/shown"])
