@@ -2,11 +2,10 @@
 # Installs the CPU build of the pinned torch, never the CUDA build of several gigabytes. The dependencies of torch are in
 # requirements.lock, which is installed first.
 #   install_torch.sh PYTHON
-# On a machine with a GPU, TORCH_SPEC selects another build, for example torch==2.13.0+cu130.
+# A CUDA build of that version that is already there stays.
 set -euo pipefail
 python=$1
-pin=$(grep -E '^torch==' "$(dirname "$0")/../constraints.txt")
-spec=${TORCH_SPEC:-$pin}
+spec=$(grep -E '^torch==' "$(dirname "$0")/../constraints.txt")
 if "$python" - "${spec#torch==}" <<'PY'
 import importlib.metadata as metadata, sys
 try:
@@ -18,7 +17,6 @@ sys.exit(0 if have == want or have.split("+")[0] == want else 1)
 PY
 then exit 0; fi
 pip=("$python" -m pip install -q --disable-pip-version-check --progress-bar off)
-if [ -n "${TORCH_SPEC:-}" ]; then exec "${pip[@]}" "$spec"; fi
 # A dry run shows which build the index offers; only a CPU build is installed from it.
 report=$("$python" -m pip install -q --disable-pip-version-check --dry-run --no-deps --report - "$spec" 2>/dev/null || true)
 if printf '%s' "$report" | grep -q '%2Bcpu\|+cpu'; then exec "${pip[@]}" --no-deps "$spec"; fi

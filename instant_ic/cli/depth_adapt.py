@@ -64,7 +64,7 @@ def adapt(args: argparse.Namespace) -> int:
     checked = {"places left out": parts.places, "sector left out": parts.sector}
     config = TrainingConfig(
         minutes=args.minutes, epochs=MOST_EPOCHS, batch_size=BATCH, learning_rate=args.learning_rate, warmup=0.1,
-        sigma_share=0.0, checkpoint_s=1e9, evaluation_panoramas=1, threads=args.threads,
+        sigma_share=0.0, no_lidar=0.0, checkpoint_s=1e9, evaluation_panoramas=1, threads=args.threads,
         max_range_m=manifest.max_range_m, brightness=manifest.brightness,
     )  # fmt: skip
     with progress("training") as bar, tempfile.TemporaryDirectory() as folder:

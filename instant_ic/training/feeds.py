@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from instant_ic.training.dataset import Sample
 from instant_ic.training.sparse import prior_of_image
 
-Batch = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]]
-"""rgb (B, H, W, 3) uint8, radial depth (B, H, W) metres, 0 = unknown, and prior (B, 6, H, W)."""
+Batch = tuple[NDArray[np.uint8], NDArray[np.floating], NDArray[np.floating]]
+"""rgb (B, H, W, 3) uint8, radial depth (B, H, W) metres, 0 = unknown, and prior (B, 6, H, W); floats as stored."""
 
 
 class FeedError(RuntimeError):
@@ -44,8 +44,8 @@ def stack(samples: Sequence[Sample], rng: np.random.Generator | None = None) -> 
         raise FeedError(f"no LiDAR fits to any of {len(samples)} panoramas: is their depth in metres?")
     return (
         np.stack([sample.rgb for sample, _ in usable]),
-        np.stack([sample.depth_m for sample, _ in usable]).astype(np.float32),
-        np.stack([prior for _, prior in usable]).astype(np.float32),
+        np.stack([sample.depth_m for sample, _ in usable]),
+        np.stack([prior for _, prior in usable]),
     )
 
 

@@ -24,7 +24,7 @@ from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
-from instant_ic.training.augment import photograph, to_brightness, turn_and_mirror
+from instant_ic.training.augment import photograph, to_brightness, turn_and_mirror, without_lidar
 from instant_ic.training.completion import CompletionNet
 from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import Ahead, Batch, Feed, Samples, stack
@@ -61,6 +61,7 @@ class TrainingConfig:
         edge_share: weight of the edge loss.
         sigma_share: weight of the loss of the uncertainty.
         photograph: augment images with the effects of a real camera.
+        no_lidar: share of the panoramas whose prior is the network's depth alone, as where no LiDAR measures.
         brightness: mean byte to which each image is scaled before the network, as in inference; 0: unchanged.
         evaluation_panoramas: number of held-out panoramas evaluated during training.
         checkpoint_s: seconds between checkpoints with evaluation.
@@ -81,6 +82,7 @@ class TrainingConfig:
     edge_share: float = 0.5
     sigma_share: float = 0.1
     photograph: bool = True
+    no_lidar: float = 0.2
     brightness: float = 178.5
     evaluation_panoramas: int = 48
     checkpoint_s: float = 300.0
@@ -165,11 +167,10 @@ def to_tensors(batch: Batch, max_range_m: float, device: torch.device) -> tuple[
     """Convert a batch to tensors: (B, 3, H, W) in 0..1, ground truth (B, H, W), 0 where unknown or too far, and prior
     (B, 6, H, W).
     """
-    rgb, depth, prior = batch
-    pictures = torch.tensor(rgb).to(device).permute(0, 3, 1, 2).float() / 255.0
-    truth = torch.tensor(depth).to(device)
+    rgb, depth, prior = (torch.from_numpy(part).to(device) for part in batch)
+    truth = depth.float()
     truth = torch.where(torch.isfinite(truth) & (truth <= max_range_m), truth, 0.0)
-    return pictures, truth, torch.tensor(prior).to(device)
+    return rgb.permute(0, 3, 1, 2).float() / 255.0, truth, prior.float()
 
 
 @torch.inference_mode()
@@ -267,6 +268,7 @@ class Trainer:
         rgb, depth, prior = turn_and_mirror(generator, rgb, depth, prior)
         if self.config.photograph:
             rgb = photograph(rgb, depth, generator)
+        prior = without_lidar(prior, self.config.no_lidar, generator)
         return to_brightness(rgb, self.config.brightness), depth, prior
 
     def train_step(self, progress: float | None = None) -> float:

@@ -120,7 +120,7 @@ class VirtualSpaceConfig:
         mesh_pose: where the mesh lies in the map: x, y, z (m), yaw (degrees, counter-clockwise).
         mesh_max_triangles: larger meshes are refused.
         mesh_fit_colours: a factor a colour, so that the mesh looks like the newest keyframe.
-        device: auto: cuda where there is a GPU, else cpu (numba); cuda: triton where it works, else torch-cuda;
+        device: auto: triton where it works, else cpu (numba); cuda: triton where it works, else torch-cuda;
             torch-cpu (slow).
         panorama_width: px; wider panoramas are area-averaged to this.
         keyframes: newest keyframes that are kept and shown together, 1..8; the time per view grows with it.

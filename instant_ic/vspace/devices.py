@@ -24,6 +24,10 @@ class DeviceError(RuntimeError):
     """The requested device is absent or does not work."""
 
 
+class KernelError(DeviceError):
+    """The Triton kernels are absent, or do not work on this GPU."""
+
+
 def is_out_of_memory(error: Exception) -> bool:
     """Whether torch raised this because the GPU has too little memory; does not import torch."""
     torch = sys.modules.get("torch")
@@ -48,11 +52,18 @@ def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
 
         if torch.cuda.is_available():
             try:
-                return _make_gpu_device(config)
+                return _make_gpu_device(config), ""
             except torch.OutOfMemoryError as error:
                 if wants_gpu:
                     raise
                 warning = f"the GPU is out of memory; on the CPU ({error})"
+            except KernelError as error:
+                if config.device == "triton":
+                    raise DeviceError(f"device is triton, but {error}") from error
+                if config.device == "cuda":
+                    slow = f"{error}: on the GPU by plain torch, which takes a second and more for a view"
+                    return _plain_torch(config.field, config.train), slow
+                warning = f"{error}: on the CPU"
         elif wants_gpu:
             raise DeviceError(f"device is {config.device}, but torch finds no CUDA device; use auto or cpu")
     if config.device != "torch-cpu":
@@ -69,33 +80,34 @@ def _may_have_cuda() -> bool:
     return any(Path(place).exists() for place in ("/dev/nvidiactl", "/dev/nvmap", "/dev/dxg"))
 
 
-def _make_gpu_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
+def _plain_torch(field: FieldConfig, train: TrainConfig) -> Device:
+    from instant_ic.vspace.nerf.torch_device import TorchDevice
+
+    return TorchDevice(field, train, "cuda")
+
+
+def _make_gpu_device(config: VirtualSpaceConfig) -> Device:
     """``make_device`` on a machine with CUDA.
 
     The Triton kernels are compiled here (seconds at the first start of an installation, then kept on disk), and their
-    results compared with plain torch's. Where that fails plain torch runs, with a warning.
+    results compared with plain torch's.
+
+    Raises:
+        KernelError: they fail.
     """
-    from instant_ic.vspace.nerf.torch_device import TorchDevice
-
-    def plain(field: FieldConfig, train: TrainConfig) -> Device:
-        return TorchDevice(field, train, "cuda")
-
     if config.device == "torch-cuda" or (config.device != "triton" and config.field.geometry != "distance"):
-        return plain(config.field, config.train), ""
+        return _plain_torch(config.field, config.train)
     try:
         from instant_ic.vspace.nerf.triton_device import TritonDevice
 
-        check_device(TritonDevice, plain, config.field)
-        return TritonDevice(config.field, config.train), ""
+        check_device(TritonDevice, _plain_torch, config.field)
+        return TritonDevice(config.field, config.train)
     except ImportError as error:
-        words = f"Triton is not installed ({error}); pip install 'instant-ic[triton]'"
-    except Exception as error:  # a compiler, a driver: whatever they raise, plain torch still works
+        raise KernelError(f"Triton is not installed ({error}); pip install 'instant-ic[triton]'") from error
+    except Exception as error:  # a compiler, a driver: whatever they raise, other devices still work
         if is_out_of_memory(error):
             raise
-        words = f"the Triton kernels do not work here ({type(error).__name__}: {error})"
-    if config.device == "triton":
-        raise DeviceError(f"device is triton, but {words}")
-    return plain(config.field, config.train), f"{words}: on the GPU by plain torch, which is slower"
+        raise KernelError(f"the Triton kernels do not work here ({type(error).__name__}: {error})") from error
 
 
 def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfig) -> None:

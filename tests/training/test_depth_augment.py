@@ -14,6 +14,7 @@ from instant_ic.training.augment import (
     to_brightness,
     turn_and_mirror,
     vignetting,
+    without_lidar,
 )
 
 
@@ -98,3 +99,14 @@ def test_jpeg_matches_a_real_one() -> None:
 def test_jpeg_of_the_best_quality_is_nearly_the_picture() -> None:
     rgb = torch.rand(2, 3, 16, 32, generator=seeded())
     assert (jpeg(rgb, seeded(), (100.0, 100.0)) - rgb).abs().max() == pytest.approx(0, abs=0.03)
+
+
+def test_a_prior_without_lidar_by_hand() -> None:
+    prior = torch.zeros(1, 6, 1, 3)
+    prior[0, :, 0] = torch.tensor([[2.0, 3.0, 0.0], [0.01, 0.1, 0.0], [1, 0, 0], [7, 8, 9], [4, 5, 6], [2.5, 0, 1.5]])
+    alone = without_lidar(prior, 1.0, seeded())[0, :, 0]
+    expected = torch.tensor([[2.5, 0.0, 1.5], [0.3, 0.0, 0.3], [0, 0, 0], [7, 8, 9], [4, 5, 6], [2.5, 0, 1.5]])
+    assert torch.equal(alone, expected)
+    assert torch.equal(without_lidar(prior, 0.0, seeded()), prior)
+    many = without_lidar(prior.repeat(400, 1, 1, 1), 0.2, seeded())
+    assert 50 < int((many[:, 2, 0, 0] == 0).sum()) < 110

@@ -20,7 +20,7 @@ def marked(number: int) -> Sample:
 
 def numbers(batch: feeds.Batch) -> list[int]:
     rgb, depth, prior = batch
-    assert rgb.dtype == np.uint8 and depth.dtype == prior.dtype == np.float32
+    assert (rgb.dtype, depth.dtype, prior.dtype) == (np.uint8, np.float32, np.float16)  # as stored
     np.testing.assert_array_equal(prior[:, 4], depth)
     np.testing.assert_array_equal(rgb[..., 0], depth)
     return [int(value) for value in depth[:, 0, 0]]

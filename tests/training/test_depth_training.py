@@ -126,9 +126,10 @@ def test_images_of_another_size_are_refused(tmp_path: Path) -> None:
 
 
 def test_truth_that_is_unknown_or_too_far_is_zero() -> None:
-    depth = np.array([[[1.0, 17.0, np.nan, np.inf]]], np.float32)
-    batch = np.full((1, 1, 4, 3), 51, np.uint8), depth, np.zeros((1, 6, 1, 4), np.float32)
-    rgb, truth, _ = to_tensors(batch, 16.0, torch.device("cpu"))
+    depth = np.array([[[1.0, 17.0, np.nan, np.inf]]], np.float16)  # as stored
+    batch = np.full((1, 1, 4, 3), 51, np.uint8), depth, np.zeros((1, 6, 1, 4), np.float16)
+    rgb, truth, prior = to_tensors(batch, 16.0, torch.device("cpu"))
+    assert truth.dtype == prior.dtype == torch.float32
     assert truth.tolist() == [[[1.0, 0.0, 0.0, 0.0]]]
     assert rgb.shape == (1, 3, 1, 4) and torch.allclose(rgb, torch.tensor(0.2))
 

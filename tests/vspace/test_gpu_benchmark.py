@@ -20,7 +20,7 @@ def test_a_dry_run_writes_every_steps_figures(tmp_path):
     done = run("--dry-run", "--out", str(tmp_path))
     assert done.returncode == 0, done.stderr[-2000:]
     found = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("*.json")}
-    assert set(found) == {"kernels", "train", "views", "field-or-warp", "depth"}
+    assert set(found) == {"kernels", "train", "views", "field-or-warp"}
     assert all(step["targets"] and step["machine"] == "dry run on the CPU" for step in found.values())
     kernels = found["kernels"]["result"]
     for keyframes in ("one", "three"):  # numba's values are torch's
@@ -32,7 +32,6 @@ def test_a_dry_run_writes_every_steps_figures(tmp_path):
     compared = found["field-or-warp"]["result"]["corridor"]["depth 0% off"]
     assert compared["one"]["warp"]["psnr_db"]["0.5 m"] > 15
     assert set(compared["three, one ahead"]["gain_db"]) == {"field", "taught", "density"}
-    assert found["depth"]["result"]["held_out"]["mre"] > 0
     for name in ("train", "field-or-warp"):
         assert cv2.imread(str(tmp_path / f"{name}.png")) is not None
 
