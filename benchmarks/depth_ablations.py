@@ -29,16 +29,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from instant_ic.cli.depth_train import published_encoder
-from instant_ic.training.augment import photograph
+from instant_ic.training.augment import ALONE_SIGMA, photograph
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_encoder, padded
 from instant_ic.training.dataset import RenderedDataset, Sample
 from instant_ic.training.feeds import FileFeed, Samples
 from instant_ic.training.trainer import Trainer, TrainingConfig, evaluate
 
 HEIGHT, BATCH, AVERAGE, WARMUP = 128, 8, 0.995, 0.1
-ALONE_SIGMA = 0.3
-"""Relative sigma of a prior that is the network's depth alone."""
-ALONE_SHARE = 0.2
 
 
 @dataclass(frozen=True)
@@ -124,11 +121,6 @@ def alone(sample: Sample, number: int) -> Sample:
     return replace(sample, prior=prior)
 
 
-def sometimes_alone(sample: Sample, number: int) -> Sample:
-    drawn = np.random.default_rng(number).random()
-    return alone(sample, number) if drawn < ALONE_SHARE else sample
-
-
 def photographed(sample: Sample, number: int) -> Sample:
     """The sample with the faults of a real camera."""
     image = torch.from_numpy(sample.rgb.copy()).permute(2, 0, 1)[None].float() / 255
@@ -173,6 +165,7 @@ def run(variant: Variant, data: Samples, minutes: float, views: dict[str, Sample
         batch_size=BATCH,
         encoder_rate=variant.encoder_rate,
         photograph=variant.photograph,
+        no_lidar=0.2 if variant.alone else 0.0,
         average=AVERAGE,
         warmup=WARMUP,
     )
@@ -181,8 +174,7 @@ def run(variant: Variant, data: Samples, minutes: float, views: dict[str, Sample
     model = Propagating(network) if variant.propagates else CompletionNet(network)
     if variant.pretrained:
         load_encoder(model, published_encoder())
-    samples: Samples = Changed(data, sometimes_alone) if variant.alone else data
-    feed = FileFeed(samples, np.arange(len(data)), BATCH, threads=1)
+    feed = FileFeed(data, np.arange(len(data)), BATCH, threads=1)
     trainer = Trainer(feed, views["as rendered"], model, config, folder / "checkpoint.pt")
     began_s, spent_s, losses = time.process_time(), 0.0, []
     while spent_s < 60 * minutes:
