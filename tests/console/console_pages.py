@@ -93,16 +93,23 @@ def moving(demo):
     return bool(demo.commands) and demo.commands[-1] != (0.0, 0.0)
 
 
-def start_driving(page, demo, key="w"):
-    """Holds a key until it drives. A press while the link is away does not count, as for a driver: it is repeated."""
+def until_driving(page, demo, press, what):
+    """Presses until it drives. A press while the link is away does not count, as for a driver: it is repeated."""
     deadline = time.monotonic() + WAIT_MS / 1000
     while not moving(demo):
-        assert time.monotonic() < deadline, "the key drives"
-        page.keyboard.up(key)
-        page.keyboard.down(key)
+        assert time.monotonic() < deadline, what
+        press()
         again = time.monotonic() + 5.0
         while not moving(demo) and time.monotonic() < again:
             page.wait_for_timeout(20)
+
+
+def start_driving(page, demo, key="w"):
+    def press():
+        page.keyboard.up(key)
+        page.keyboard.down(key)
+
+    until_driving(page, demo, press, "the key drives")
 
 
 def wait_stopped(page, demo):
@@ -177,17 +184,14 @@ def stick_middle(page):
 
 
 def push_stick(page, demo):
-    """Pushes the stick until it drives: as ``start_driving``, again where it was in vain."""
-    deadline = time.monotonic() + WAIT_MS / 1000
     x, y = stick_middle(page)
-    while not moving(demo):
-        assert time.monotonic() < deadline, "the stick drives"
+
+    def press():
         touch(page, "pointerup", x, y)
         touch(page, "pointerdown", x, y)
         touch(page, "pointermove", x, y - 60)
-        again = time.monotonic() + 5.0
-        while not moving(demo) and time.monotonic() < again:
-            page.wait_for_timeout(20)
+
+    until_driving(page, demo, press, "the stick drives")
 
 
 def release_stick(page, how="pointerup"):
