@@ -45,7 +45,8 @@ def grid_image(grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float
         return None
     row, column = max(known_rows[0] - 2, 0), max(known_columns[0] - 2, 0)
     cells = grid[row : known_rows[-1] + 3, column : known_columns[-1] + 3]
-    grey = np.ascontiguousarray(np.where(cells < 0, UNKNOWN, cells).astype(np.uint8)[::-1])
+    grey = cells[::-1].astype(np.uint8, order="C")
+    grey[cells[::-1] < 0] = UNKNOWN
     header = {
         "resolution": float(resolution),
         "width": int(grey.shape[1]),

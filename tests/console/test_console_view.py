@@ -96,6 +96,16 @@ def test_grid_is_cropped_and_turned_top_down():
     assert np.count_nonzero(cells == 255) == 70
 
 
+def test_every_cell_value_becomes_a_grey_value_with_any_numpy() -> None:
+    """NumPy 2.5 refuses ``np.where(cells < 0, 255, cells)`` for int8 cells: no map appeared."""
+    grid = np.arange(-128, 128).astype(np.int8).reshape(16, 16)
+    image = grid_image(np.ascontiguousarray(grid), 0.1, (0, 0))
+    assert image is not None
+    grey = cv2.imdecode(np.frombuffer(image.png, np.uint8), cv2.IMREAD_GRAYSCALE)[::-1]
+    assert grey[-8:].ravel().tolist() == list(range(128))
+    assert np.all(grey[:-8] == 255)  # the margin, unknown
+
+
 def test_unknown_grid_is_no_picture_and_same_grid_same_digest():
     assert grid_image(np.full((4, 4), -1, np.int8), 0.1, (0, 0)) is None
     grid = np.zeros((4, 4), np.int8)
