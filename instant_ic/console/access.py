@@ -26,8 +26,8 @@ from instant_ic.web_access import is_loopback
 COOKIE = "instant_ic_session"
 SIGN_IN = ("auto", "always", "never")
 MIN_TOKEN = 16
-FIRST_WAIT_S = 0.25  # before a token is checked, once its address has sent too many wrong ones
-MAX_WAIT_S = 4.0  # bounds the wait of a user who shares his address with an attacker
+FIRST_WAIT_S = 0.25  # before a wrong token is answered, once its address has sent too many of them
+MAX_WAIT_S = 4.0
 _MOST_SESSIONS = 256  # of one role
 _MOST_ADDRESSES = 1024
 _MOST_DOUBLINGS = 8
@@ -55,8 +55,8 @@ class AccessConfig:
             shows it on the terminal and in a file readable by its owner only, never in the log.
         watch_token_file: file with the token to watch and stop the robot only; empty: there is no such token.
         session_hours: lifetime of a sign-in.
-        tries_per_minute: wrong tokens that one address may send without a wait. Each further one doubles the wait of
-            its next try, right or wrong, up to ``MAX_WAIT_S``. A right token is never refused.
+        tries_per_minute: wrong tokens of one address that are answered at once. Each further one doubles the wait for
+            the answer, up to ``MAX_WAIT_S``. A right token never waits.
         tls_certificate, tls_key: PEM files; both empty: plain HTTP.
     """
 
@@ -152,26 +152,24 @@ class Access:
                 )
             self._digests[Role.WATCH] = _digest(watch)
 
-    def role_of_token(self, token: str, address: str, now_s: float) -> Role | None:
-        """Return the role of a token; None for a wrong one, which counts against the address.
-
-        The caller first waits :meth:`wait_s`. So guessing is slow, and a right token is slow at worst.
-        """
+    def role_of_token(self, token: str) -> Role | None:
+        """Return the role of a token; None for a wrong one."""
         digest = _digest(token)
         # Compare every token, each in constant time, so that the duration reveals nothing.
         roles = [role for role, known in self._digests.items() if hmac.compare_digest(known, digest)]
-        if roles:
-            return roles[0]  # earlier failures still count: another user of the same address may have caused them
+        return roles[0] if roles else None
+
+    def count_wrong_token(self, address: str, now_s: float) -> float:
+        """Count a wrong token against its address; return the seconds to wait before answering it.
+
+        Only wrong tokens wait: an emergency stop must not queue behind a guesser who shares its address.
+        """
         failures = self._failures.setdefault(address, deque(maxlen=self.config.tries_per_minute + _MOST_DOUBLINGS))
         self._failures.move_to_end(address)
+        recent = sum(now_s - at < 60.0 for at in failures)
         failures.append(now_s)
         while len(self._failures) > _MOST_ADDRESSES:
             self._failures.popitem(last=False)
-        return None
-
-    def wait_s(self, address: str, now_s: float) -> float:
-        """Seconds to wait before comparing a token of this address, at most ``MAX_WAIT_S``."""
-        recent = sum(now_s - at < 60.0 for at in self._failures.get(address, ()))
         too_many = recent - self.config.tries_per_minute
         return min(MAX_WAIT_S, FIRST_WAIT_S * 2.0**too_many) if too_many >= 0 else 0.0
 

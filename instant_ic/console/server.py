@@ -70,6 +70,7 @@ SECURITY_HEADERS = {
 PLAIN_HTTP = "Plain HTTP: anyone on the network can read the traffic and take over. Set server.access.tls_certificate."
 logger = logging.getLogger("instant_ic.console")
 _COOKIE: web.RequestKey[str] = web.RequestKey("cookie", str)
+_PAYER: web.RequestKey[str] = web.RequestKey("payer", str)  # whose rate a request counts against
 _ROLE: web.RequestKey[Role | None] = web.RequestKey("role", Role | None)  # type: ignore[arg-type]
 
 
@@ -334,41 +335,50 @@ class ConsoleServer:
     async def _guard(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        request[_COOKIE] = cookie = request.cookies.get(COOKIE, "")
-        signed_in = not self.access.required or self.access.role_of_session(cookie, time.monotonic()) is not None
-        if not (signed_in and request.path == "/estop"):
+        # The sign-in comes first: a signed-in client never waits for others of the same address.
+        request[_COOKIE] = request.cookies.get(COOKIE, "")
+        request[_PAYER] = network_of(request.remote or "")
+        request[_ROLE] = role = self._role(request)
+        asked, known_host = f"{request.method} {request.path}", self._host_allowed(request)
+        stops = role is not None and request.path == "/estop"
+        enters = role is None and (asked == "POST /sign-in" or (asked == "GET /" and "token" in request.query))
+        if not (known_host and (stops or enters)):
             await self._pace(request, self._requests)
-        if not host_allowed(request.headers.get("Host", ""), self.config.allowed_hosts):
+        if not known_host:
             raise web.HTTPForbidden(text="Host not allowed; add it to server.allowed_hosts\n")
-        request[_ROLE] = role = await self._role(request)
         open_to_all = request.path == "/sign-in" or request.path.startswith("/static/")
         return await (self._turn_away(request) if role is None and not open_to_all else handler(request))
 
+    def _host_allowed(self, request: web.Request) -> bool:
+        return host_allowed(request.headers.get("Host", ""), self.config.allowed_hosts)
+
     @staticmethod
     async def _pace(request: web.Request, buckets: AddressBuckets) -> None:
-        """Delay requests of an address above its rate; its connection limit bounds how many wait."""
-        bucket = buckets.of(network_of(request.remote or ""))
+        """Delay requests of a sign-in or address above its rate; the connection limit bounds how many wait."""
+        bucket = buckets.of(request[_PAYER])
         while not bucket.take(time.monotonic()):
             await asyncio.sleep(bucket.wait_s())
             _end_if_left(request)
 
-    async def _role(self, request: web.Request) -> Role | None:
+    def _role(self, request: web.Request) -> Role | None:
         """Return the role of a request: programs send a token in the header, pages the cookie of their sign-in."""
         if not self.access.required:
             return Role.DRIVE
-        scheme, _, token = request.headers.get("Authorization", "").partition(" ")
-        if scheme.lower() == "bearer" and token:
-            request[_COOKIE] = ""
-            return await self._role_of_token(request, token.strip())
-        return self.access.role_of_session(request[_COOKIE], time.monotonic())
-
-    async def _role_of_token(self, request: web.Request, token: str) -> Role | None:
-        address = network_of(request.remote or "")
-        await asyncio.sleep(self.access.wait_s(address, time.monotonic()))
-        role = self.access.role_of_token(token, address, time.monotonic())
-        if role is None:
-            logger.warning("wrong token from %s", address)
+        credential = request[_COOKIE]
+        if token := _bearer(request):
+            request[_COOKIE], credential = "", token
+            role = self.access.role_of_token(token)
+        else:
+            role = self.access.role_of_session(credential, time.monotonic())
+        if role is not None:
+            request[_PAYER] = credential
         return role
+
+    async def _slow_down(self, request: web.Request) -> None:
+        """Delay the answer to a wrong token."""
+        address = request[_PAYER]
+        logger.warning("wrong token from %s", address)
+        await asyncio.sleep(self.access.count_wrong_token(address, time.monotonic()))
 
     async def _turn_away(self, request: web.Request) -> web.StreamResponse:
         """Answer a request without sign-in: the form for browsers that open the page, 401 for everything else."""
@@ -376,6 +386,8 @@ class ConsoleServer:
             if token := request.query.get("token", ""):
                 return await self._enter(request, token)
             return self._sign_in_page("Sign in to see the robot.")
+        if _bearer(request):
+            await self._slow_down(request)
         return web.Response(
             status=401, text="sign in first, or send 'Authorization: Bearer TOKEN'\n",
             headers={"WWW-Authenticate": "Bearer"},
@@ -383,8 +395,10 @@ class ConsoleServer:
 
     async def _enter(self, request: web.Request, token: str) -> web.Response:
         """Sign a browser in: set a cookie and redirect, so that the token leaves address and history."""
-        role = await self._role_of_token(request, token)
+        role = self.access.role_of_token(token)
         if role is None:
+            await self._pace(request, self._requests)
+            await self._slow_down(request)
             return self._sign_in_page("Wrong token.")
         now = time.monotonic()
         response = web.Response(status=303, headers={"Location": "/"})
@@ -410,6 +424,9 @@ class ConsoleServer:
                 token = (await request.post()).get("token", "")
         except TimeoutError:
             raise web.HTTPRequestTimeout(text=f"no token received within {HEADERS_S:g} s\n") from None
+        except web.HTTPRequestEntityTooLarge:
+            await self._pace(request, self._requests)
+            raise
         return await self._enter(request, token.strip() if isinstance(token, str) else "")
 
     async def _sign_out(self, request: web.Request) -> web.StreamResponse:
@@ -831,6 +848,12 @@ def zip_of(files: dict[str, bytes]) -> bytes:
         for name, content in files.items():
             archive.writestr(name, content)
     return packed.getvalue()
+
+
+def _bearer(request: web.Request) -> str:
+    """Return the token in the header; empty if there is none."""
+    scheme, _, token = request.headers.get("Authorization", "").partition(" ")
+    return token.strip() if scheme.lower() == "bearer" else ""
 
 
 def _end_if_left(request: web.Request) -> None:
