@@ -1,8 +1,9 @@
 """Control channel of a node: read and change its parameters and log level while it runs.
 
 Each node process listens on ``RUN_DIR/nodes/<node>.sock`` (a Unix socket in a folder of mode 0700). A request is one
-line of JSON, ``{"op": "set", "values": {"rate_hz": 5.0}}``. The answer is one line too: ``{"ok": true, ...}`` or
-``{"ok": false, "error": "what is wrong", "kind": "parameter"}``. Separate threads answer, even while the node's own
+line of JSON, ``{"op": "set", "values": {"rate_hz": 5.0}}``; ``"yaml": {"label": "0123"}`` has values as YAML text. The
+answer is one line too: ``{"ok": true, ...}`` or ``{"ok": false, "error": "what is wrong", "kind": "parameter"}``.
+Separate threads answer, even while the node's own
 thread is in a long callback. Only a change has to wait for the node's thread; it is dropped if it waits too long.
 """
 
@@ -23,7 +24,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from instant_ic.bus import registry
 from instant_ic.bus.node import NodeError
 from instant_ic.config.parameter_info import ParameterInfo, plain
-from instant_ic.config.params import ParameterError
+from instant_ic.config.params import ParameterError, yaml_value
+from instant_ic.config.yaml_text import one_line
 
 if TYPE_CHECKING:
     from instant_ic.bus.node import Node
@@ -152,9 +154,10 @@ class ControlServer:
         return {"values": {info.name: info.value for info in self._node.parameters()}}
 
     def _set(self, request: dict[str, Any]) -> dict[str, Any]:
-        values = request.get("values")
-        if not isinstance(values, dict) or not values:
-            raise _RequestError('set needs "values": {key: value}')
+        values, texts = request.get("values", {}), request.get("yaml", {})
+        if not isinstance(values, dict) or not isinstance(texts, dict) or not (values or texts):
+            raise _RequestError('set needs "values": {key: value} or "yaml": {key: text}')
+        values |= {key: yaml_value(str(text), key) for key, text in texts.items()}
         return {"changed": self._on_node(lambda: self._node.set_parameters(values))}
 
     def _log_level(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -247,13 +250,15 @@ class NodeControl:
     def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Change several parameters together, or none; returns those whose value has changed.
 
+        Args:
+            values: plain values, or with the spelling of their scalars.
+
         Raises:
             ParameterError: a value is refused; the message says why.
             NodeBusyError: the node's thread is busy.
         """
-        changed: dict[str, Any] = self.request({"op": "set", "values": {k: plain(v) for k, v in values.items()}})[
-            "changed"
-        ]
+        texts = {key: one_line(plain(value)) for key, value in values.items()}
+        changed: dict[str, Any] = self.request({"op": "set", "yaml": texts})["changed"]
         return changed
 
     def log_level(self, level: str | None = None) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.names import find_type
 from instant_ic.config.params import ParameterError, yaml_value
+from instant_ic.config.scalars import READERS, Scalar, to_whole_number
 from instant_ic.msg import message_type, to_time, type_name, typestore
 
 _INTEGERS = {
@@ -20,6 +21,7 @@ _INTEGERS = {
     }.items()
 }
 _FLOATS = ("float32", "float64")
+_NOT_FINITE = tuple(f"{sign}{word}" for sign in ("", "+", "-") for word in (".inf", ".nan", "inf", "nan"))
 _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
 
 TIME = "builtin_interfaces/msg/Time"
@@ -68,9 +70,9 @@ def build(name: str, values: Any, now_ns: int, path: str = "") -> Any:
     """
     known = dict(fields(name))
     full = type_name(message_type(name))
-    if full == TIME and values == "now":
+    if full == TIME and _word(values) == "now":
         return to_time(now_ns)
-    if full == HEADER and values == "auto":
+    if full == HEADER and _word(values) == "auto":
         values = {"stamp": "now"}
     if not isinstance(values, dict):
         raise _misfit(path, f"a mapping with the fields of {full}", values)
@@ -131,24 +133,25 @@ def _value(kind: Any, value: Any, now_ns: int, path: str) -> Any:
     return parts
 
 
+def _word(values: Any) -> Any:
+    return values.text if isinstance(values, Scalar) else values
+
+
 def _scalar(base: str, most: int, value: Any, path: str) -> Any:
-    if base == "bool":
-        if isinstance(value, bool):
-            return value
-    elif base in ("string", "wstring"):
-        if isinstance(value, str):
-            if most and len(value) > most:
-                raise UserError(f"{path} must have at most {most} characters (got {len(value)})", 2)
-            return value
-    elif base in _FLOATS:
-        if isinstance(value, (int, float, str)) and not isinstance(value, bool):  # YAML 1.1 reads 1e-3 as a string
-            try:
-                return float(value)
-            except (ValueError, OverflowError):
-                raise _misfit(path, base, value) from None
-    elif isinstance(value, int) and not isinstance(value, bool):
+    kind = {"bool": bool, "string": str, "wstring": str}.get(base, float if base in _FLOATS else int)
+    if kind is float and isinstance(value, float):
+        return value
+    # A scan's range is infinite where nothing returns.
+    if kind is float and isinstance(value, Scalar) and value.text.lower() in _NOT_FINITE:
+        return float(value.text.replace(".", ""))
+    try:
+        found: Any = to_whole_number(value) if kind is int else READERS[kind](value)
+    except ValueError:
+        raise _misfit(path, base, value) from None
+    if kind is str and most and len(found) > most:
+        raise UserError(f"{path} must have at most {most} characters (got {len(found)})", 2)
+    if kind is int:
         low, high = _INTEGERS[base]
-        if low <= value <= high:
-            return value
-        raise _misfit(path, f"{base}, {low}..{high}", value)
-    raise _misfit(path, base, value)
+        if not low <= found <= high:
+            raise _misfit(path, f"{base}, {low}..{high}", value)
+    return found

@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
-import math
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -26,7 +25,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import yaml
 
 from instant_ic.config.ranges import Checked, Range, range_of
-from instant_ic.config.yaml_text import compose_yaml, construct, read_yaml
+from instant_ic.config.scalars import READERS, is_null
+from instant_ic.config.yaml_text import compose_yaml, read_spelled, resolved, spelled
 
 ConfigT = TypeVar("ConfigT")
 
@@ -65,16 +65,21 @@ class Value:
     """A value with its origin.
 
     Attributes:
-        value: as YAML gives it.
+        given: value with the spelling of its scalars (``yaml_text.spelled``), or a plain value.
         where: ``config/slam.yaml:12`` or ``-p key:=value``.
         file: the parameter file; None: the command line.
         shared: whether it comes from a ``/**`` section, which is for every node that has such a parameter.
     """
 
-    value: Any
+    given: Any
     where: str
     file: Path | None = None
     shared: bool = False
+
+    @property
+    def value(self) -> Any:
+        """Plain value, with the types that YAML 1.1 gives."""
+        return resolved(self.given)
 
 
 Values = dict[str, Value]
@@ -218,12 +223,12 @@ def _flatten(node: yaml.Node, prefix: str, path: Path, out: Values, shared: bool
             _flatten(value, f"{prefix}{key}.", path, out, shared)
         else:
             where = _where(path, value)
-            out[prefix + key] = Value(_construct(value, prefix + key, where), where, path, shared)
+            out[prefix + key] = Value(_spelled(value, prefix + key, where), where, path, shared)
 
 
-def _construct(node: yaml.Node, key: str, where: str) -> Any:
+def _spelled(node: yaml.Node, key: str, where: str) -> Any:
     try:
-        return construct(node)
+        return spelled(node)
     except yaml.YAMLError as error:
         raise ParameterError(Problem(f"{key}: the value is not YAML: {_one_line(error)}", where, key)) from error
 
@@ -233,7 +238,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def yaml_value(text: str, what: str) -> Any:
-    """Parse a value typed by the user.
+    """Parse a value typed by the user; its unquoted scalars keep their spelling.
 
     Args:
         text: YAML.
@@ -243,7 +248,7 @@ def yaml_value(text: str, what: str) -> Any:
         ParameterError: the text is not YAML.
     """
     try:
-        return read_yaml(text)
+        return read_spelled(text)
     except yaml.YAMLError as error:
         raise ParameterError(Problem(f"the value is not YAML: {_one_line(error)}", what)) from error
 
@@ -275,7 +280,7 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
     typed: dict[str, Any] = {}
     for key, value in values.items():
         try:
-            typed[key] = _coerce(value.value, _type_of(config_class, key), key)
+            typed[key] = typed_value(config_class, key, value.given)
         except _UnknownError as error:
             if not value.shared:
                 problems.append(Problem(str(error), value.where, key))
@@ -296,6 +301,18 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
     if problems:
         raise ParameterError(*problems)
     return config
+
+
+def typed_value(config_class: type[Any], key: str, given: Any) -> Any:
+    """A parameter's value by its declared type and range.
+
+    Raises:
+        ValueError: there is no such parameter, or the value does not fit it.
+    """
+    try:
+        return _coerce(given, _type_of(config_class, key), key)
+    except yaml.YAMLError as error:
+        raise _RefusedError(f"{key}: the value is not YAML: {_one_line(error)}") from None
 
 
 def _required(config_class: type[Any]) -> set[str]:
@@ -380,32 +397,24 @@ def _coerce(value: Any, hint: Any, key: str) -> Any:
         return plain
     if origin in (typing.Union, UnionType):
         options = get_args(hint)
-        if value is None and NoneType in options:
+        if is_null(value) and NoneType in options:
             return None
         return _coerce(value, next(o for o in options if o is not NoneType), key)
     if origin is typing.Literal:
-        if value in get_args(hint):
-            return value
+        for option in get_args(hint):
+            with suppress(ValueError):
+                if READERS[type(option)](value) == option:
+                    return option
         raise _RefusedError(f"{key} must be one of {', '.join(map(str, get_args(hint)))} (got {value!r})")
-    if hint is bool and isinstance(value, bool):
-        return value
-    if hint is int and isinstance(value, int) and not isinstance(value, bool):
-        if not -(1 << 63) <= value < 1 << 63:
-            raise _RefusedError(f"{key} must have at most 64 bits, as in ROS 2 (got {value})")
-        return value
-    if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        with suppress(OverflowError):  # of a huge int
-            if math.isfinite(number := float(value)):
-                return number
-        raise _RefusedError(f"{key} must be a finite number (got {value})")
-    if hint is str and isinstance(value, (str, int, float)) and not isinstance(value, bool):
-        return str(value)
-    if hint is Path and isinstance(value, str):
-        return Path(value)
+    if hint in READERS:
+        try:
+            return READERS[hint](value)
+        except ValueError as error:
+            raise _RefusedError(f"{key} {error} (got {value!r})") from None
     if origin in (tuple, list) and isinstance(value, list):
         return _coerce_sequence(value, origin, get_args(hint), key)
     if hint is Any:
-        return value
+        return resolved(value)
     wanted = getattr(hint, "__name__", str(hint)) if origin is None else str(hint)
     raise _RefusedError(f"{key} must be {wanted} (got {value!r})")
 

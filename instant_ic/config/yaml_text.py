@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 
 import yaml
 
+from instant_ic.config.scalars import Scalar
+
 T = TypeVar("T")
 # What PyYAML lets through for a value that does not fit its type, such as `!!int "_"`.
 _STRAY = (ValueError, TypeError, AttributeError, IndexError, KeyError, OverflowError)
@@ -35,6 +37,26 @@ class _Loader(yaml.SafeLoader):
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
+class _SpelledLoader(_Loader):
+    """Keeps the spelling of unquoted scalars; keys of mappings are text."""
+
+    def construct_object(self, node: Any, deep: bool = False) -> Any:
+        if isinstance(node, yaml.ScalarNode) and not node.style and node.tag == _implicit_tag(node.value):
+            return Scalar(node.value)
+        return super().construct_object(node, deep)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        found = super().construct_mapping(node, deep)
+        return {key.text if isinstance(key, Scalar) else key: value for key, value in found.items()}
+
+
+def _implicit_tag(text: str) -> str:
+    return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))
+
+
+_RESOLVER = yaml.SafeLoader("")
+
+
 def read_yaml(text: str) -> Any:
     """The plain value of a YAML document.
 
@@ -43,6 +65,16 @@ def read_yaml(text: str) -> Any:
     """
     root = compose_yaml(text)
     return None if root is None else construct(root)
+
+
+def read_spelled(text: str) -> Any:
+    """The value of a YAML document whose unquoted scalars keep their spelling; see :func:`spelled`.
+
+    Raises:
+        yaml.YAMLError: see :func:`read_yaml`.
+    """
+    root = compose_yaml(text)
+    return Scalar("") if root is None else spelled(root)
 
 
 def compose_yaml(text: str) -> yaml.Node | None:
@@ -66,21 +98,58 @@ def construct(node: yaml.Node) -> Any:
     Raises:
         yaml.YAMLError: a value does not fit its type.
     """
-    loader = _Loader("")
+    return _constructed(node, _Loader(""))
+
+
+def spelled(node: yaml.Node) -> Any:
+    """The value of a node: lists, mappings with text as keys, :class:`Scalar`, and plain values of what is quoted.
+
+    Raises:
+        yaml.YAMLError: a value does not fit its tag.
+    """
+    return _constructed(node, _SpelledLoader(""))
+
+
+def _constructed(node: yaml.Node, loader: _Loader) -> Any:
     try:
         return _checked(lambda: loader.construct_object(node, deep=True))
     finally:
         loader.dispose()
 
 
+def resolved(value: Any) -> Any:
+    """A spelled value with the types that YAML 1.1 gives its scalars.
+
+    Raises:
+        yaml.YAMLError: a scalar does not fit its type, such as a date in month 13.
+    """
+    if isinstance(value, Scalar):
+        return construct(yaml.ScalarNode(_implicit_tag(value.text), value.text))
+    if isinstance(value, list):
+        return [resolved(part) for part in value]
+    return {key: resolved(part) for key, part in value.items()} if isinstance(value, dict) else value
+
+
 def dump_yaml(value: object, **style: Any) -> str:
-    """``yaml.safe_dump`` with keys in their order; by the C emitter where there is one."""
-    if (fast := getattr(yaml, "CSafeDumper", None)) is not None:
-        try:
-            return str(yaml.dump(value, Dumper=fast, sort_keys=False, **style))
-        except UnicodeEncodeError:  # half a surrogate pair, from a file name that is not UTF-8; Python escapes it
-            pass
-    return str(yaml.safe_dump(value, sort_keys=False, **style))
+    """``yaml.safe_dump`` with keys in their order; by the C emitter where there is one. Scalars keep their spelling."""
+    try:
+        return str(yaml.dump(value, Dumper=_FastDumper, sort_keys=False, **style))
+    except UnicodeEncodeError:  # half a surrogate pair, from a file name that is not UTF-8; Python escapes it
+        return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, **style))
+
+
+class _Dumper(yaml.SafeDumper):
+    pass
+
+
+class _FastDumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    pass
+
+
+for _dumper in (_Dumper, _FastDumper):
+    _dumper.add_representer(
+        Scalar, lambda dumper, scalar: dumper.represent_scalar(_implicit_tag(scalar.text), scalar.text)
+    )
 
 
 def one_line(value: object) -> str:

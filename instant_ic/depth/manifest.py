@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import yaml
 
-from instant_ic.config.yaml_text import compose_yaml, construct
+from instant_ic.config.scalars import READERS
+from instant_ic.config.yaml_text import compose_yaml, resolved, spelled
 from instant_ic.depth.scaler import OUTPUT_KINDS
 
 MOST_PIXELS = 16384
@@ -100,14 +102,14 @@ class ModelManifest:
     def __post_init__(self) -> None:
         for field in fields(self):
             if field.type == "str" and not isinstance(getattr(self, field.name), str):
-                raise ValueError(f"{field.name} must be text (got {_shown(getattr(self, field.name))})")
+                raise ValueError(f"{field.name} must be text (got {getattr(self, field.name)!r})")
         for key in ("model", "name", "licence"):
             if not getattr(self, key):
                 raise ValueError(f"{key} must not be empty")
         for key in ("input_height", "input_width"):
             value = getattr(self, key)
             if not isinstance(value, int) or isinstance(value, bool) or not 16 <= value <= MOST_PIXELS:
-                raise ValueError(f"{key} must be a whole number from 16 to {MOST_PIXELS} (got {_shown(value)})")
+                raise ValueError(f"{key} must be a whole number from 16 to {MOST_PIXELS} (got {value!r})")
         if not 1.5 <= self.input_width / self.input_height <= 2.5:
             raise ValueError(f"input_width must be about twice input_height: 360° by 180° (got {self.input_width} x "
                              f"{self.input_height})")  # fmt: skip
@@ -117,18 +119,18 @@ class ModelManifest:
         for key in ("mean", "std"):
             values = getattr(self, key)
             if not isinstance(values, (list, tuple)) or len(values) != 3 or not all(map(_is_number, values)):
-                raise ValueError(f"{key} must be three numbers (got {_shown(values)})")
+                raise ValueError(f"{key} must be three numbers (got {values!r})")
             object.__setattr__(self, key, tuple(float(value) for value in values))
         if min(self.std) <= 0:
             raise ValueError(f"std must be above 0 (got {self.std})")
         for key in ("input_scale", "output_scale", "min_range_m", "max_range_m"):
             value = getattr(self, key)
             if not _is_number(value) or value <= 0:
-                raise ValueError(f"{key} must be a number above 0 (got {_shown(value)})")
+                raise ValueError(f"{key} must be a number above 0 (got {value!r})")
         if not _is_number(self.mask_threshold):
-            raise ValueError(f"mask_threshold must be a number (got {_shown(self.mask_threshold)})")
+            raise ValueError(f"mask_threshold must be a number (got {self.mask_threshold!r})")
         if not _is_number(self.brightness) or not 0 <= self.brightness < 255:
-            raise ValueError(f"brightness must be a number from 0 to under 255 (got {_shown(self.brightness)})")
+            raise ValueError(f"brightness must be a number from 0 to under 255 (got {self.brightness!r})")
         if self.max_range_m <= self.min_range_m:
             raise ValueError(f"max_range_m must be above min_range_m (got {self.max_range_m}, {self.min_range_m})")
         if self.output_form != "depth" and self.output_kind not in ("metric", "scale_invariant"):
@@ -151,11 +153,17 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300
 
 
-def _shown(value: Any) -> str:
-    """The value for an error message; notes that YAML reads ``1e-3`` as text, not as a number."""
-    if isinstance(value, str) and re.fullmatch(r"[+-]?\d+e[+-]?\d+", value, re.IGNORECASE):
-        return f"the text {value!r}: YAML wants a point in it, as in 1.0e-3"
-    return repr(value)
+_TYPES = {key: hint if hint in READERS else float for key, hint in get_type_hints(ModelManifest).items()}
+"""Type of each value, or of the entries of a list."""
+
+
+def _typed(kind: type, value: Any) -> Any:
+    """A spelled value by its type; what does not fit stays as YAML reads it, and the manifest refuses it."""
+    if isinstance(value, list):
+        return [_typed(kind, part) for part in value]
+    with suppress(ValueError):
+        return READERS[kind](value)
+    return resolved(value)
 
 
 def manifest_path(model: str | Path) -> Path:
@@ -175,7 +183,7 @@ def load_manifest(path: str | Path) -> ModelManifest:
     try:
         text = path.read_text(encoding="utf-8")
         root = compose_yaml(text)
-        values = None if root is None else construct(root)
+        values = None if root is None else spelled(root)
     except (yaml.YAMLError, ValueError) as error:
         raise ManifestError(f"{path}: not YAML: {error}") from error
     except OSError as error:
@@ -196,8 +204,8 @@ def load_manifest(path: str | Path) -> ModelManifest:
     if missing := [key for key in REQUIRED if key not in values]:
         raise ManifestError(f"{path}: missing key {', '.join(missing)}")
     try:
-        return ModelManifest(**values)
-    except ValueError as error:
+        return ModelManifest(**{key: _typed(_TYPES[key], value) for key, value in values.items()})
+    except (ValueError, yaml.YAMLError) as error:
         line = lines.get(str(error).split()[0], 0)
         raise ManifestError(f"{path}:{line}: {error}" if line else f"{path}: {error}") from None
 

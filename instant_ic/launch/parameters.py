@@ -44,8 +44,8 @@ class _Node:
     words: tuple[str, ...]
     at: str
     places: Mapping[str, str]
-    shared: Mapping[str, tuple[Any, str, str]]
-    """Value, place and file of each parameter that a ``/**`` section sets for the nodes of this run directory."""
+    shared: Mapping[str, tuple[str, str, str]]
+    """Value as YAML, place and file of each parameter that a ``/**`` section sets for this run directory."""
     own_programs: bool
     """Whether the stack has nodes that are not checked."""
 
@@ -118,18 +118,19 @@ def _files(words: Sequence[str]) -> list[Path]:
     return [Path(word) for option, word in itertools.pairwise(words) if option == "--params-file"]
 
 
-def _shared(specs: Sequence[NodeSpec]) -> dict[str, dict[str, tuple[Any, str, str]]]:
+def _shared(specs: Sequence[NodeSpec]) -> dict[str, dict[str, tuple[str, str, str]]]:
     """The ``/**`` values of each run directory; the first node with a value decides, so that others can differ."""
     from instant_ic.config.params import PROCESS_KEYS, SHARED, ParameterError, load_sections
+    from instant_ic.config.yaml_text import one_line
 
     sections = functools.cache(load_sections)
-    found: dict[str, dict[str, tuple[Any, str, str]]] = {}
+    found: dict[str, dict[str, tuple[str, str, str]]] = {}
     for spec in specs:
-        own: dict[str, tuple[Any, str, str]] = {}
+        own: dict[str, tuple[str, str, str]] = {}
         for file in _files(_words(spec)):
             with suppress(ParameterError):  # the check of the node reports it
                 for key, value in sections(file).get(SHARED, {}).items():
-                    own[key] = (value.value, value.where, str(file))
+                    own[key] = (one_line(value.given), value.where, str(file))
         values = found.setdefault(spec.group, {})
         values.update({key: value for key, value in own.items() if key not in values and key not in PROCESS_KEYS})
     return found
@@ -274,14 +275,18 @@ def _problems(node: _Node) -> list[str]:
 def _contradictions(node: _Node, values: Values, config: Any) -> list[str]:
     """Values that differ from the one shared by the nodes, unless stated beside it or on the node's own entry."""
     from instant_ic.config.parameter_info import plain
-    from instant_ic.config.params import flatten, to_dict
+    from instant_ic.config.params import flatten, to_dict, typed_value, yaml_value
 
     problems: list[str] = []
     effective = flatten(to_dict(config))
     for key, (wanted, place, file) in node.shared.items():
         value = values.get(key)
-        if key not in effective or (got := plain(effective[key])) == wanted or str(got) == str(wanted):
+        if key not in effective:
             continue
+        got = plain(effective[key])
+        with suppress(ValueError):  # the node that takes it reports it
+            if got == plain(typed_value(type(config), key, yaml_value(wanted, place))):
+                continue
         if value is None:
             problems.append(
                 f"{node.at}: node {node.label}: {key} is {got}, its default, but {place} sets {wanted} for the other "

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from instant_ic.config.yaml_text import compose_yaml, construct
+from instant_ic.config.yaml_text import compose_yaml, spelled
 
 _NO_VALUE = "tag:yaml.org,2002:null"
 
@@ -112,10 +112,10 @@ class Value:
                 self.problem(f"{name!r} is missing")
         return found
 
-    def plain(self) -> object:
-        """The value as plain Python objects; None, with the problem noted, if it does not fit its type."""
+    def spelled(self) -> object:
+        """The value with the spelling of its scalars; None, with the problem noted, if it does not fit its tag."""
         try:
-            return construct(self.node)
+            return spelled(self.node)
         except yaml.YAMLError as error:
             self.problem(f"not YAML: {error}")
             return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +62,7 @@ def read_topic_rates(file: Path) -> dict[str, TopicRate]:
     Raises:
         TopicTableError: all mistakes: an unreadable file, an unknown key, or a rate that is not a number > 0.
     """
+    from instant_ic.config.scalars import to_float
     from instant_ic.launch.source import Problem, load
 
     problems: list[Problem] = []
@@ -69,13 +71,16 @@ def read_topic_rates(file: Path) -> dict[str, TopicRate]:
     for topic, entry in root.fields().items() if root is not None else ():
         fields = entry.fields(known=("rate_hz", "when"), required=("rate_hz",))
         rate, when = fields.get("rate_hz"), fields.get("when")
-        number = rate.plain() if rate is not None else 1
-        if not isinstance(number, int | float) or isinstance(number, bool) or not 0 < number < math.inf:
-            entry.problem(f"{topic}: rate_hz must be a number > 0 (got {number!r})")
+        given = rate.spelled() if rate is not None else 1
+        number = 0.0
+        with suppress(ValueError):
+            number = to_float(given)
+        if number <= 0:
+            entry.problem(f"{topic}: rate_hz must be a number > 0 (got {given!r})")
         elif not topic.startswith("/"):
             entry.problem(f"topic {topic!r} must begin with /")
         else:
-            rates[topic] = TopicRate(float(number), (when.text() if when is not None else "") or "")
+            rates[topic] = TopicRate(number, (when.text() if when is not None else "") or "")
     if problems:
         raise TopicTableError("\n".join(map(str, problems)))
     return rates

@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping
 
 import yaml
 
-from instant_ic.config.yaml_text import read_yaml
+from instant_ic.config.scalars import Scalar, is_null
+from instant_ic.config.yaml_text import read_spelled
 from instant_ic.launch.source import Value
 from instant_ic.launch.substitutions import MOST_TEXT, Context, SubstitutionError, has_substitution, substitute, truth
 
@@ -104,7 +105,7 @@ def pairs_of(value: Value | None, first: str, second: str, context: Context) -> 
 
 
 def parameter_value(value: Value, kind: str, context: Context) -> object:
-    """The value of a parameter, of the given type, or as YAML reads it."""
+    """The value of a parameter, of the given type, or with the spelling of its unquoted scalars."""
     if value.is_list or value.is_mapping:
         return _texts_replaced(value, context)
     text = text_of(value, context)
@@ -115,7 +116,7 @@ def parameter_value(value: Value, kind: str, context: Context) -> object:
         "int": int,
         "float": float,
         "bool": truth,
-        "": read_yaml,
+        "": read_spelled,
     }
     if kind not in readers:
         value.problem(f"unknown type {kind!r} (types: str, int, float, bool)")
@@ -136,12 +137,12 @@ def _texts_replaced(value: Value, context: Context) -> object:
 
     def read(plain: object) -> object:
         nonlocal length
-        if isinstance(plain, str):
-            text = replaced(plain, value, context) or ""
+        if isinstance(plain, (str, Scalar)) and not is_null(plain):
+            text = replaced(str(plain), value, context) or ""
             length += len(text)
             if length > MOST_TEXT:  # 300 bytes of aliases can stand for 100 000 uses of a long text
                 raise OverflowError
-            return text
+            return Scalar(text) if text and isinstance(plain, Scalar) else text
         if isinstance(plain, list):
             return [read(entry) for entry in plain]
         if isinstance(plain, dict):
@@ -149,7 +150,7 @@ def _texts_replaced(value: Value, context: Context) -> object:
         return plain
 
     try:
-        return read(value.plain())
+        return read(value.spelled())
     except OverflowError:
         value.problem(f"its texts have more than {MOST_TEXT} characters, each alias counted where it is used")
         return None

@@ -6,13 +6,15 @@ The image follows map_saver and map_server (nav2): 0 occupied, 254 free, 205 unk
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.yaml_text import read_yaml
+from instant_ic.config.scalars import to_float
+from instant_ic.config.yaml_text import read_spelled, resolved
 from instant_ic.limits import check_arrays, load_image
 from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.occupancy import OccupancyGrid
@@ -92,7 +94,7 @@ def load_grid(path: Path) -> OccupancyGrid:
 
     path = path if path.suffix in (".yaml", ".yml") else path.with_name(path.name + ".yaml")
     try:
-        content = read_yaml(path.read_text())
+        content = read_spelled(path.read_text())
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise MapError(f"map {path} cannot be read: {error}") from None
     if not isinstance(content, dict):
@@ -105,15 +107,12 @@ def load_grid(path: Path) -> OccupancyGrid:
     if not 0 <= free < occupied <= 1:
         raise MapError(f"{path}: need 0 <= free_thresh < occupied_thresh <= 1 (got {free}, {occupied})")
     origin = content.get("origin")
-    if not (
-        isinstance(origin, list)
-        and len(origin) >= 2
-        and all(isinstance(v, int | float) and abs(v) < _MOST_NUMBER for v in origin)
-    ):
+    if not isinstance(origin, list) or len(origin) < 2:
         raise MapError(f"{path}: origin must be [x, y, yaw] (got {origin!r})")
+    origin = [_checked_number(f"{path}: origin", part) for part in origin]
     if len(origin) > 2 and abs(origin[2]) > 1e-6:
         raise MapError(f"{path}: a rotated map (origin yaw {origin[2]}) is not supported: rotate the image instead")
-    mode = content.get("mode", "trinary")
+    mode = str(content.get("mode", "trinary"))
     if mode not in ("trinary", "scale", "raw"):
         raise MapError(f"{path}: mode must be trinary, scale or raw (got {mode!r})")
     image = path.parent / str(content.get("image", ""))
@@ -132,9 +131,10 @@ def load_grid(path: Path) -> OccupancyGrid:
         known = grey <= 100
         values[known] = grey[known].astype(np.int8)
         return OccupancyGrid(values, resolution, np.array(origin[:2], dtype=np.float64))
-    share = grey / 255 if content.get("negate") else (255 - grey) / 255
+    negate = resolved(content.get("negate"))
+    share = grey / 255 if negate else (255 - grey) / 255
     # Grey 205 is unknown, whatever the threshold: nav2 writes 0.25, which would make it free.
-    unknown = (grey == 205) & (not content.get("negate"))
+    unknown = (grey == 205) & (not negate)
     values[(share < free) & ~unknown] = 0
     values[share > occupied] = 100
     if mode == "scale":
@@ -148,10 +148,14 @@ _MOST_NUMBER = 1e9
 
 
 def _number(path: Path, content: dict[str, Any], key: str, default: float | None) -> float:
-    value = content.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _MOST_NUMBER:
-        raise MapError(f"{path}: {key} must be a number (got {value!r})")
-    return float(value)
+    return _checked_number(f"{path}: {key}", content.get(key, default))
+
+
+def _checked_number(what: str, value: Any) -> float:
+    with suppress(ValueError):
+        if abs(number := to_float(value)) < _MOST_NUMBER:
+            return number
+    raise MapError(f"{what} must be a number (got {value!r})")
 
 
 def occupied_points(grid: OccupancyGrid) -> FloatArray:

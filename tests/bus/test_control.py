@@ -22,6 +22,7 @@ from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.control import ControlError, ControlServer, NodeBusyError, NodeControl
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.config.params import yaml_value
 from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.msg import deserialize
 
@@ -134,11 +135,19 @@ def test_set_is_taken_on_the_nodes_thread_and_told(tuned):
     assert event.changed_parameters[1].value.double_value == 1.0
 
 
+def test_a_value_typed_by_hand_is_read_by_the_type_of_its_parameter(tuned):
+    node, client = tuned
+    client.set({"label": yaml_value("0123", "label"), "inner.gain": yaml_value("5e-01", "inner.gain")})
+    assert node.config.label == "0123" and node.config.inner.gain == 0.5
+    client.request({"op": "set", "values": {"inner.gain": 0.25}, "yaml": {"label": "1:30"}})
+    assert node.config.label == "1:30" and node.config.inner.gain == 0.25
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [
         ({"inner.gain": 1.5}, r"tuned: inner.gain must lie in 0..1 \(got 1.5\)"),
-        ({"inner.gain": float("nan")}, r"inner.gain must be a finite number \(got nan\)"),
+        ({"inner.gain": float("nan")}, r"inner.gain must be a finite number \(got .nan\)"),
         ({"rate_hz": 0}, r"rate_hz must be > 0 \(got 0\)"),
         ({"rate_hz": "fast"}, r"rate_hz must be float \(got 'fast'\)"),
         ({"inner.gian": 0.1}, "unknown parameter 'inner.gian'; did you mean 'inner.gain'"),

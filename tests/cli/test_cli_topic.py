@@ -232,7 +232,7 @@ def test_auto_and_now():
 
 
 def test_arrays_are_of_the_types_that_the_message_has():
-    scan = build("LaserScan", {"ranges": [1, 2.5, float("inf"), "1e-3"]}, 0)
+    scan = build("LaserScan", parse("{ranges: [1, 2.5, .inf, 1e-3]}", "LaserScan"), 0)
     assert scan.ranges.dtype == np.float32 and scan.ranges[3] == np.float32(1e-3)
     with pytest.raises(UserError, match=r"pose\.covariance must have 36 values"):
         build("Odometry", {"pose": {"covariance": [1, 2]}}, 0)

@@ -134,7 +134,7 @@ launch:
         str(program),
         *("--name", "t1", "--params-file", str(tmp_path / "params.yaml")),
         *("-p", "port:=80", "-p", "label:='80'", "-p", "quoted:='12'", "-p", "url:=http://host:80"),
-        *("-p", "nothing:=''", "-p", "list:=[1, '80']", "-r", "/scan:=/other", "--log-level", "very loud"),
+        *("-p", "nothing:=''", "-p", "list:=[1, 80]", "-r", "/scan:=/other", "--log-level", "very loud"),
     )
     assert node.env == {"OMP_NUM_THREADS": "1"}
     assert (node.respawn, node.respawn_delay_s, node.required) == (True, 2.5, True)

@@ -170,7 +170,7 @@ def load(args: argparse.Namespace) -> int:
     values = params.load_file(args.file, name)
     if not values:
         raise UserError(f"{args.file} has no parameters for {name} (it must have a section {name!r} or '/**')", 2)
-    return _change(name, {key: value.value for key, value in values.items()})
+    return _change(name, {key: value.given for key, value in values.items()})
 
 
 def _show(value: Any) -> str:

@@ -6,6 +6,7 @@ import os
 import re
 import string
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -15,6 +16,8 @@ import yaml
 
 from instant_ic.config.params import ParameterError, Value, build
 from instant_ic.config.ranges import Range
+from instant_ic.config.scalars import to_bool
+from instant_ic.config.yaml_text import read_spelled
 from instant_ic.private import make_folder, open_file
 
 CONDITIONS = ("ic", "stop", "shared", "mesh")
@@ -187,7 +190,7 @@ def load(folder: Path) -> Study:
     """
     path = folder / "study.yaml"
     try:
-        raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+        raw = read_spelled(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise StudyError(f"{path} does not exist: create a study with `ic study new {folder}`") from None
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -206,7 +209,7 @@ def load(folder: Path) -> Study:
         _build(Study, raw, str(path)),
         folder=folder,
         participants={str(code): tuple(map(str, order)) for code, order in parts["participants"].items()},
-        arguments=parts["arguments"],
+        arguments={key: _argument(value) for key, value in parts["arguments"].items()},
         texts={str(key): str(value) for key, value in parts["texts"].items()},
         questionnaires=tuple(
             _questionnaire(one, f"{path}: questionnaires[{n}]") for n, one in enumerate(parts["questionnaires"])
@@ -214,6 +217,13 @@ def load(folder: Path) -> Study:
     )
     _check(study, path)
     return study
+
+
+def _argument(value: Any) -> Any:
+    """A launch argument: a truth value, or text in its spelling."""
+    with suppress(ValueError):
+        return to_bool(value)
+    return str(value)
 
 
 def _build(kind: type[T], raw: Any, where: str) -> T:
