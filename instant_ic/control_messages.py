@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from instant_ic.bus import Latest
 from instant_ic.bus.clock import Clock
+from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter import Decision
 from instant_ic.control.estop import KeptEstop
 from instant_ic.control.freshness import TimeoutConfig
@@ -26,6 +27,7 @@ from instant_ic.msg import (
     ControlState,
     MessageError,
     Odometry,
+    PoseIntegrity,
     ShownPictures,
     TwistStamped,
     VspaceStatus,
@@ -132,9 +134,12 @@ class ArbiterInbox:
         pose, velocity = surroundings.robot_pose(), self._twist("odometry")
         vbot, status = self.sources["vbot"].message, self.vspace.message
         report = page_report(self.shown.message)
+        trust = None if self.integrity is None else self.integrity.message
         return ArbiterInputs(
             robot_pose=pose,
-            pose_lost_probability=self._pose_lost_probability(),
+            pose_lost_probability=_pose_lost_probability(trust),
+            contradiction=Contradiction.NONE if trust is None else Contradiction(trust.contradiction),
+            contradictions=0 if trust is None else int(trust.contradictions),
             robot_velocity=velocity,
             operator_command=self._twist("command"),
             operator_gone=self.operator_gone(),
@@ -161,11 +166,6 @@ class ArbiterInbox:
     def _twist(self, key: str) -> tuple[float, float]:
         message = self.sources[key].message
         return (0.0, 0.0) if message is None else twist_values(message)
-
-    def _pose_lost_probability(self) -> float:
-        message = None if self.integrity is None else self.integrity.message
-        probability = 0.0 if message is None else float(message.lost_probability)
-        return probability if 0.0 <= probability <= 1.0 else 1.0  # NaN too: such a report is no reason to drive on
 
     def _arrived_ns(self, latest: Latest) -> int:
         return self.clock.steady_ns() - round(latest.age_s * 1e9)
@@ -214,6 +214,11 @@ def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> Con
         vbot_limit_m_s=decision.vbot_limit_m_s,
         reason_code=int(decision.reason_code),
     )
+
+
+def _pose_lost_probability(trust: PoseIntegrity | None) -> float:
+    probability = 0.0 if trust is None else float(trust.lost_probability)
+    return probability if 0.0 <= probability <= 1.0 else 1.0  # NaN too: such a report is no reason to drive on
 
 
 def _age_s(latest: Latest) -> float:

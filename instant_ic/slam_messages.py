@@ -46,9 +46,9 @@ def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> t
         raise ScanError(f"the scan cannot be used: {error}") from None
 
 
-def integrity_message(result: SlamResult, map_frame: str, stamp: int) -> Any:
-    """PoseIntegrity after a scan."""
-    trust = result.integrity
+def integrity_message(slam: GridSlam, result: SlamResult, map_frame: str, stamp: int) -> Any:
+    """PoseIntegrity after a scan, of which ``result`` is the result."""
+    trust, found = result.integrity, slam.contradiction
     return PoseIntegrity(
         header=header(map_frame, stamp),
         lost_probability=trust.lost_probability,
@@ -56,6 +56,8 @@ def integrity_message(result: SlamResult, map_frame: str, stamp: int) -> Any:
         heading_bound_rad=trust.heading_bound_rad,
         localized=result.localized,
         status=result.status.value,
+        contradiction=int(found.state),
+        contradictions=found.count,
     )
 
 

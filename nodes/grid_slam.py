@@ -102,7 +102,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         result = slam.process(queued.scan, odometry, queued.base_from_laser)
         self.diagnose_all(*diagnoses(slam, result, odometry is not None, config.use_wheel_odom))
         self.placed_ns = stamp
-        self.integrity_out.publish(slam_messages.integrity_message(result, config.map_frame, stamp))
+        self.integrity_out.publish(slam_messages.integrity_message(slam, result, config.map_frame, stamp))
         for parent, child, matrix in transforms(slam, self.limiter, config, stamp, odometry is not None):
             self.tf_broadcast(parent, child, matrix, stamp)
         if slam.in_map_frame:

@@ -93,6 +93,7 @@ class Arbiter:
         self._yaw_gap_before = 0.0  # in the previous step
         self._stopped_for_pose = False  # since the pose was last trusted
         self._poses_before: dict[str, tuple[NDArray[np.float64], int]] = {}  # by robot, and when: the previous step
+        self._contradictions = 0  # those that the robot has been stopped for
         self._stopped_by = Notice(Reason.STARTING, "waiting for the sensors")
         self._awaits_operator = False  # STOPPED because the operator's link was lost
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
@@ -127,6 +128,8 @@ class Arbiter:
             # The driven robot has changed, and with it prediction and gap.
             snapshot = self._assess(inputs, now_ns)
         self._yaw_gap_before = snapshot.yaw_gap_rad
+        if self.mode == Mode.STOPPED:
+            self._contradictions = inputs.contradictions
         sent = self.rules.command(snapshot, self._stopped_by)
         # Letting go of the key during hard braking does not make it softer.
         self._hard = sent.twist == NO_MOTION and (self._hard or sent.hard)
@@ -216,6 +219,7 @@ class Arbiter:
         self._slow_since_ns = _kept(self._slow_since_ns, now_ns) if slow else None
         trust, lost = self.config.pose_trust, inputs.pose_lost_probability
         self._stopped_for_pose = self._stopped_for_pose and lost >= trust.slow
+        self._contradictions = min(self._contradictions, inputs.contradictions)  # a new SLAM counts from 0
         snapshot = Snapshot(
             config=self.config,
             predictor=self.predictor,
@@ -244,6 +248,7 @@ class Arbiter:
             slow_s=self._since_s(self._slow_since_ns, now_ns, 0.0),
             pose_lost=lost >= trust.stop and not self._stopped_for_pose,
             pose_jumped=self._jumps("r-bot", inputs.robot_pose, now_ns),
+            contradicted=inputs.contradictions > self._contradictions,
             vbot_jumped=self._vbot_jumps(vbot, now_ns),
         )
         self._no_view_fits = self._no_view_fits and not _may_enter_again(snapshot)

@@ -95,6 +95,8 @@ class CommandRules:
         if not blocked and s.pose_doubtful:
             text = "the robot is not sure of its place: drive slowly, by the camera, until it is recognized"
             notice = Notice(notice.reason, text)
+        elif not blocked and s.must_be_slow:
+            notice = Notice(notice.reason, f"{s.inputs.contradiction.text}; slow until they agree")
         elif not blocked:
             notice = Notice(notice.reason, notice.text + self.sources.slowed(s.inputs, s.mode, abs(command[0])))
         sent = self.monitored(paced, s.inputs)
@@ -127,7 +129,7 @@ class CommandRules:
     def _paced(self, command: Twist2, s: Snapshot) -> Twist2:
         """The command slowed to what the image rate and the trust in the pose allow, with the same curvature."""
         limit = self.sources.speed_limit_m_s(s.inputs, s.mode)
-        if s.pose_doubtful:
+        if s.must_be_slow:
             limit = min(limit, self.config.pose_trust.speed_m_s)
         factor = min(1.0, limit / max(abs(command[0]), 1e-9))
         return command[0] * factor, command[1] * factor

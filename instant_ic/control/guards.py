@@ -34,6 +34,10 @@ def pose_lost(s: Snapshot) -> bool:
     return s.pose_lost or s.pose_jumped or s.vbot_jumped
 
 
+def contradicted(s: Snapshot) -> bool:
+    return s.contradicted
+
+
 def vspace_lost(s: Snapshot) -> bool:
     return s.inputs.vspace.failed or min(s.inputs.age("vspace"), s.in_mode_s) > s.config.timeouts.vspace
 
@@ -167,6 +171,8 @@ def against_switch(s: Snapshot) -> Notice | None:
     assert inputs.robot_pose is not None
     if s.pose_doubtful:
         return Notice(Reason.POSE_DOUBTFUL, "the robot is not sure of its place")
+    if s.inputs.contradiction:
+        return Notice(Reason.CONTRADICTION, s.inputs.contradiction.text)
     if abs(s.command[0]) < MIN_SWITCH_SPEED_M_S:
         return Notice(Reason.NO_ROOM_TO_TURN, "there is no room to turn")
     if inputs.age("vspace") > s.config.timeouts.vspace:
@@ -207,6 +213,8 @@ def stop_notice(s: Snapshot) -> Notice:
         return Notice(Reason.POSE_LOST, "the robot has lost its place")
     if s.pose_jumped:
         return Notice(Reason.POSE_LOST, "the robot's place on the map has jumped; check where it stands")
+    if s.contradicted:
+        return Notice(Reason.CONTRADICTION, s.inputs.contradiction.text)
     if s.vbot_jumped:
         return Notice(Reason.VBOT_STALE, "the v-bot's place on the map has jumped")
     if s.inputs.vspace.failed:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.moving import NOTHING_MOVES, MovingPoints
@@ -45,6 +46,10 @@ class ArbiterInputs:
     """(3,) map_from_base of the r-bot; None while unknown."""
     pose_lost_probability: float = 0.0
     """0..1, that the r-bot is somewhere else; 0 without a report."""
+    contradiction: Contradiction = Contradiction.NONE
+    """Between wheels and LiDAR; until they have agreed again."""
+    contradictions: int = 0
+    """Number of contradictions that the SLAM has reported."""
     robot_velocity: Twist2 = (0.0, 0.0)
     operator_command: Twist2 = (0.0, 0.0)
     operator_gone: bool = False
@@ -139,6 +144,8 @@ class Snapshot:
     """The SLAM is lost, and the robot has not been stopped for it yet."""
     pose_jumped: bool = False
     """The r-bot's pose has jumped since the previous step."""
+    contradicted: bool = False
+    """Wheels and LiDAR contradict each other, and the robot has not been stopped for it yet."""
     vbot_jumped: bool = False
     """As ``pose_jumped``: the r-bot would follow the v-bot to a place where nobody drove it."""
     no_view_fits: bool = False
@@ -153,6 +160,11 @@ class Snapshot:
     def pose_doubtful(self) -> bool:
         """Whether the r-bot must drive slowly because its pose may be wrong."""
         return self.inputs.pose_lost_probability >= self.config.pose_trust.slow
+
+    @property
+    def must_be_slow(self) -> bool:
+        """Whether the r-bot must drive slowly: its pose, or its motion, may be wrong."""
+        return self.pose_doubtful or self.inputs.contradiction != Contradiction.NONE
 
     @property
     def obstacle_ahead(self) -> bool:

@@ -76,6 +76,7 @@ class Reason(IntEnum):
     VSPACE_FAILED = 57
     VSPACE_LOST = 58
     POSE_LOST = 59
+    CONTRADICTION = 64
     # Held or stopped: a source is stale
     SCAN_STALE = 70
     POINTS_STALE = 71
@@ -135,10 +136,12 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.REAL, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.REAL, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.REAL, Mode.STOPPED, "pose_lost", "stop"),
+    Transition(Mode.REAL, Mode.STOPPED, "contradicted", "stop"),
     Transition(Mode.REAL, Mode.ENTERING, "obstacle_and_ready", "call_vbot"),
     Transition(Mode.ENTERING, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.ENTERING, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.ENTERING, Mode.STOPPED, "pose_lost", "stop"),
+    Transition(Mode.ENTERING, Mode.STOPPED, "contradicted", "stop"),
     Transition(Mode.ENTERING, Mode.REAL, "vspace_not_ready", "hand_back"),
     Transition(Mode.ENTERING, Mode.REAL, "no_view_in_time", "abandon_entry"),
     Transition(Mode.ENTERING, Mode.REAL, "way_free", "hand_back"),
@@ -146,11 +149,13 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.VIRTUAL, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "pose_lost", "stop"),
+    Transition(Mode.VIRTUAL, Mode.STOPPED, "contradicted", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "vspace_lost", "stop"),
     Transition(Mode.VIRTUAL, Mode.RETURNING, "rejoined", "ease_vbot"),
     Transition(Mode.RETURNING, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "pose_lost", "stop"),
+    Transition(Mode.RETURNING, Mode.STOPPED, "contradicted", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "vspace_lost", "stop"),
     Transition(Mode.RETURNING, Mode.VIRTUAL, "unsafe_again", "drive_vbot_on"),
     Transition(Mode.RETURNING, Mode.REAL, "image_fits", "hand_back"),
@@ -165,6 +170,8 @@ GUARDS: dict[str, str] = {
     "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more, or the pose (or the shown v-bot's) "
     "has jumped by pose_trust.jump_m or jump_deg; once the operator has let go, the r-bot may drive, slowly until its "
     "place is recognized",
+    "contradicted": "wheels and LiDAR contradict each other for 0.5 s or 0.15 m; once the operator has let go, the "
+    "r-bot may drive, slowly until they have agreed for 0.3 m; a contradiction that lasts stops it again",
     "vspace_lost": "the virtual space has failed, or its node is silent",
     "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, the r-bot has a way "
     "round; after an abandoned entry, also: a view fits, or the operator let go",

@@ -96,13 +96,31 @@ class Guess:
 
 @dataclass(frozen=True)
 class Track:
-    """Result of the front end for one scan."""
+    """Result of the front end for one scan.
+
+    Attributes:
+        pose: (3,).
+        covariance: (3, 3) of the pose.
+        score: 0..1, mean field value over the points.
+        status: outcome of the scan.
+        keyframe: the keyframe that was added; None if none was.
+        scan_covariance: (3, 3) of the pose by the scan alone; None if the pose is not that of a match.
+    """
 
     pose: FloatArray
     covariance: FloatArray
     score: float
     status: SlamStatus
     keyframe: Keyframe | None
+    scan_covariance: FloatArray | None = None
+
+    @property
+    def scan_sigma(self) -> FloatArray | None:
+        """Standard deviations (3,) by the scan alone: along, across, rotation; None without a match."""
+        if self.scan_covariance is None:
+            return None
+        sigma: FloatArray = np.sqrt(np.diag(turned(self.scan_covariance, -float(self.pose[2]))))
+        return sigma
 
 
 class FrontEnd:
@@ -205,7 +223,7 @@ class FrontEnd:
                 self._build_known(match.pose)
         elif accepted and (self._moved(match.pose) or self._first_was_poor(match, status)):
             added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns)
-        return Track(match.pose, match.covariance, match.score, status, added)
+        return Track(match.pose, match.covariance, match.score, status, added, match.scan_covariance)
 
     def restart(self, scan: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
         """Start a new local map and trajectory with a scan, at the predicted pose."""
@@ -237,7 +255,7 @@ class FrontEnd:
         other = max(score, found.runner_up)
         if found.score - other < WIDE_GAIN * (1.0 - other):
             return None
-        return Match(found.pose, found.covariance, found.score, False)
+        return Match(found.pose, found.covariance, found.score, False, found.covariance)
 
     def reach_m(self, guess: Guess) -> float:
         """Distance from the guess within which the robot is, by odometry since the last match."""

@@ -15,6 +15,7 @@ from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import Matrix, compose2, inverse2, matrix_from_pose2, relative2
 from instant_ic.jit import leave_out_blas
 from instant_ic.slam.config import GridSlamConfig, SlamConfig
+from instant_ic.slam.contradiction import ContradictionMonitor
 from instant_ic.slam.front_end import MIN_POINTS, FrontEnd, Guess, SlamStatus, Track
 from instant_ic.slam.integrity import Integrity, IntegrityMonitor, mixture
 from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, Keyframe
@@ -112,6 +113,7 @@ class GridSlam:
         front_end: matches scans and makes keyframes.
         loop_closure: finds loops and optimises the keyframes' poses.
         motion: compares wheel odometry with scan matching.
+        contradiction: whether the two contradict each other.
         monitor: probability of being lost.
     """
 
@@ -122,6 +124,7 @@ class GridSlam:
         self.loop_closure = LoopClosure(self.config)
         self.map = OccupancyMap(self.config.map)
         self.motion = MotionMonitor()
+        self.contradiction = ContradictionMonitor()
         self.monitor = IntegrityMonitor()
         self.in_map_frame = saved is None
         self._apart = False  # a session began after the robot was lost in the map being made
@@ -463,7 +466,9 @@ class GridSlam:
             matched = track.status in (SlamStatus.TRACKED, SlamStatus.RECOVERED)
             self._step, self._step_s = step, (stamp_ns - self._stamp_ns) * 1e-9
             if odometry is not None and self._odometry_stamp_ns == self._stamp_ns:
-                self.motion.update(relative2(self._odometry_pose, odometry), step, self._step_s, matched)
+                wheels = relative2(self._odometry_pose, odometry)
+                self.motion.update(wheels, step, self._step_s, matched)
+                self.contradiction.update(wheels, step, self._step_s, track.scan_sigma)
             if not matched:
                 # Damp the velocity: without a match, the estimate must not keep moving for ever.
                 self._step = 0.5 * self._step

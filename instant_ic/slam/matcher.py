@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 
 from instant_ic.geometry.poses import relative2, wrap_angle
+from instant_ic.slam.keyframes import turned
 from instant_ic.slam.likelihood_field import LikelihoodField
 from instant_ic.slam.scan import FloatArray
 
@@ -24,6 +25,8 @@ ODOMETRY_CUTOFF = 4.0
 """Distance from the guess, in σ, beyond which its pull hardly grows: odometry may be entirely wrong."""
 COARSE_STEP_RAD, FINE_STEP_RAD = 0.02, 0.005
 """Heading steps of the two searches; at 2.5 m the coarse one is a cell of the field."""
+LEAST_INFORMATION = 0.01
+"""1/m² and 1/rad²; keeps the information of a scan along a bare corridor invertible."""
 REFINE_ITERATIONS = 20
 """Maximum number of Gauss-Newton steps; they end earlier once the step is below 0.01 mm."""
 
@@ -238,12 +241,14 @@ class Match:
         covariance: (3, 3) in the field's frame.
         score: 0..1, mean field value over the points.
         at_border: the search ended at the edge of its window, so a better pose may lie outside.
+        scan_covariance: (3, 3) in the field's frame, of the scan alone, without the guess.
     """
 
     pose: FloatArray
     covariance: FloatArray
     score: float
     at_border: bool
+    scan_covariance: FloatArray
 
 
 def match_scan(
@@ -287,5 +292,7 @@ def match_scan(
     # The residuals measure the quality of the fit: a poor fit gets a wide covariance.
     variance = max(squares / max(len(points) - 3, 1), 1e-3) * weight
     covariance = variance * np.linalg.inv(hessian)
+    scan_information = hessian - turned(np.diag(information), float(guess[2])) + LEAST_INFORMATION * np.eye(3)
+    scan_covariance = variance * np.linalg.inv(scan_information)
     pose[2] = wrap_angle(float(pose[2]))
-    return Match(pose, 0.5 * (covariance + covariance.T), float(score), bool(at_border))
+    return Match(pose, 0.5 * (covariance + covariance.T), float(score), bool(at_border), scan_covariance)

@@ -59,10 +59,13 @@ def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel
         yield Diagnosis("place", Level.OK, "found in the saved map")
     motion = slam.motion
     level, text = _MOTIONS[motion.state] if with_odometry else (Level.OK, "no wheels to compare with")
+    if slam.contradiction.state:
+        level, text = Level.ERROR, slam.contradiction.state.text
     factor = {
         "slip": round(motion.slip, 2),
         "turn_factor": round(motion.turn_factor, 3),
         "turn_factor_sigma": round(min(motion.turn_factor_sigma, 9.999), 3),
+        "contradictions": slam.contradiction.count,
     }
     yield Diagnosis("motion", level, text, factor)
     if with_odometry:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import CostmapConfig, RollingCostmap, scan_points, scan_rays
@@ -164,6 +165,7 @@ class Loop:
         self.vbot = VirtualRobot(VbotConfig(), limits)
         self.base = Base(np.array(start))
         self.pose_lost = 0.0
+        self.contradiction, self.contradictions = Contradiction.NONE, 0
         self.vspace = Vspace(ready=True, position=np.zeros(2), ready_radius_m=100.0)
         self.k = 0
         self.frames: list[Frame] = []
@@ -202,6 +204,8 @@ class Loop:
         inputs = ArbiterInputs(
             robot_pose=robot,
             pose_lost_probability=self.pose_lost,
+            contradiction=self.contradiction,
+            contradictions=self.contradictions,
             robot_velocity=(self.base.v, self.base.w),
             operator_command=operator,
             estop=self.estop,

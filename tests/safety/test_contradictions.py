@@ -1,0 +1,111 @@
+"""Motion that contradicts the tracks: the robot stops, says why, and can be driven free, slowly.
+
+Real nodes with the shipped parameters against the simulated robot, in simulated time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+
+from instant_ic.base.config import SkidSteerConfig
+from instant_ic.base.kinematics import SkidSteer
+from instant_ic.contradiction import Contradiction
+from instant_ic.control.arbiter_config import PoseTrustConfig
+from instant_ic.control.states import Reason
+from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
+from instant_ic.geometry.poses import wrap_angle
+from instant_ic.msg import ControlState
+from instant_ic.sim.worlds import make_world
+
+FORWARD, TURN, NOTHING = (0.38, 0.0), (0.0, 0.8), (0.0, 0.0)
+TRACKS = SkidSteerConfig()
+INVERTED = replace(TRACKS, invert_left=True, invert_right=True)
+SWAPPED = replace(TRACKS, left_motor=2)
+TOO_FEW_PULSES = replace(TRACKS, pulses_per_metre=TRACKS.pulses_per_metre / 5)
+
+
+class Stack(SimulatedStack):
+    """A stack at whose images nobody looks."""
+
+    def on_frame(self, *_: object) -> None:
+        pass
+
+    def drive(self, command: tuple[float, float], seconds: float, until: Callable[[], bool] = lambda: False) -> float:
+        """Hold a command until something happens; return the seconds that it took."""
+        began_s = self.time_s
+        while not until() and self.time_s - began_s < seconds:
+            self.step(lambda: command)
+        return self.time_s - began_s
+
+    @property
+    def stopped(self) -> bool:
+        return bool(self.state.mode == ControlState.STOPPED)
+
+    @property
+    def tracks_stand(self) -> bool:
+        return bool((abs(self.simulation.robot.tracks) < 0.01).all())
+
+
+@pytest.fixture
+def stack() -> Iterator[Stack]:
+    with Stack(make_world("random:3"), StackConfig(method="stop", command_latency_s=(0.0, 0.0))) as made:
+        made.drive(NOTHING, 3.0)
+        yield made
+
+
+def stops(stack: Stack, command: tuple[float, float], kind: Contradiction, within_s: float) -> None:
+    """Hold a command: the robot is stopped in time, says why, and the held key does not start it again."""
+    assert stack.drive(command, 6.0, until=lambda: stack.stopped) <= within_s
+    stack.drive(command, 1.0)
+    assert stack.stopped and stack.tracks_stand
+    assert stack.page.state["reason"] == f"let go of the controls to continue (stopped: {kind.text})"
+    assert stack.state.reason_code == Reason.RELEASE_CONTROLS
+
+
+@pytest.mark.parametrize(
+    ("broken", "command", "kind", "within_s", "within"),
+    [
+        (INVERTED, FORWARD, Contradiction.OTHER_WAY, 0.8, 0.2),
+        (SWAPPED, TURN, Contradiction.OTHER_WAY, 0.9, 0.5),
+        (TOO_FEW_PULSES, FORWARD, Contradiction.FARTHER, 0.8, 0.75),
+    ],
+    ids=["inverted motors", "swapped motors", "pulses per metre five times too large"],
+)
+def test_a_robot_that_moves_otherwise_than_its_tracks_stops(
+    stack: Stack,
+    broken: SkidSteerConfig,
+    command: tuple[float, float],
+    kind: Contradiction,
+    within_s: float,
+    within: float,
+) -> None:
+    stack.simulation.robot.kinematics = SkidSteer(broken)
+    before = stack.robot
+    stops(stack, command, kind, within_s)
+    moved = stack.robot - before
+    assert math.hypot(moved[0], moved[1]) < within and abs(wrap_angle(float(moved[2]))) < within
+
+
+def test_tracks_that_slip_on_the_spot_stop_and_the_operator_drives_free_slowly(stack: Stack) -> None:
+    stack.drive(FORWARD, 2.0)
+    robot = stack.simulation.robot
+    touches = robot.touches
+    robot.touches = lambda pose: True  # it hangs on a sill that no sensor sees
+    stops(stack, FORWARD, Contradiction.SLIPPING, 0.7)
+    # It still hangs: slow, and stopped again.
+    stack.drive(NOTHING, 1.5)
+    stack.drive((-0.38, 0.0), 0.5)
+    assert not stack.stopped and abs(robot.tracks).max() < PoseTrustConfig().speed_m_s + 0.01
+    stops(stack, (-0.38, 0.0), Contradiction.SLIPPING, 1.5)
+    # Free: slow until tracks and LiDAR have agreed, then as ever.
+    robot.touches = touches
+    stack.drive(NOTHING, 1.5)
+    stack.drive((-0.38, 0.0), 1.0)
+    assert abs(robot.tracks).max() < PoseTrustConfig().speed_m_s + 0.01
+    assert stack.page.state["reason"].startswith(f"{Contradiction.SLIPPING.text}; slow until they agree")
+    stack.drive((-0.38, 0.0), 3.0)
+    assert abs(robot.tracks).min() > 0.3 and not stack.stopped
