@@ -5,7 +5,10 @@ from typing import Annotated, Literal
 
 from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
 from instant_ic.config.robot import LIDAR_MOUNT, Mount
+from instant_ic.lidar.head import TURN_CDEG, Sector
 from instant_ic.lidar.receiver import ReceiverConfig
+
+Azimuth = Annotated[float, Range(0, 360)]
 
 
 @dataclass(frozen=True)
@@ -16,16 +19,28 @@ class DecoderConfig:
         cut_angle_deg: azimuth at which a revolution ends, clockwise from ahead, degrees.
         min_range: smallest range of a return, metres; nearer ones are dropped as too close.
         max_range: largest range of a return, metres; farther ones are dropped.
+        fov_start_deg: start of the field of view that the sensor is set to, clockwise from ahead, degrees.
+        fov_end_deg: end of that field of view; 0 to 359 or 360 is the whole circle.
     """
 
     cut_angle_deg: Annotated[float, Range(0, below=360)] = 180.0
     min_range: NotNegative = 0.4
     max_range: Annotated[float, Range(above=0, high=131.07)] = 130.0
+    fov_start_deg: Azimuth = 0.0
+    fov_end_deg: Azimuth = 360.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
         if not self.min_range < self.max_range:
             raise ValueError(f"min_range must be below max_range (got {self.min_range}, {self.max_range})")
+        if self.fov_start_deg == self.fov_end_deg:
+            raise ValueError(f"fov_start_deg and fov_end_deg must differ (got {self.fov_start_deg} for both)")
+
+    @property
+    def blocked(self) -> Sector | None:
+        """The sector outside the configured field of view; None for the whole circle."""
+        width = round((self.fov_start_deg - self.fov_end_deg) % 360.0 * 100.0)
+        return Sector(round(self.fov_end_deg * 100.0) % TURN_CDEG, width) if width > 100 else None
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """Decoder from data packets to points, one revolution at a time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from instant_ic.lidar.packets import (
@@ -39,6 +40,13 @@ _COS_AZIMUTH = np.cos(_AZIMUTH)
 _SIN_AZIMUTH = np.sin(_AZIMUTH)
 _RAY_TIME_US = FIRING_PERIOD_US * np.arange(FIRINGS)[:, None] + LASER_PERIOD_US * np.arange(LASERS)
 """Time of each ray of a block after the first ray of the block, (2, 16)."""
+_TURN_CDEG = 36000
+_BACK_CDEG = 50
+"""Largest apparent turn backwards from one block to the next, of a head that stands."""
+_MAX_STEP_CDEG = 100
+"""Largest turn from one block to the next, in 0.01 degrees: 80 at 1200 rpm, the highest speed, and a margin."""
+_LONGEST_TURN_US = 200_000.0
+"""Time of a turn at 300 rpm, the lowest speed: an upper limit of the time in a blocked sector."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +59,7 @@ class DecodedPackets:
         firing_time: time of each firing sequence after the first one, seconds, (F,).
         firing_too_close: whether a laser of the firing sequence had a return nearer than min_range, (F,).
         duration_s: time from the first firing to the end of the last one.
+        start_us: time of the first firing after the first firing of its packet, microseconds.
     """
 
     points: NDArray[np.void]
@@ -58,6 +67,7 @@ class DecodedPackets:
     firing_time: NDArray[np.float32]
     firing_too_close: NDArray[np.bool_]
     duration_s: float
+    start_us: float = field(default=0.0, kw_only=True)
 
 
 def decode_packets(
@@ -73,6 +83,10 @@ def decode_packets(
     Axes follow ROS: x ahead (azimuth 0), y left, z up. The azimuth of each ray is interpolated with the mean turn rate
     of its packet and rounded to the sensor's unit, 0.01 degrees. In dual return mode a ray yields its last return, then
     its strongest (or second strongest) one; two returns at the same distance yield one point.
+
+    A sensor with a limited field of view sends no blocks of the other directions, so that a packet may span them. The
+    turn rate then comes from the neighbouring blocks alone, and the blocks after the gap are later by the time of the
+    turn across it.
 
     Args:
         packets: payloads, (P, 1206); all have the return mode of the first.
@@ -90,7 +104,7 @@ def decode_packets(
     azimuth = np.empty(firings, np.float32)
     time = np.empty(firings, np.float32)
     too_close = np.empty(firings, np.bool_)
-    n_points, n_firings, end_us = _decode(
+    n_points, n_firings, start_us, end_us = _decode(
         packets,
         time_us,
         first_block,
@@ -104,8 +118,80 @@ def decode_packets(
         too_close,
     )
     return DecodedPackets(
-        points[:n_points], azimuth[:n_firings], time[:n_firings], too_close[:n_firings], end_us * 1e-6
+        points[:n_points],
+        azimuth[:n_firings],
+        time[:n_firings],
+        too_close[:n_firings],
+        end_us * 1e-6,
+        start_us=start_us,
     )
+
+
+@register_jitable
+def turn_to(before: int, after: int) -> int:
+    """Return the turn from one azimuth to the next, 0.01 degrees; slightly negative if the head stands."""
+    turn = (after - before) % _TURN_CDEG
+    return turn - _TURN_CDEG if turn >= _TURN_CDEG - _BACK_CDEG else turn
+
+
+@register_jitable
+def largest_step(smallest: int) -> int:
+    """Return the largest turn between neighbouring blocks of a packet; a larger one spans a gap.
+
+    Args:
+        smallest: smallest turn between consecutive blocks of the packet, 0.01 degrees.
+    """
+    return min(_MAX_STEP_CDEG, smallest + max(smallest, 0) // 4 + 2)
+
+
+@njit(nogil=True, cache=True)
+def _steps(packet, pair, steps):  # type: ignore[no-untyped-def]
+    """Write the turn before each column of a packet into ``steps``; return the neighbours' number, turn, and limit."""
+    smallest = _TURN_CDEG
+    before = packet[2] | np.int32(packet[3]) << 8
+    for column in range(1, BLOCKS // pair):
+        at = 100 * pair * column
+        azimuth = packet[at + 2] | np.int32(packet[at + 3]) << 8
+        steps[column] = turn_to(before, azimuth)
+        smallest = min(smallest, steps[column])
+        before = azimuth
+    limit = largest_step(smallest)
+    count, turned = 0, 0
+    for column in range(1, BLOCKS // pair):
+        if steps[column] <= limit:
+            count += 1
+            turned += steps[column]
+    return count, turned, limit
+
+
+@njit(nogil=True, cache=True)
+def _column_times(steps, columns, count, limit, per_us, sent_us, column_us):  # type: ignore[no-untyped-def]
+    """Write the time of each column of a packet after its first one into ``column_us``.
+
+    Args:
+        steps: turn before each column, 0.01 degrees.
+        columns: number of columns.
+        count: number of steps between neighbours.
+        limit: largest step between neighbours.
+        per_us: turn rate, 0.01 degrees per microsecond.
+        sent_us: time to the next packet; infinite if unknown.
+        column_us: output.
+    """
+    jumped = 0.0
+    for column in range(1, columns):
+        if steps[column] > limit:
+            jumped += steps[column]
+    gap_us = 0.0
+    if jumped > 0.0:
+        gap_us = min(jumped / per_us, _LONGEST_TURN_US) if per_us > 0.0 else BLOCK_PERIOD_US
+        # The next packet's time is exact, unless packets are missing before it.
+        exact_us = sent_us - (count + 1) * BLOCK_PERIOD_US
+        if exact_us < gap_us + 0.5 * BLOCK_PERIOD_US * columns:
+            gap_us = max(exact_us, 0.0)
+    column_us[0] = 0.0
+    for column in range(1, columns):
+        step_us = BLOCK_PERIOD_US if steps[column] <= limit else gap_us * steps[column] / jumped
+        column_us[column] = column_us[column - 1] + step_us
 
 
 @njit(nogil=True, cache=True, boundscheck=False)
@@ -122,25 +208,32 @@ def _decode(  # type: ignore[no-untyped-def]
     firing_time,
     firing_too_close,
 ):
-    """Kernel of `decode_packets`; returns the number of points, the number of firings, and the end time in us."""
+    """Kernel of `decode_packets`; returns the number of points, the number of firings, start and end time in us."""
     n_points = 0
     n_firings = 0
     n_packets = packets.shape[0]
-    origin_us = time_us[0] + BLOCK_PERIOD_US * (first_block // pair)
+    columns = BLOCKS // pair
+    steps = np.zeros(BLOCKS, np.int64)
+    column_us = np.zeros(BLOCKS)
+    per_us = np.float32(0.0)
+    start_us = 0.0
     end_us = 0.0
     for p in range(n_packets):
         packet = packets[p]
-        first_azimuth = packet[2] | np.int32(packet[3]) << 8
-        last_azimuth = packet[1102] | np.int32(packet[1103]) << 8
-        turned = (last_azimuth - first_azimuth) % 36000
-        # Single precision and order of additions as in the C++ drivers, so that ties round the same way.
-        per_us = np.float32(turned) / np.float32(BLOCKS // pair - 1) / np.float32(BLOCK_PERIOD_US)
+        count, turned, limit = _steps(packet, pair, steps)
+        if count > 0:
+            # Single precision and order of additions as in the C++ drivers, so that ties round the same way.
+            per_us = np.float32(turned) / np.float32(count) / np.float32(BLOCK_PERIOD_US)
+        sent_us = time_us[p + 1] - time_us[p] if p + 1 < n_packets else np.inf
+        _column_times(steps, columns, count, limit, per_us, sent_us, column_us)
+        if p == 0:
+            start_us = column_us[first_block // pair]
         start = first_block if p == 0 else 0
         stop = end_block if p == n_packets - 1 else BLOCKS
         for block in range(start, stop, pair):
             at = 100 * block
             block_azimuth = np.float32(packet[at + 2] | np.int32(packet[at + 3]) << 8)
-            block_us = time_us[p] - origin_us + BLOCK_PERIOD_US * (block // pair)
+            block_us = time_us[p] - time_us[0] - start_us + column_us[block // pair]
             for firing in range(FIRINGS):
                 too_close = False
                 for laser in range(LASERS):
@@ -152,10 +245,10 @@ def _decode(  # type: ignore[no-untyped-def]
                         units = packet[offset] | np.int32(packet[offset + 1]) << 8
                         reflectivity = packet[offset + 2]
                         offset += 100
-                        if units < min_units:
-                            too_close |= units > 0
+                        if units == 0 or units == before or units > max_units:
                             continue
-                        if units > max_units or units == before:
+                        if units < min_units:
+                            too_close = True
                             continue
                         before = units
                         if index < 0:
@@ -178,4 +271,4 @@ def _decode(  # type: ignore[no-untyped-def]
                 firing_too_close[n_firings] = too_close
                 n_firings += 1
                 end_us = block_us + firing_us + FIRING_PERIOD_US
-    return n_points, n_firings, end_us
+    return n_points, n_firings, start_us, end_us

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.config import FlatScanConfig
+from instant_ic.lidar.head import TURN_CDEG, Sector
 from instant_ic.lidar.motion import PlanarMotion
 from instant_ic.lidar.packets import BLOCKS, FIRINGS, LASERS, encode_data_packet
 from instant_ic.lidar.stream import PacketStream, Revolution
@@ -79,13 +80,21 @@ def check_level(base_from_lidar: NDArray[np.float64]) -> None:
         )
 
 
-def coverage(revolution: Revolution) -> float:
-    """Share of the circle that a revolution measured, counted in whole degrees, 0-1.
+def coverage(revolution: Revolution, blocked: Sector | None = None) -> float:
+    """Share of the configured field of view that a revolution measured, counted in whole degrees, 0-1.
 
     Below 1 for a partial revolution: after the start, at a jump of the sensor's clock, or with missing packets.
+
+    Args:
+        revolution: decoded points.
+        blocked: sector outside the configured field of view; None for a view of the whole circle.
     """
-    degrees = np.floor(np.degrees(revolution.firing_azimuth)).astype(np.int64) % 360
-    return float(len(np.unique(degrees))) / 360.0
+    wanted = np.ones(360, np.bool_)
+    if blocked is not None:
+        wanted = (np.arange(50, TURN_CDEG, 100) - blocked.start) % TURN_CDEG >= blocked.width
+    measured = np.zeros(360, np.bool_)
+    measured[np.floor(np.degrees(revolution.firing_azimuth)).astype(np.int64) % 360] = True
+    return float(measured[wanted].mean()) if wanted.any() else 0.0
 
 
 def warm_up() -> None:

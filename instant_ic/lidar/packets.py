@@ -22,6 +22,7 @@ BLOCK_PERIOD_US = 110.592
 PACKET_PERIOD_US = BLOCKS * BLOCK_PERIOD_US
 """Time from one packet to the next in single return mode; half of it in dual return mode."""
 HOUR_US = 3_600_000_000
+"""Period of the sensor's time. Some sensors count on past it, so a received time is taken modulo the hour."""
 
 RETURN_STRONGEST = 0x37
 RETURN_DUAL = 0x39
@@ -149,13 +150,11 @@ def decode_position_packet(payload: bytes) -> PositionPacket:
     """Decode one position packet.
 
     Raises:
-        PacketError: not 512 bytes, or a time past the hour.
+        PacketError: not 512 bytes.
     """
     if len(payload) != POSITION_PACKET_BYTES:
         raise PacketError(f"a position packet has {POSITION_PACKET_BYTES} bytes (got {len(payload)})")
-    timestamp_us = int.from_bytes(payload[_POSITION_TIME : _POSITION_TIME + 4], "little")
-    if timestamp_us >= HOUR_US:
-        raise PacketError(f"position packet's time is {timestamp_us} us, past the hour")
+    timestamp_us = int.from_bytes(payload[_POSITION_TIME : _POSITION_TIME + 4], "little") % HOUR_US
     text = payload[_POSITION_NMEA:].split(b"\0", 1)[0].split(b"\r\n", 1)[0]
     return PositionPacket(timestamp_us, payload[_POSITION_PPS], text.decode("ascii", "replace"))
 

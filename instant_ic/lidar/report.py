@@ -19,6 +19,19 @@ _SILENT = {
 """What to check when no packets arrive, by source."""
 _LEAST_RETURNS = 0.01
 """Share of the rays with a return below which the sensor is covered or broken: the ground alone gives more."""
+_PAST_HOUR = (
+    "The sensor counts its time of the hour beyond 3600 s; it is taken modulo the hour. Check the sensor's GPS "
+    "receiver and pulse per second."
+)
+_LEAST_BLOCKED_DEG = 5.0
+"""A smaller sector without blocks is not reported; two blocks at 1200 rpm take 1.6 degrees."""
+_VIEW = "The sensor measures {view} degrees only, clockwise from ahead"
+_UNSEEN = _VIEW + ". The robot does not see what is elsewhere: do not turn or reverse towards it."
+_TOO_SMALL = (
+    _VIEW
+    + ", of the {wanted} that the driver expects. No scan, the robot stands. Set the sensor's field of view to 0 to "
+    "359 on its web page. If the rest may stay unseen, set vlp16_driver decoder.fov_start_deg and decoder.fov_end_deg."
+)
 _PPS = ("absent", "synchronising", "locked", "error")
 
 
@@ -37,6 +50,8 @@ class LidarReport:
         self.blind = False
         self._feed = feed
         self._reported = (0, 0, 0)
+        self._past_hour_reported = False
+        self._covered = True
         self._partial_reported = 0
 
     def trusts(self, steady_ns: int) -> bool:
@@ -49,7 +64,9 @@ class LidarReport:
     def covers(self, revolution: Revolution, min_coverage: float) -> bool:
         """Whether a revolution gives a scan: not an incomplete one, which counts as partial, nor a blind one."""
         # Half blind: it would mislead map matching, and the scan itself does not show the fault to other nodes.
-        covered = coverage(revolution) >= min_coverage
+        covered = coverage(revolution, self._feed.stream.config.blocked) >= min_coverage
+        if covered or revolution.complete:
+            self._covered = covered
         self.partial += not covered
         # Without a return nothing would seem to be in the way.
         self.blind = len(revolution.points) < _LEAST_RETURNS * LASERS * len(revolution.firing_azimuth)
@@ -80,6 +97,9 @@ class LidarReport:
             where: address or file of the source.
         """
         yield self.source(steady_ns)
+        yield from self._clock()
+        if self._feed.stream.counters.revolutions:
+            yield self._view()
         stream, counters = self._feed.stream, self._feed.stream.counters
         losses = (counters.missing, counters.bad, self.skipped)
         new = [now - before for now, before in zip(losses, self._reported, strict=True)]
@@ -90,6 +110,7 @@ class LidarReport:
             "missing": counters.missing,
             "late": counters.late,
             "bad": counters.bad,
+            "past_hour": counters.past_hour,
             "clock_resets": counters.clock_resets + stream.clock.resets,
             "revolutions_skipped": self.skipped,
             "revolutions_partial": self.partial,
@@ -112,3 +133,21 @@ class LidarReport:
             if partial:
                 text += f"; {partial} incomplete revolutions gave no scan"
         yield Diagnosis("packets", level, text, values)
+
+    def _clock(self) -> Iterator[Diagnosis]:
+        """Warn once of a sensor whose time of the hour does not wrap; its packets are used all the same."""
+        if self._feed.stream.counters.past_hour:
+            yield Diagnosis("clock", Level.OK if self._past_hour_reported else Level.WARN, _PAST_HOUR)
+            self._past_hour_reported = True
+
+    def _view(self) -> Diagnosis:
+        """Whether the sensor measures all around, or why there is no scan although every packet arrives."""
+        stream = self._feed.stream
+        blocked = stream.head.blocked
+        if blocked is None or blocked.width < 100.0 * _LEAST_BLOCKED_DEG:
+            return Diagnosis("view", Level.OK, "the sensor measures all around")
+        view = f"{blocked.end / 100.0:.0f} to {blocked.start / 100.0:.0f}"
+        if self._covered:
+            return Diagnosis("view", Level.WARN, _UNSEEN.format(view=view))
+        wanted = f"{stream.config.fov_start_deg:.0f} to {stream.config.fov_end_deg:.0f}"
+        return Diagnosis("view", Level.ERROR, _TOO_SMALL.format(view=view, wanted=wanted))

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from instant_ic.lidar.capture import CaptureReader
 from instant_ic.lidar.clock import DeviceClock
 from instant_ic.lidar.config import DecoderConfig
-from instant_ic.lidar.decode import DecodedPackets, decode_packets
+from instant_ic.lidar.decode import DecodedPackets, decode_packets, turn_to
+from instant_ic.lidar.head import TURN_CDEG, Head
 from instant_ic.lidar.packets import (
-    BLOCK_PERIOD_US,
     BLOCKS,
     DATA_PACKET_BYTES,
     HOUR_US,
@@ -22,15 +22,14 @@ from instant_ic.lidar.packets import (
     check_data_packet,
 )
 
-_TAIL = struct.Struct("<H96xIBB")
-_TAIL_AT = 1102
-"""Offset of the last block's azimuth; then follow 96 bytes of returns, time, return mode and product."""
+_HEADS = struct.Struct("<" + "2xH96x" * BLOCKS + "IBB")
+"""Azimuth of each block, time, return mode and product."""
 
 _OTHER_PRODUCTS = (0x21, 0x24, 0x28)
 """HDL-32E, Puck Hi-Res, VLP-32C: same packets, other elevations. Old firmware sends no product."""
 
 _MAX_GAP_US = 20_000
-"""A longer gap ends the revolution: at 1200 rpm half a turn takes 25 ms, and the head may pass the cut in the gap."""
+"""A longer gap, without the time in a blocked sector, ends the revolution."""
 _LATE_US = -100_000
 """Age limit of a late packet, relative to the newest; an even older one means that the sensor's clock was reset."""
 _LEAST_STEP = 0.75
@@ -70,6 +69,7 @@ class StreamCounters:
         missing: packets that never arrived.
         late: packets dropped because a newer one, or one of the same time, had already arrived.
         bad: payloads dropped because they are not data packets; by reason in ``bad_reasons``.
+        past_hour: accepted or late packets whose time of the hour was beyond 3600 s.
         clock_resets: jumps of the sensor's clock (the sensor or a capture was restarted).
         revolutions: returned revolutions.
     """
@@ -78,6 +78,7 @@ class StreamCounters:
     missing: int = 0
     late: int = 0
     bad: int = 0
+    past_hour: int = 0
     clock_resets: int = 0
     revolutions: int = 0
     bad_reasons: dict[str, int] = field(default_factory=dict)
@@ -90,6 +91,7 @@ class PacketStream:
         self.config = config or DecoderConfig()
         self.clock = DeviceClock()
         self.counters = StreamCounters()
+        self.head = Head(self.config.blocked)
         self._cut = round(self.config.cut_angle_deg * 100.0)
         self._payloads: list[bytes] = []
         self._times_us: list[int] = []
@@ -98,6 +100,7 @@ class PacketStream:
         self._dual = False
         self._cut_before = False
         self._turned: int | None = None
+        """Turn from the cut angle to the last block, 0.01 degrees; None where the stream was interrupted."""
         self._received_ns = 0
 
     def feed(self, payload: bytes, received_ns: int) -> Revolution | None:
@@ -111,58 +114,74 @@ class PacketStream:
             The revolution that this packet ends, if any.
         """
         reason = check_data_packet(payload)
-        azimuth = timestamp_us = mode = 0
+        azimuths, timestamp_us, mode = [0], 0, 0
         if reason is None:
-            azimuth, timestamp_us, mode, product = _TAIL.unpack_from(payload, _TAIL_AT)
+            *azimuths, timestamp_us, mode, product = _HEADS.unpack_from(payload)
             if product in _OTHER_PRODUCTS:
                 reason = f"product 0x{product:02x} is not a VLP-16"
-            elif timestamp_us >= HOUR_US or azimuth >= 36000:
-                reason = "time or azimuth out of range"
+            elif max(azimuths) >= TURN_CDEG:
+                reason = "azimuth out of range"
         if reason is not None:
             self.counters.bad += 1
             self.counters.bad_reasons[reason] = self.counters.bad_reasons.get(reason, 0) + 1
             return None
+        self.counters.past_hour += timestamp_us >= HOUR_US
+        timestamp_us %= HOUR_US
 
         dual = mode == RETURN_DUAL
-        period_us = PACKET_PERIOD_US / 2 if dual else PACKET_PERIOD_US
-        done = None
         step_us = self.clock.step_us(timestamp_us)
         elapsed_us = (received_ns - self._received_ns) * 1e-3
         self._received_ns = received_ns
-        if step_us is not None:
-            if _LATE_US < step_us < _LEAST_STEP * period_us:
-                self.counters.late += 1
-                return None
-            if step_us <= _LATE_US or (step_us > _MAX_GAP_US and step_us - elapsed_us > _CLOCK_SET_US):
-                self.counters.clock_resets += 1
-                done = self._end_early()
-                self.clock.restart()
-            elif step_us > 1.5 * period_us:
-                missing = round(step_us / period_us) - 1
-                self.counters.missing += missing
-                self._missing += missing
-                if step_us > _MAX_GAP_US:
-                    done = self._end_early()
-        if dual != self._dual or len(self._payloads) >= _MAX_PACKETS:
-            # A revolution has one return mode, and it also ends if the head does not turn.
-            done = self._end_early() or done
-            self._dual = dual
+        period_us = PACKET_PERIOD_US / 2 if dual else PACKET_PERIOD_US
+        if step_us is not None and _LATE_US < step_us < _LEAST_STEP * period_us:
+            self.counters.late += 1
+            return None
+        azimuths = azimuths[::2] if dual else azimuths
+        sent_us, between = self.head.take(azimuths, step_us)
+        done = self._interruption(step_us, sent_us, elapsed_us, dual)
 
         self.counters.packets += 1
         # A packet arrives after its last firing, but carries the time of its first firing.
         device_us = self.clock.take(timestamp_us, received_ns - round(period_us * 1000.0))
         self._payloads.append(payload)
         self._times_us.append(device_us)
-        turned = (azimuth - self._cut) % 36000
-        before, self._turned = self._turned, turned
-        if before is not None and before - turned > 18000:
-            done = self._end_at_cut(before) or done
+        column = None if self._turned is None else _column_after_cut(azimuths, self._turned + between)
+        self._turned = (azimuths[-1] - self._cut) % TURN_CDEG
+        return done if column is None else self._end_at_cut(column * (2 if dual else 1))
+
+    def _interruption(self, step_us: int | None, sent_us: float, elapsed_us: float, dual: bool) -> Revolution | None:
+        """Count missing packets before a new one, and end the revolution where it cannot go on.
+
+        Args:
+            step_us: time since the last packet on the sensor's clock; None before the first one.
+            sent_us: part of it in which the sensor sent packets.
+            elapsed_us: time since the last packet on the host's clock.
+            dual: whether the new packet has two returns.
+        """
+        period_us = PACKET_PERIOD_US / 2 if dual else PACKET_PERIOD_US
+        done = None
+        if step_us is not None:
+            if step_us <= _LATE_US or (step_us > _MAX_GAP_US and step_us - elapsed_us > _CLOCK_SET_US):
+                self.counters.clock_resets += 1
+                done = self._end_early()
+                self.clock.restart()
+            elif sent_us > 1.5 * period_us:
+                missing = round(sent_us / period_us) - 1
+                self.counters.missing += missing
+                self._missing += missing
+                if sent_us > _MAX_GAP_US:
+                    done = self._end_early()
+        if dual != self._dual or len(self._payloads) >= _MAX_PACKETS:
+            # A revolution has one return mode, and it also ends if the head does not turn.
+            done = self._end_early() or done
+            self._dual = dual
         return done
 
     def restart(self) -> None:
         """Drop the current revolution and the sensor's clock, because earlier packets cannot be trusted."""
         self._end_early()
         self.clock.restart()
+        self.head.restart()
 
     def finish(self) -> Revolution | None:
         """Return the rest as the last revolution, for example at the end of a capture."""
@@ -180,26 +199,13 @@ class PacketStream:
         if (last := self.finish()) is not None:
             yield last
 
-    def _end_at_cut(self, turned: int) -> Revolution | None:
-        """End the revolution inside the newest packet, where the azimuth passes the cut angle."""
-        packet = self._payloads[-1]
-        block = 0
-        while block < BLOCKS:
-            azimuth = packet[100 * block + 2] | packet[100 * block + 3] << 8
-            relative = (azimuth - self._cut) % 36000
-            if turned - relative > 18000:
-                break
-            turned = relative
-            block += 1
-        if self._dual:
-            block -= block % 2
-        end_block = block or BLOCKS
-        keep_packet = block < BLOCKS
+    def _end_at_cut(self, block: int) -> Revolution | None:
+        """End the revolution before a block of the newest packet."""
         payloads = self._payloads if block else self._payloads[:-1]
-        revolution = self._decode(payloads, end_block, cut_after=True)
-        self._payloads = self._payloads[-1:] if keep_packet else []
-        self._times_us = self._times_us[-1:] if keep_packet else []
-        self._first_block = block if keep_packet else 0
+        revolution = self._decode(payloads, block or BLOCKS, cut_after=True)
+        self._payloads = self._payloads[-1:]
+        self._times_us = self._times_us[-1:]
+        self._first_block = block
         self._missing = 0
         self._cut_before = True
         return revolution
@@ -229,8 +235,7 @@ class PacketStream:
             self.config.min_range,
             self.config.max_range,
         )
-        block_us = BLOCK_PERIOD_US * (self._first_block // 2 if self._dual else self._first_block)
-        start_us = first_us + block_us
+        start_us = first_us + decoded.start_us
         self.counters.revolutions += 1
         return Revolution(
             **vars(decoded),
@@ -238,3 +243,18 @@ class PacketStream:
             end_ns=self.clock.host_ns(start_us + decoded.duration_s * 1e6),
             complete=self._cut_before and cut_after and self._missing == 0,
         )
+
+
+def _column_after_cut(azimuths: list[int], turned: int) -> int | None:
+    """Return the first block (or pair of blocks) of a packet after the cut angle; None if the head does not pass it.
+
+    Args:
+        azimuths: azimuth of each, 0.01 degrees.
+        turned: turn from the cut angle to the first one, 0.01 degrees.
+    """
+    for column, azimuth in enumerate(azimuths):
+        if column:
+            turned += turn_to(azimuths[column - 1], azimuth)
+        if turned >= TURN_CDEG:
+            return column
+    return None

@@ -1,6 +1,7 @@
 """Packets and captures made for the tests of the lidar."""
 
 import struct
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,61 @@ def wall_stream(packets: int, distance_m: float, start_us: int = 0, azimuth_cdeg
         )
         for index in range(packets)
     ]
+
+
+def retimed(payload: bytes, timestamp_us: int) -> bytes:
+    """A data packet with another time, also one beyond the hour."""
+    return payload[:1200] + timestamp_us.to_bytes(4, "little") + payload[1204:]
+
+
+@dataclass(frozen=True)
+class Limited:
+    """Packets of a sensor with a limited field of view, and what it did.
+
+    Attributes:
+        payloads: data packets.
+        sent_s: time at which each packet is full and sent.
+        azimuth_deg: azimuth of each ray, not wrapped, (packets, rays).
+        time_s: time of each ray, (packets, rays).
+        block_deg: azimuth at the start of each block or pair of blocks, not wrapped, (packets, columns).
+    """
+
+    payloads: list[bytes]
+    sent_s: np.ndarray
+    azimuth_deg: np.ndarray
+    time_s: np.ndarray
+    block_deg: np.ndarray
+
+
+def limited_stream(
+    turns: float, view_deg: tuple[float, float], rpm: float, dual: bool = False, start_deg: float = 123.4
+) -> Limited:
+    """Packets inside a round wall of 5 m from a sensor that sends only the blocks that begin within its field of view.
+
+    The head turns evenly and fires all the time, a block each 110.592 us. Every ray has a return.
+    """
+    start, end = view_deg
+    count = round(turns * 60.0 / rpm / (BLOCK_PERIOD_US * 1e-6))
+    times = np.arange(count) * BLOCK_PERIOD_US * 1e-6
+    turned = start_deg + times * rpm * 6.0
+    columns = 6 if dual else 12
+    sent = np.flatnonzero((turned - start) % 360.0 < ((end - start) % 360.0 or 360.0))
+    sent = sent[: len(sent) // columns * columns].reshape(-1, columns)
+    rays = (np.arange(2)[:, None] * 55.296 + np.arange(16) * 2.304).reshape(-1) * 1e-6
+    time_s = (times[sent][..., None] + rays).reshape(len(sent), -1)
+    pair = 2 if dual else 1
+    payloads = [
+        encode_data_packet(
+            np.repeat(np.round(turned[row] * 100.0).astype(int) % 36000, pair),
+            np.full((12, 2, 16), 2500),
+            np.full((12, 2, 16), 50),
+            round(times[row[0]] * 1e6),
+            RETURN_DUAL if dual else RETURN_STRONGEST,
+        )
+        for row in sent
+    ]
+    sent_s = times[sent[:, -1]] + BLOCK_PERIOD_US * 1e-6
+    return Limited(payloads, sent_s, start_deg + time_s * rpm * 6.0, time_s, turned[sent])
 
 
 def udp_frame(payload: bytes, port: int = 2368, vlan: bool = False) -> bytes:

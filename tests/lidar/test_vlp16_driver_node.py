@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lidar_streams import SECOND, pcap, udp_frame, wall_stream
+from lidar_streams import SECOND, limited_stream, pcap, retimed, udp_frame, wall_stream
 
 from instant_ic.bus import ERROR, OK, RELIABLE, WARN, Node, NodeError
 from instant_ic.bus.clock import SystemClock
@@ -22,8 +22,8 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.config.params import build, load_file
 from instant_ic.config.robot import Mount
 from instant_ic.geometry.poses import matrix_from_pose2
-from instant_ic.lidar.config import FlatScanConfig
-from instant_ic.lidar.packets import PACKET_PERIOD_US, encode_position_packet
+from instant_ic.lidar.config import DecoderConfig, FlatScanConfig
+from instant_ic.lidar.packets import HOUR_US, PACKET_PERIOD_US, encode_position_packet
 from instant_ic.msg import (
     LaserScan,
     PointCloud2,
@@ -161,6 +161,66 @@ def test_old_odometry_is_told_and_not_used(capture: Path) -> None:
     level, text, _ = node.diagnoses()["motion"]
     assert level == WARN and text.startswith("scan is not motion-compensated")
     np.testing.assert_allclose(bus.messages("/scan")[1].ranges, 5.0, atol=2e-3)
+
+
+def limited(path: Path, view: tuple[float, float]) -> Path:
+    """A capture of a sensor set to a field of view."""
+    made = limited_stream(12.0, view, 600.0)
+    stamps = [RECORDED + round(sent * SECOND) for sent in made.sent_s]
+    path.write_bytes(pcap([(s, udp_frame(p)) for s, p in zip(stamps, made.payloads, strict=True)], nano=True))
+    return path
+
+
+def test_a_limited_field_of_view_gives_no_scan_and_says_why_until_it_is_configured(tmp_path: Path) -> None:
+    path = limited(tmp_path / "half.pcap", (270.0, 90.0))
+    bus, node = played(path)
+    bus.advance(1.15)
+    assert not bus.messages("/scan")
+    level, text, _ = node.diagnoses()["view"]
+    assert level == ERROR
+    assert "270 to 90 degrees only" in text and "0 to 360 that the driver expects" in text
+    assert "No scan" in text and "0 to 359 on its web page" in text
+    level, text, values = node.diagnoses()["packets"]
+    assert (level, values["missing"]) == (OK, 0)
+    bus, node = played(path, decoder=DecoderConfig(fov_start_deg=270.0, fov_end_deg=90.0))
+    bus.advance(1.15)
+    scans = bus.messages("/scan")
+    assert len(scans) >= 10
+    assert np.diff([stamp_ns(scan) for scan in scans]) == pytest.approx(0.1 * SECOND, rel=0.02)
+    angle = -np.pi + np.arange(720) * 2 * np.pi / 720
+    ahead = np.abs(angle) < np.radians(89.0)
+    np.testing.assert_allclose(np.asarray(scans[5].ranges)[ahead], 5.0, atol=0.04)  # the wall's slant range
+    assert np.isnan(np.asarray(scans[5].ranges)[np.abs(angle) > np.radians(91.0)]).all()  # no ghost behind
+    level, text, _ = node.diagnoses()["view"]
+    assert level == WARN and "270 to 90 degrees only" in text and "does not see" in text
+
+
+def test_a_field_of_view_of_three_quarters_gives_a_scan_each_turn_and_a_warning(tmp_path: Path) -> None:
+    """With 45 to 315 degrees there was never a scan: each turn was cut twice."""
+    bus, node = played(limited(tmp_path / "most.pcap", (45.0, 315.0)), scan=FlatScanConfig(min_coverage=0.7))
+    bus.advance(1.15)
+    assert len(bus.messages("/scan")) >= 10
+    assert node.diagnoses()["view"][0] == WARN
+    assert "45 to 315 degrees only" in node.diagnoses()["view"][1]
+
+
+def test_time_past_the_hour_is_reported_once(tmp_path: Path) -> None:
+    frames = [
+        (RECORDED + round((index + 1) * PACKET_PERIOD_US * 1000.0), udp_frame(retimed(payload, HOUR_US + index * 1327)))
+        for index, payload in enumerate(wall_stream(1600, 5.0))
+    ]
+    path = tmp_path / "late.pcap"
+    path.write_bytes(pcap(frames, nano=True))
+    bus, node = played(path)
+    seen = []
+    for _ in range(4):
+        bus.advance(0.5)
+        seen.append(node.diagnoses().get("clock", (None, ""))[:2])
+    levels = [level for level, _ in seen]
+    assert WARN in levels and levels[-1] == OK and levels.count(WARN) <= 2  # for one second
+    assert "beyond 3600 s" in seen[-1][1]
+    assert len(bus.messages("/scan")) >= 18
+    assert node.diagnoses()["packets"][2]["bad"] == 0
 
 
 def test_capture_that_is_missing_or_none_is_told(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from lidar_streams import DATA, SECOND, random_stream, wall_stream
+from lidar_streams import DATA, SECOND, random_stream, retimed, wall_stream
 
 from instant_ic.lidar.clock import DeviceClock
 from instant_ic.lidar.config import DecoderConfig
@@ -111,6 +111,42 @@ def test_hour_of_the_sensors_clock_rolls_over_unseen() -> None:
     assert revolutions[2].stamp_ns - revolutions[1].stamp_ns == pytest.approx(0.1 * SECOND, rel=2e-3)
 
 
+def same(ours: list[Revolution], theirs: list[Revolution]) -> None:
+    assert len(ours) == len(theirs)
+    for a, b in zip(ours, theirs, strict=True):
+        assert (a.stamp_ns, a.end_ns, a.complete) == (b.stamp_ns, b.end_ns, b.complete)
+        np.testing.assert_array_equal(a.points, b.points)
+
+
+@pytest.mark.parametrize("over_us", [0, 200_000, 300_000])  # the sensor never wraps, or late
+def test_time_of_the_hour_that_runs_past_3600_s_is_taken_modulo_the_hour(over_us: int) -> None:
+    """Of 400 packets 324 were dropped, and no revolution was made until the sensor wrapped."""
+    payloads = wall_stream(400, 5.0, start_us=HOUR_US - 100_000)
+    beyond = [
+        retimed(payload, us + HOUR_US) if index > 75 and (us < over_us or not over_us) else payload
+        for index, payload in enumerate(payloads)
+        for us in [int.from_bytes(payload[1200:1204], "little")]
+    ]
+    wrapped, stream = PacketStream(), PacketStream()
+    same(feed(stream, beyond), feed(wrapped, payloads))
+    assert (stream.counters.packets, stream.counters.bad, stream.counters.clock_resets) == (400, 0, 0)
+    assert stream.counters.past_hour == (
+        324 if not over_us else sum(a != b for a, b in zip(payloads, beyond, strict=True))
+    )
+
+
+def test_a_single_wrong_time_costs_one_revolution() -> None:
+    """3599.99, 3600, 48, 3600.01: the series of a user's sensor."""
+    payloads = wall_stream(400, 5.0, start_us=HOUR_US - 100_000)
+    payloads[110] = retimed(payloads[110], 48_000_000)
+    stream = PacketStream()
+    revolutions = feed(stream, payloads)
+    assert (stream.counters.packets, stream.counters.bad) == (400, 0)
+    assert [revolution.complete for revolution in revolutions[-2:]] == [True, True]
+    assert sum(not revolution.complete for revolution in revolutions) <= 4
+    assert revolutions[-1].end_ns == pytest.approx(received(376), abs=0.1 * SECOND)
+
+
 def test_repeated_late_and_foreign_packets_are_dropped_and_counted() -> None:
     payloads = wall_stream(10, 5.0)
     stream = PacketStream()
@@ -118,7 +154,7 @@ def test_repeated_late_and_foreign_packets_are_dropped_and_counted() -> None:
         stream.feed(payloads[index], received(index))
     stream.feed(b"\0" * 1206, received(4))
     stream.feed(b"\xff\xee", received(4))
-    stream.feed(payloads[4][:1200] + b"\xff\xff\xff\xff\x37\x22", received(4))
+    stream.feed(payloads[4][:702] + b"\xa0\x8c" + payloads[4][704:], received(4))  # the 8th block's azimuth is 360.00
     stream.feed(payloads[4][:-1] + b"\x24", received(4))
     assert (stream.counters.packets, stream.counters.late, stream.counters.bad) == (4, 2, 4)
     assert len(stream.counters.bad_reasons) == 4
@@ -200,12 +236,18 @@ def test_revolutions_of_a_recording() -> None:
 
 
 @pytest.mark.real_data
-def test_gaps_of_a_malformed_recording_are_told() -> None:
+def test_recording_of_a_sensor_limited_to_a_sector_misses_no_packet() -> None:
+    """Real packets of a sensor set to 320 to 41 degrees, at 300 rpm: two of them span the rest."""
     path = DATA / "btlad_my.pcap"
     if not path.exists():
         pytest.skip(f"{path} is not there")
     stream = PacketStream()
     revolutions = list(stream.revolutions(path))
-    assert len(revolutions) == 3  # two gaps
-    assert stream.counters.missing == 235
-    assert not any(r.complete for r in revolutions)
+    assert [revolution.complete for revolution in revolutions] == [False, True, False]
+    assert (stream.counters.packets, stream.counters.missing) == (41, 0)
+    for revolution in revolutions:
+        ahead = (np.degrees(revolution.firing_azimuth) + 180.0) % 360.0 - 180.0
+        assert ahead.min() >= -40.1 and ahead.max() <= 41.1
+        assert (np.diff(revolution.points["time"]) >= 0.0).all()
+    assert revolutions[1].end_ns - revolutions[1].stamp_ns == pytest.approx(0.045 * SECOND, rel=0.02)  # 81 degrees
+    assert revolutions[2].stamp_ns - revolutions[1].stamp_ns == pytest.approx(0.2 * SECOND, rel=0.01)
