@@ -25,6 +25,7 @@ import numpy as np
 from reporting import parser_of, report
 
 from instant_ic.console import ConsoleClient, ConsoleServer, ServerConfig
+from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 
 ELSEWHERE = "127.0.0.2"
@@ -50,7 +51,9 @@ class Backend:
 def serve(channel: Connection, max_clients: int) -> None:
     """Server process: sends its port, and at the end the times of the stops."""
     backend: Any = Backend()
-    server = ConsoleServer(backend, ServerConfig(port=0, max_clients=max_clients, drive=PATIENT))
+    server = ConsoleServer(
+        backend, ServerConfig(port=0, max_clients=max_clients, drive=PATIENT, access=AccessConfig(simulated=True))
+    )
     server.start()
     for n in range(4):  # data of a running stack, which a new client gets at once
         server.publish(f"state{n}", {"filler": "x" * 400})

@@ -75,7 +75,12 @@ from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import corridor_world
 
 LAUNCH = """launch:
-- node: {{exec: console, param: [{{from: $(config console.yaml)}}, {{name: server.port, value: {port}}}]}}
+- node:
+    exec: console
+    param:
+    - from: $(config console.yaml)
+    - {{name: server.port, value: {port}}}
+    - {{name: server.access.simulated, value: true}}
 - node: {{exec: virtual_robot, param: [{{from: $(config control.yaml)}}]}}
 {more}
 """

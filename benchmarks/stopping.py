@@ -93,6 +93,7 @@ LAUNCH = """launch:
     - {{name: vspace, value: false}}
     - {{name: recorder, value: false}}
     - {{name: console_port, value: {console}}}
+    - {{name: simulated, value: true}}
 """
 
 

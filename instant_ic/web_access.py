@@ -1,11 +1,53 @@
-"""Access of browsers to a server of this machine: Host and Origin headers, and the rate of one client."""
+"""Access to a server of this machine: sign-in, Host and Origin headers, and the rate of one client."""
 
 from __future__ import annotations
 
 import ipaddress
+import logging
 import math
+import os
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from urllib.parse import urlsplit
+
+SIGN_IN = ("auto", "always", "never")
+logger = logging.getLogger(__name__)
+
+
+class AccessError(ValueError):
+    """A token or certificate cannot be used; the text says which and what to do."""
+
+
+def sign_in_needed(sign_in: str, host: str, simulated: bool) -> bool:
+    """Whether a server asks for a token. Other users of this machine may not drive a real robot either.
+
+    Args:
+        sign_in: one of ``SIGN_IN``; ``auto`` asks unless the server is on loopback and its robots are simulated.
+        host: listen address.
+        simulated: whether nothing real can move. False also if that is not known.
+    """
+    return sign_in == "always" or (sign_in == "auto" and not (simulated and is_loopback(host)))
+
+
+def offer_sign_in(address: str, file: Path) -> None:
+    """Write an address with its token to a file that only its owner can read, and show it on a terminal.
+
+    The token is never logged, because the log goes to ``/rosout`` and into bags.
+
+    Raises:
+        AccessError: the file cannot be written.
+    """
+    try:
+        file.unlink(missing_ok=True)
+        with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
+            out.write(f"{address}\n")
+    except OSError as error:
+        raise AccessError(f"cannot write the address with the token to {file}: {error.strerror}") from error
+    logger.info("the address with the token is in %s", file)
+    if sys.stdout.isatty():  # `ic run`; the launcher shows the address itself
+        sys.stdout.write(f"sign in at {address}\n")
+        sys.stdout.flush()
 
 
 def is_loopback(host: str) -> bool:

@@ -10,11 +10,11 @@ from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node, NodeError, main
 from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
 from instant_ic.bus.node import Subscription, Timer
 from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
-from instant_ic.console.access import AccessError, offer_sign_in
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.paths import sign_in_file
+from instant_ic.web_access import AccessError, offer_sign_in
 
 RECORDER_TIMEOUT_S = 3.0
 
@@ -73,7 +73,9 @@ class ConsoleNode(Node[ConsoleConfig]):
         try:
             self.server.start()
             self.log.info("open %s in a browser", self.server.url)
-            offer_sign_in(self.server.access, self.server.sign_in_url, sign_in)
+            sign_in.unlink(missing_ok=True)  # left by a console that was killed
+            if self.server.access.made_token:
+                offer_sign_in(self.server.sign_in_url, sign_in)
         except (ConsoleError, AccessError) as error:
             raise NodeError(str(error)) from error
         self.recording.start()

@@ -13,7 +13,8 @@ from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, Ser
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.bus.registry import TopicWatch
 from instant_ic.config.ranges import Range
-from instant_ic.web_access import is_loopback
+from instant_ic.paths import sign_in_file
+from instant_ic.web_access import AccessError, is_loopback, offer_sign_in
 
 _TIME_S = 0.05
 _REFUSED_S = 1.0
@@ -54,18 +55,31 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             self.server = FoxgloveServer(self, self.run_dir, config, choice.takes, self.gate, self.use_sim_time)
         except FoxgloveError as error:
             raise NodeError(str(error)) from None
-        scheme = "wss" if config.tls_cert else "ws"
-        self.log.info("Foxglove: open %s://%s:%d", scheme, config.host, self.server.port)
-        may = ["drive the robot"] * config.accept_operator + ["change parameters"] * config.set_parameters
-        if not is_loopback(config.host):
+        address = f"{'wss' if config.tls_cert else 'ws'}://{config.host}:{self.server.port}"
+        self.log.info("Foxglove: open %s", address)
+        self._offer_sign_in(address)
+        local = is_loopback(config.host)
+        if not self.server.token and not (config.simulated and local):
+            may = ["drive the robot"] * config.accept_operator + ["change parameters"] * config.set_parameters
             what = " and ".join(may or ["read everything"])
-            self.diagnose(
-                "access", WARN, f"anyone who reaches {config.host}:{self.server.port} can {what}: there is no sign-in"
-            )
+            text = f"anyone who reaches {config.host}:{self.server.port} can {what}, because sign_in is never"
+            self.diagnose("access", WARN, text)
+        elif not (local or config.tls_cert):
+            self.diagnose("access", WARN, "token and data go over the network unencrypted; set tls_cert and tls_key")
         self._refused, self._next_refused_s = 0, 0.0
         # A thread, not a timer: with simulated time the timers may stand still while messages already arrive.
         self._look_thread = threading.Thread(target=self._look, name="discovery", daemon=True)
         self._look_thread.start()
+
+    def _offer_sign_in(self, address: str) -> None:
+        assert self.server is not None and self.run_dir is not None
+        file = sign_in_file(self.run_dir, self.node_name)
+        file.unlink(missing_ok=True)  # left by a bridge that was killed
+        if self.server.token:
+            try:
+                offer_sign_in(f"{address}/?token={self.server.token}", file)
+            except AccessError as error:
+                raise NodeError(str(error)) from None
 
     def _look(self) -> None:
         assert self.server is not None
@@ -109,6 +123,8 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             self.server.wake.set()
             self._look_thread.join(2.0)
             self.server.close()
+            if self.run_dir is not None:
+                sign_in_file(self.run_dir, self.node_name).unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

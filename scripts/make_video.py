@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.console import ConsoleServer, Look, ServerConfig
+from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.experiments.page_renderer import launch_chromium
 from instant_ic.experiments.pictures import jpeg
@@ -125,7 +126,9 @@ def film() -> list[bytes]:
         operator = Operator(stack)
         patient = DriveConfig(watchdog_s=60.0, lease_timeout_s=600.0, max_command_age_s=60.0, beat_timeout_s=60.0)
         page_values = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
-        server = ConsoleServer(operator, ServerConfig(port=0, drive=patient), page_values)
+        server = ConsoleServer(
+            operator, ServerConfig(port=0, drive=patient, access=AccessConfig(simulated=True)), page_values
+        )
         stack.page = stack.nodes["console"].feed.server = page_in = Page(stack, server)
         stack.nodes["console"].feed_layers(True)
         server.start()

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hmac
 import logging
+import secrets
 import ssl
 import threading
 import time
@@ -30,7 +32,7 @@ from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Received
 from instant_ic.config.ranges import Range, check_ranges
-from instant_ic.web_access import TokenBucket, refusal
+from instant_ic.web_access import SIGN_IN, TokenBucket, refusal, sign_in_needed
 
 _START_S = 10.0
 _END_S = 2.0
@@ -60,7 +62,10 @@ class ServerConfig:
     """Parameters of the server.
 
     Attributes:
-        host: address to listen on; 0.0.0.0 opens the server to the network (there is no sign-in).
+        host: address to listen on; 0.0.0.0 opens the server to the network.
+        sign_in: whether viewers need the token of this start: ``auto`` (unless ``simulated``), ``always`` or ``never``.
+        simulated: there are simulated robots only. Then ``auto`` needs no token on this machine. The simulator's launch
+            files set it.
         port: TCP port; 0: any free port, reported in the log.
         tls_cert: certificate in PEM; with tls_key the server speaks wss:// only.
         tls_key: its private key, PKCS#8 in PEM.
@@ -75,6 +80,8 @@ class ServerConfig:
     """
 
     host: str = "127.0.0.1"
+    sign_in: str = "auto"
+    simulated: bool = False
     port: Annotated[int, Range(0, 65535)] = 8765
     tls_cert: str = ""
     tls_key: str = ""
@@ -87,6 +94,8 @@ class ServerConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        if self.sign_in not in SIGN_IN:
+            raise ValueError(f"sign_in must be one of {', '.join(SIGN_IN)} (got {self.sign_in!r})")
         if bool(self.tls_cert) != bool(self.tls_key):
             raise ValueError("tls_cert and tls_key go together: give both or none")
 
@@ -104,6 +113,7 @@ class FoxgloveServer:
         count, bytes: messages of the bus that were passed to clients, and their size.
         refused: rejected requests: wrong Origin or Host, or too many clients.
         refusal: reason of the last rejection.
+        token: token that viewers need in the address; empty: none.
 
     Raises:
         FoxgloveError: the server cannot start.
@@ -140,6 +150,8 @@ class FoxgloveServer:
         self.bytes = 0
         self.refused = 0
         self.refusal = ""
+        needed = sign_in_needed(config.sign_in, config.host, config.simulated)
+        self.token = secrets.token_urlsafe(24) if needed else ""
         self.port = 0
         self._loop = asyncio.new_event_loop()
         self._finish = asyncio.Event()
@@ -339,6 +351,11 @@ class FoxgloveServer:
         if why:
             self._refuse(why)
             return web.Response(status=403, text=f"{why} of foxglove_bridge\n")
+        given = request.query.get("token", "").encode()
+        if self.token and not hmac.compare_digest(given, self.token.encode()):
+            why = "no token or a wrong one; foxglove_bridge's log names the file that has the address with it"
+            self._refuse(why)
+            return web.Response(status=401, text=f"{why}\n")
         if len(self._clients) >= config.max_clients:
             self._refuse("too many clients")
             return web.Response(status=503, text=f"{config.max_clients} clients are connected; see max_clients\n")

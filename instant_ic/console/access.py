@@ -7,13 +7,10 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import logging
 import math
-import os
 import secrets
 import ssl
 import stat
-import sys
 from collections import OrderedDict, deque
 from dataclasses import dataclass
 from enum import Enum
@@ -21,21 +18,15 @@ from pathlib import Path
 from typing import Annotated
 
 from instant_ic.config.ranges import Positive, Range, check_ranges
-from instant_ic.web_access import is_loopback
+from instant_ic.web_access import SIGN_IN, AccessError, is_loopback, sign_in_needed
 
 COOKIE = "instant_ic_session"
-SIGN_IN = ("auto", "always", "never")
 MIN_TOKEN = 16
 FIRST_WAIT_S = 0.25  # before a wrong token is answered, once its address has sent too many of them
 MAX_WAIT_S = 4.0
 _MOST_SESSIONS = 256  # of one role
 _MOST_ADDRESSES = 1024
 _MOST_DOUBLINGS = 8
-logger = logging.getLogger("instant_ic.console")
-
-
-class AccessError(ValueError):
-    """A token or certificate cannot be used; the text says which and what to do."""
 
 
 class Role(Enum):
@@ -50,7 +41,9 @@ class AccessConfig:
     """Sign-in and TLS.
 
     Attributes:
-        sign_in: ``auto`` (required on a network address or with a token file), ``always`` or ``never``.
+        sign_in: ``auto`` (required unless ``simulated``), ``always`` or ``never``.
+        simulated: the page drives simulated robots only. Then ``auto`` needs no sign-in on this machine, unless there
+            is a token file. The simulator's launch files set it.
         token_file: file with the token to drive, readable by its owner only. Empty: each start makes a token and
             shows it on the terminal and in a file readable by its owner only, never in the log.
         watch_token_file: file with the token to watch and stop the robot only; empty: there is no such token.
@@ -61,6 +54,7 @@ class AccessConfig:
     """
 
     sign_in: str = "auto"
+    simulated: bool = False
     token_file: str = ""
     watch_token_file: str = ""
     session_hours: Positive = 12.0
@@ -131,10 +125,9 @@ class Access:
     def __init__(self, config: AccessConfig, host: str) -> None:
         self.config = config
         open_to_network = not is_loopback(host)
-        self.required = config.sign_in == "always" or (
-            config.sign_in == "auto" and (open_to_network or bool(config.token_file or config.watch_token_file))
-        )
-        self.unguarded = open_to_network and not self.required
+        protected = bool(config.token_file or config.watch_token_file)
+        self.required = sign_in_needed(config.sign_in, host, config.simulated and not protected)
+        self.unguarded = not self.required and (open_to_network or not config.simulated)
         self.made_token = ""
         self._digests: dict[Role, bytes] = {}
         self._sessions: OrderedDict[bytes, tuple[Role, float]] = OrderedDict()
@@ -195,28 +188,6 @@ class Access:
     def close_session(self, cookie: str) -> None:
         """Sign a page out."""
         self._sessions.pop(_digest(cookie), None)
-
-
-def offer_sign_in(access: Access, url: str, file: Path) -> None:
-    """Write the address with the token to a file that only its owner can read, and show it on the terminal.
-
-    The token is never logged, because the log goes to ``/rosout`` and into bags.
-
-    Raises:
-        AccessError: the file cannot be written.
-    """
-    try:
-        file.unlink(missing_ok=True)  # left by a console that was killed
-        if not access.made_token:
-            return
-        with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
-            out.write(f"{url}\n")
-    except OSError as error:
-        raise AccessError(f"cannot write the address with the token to {file}: {error.strerror}") from error
-    logger.info("the address with the token is in %s", file)
-    if sys.stdout.isatty():  # `ic run console`; the launcher shows the address itself
-        sys.stdout.write(f"sign in at {url}\n")
-        sys.stdout.flush()
 
 
 def _digest(text: str) -> bytes:

@@ -111,7 +111,7 @@ class ServerConfig(Checked):
     """Address, limits and access of the server.
 
     Attributes:
-        host: listen address; any but loopback (e.g. 0.0.0.0) opens the page to the network, with sign-in.
+        host: listen address; any but loopback (e.g. 0.0.0.0) opens the page to the network.
         port: 0 = any free port; the log states it.
         allowed_hosts: host names by which browsers may reach the page, besides localhost and IP addresses.
         max_clients: simultaneous pages; two places are reserved for pages that may drive.
@@ -221,7 +221,8 @@ class ConsoleServer:
     @property
     def warnings(self) -> list[str]:
         """What the log should warn about: access that the parameters leave open."""
-        unguarded = "anyone on the network may drive, because server.access.sign_in is never"
+        who = "every user of this machine" if is_loopback(self.config.host) else "anyone on the network"
+        unguarded = f"{who} may drive, because server.access.sign_in is never"
         return [PLAIN_HTTP] * self.plain_http + [unguarded] * self.access.unguarded
 
     @property

@@ -98,7 +98,6 @@ class _Output:
         self._left_out = 0  # lines not shown on the terminal
         self._next_view_s = 0.0
         self._reached = 0
-        self._address: str | None = None
 
     def make_health(self) -> HealthMonitor:
         """Create the health monitor, once the processes have been started, so that they need not wait for it."""
@@ -134,7 +133,7 @@ class _Output:
             return View(tuple(_row(process, None, []) for process in processes), looked=False, ending=self._ending)
         faults = health.topic_faults()
         # Only a terminal gets the token: others may read the file or pipe that standard output goes to.
-        self._address = self._address or health.console_address(with_token=sys.stdout.isatty())
+        addresses = health.addresses(with_token=sys.stdout.isatty())
         if not self._ending:
             down = {p.spec.label: p.state.value for p in processes if p.state in (State.FAILED, State.WAITING)}
             health.publish(down, faults)
@@ -144,7 +143,7 @@ class _Output:
             rows=tuple(_row(process, health, faults) for process in processes),
             missing=tuple(label for label in health.nodes_missing() if label not in gone),
             waiting=tuple(health.waiting_for()),
-            address=self._address,
+            addresses=dict(addresses),
             faults=tuple(f"{fault.topic} of {fault.label}: {fault.words}" for fault in faults),
             ending=self._ending,
             pace=self.pacing.text if self.pacing is not None else "",

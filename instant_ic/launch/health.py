@@ -86,6 +86,7 @@ class HealthMonitor:
         self._control = [self._subscribe(spec, "/ic/state", control) for spec in self._of("arbiter") if self._late]
         self._vspace_text: dict[str, str] = {}
         self._next_diagnostics_s = 0.0
+        self._addresses: dict[str, str] = {}
         self._reached: set[str] = set()
         self._flowed: set[tuple[str, str]] = set()
         self._wrong_since: dict[tuple[str, str], float] = {}
@@ -204,28 +205,38 @@ class HealthMonitor:
             ]
             publisher.send(serialize(_diagnostic_array(entries)))
 
-    def console_address(self, *, with_token: bool) -> str | None:
-        """Address of the operator's page once a console node reports that it runs.
+    def addresses(self, *, with_token: bool) -> dict[str, str]:
+        """Addresses of the operator's page and, if it needs a token, of the Foxglove bridge, once their nodes run.
 
         Args:
-            with_token: for a terminal: include the token, if one was created at this start; else name its file.
+            with_token: for a terminal: include the token, which is a new one after a restart; else name its file.
         """
         for spec in self._specs:
             health = self.nodes.get(spec.label)
-            if spec.exec != "console" or health is None or not health.up:
+            if spec.exec not in ("console", "foxglove_bridge") or health is None or not health.up:
                 continue
             folder = self._folders[spec.group]
-            address = find_console(registry.list_nodes(folder), [spec.name])
             file = sign_in_file(folder, spec.name)
-            if file.is_file():
-                return file.read_text().strip() if with_token else f"{address or 'console'}, sign in as {file} says"
-            if address:
-                return address
-        return None
+            if with_token and (address := _line_of(file)):
+                self._addresses[spec.label] = address
+            elif spec.label not in self._addresses:
+                address = find_console(registry.list_nodes(folder), [spec.name]) or ""
+                if file.is_file():
+                    address = f"{address or spec.exec}, sign in as {file} says"
+                if address:
+                    self._addresses[spec.label] = address
+        return self._addresses
 
     def close(self) -> None:
         for transport in self._transports.values():
             transport.close()
+
+
+def _line_of(file: Path) -> str:
+    """A file's text; empty if there is none, because its node has just ended."""
+    with suppress(OSError):
+        return file.read_text(encoding="utf-8").strip()
+    return ""
 
 
 def _published(subscriptions: Iterable[Any]) -> Iterable[tuple[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rich.console import Console, Group, RenderableType
@@ -61,7 +61,7 @@ class View:
         rows: its processes, in the order of the launch file.
         missing: nodes that have not reported yet that they run.
         waiting: what an operator still waits for (camera, map, ...).
-        address: of the operator's page; None until it is available.
+        addresses: address of each page, by its node's label, once it is available.
         faults: topics that have stopped or are too slow, as text.
         looked: whether the launcher receives heartbeats already.
         ending: whether the stack is shutting down, so that nothing is waited for.
@@ -71,7 +71,7 @@ class View:
     rows: tuple[Row, ...] = ()
     missing: tuple[str, ...] = ()
     waiting: tuple[str, ...] = ()
-    address: str | None = None
+    addresses: Mapping[str, str] = field(default_factory=dict)
     faults: tuple[str, ...] = field(default=())
     looked: bool = True
     ending: bool = False
@@ -106,7 +106,7 @@ class Screen:
         self._started_s = time.monotonic()
         self._next_progress_s = self._started_s + progress_period_s
         self._told_nodes = self._told_ready = False
-        self._address: str | None = None
+        self._addresses: dict[str, str] = {}
         self._told_faults: tuple[str, ...] = ()
         self._verbose = verbose
         self._shows = dict.fromkeys(nodes, True)
@@ -166,12 +166,13 @@ class Screen:
             count = sum(row.state not in ("failed", "ended") for row in view.rows) or len(self._colours)
             up = "the node is up" if count == 1 else f"all {count} nodes are up"
             self.event(f"{up} after {now - self._started_s:.1f} s")
-        if self._address is None and view.address:
-            self._address = view.address
-            self.event(f"console: {view.address}")
+        for node, address in view.addresses.items():
+            if self._addresses.setdefault(node, "") != address:
+                self._addresses[node] = address
+                self.event(f"{node}: {address}")
         if self._told_nodes and not view.waiting and not self._told_ready:
             self._told_ready = True
-            at = f": {self._address}" if self._address else ""
+            at = f": {self._page}" if self._page else ""
             self.event(f"ready after {now - self._started_s:.1f} s{at}")
             self._held_back.clear()  # the start's; what is still wrong is in the nodes' own reports
             for row in view.rows:
@@ -190,6 +191,11 @@ class Screen:
                 progress = f"{running} of {len(self._colours)} nodes are up, " if view.missing else ""
                 self.event(f"{progress}waiting for {', '.join(view.missing or view.waiting)}")
             self._tell_faults(view.faults)
+
+    @property
+    def _page(self) -> str | None:
+        """Address of the operator's page."""
+        return next((url for node, url in self._addresses.items() if node.rpartition("/")[2] == "console"), None)
 
     def _tell_faults(self, faults: tuple[str, ...]) -> None:
         """Report a topic when it becomes faulty and when it recovers; changing numbers are not reported again."""
@@ -248,8 +254,8 @@ class Screen:
             words.append(f"waiting for {', '.join(waiting)}", style="yellow")
         else:
             words.append("ready", style="bold green")
-        if self._address:
-            words.append(" · ").append(self._address, style="bold underline")
+        if self._page:
+            words.append(" · ").append(self._page, style="bold underline")
         if view.pace:
             words.append(f" · {view.pace}", style="yellow")
         words.append(f" · {_duration(time.monotonic() - self._started_s)} · Ctrl-C stops the stack", style="dim")

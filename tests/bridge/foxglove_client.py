@@ -19,10 +19,10 @@ from nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
 class Client:
     """A client of Foxglove's protocol."""
 
-    def __init__(self, port, host="127.0.0.1", protocol="foxglove.sdk.v1", **options):
+    def __init__(self, port, host="127.0.0.1", protocol="foxglove.sdk.v1", path="", **options):
         self._open = contextlib.ExitStack()
         self.socket = self._open.enter_context(
-            connect(f"ws://{host}:{port}", subprotocols=[protocol], max_size=None, compression=None, **options)
+            connect(f"ws://{host}:{port}{path}", subprotocols=[protocol], max_size=None, compression=None, **options)
         )
         self.channels = {}
         self.messages = deque()
@@ -104,6 +104,10 @@ class FoxgloveWorld:
         return self
 
     def __exit__(self, *error):
+        self.close()
+
+    def close(self):
+        """End the clients, the bridge and what is beside it."""
         self._open.close()
 
     def keep(self, thing):
@@ -111,7 +115,7 @@ class FoxgloveWorld:
         return thing
 
     def bridge(self, sim_time=False, **parameters):
-        config = FoxgloveBridgeConfig(port=0, discovery_period_s=0.05, **parameters)
+        config = FoxgloveBridgeConfig(port=0, discovery_period_s=0.05, **{"simulated": True, **parameters})
         self.live = self.keep(LiveNode(self.run_dir, FoxgloveBridgeNode, config, "foxglove_bridge", sim_time))
         return self.live.node
 

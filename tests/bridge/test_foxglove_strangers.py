@@ -3,6 +3,7 @@
 import contextlib
 import json
 import socket
+import stat
 import struct
 import threading
 import time
@@ -21,7 +22,7 @@ from instant_ic.bus.control import NodeControl
 from instant_ic.bus.node import Node
 from instant_ic.bus.node_files import node_class
 from instant_ic.msg import String, deserialize
-from instant_ic.paths import node_names
+from instant_ic.paths import node_names, sign_in_file
 from instant_ic.web_access import is_loopback, refusal
 
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
@@ -83,6 +84,23 @@ def test_origin_and_host_rules():
     assert [is_loopback(host) for host in ("127.3.2.1", "::1", "localhost", "0.0.0.0", "robot")] == [True] * 3 + [
         False
     ] * 2
+
+
+def test_fault_every_local_user_sees_and_drives_a_real_robot(world):
+    bridge = world.bridge(simulated=False, accept_operator=True)
+    file = sign_in_file(world.run_dir, "foxglove_bridge")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    address, _, token = file.read_text().strip().partition("/?token=")
+    assert address == f"ws://127.0.0.1:{bridge.server.port}" and len(token) > 20
+    for query in ("", "?token=", "?token=" + token[:-1], "?Token=" + token):
+        with pytest.raises(InvalidStatus) as refused:
+            world.client(path="/" + query)
+        assert refused.value.response.status_code == 401
+    assert world.client(path=f"/?token={token}").info["name"] == "Instant IC"
+    wait_for(lambda: "no token" in bridge.diagnoses().get("door", (0, "", {}))[1], "the diagnosis")
+    assert token not in str(bridge.diagnoses())
+    world.close()
+    assert not file.exists()
 
 
 def test_only_foxgloves_protocols_are_spoken(world):

@@ -107,7 +107,13 @@ class TwoMachines:
     def station(self, **arguments: Any) -> Stack:
         """The station's stack."""
         host, port = self.station_target
-        arguments = {"keys": self.keys("station"), "robot_host": host, "robot_port": port, **arguments}
+        arguments = {
+            "keys": self.keys("station"),
+            "robot_host": host,
+            "robot_port": port,
+            "simulated": "true",
+            **arguments,
+        }
         return Stack("station", self.run_dir("station"), arguments, prefix=self.prefix("station"))
 
     def cut(self) -> None:

@@ -18,6 +18,7 @@ import demo_world
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.console.access import AccessConfig
 from instant_ic.console.gridimage import GridImage, grey_png, grid_image
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
@@ -383,7 +384,7 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO)
-    demo = Demo(ServerConfig(port=arguments.port), DemoConfig(layers=True))
+    demo = Demo(ServerConfig(port=arguments.port, access=AccessConfig(simulated=True)), DemoConfig(layers=True))
     demo.start()
     logging.getLogger("console_demo").info("open %s (Ctrl-C stops)", demo.server.url)
     try:

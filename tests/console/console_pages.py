@@ -48,7 +48,7 @@ def make_demo(port=0, panorama_width=192, view_width=160, **access):
     drive = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
     view = ViewConfig(width=view_width, height=view_width * 5 // 8, virtual_rate_hz=5)
     config = DemoConfig(panorama_width=panorama_width, panorama_hz=4, view=view)
-    demo = Demo(ServerConfig(port=port, drive=drive, access=AccessConfig(**access)), config)
+    demo = Demo(ServerConfig(port=port, drive=drive, access=AccessConfig(simulated=True, **access)), config)
     demo.start()
     return demo
 

@@ -54,7 +54,7 @@ def serve():
     servers = []
 
     def start(**access):
-        server = ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(**access)))
+        server = ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(simulated=True, **access)))
         server.start()
         servers.append(server)
         return server
@@ -73,25 +73,48 @@ def run(scenario):
 
 
 @pytest.mark.parametrize(
-    ("host", "sign_in", "with_file", "required", "unguarded"),
+    ("host", "sign_in", "simulated", "with_file", "required", "unguarded"),
     [
-        ("127.0.0.1", "auto", False, False, False),
-        ("localhost", "auto", False, False, False),
-        ("::1", "auto", False, False, False),
-        ("0.0.0.0", "auto", False, True, False),
-        ("192.168.1.5", "auto", False, True, False),
-        ("127.0.0.1", "auto", True, True, False),
-        ("127.0.0.1", "always", False, True, False),
-        ("0.0.0.0", "never", False, False, True),
-        ("127.0.0.1", "never", True, False, False),
+        ("127.0.0.1", "auto", True, False, False, False),
+        ("localhost", "auto", True, False, False, False),
+        ("::1", "auto", True, False, False, False),
+        ("127.0.0.1", "auto", False, False, True, False),
+        ("::1", "auto", False, False, True, False),
+        ("0.0.0.0", "auto", True, False, True, False),
+        ("192.168.1.5", "auto", False, False, True, False),
+        ("127.0.0.1", "auto", True, True, True, False),
+        ("127.0.0.1", "always", True, False, True, False),
+        ("0.0.0.0", "never", True, False, False, True),
+        ("127.0.0.1", "never", False, True, False, True),
+        ("127.0.0.1", "never", True, True, False, False),
     ],
 )
-def test_when_a_sign_in_is_needed(files, host, sign_in, with_file, required, unguarded):
+def test_when_a_sign_in_is_needed(files, host, sign_in, simulated, with_file, required, unguarded):
     given = {"token_file": files["token_file"]} if with_file else {}
-    access = Access(AccessConfig(sign_in=sign_in, **given), host)
+    access = Access(AccessConfig(sign_in=sign_in, simulated=simulated, **given), host)
     assert (access.required, access.unguarded) == (required, unguarded)
     assert bool(access.made_token) == (required and not with_file)
     assert is_loopback(host) == (host in ("127.0.0.1", "localhost", "::1"))
+
+
+def test_fault_every_local_user_drives_a_real_robot():
+    """A console that does not know whether its robot is real asks for a token on this machine too."""
+    server = ConsoleServer(Nobody(), ServerConfig(port=0))
+    server.start()
+    try:
+
+        async def scenario():
+            async with aiohttp.ClientSession() as http:
+                for method, path in (("GET", ""), ("GET", "ws"), ("GET", "export/panorama.jpg"), ("POST", "estop")):
+                    async with http.request(method, server.url + path) as response:
+                        assert response.status == 401, path
+            async with ConsoleClient(server.sign_in_url) as owner:
+                assert owner.messages["hello"]["may_drive"] is True
+
+        run(scenario)
+    finally:
+        server.stop()
+    assert server.backend.estops == []
 
 
 def test_tokens_are_told_apart_and_sessions_end(files):

@@ -10,6 +10,7 @@ import pytest
 
 from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ProtocolError, ServerConfig
 from instant_ic.console import server as server_module
+from instant_ic.console.access import AccessConfig
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayer, PageLayers
 from instant_ic.console.protocol import Parts, decode_frame
@@ -98,7 +99,7 @@ class Nobody:
 
 @pytest.fixture
 def server():
-    server = ConsoleServer(Nobody(), ServerConfig(port=0))
+    server = ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(simulated=True)))
     server.start()
     yield server
     server.stop()

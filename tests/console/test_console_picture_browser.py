@@ -20,6 +20,7 @@ from console_pages import (
     wait_until,
 )
 
+from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import ServerConfig
 from instant_ic.console.view import ViewConfig
@@ -47,7 +48,9 @@ def passage_demo(**page_values):
     view = ViewConfig(width=256, height=160, virtual_rate_hz=5)
     drive = DriveConfig(lease_timeout_s=60.0)
     config = DemoConfig(panorama_width=448, panorama_hz=4, view=view)
-    demo = Demo(ServerConfig(port=0, drive=drive), config, SLOW_PASSAGE | page_values)
+    demo = Demo(
+        ServerConfig(port=0, drive=drive, access=AccessConfig(simulated=True)), config, SLOW_PASSAGE | page_values
+    )
     demo.forced_mode = "real"
     demo.start()
     return demo

@@ -9,6 +9,7 @@ import pytest
 
 from instant_ic import pace
 from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, FrameKind, ServerConfig
+from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import origin_allowed
 from instant_ic.web_access import host_allowed
@@ -51,9 +52,9 @@ class Recorder:
 def serve():
     servers = []
 
-    def start(drive=PATIENT, **config):
+    def start(drive=PATIENT, access=AccessConfig(simulated=True), **config):  # noqa: B008
         backend = Recorder()
-        server = ConsoleServer(backend, ServerConfig(port=0, drive=drive, **config), {"dissolve_ms": 1})
+        server = ConsoleServer(backend, ServerConfig(port=0, drive=drive, access=access, **config), {"dissolve_ms": 1})
         server.start()
         servers.append(server)
         return server, backend

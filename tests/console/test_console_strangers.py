@@ -39,8 +39,8 @@ ELSEWHERE = ("127.0.0.2", 0)  # another address on this machine
 def serve():
     servers = []
 
-    def start(**config):
-        server = ConsoleServer(Nobody(), ServerConfig(port=0, drive=PATIENT, **config))
+    def start(access=AccessConfig(simulated=True), **config):  # noqa: B008
+        server = ConsoleServer(Nobody(), ServerConfig(port=0, drive=PATIENT, access=access, **config))
         server.start()
         servers.append(server)
         return server
@@ -474,7 +474,7 @@ def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, t
 
 def test_fault_a_tls_handshake_takes_for_ever(serve, monkeypatch, certificate):
     monkeypatch.setattr(connections_module, "HEADERS_S", 0.5)
-    server = serve(access=AccessConfig(**certificate))
+    server = serve(access=AccessConfig(simulated=True, **certificate))
 
     async def scenario():
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
@@ -526,9 +526,11 @@ SERVER_WITHOUT_FILES = """
     import resource, sys
     from types import SimpleNamespace
     from instant_ic.console import ConsoleServer, ServerConfig
+    from instant_ic.console.access import AccessConfig
     nothing = lambda *args: None
     backend = SimpleNamespace(on_drive=nothing, on_operator=nothing, on_estop=nothing, on_look=nothing)
-    server = ConsoleServer(backend, ServerConfig(port=0, max_connections=1000, max_connections_per_address=1000))
+    many = dict(max_connections=1000, max_connections_per_address=1000)
+    server = ConsoleServer(backend, ServerConfig(port=0, access=AccessConfig(simulated=True), **many))
     server.start()
     resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
     print(server.port, flush=True)

@@ -19,7 +19,7 @@ from instant_ic.bus.local_transport import LocalTransport
 pytestmark = pytest.mark.system
 STACK = """
 launch:
-- node: {{exec: console, param: [{{name: server.host, value: 0.0.0.0}}, {{name: server.port, value: {port}}}]}}
+- node: {{exec: console, param: [{{name: server.host, value: {host}}}, {{name: server.port, value: {port}}}]}}
 - node: {{exec: bag_recorder, param: [{{name: path, value: {bags}}}]}}
 """
 TOPICS = ("/rosout", "/diagnostics", "/heartbeat", "/parameter_events")
@@ -30,10 +30,14 @@ def free_port():
         return taken.getsockname()[1]
 
 
-@pytest.mark.parametrize("terminal", [True, False], ids=["terminal", "file"])
-def test_fault_the_token_goes_to_the_log(tmp_path_factory, terminal):
+@pytest.mark.parametrize(
+    ("host", "terminal"),
+    [("0.0.0.0", False), ("127.0.0.1", True), ("127.0.0.1", False)],
+    ids=["network, journal", "terminal", "journal"],
+)
+def test_fault_the_token_goes_to_the_log(tmp_path_factory, host, terminal):
     folder = tmp_path_factory.mktemp("t")
-    (folder / "stack.yaml").write_text(STACK.format(port=free_port(), bags=folder / "bags"))
+    (folder / "stack.yaml").write_text(STACK.format(host=host, port=free_port(), bags=folder / "bags"))
     run_dir, shown = folder / "r", bytearray()
     registry.prepare(run_dir)
     transport = LocalTransport(run_dir, "stranger", time.time_ns)
@@ -91,6 +95,6 @@ def test_fault_the_token_goes_to_the_log(tmp_path_factory, terminal):
     written = [path for path in folder.rglob("*") if path.is_file()]
     assert any("bags" in path.parts for path in written)
     logged = b"".join(path.read_bytes() for path in written if path.suffix == ".log")
-    assert b"console.sign_in" in logged and b"Plain HTTP" in logged
+    assert b"console.sign_in" in logged and (b"Plain HTTP" in logged) is (host == "0.0.0.0")
     for path in written:
         assert token not in path.read_bytes(), path

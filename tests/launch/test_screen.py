@@ -44,8 +44,8 @@ def test_plain_lines_tell_what_is_waited_for(out: io.StringIO) -> None:
         screen.refresh(View(looked=False, missing=("slam",)))  # nobody has listened yet: nothing to tell
         screen.refresh(View(missing=("slam", "page"), waiting=("map",)))
         screen.refresh(View(waiting=("map",)))
-        screen.refresh(View(address="http://127.0.0.1:8080"))
-        screen.refresh(View(address="http://127.0.0.1:8080"))
+        screen.refresh(View(addresses={"console": "http://127.0.0.1:8080"}))
+        screen.refresh(View(addresses={"console": "http://127.0.0.1:8080"}))
         screen.refresh(View(waiting=("map",), ending=True))
     lines = out.getvalue().splitlines()
     assert lines[0] == "  slam │ hello red"
@@ -342,7 +342,7 @@ def test_an_optional_node_that_has_ended_is_not_waited_for(tmp_path: Path, capsy
         topic_faults=list,
         waiting_for=list,
         nodes_missing=lambda: ["recorder", "slam"],
-        console_address=lambda with_token: None,
+        addresses=lambda with_token: {},
         publish=lambda down, faults: None,
     )
     output._health = monitor

@@ -105,6 +105,16 @@ def test_only_the_simulated_robot_is_driven_by_another_arbiter() -> None:
             nodes(name, arbiter=str(file))
 
 
+def test_only_simulated_robots_are_driven_and_watched_without_a_token() -> None:
+    for name in set(NAMES) - {"replay", "fleet_robot", "sim_robot"}:
+        simulated = {node for node, command in nodes(name).items() if "server.access.simulated:=true" in command}
+        assert simulated == ({"console"} if name in ("sim", "fleet") else set()), name
+    assert "simulated" not in nodes("fleet", robot="robot4")["console"]  # none of the three
+    assert "simulated" not in {argument.name for argument in read_arguments(find_launch_file("full"))}
+    for name in ("sim", "robot", "station", "full"):
+        assert ("simulated:=true" in nodes(name, foxglove="true")["foxglove_bridge"]) is (name == "sim")
+
+
 def test_lidar_alone_starts_no_network() -> None:
     for name in ("station", "full", "sim", "replay"):
         with_network, without = nodes(name), nodes(name, depth_source="lidar")

@@ -26,7 +26,10 @@ LAUNCH = """launch:
 - node: {{exec: arbiter, param: [{{from: $(config control.yaml)}}], respawn: true}}
 - node:
     exec: console
-    param: [{{from: $(config console.yaml)}}, {{name: server.port, value: {port}}}]
+    param:
+    - from: $(config console.yaml)
+    - {{name: server.port, value: {port}}}
+    - {{name: server.access.simulated, value: true}}
     respawn: true
 """
 
