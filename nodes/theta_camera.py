@@ -6,6 +6,7 @@ from instant_ic.bus import ERROR, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.camera.config import ThetaCameraConfig
 from instant_ic.camera.device import health, open_camera
 from instant_ic.camera.files import FileCamera
+from instant_ic.camera.liveness import LiveImages
 from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import CameraError, Frame
 from instant_ic.camera.theta import ThetaCamera
@@ -24,6 +25,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.broadcast_mount()
         self.last_ns = self.started_ns = self.clock.steady_ns()
         self.published = self.published_told = 0
+        self.images = LiveImages()
         self.camera = open_camera(config, self.clock.now_ns)
         self.diagnose("camera", WARN, f"connecting to {config.url}")
         self.timer(1.0, self.check)
@@ -32,7 +34,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             return
         self.loop = CameraLoop(
             self.camera,
-            on_frame=self.publish,
+            on_frame=self.on_frame,
             on_event=lambda connected, text: self.call_soon(self.on_event, connected, text),
         )
         if isinstance(self.camera, ThetaCamera):
@@ -59,8 +61,13 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             raise NodeError(str(error)) from error
         self.timer(1.0 / self.config.files.rate_hz, lambda: self.publish(camera.next_frame()))
 
+    def on_frame(self, frame: Frame) -> None:
+        """Publish a device's image unless it is a copy or empty; runs on the camera's thread. Files may repeat."""
+        if isinstance(self.camera, FileCamera) or self.images.is_live(frame):
+            self.publish(frame)
+
     def publish(self, frame: Frame) -> None:
-        """Publish an image unchanged; runs on the camera's thread."""
+        """Publish an image unchanged."""
         self.out.publish(compressed_image_message(frame.jpeg, self.config.frame_id, frame.stamp_ns))
         self.last_ns = self.clock.steady_ns()
         self.published += 1
@@ -75,8 +82,12 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             "images": self.published,
             "rate_hz": self.published - self.published_told,
             "bad_images": self.camera.bad_frames,
+            "withheld": self.images.withheld,
         }
         self.published_told = self.published
+        if self.images.fault:
+            self.diagnose("images", ERROR, self.images.fault, **values)
+            return
         if silent_s <= self.config.silence_s:
             if self.published:
                 self.diagnose("images", OK, "receiving images", **values)

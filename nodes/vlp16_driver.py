@@ -121,7 +121,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.waiting -= 1
         if self.packets is not None and (self.lockstep or self.packets.subscriber_count):
             self.packets.publish(packets_message(packets, revolution, config.frame_id))
-        if not self.report.trusts(self.clock.steady_ns()):
+        if not self.report.trusts(revolution, self.clock.steady_ns()):
             self.diagnose_all(self.report.source(self.clock.steady_ns()))
             return
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))

@@ -9,6 +9,7 @@ from instant_ic.lidar.feed import PacketFeed
 from instant_ic.lidar.flatscan import coverage
 from instant_ic.lidar.packets import LASERS, PacketError, decode_position_packet
 from instant_ic.lidar.stream import Revolution
+from instant_ic.repeats import RepeatWatch
 
 _SILENT = {
     "topic": "no /lidar/packets for {silent_s:.1f} s",
@@ -49,15 +50,18 @@ class LidarReport:
         self.skipped = self.partial = self.withheld = 0
         self.blind = False
         self._feed = feed
+        self._repeats = RepeatWatch()
         self._reported = (0, 0, 0)
         self._past_hour_reported = False
         self._covered = True
         self._partial_reported = 0
 
-    def trusts(self, steady_ns: int) -> bool:
-        """Whether a revolution that ends now may be published; one of a doubtful sender counts as withheld."""
-        # Without a scan the robot stops; a forged one could drive it into a wall.
-        trusted = self._feed.sources.doubt(steady_ns) is None
+    def trusts(self, revolution: Revolution, steady_ns: int) -> bool:
+        """Whether a revolution that ends now may be published; a copy, or one of a doubtful sender, is withheld."""
+        # Without a scan the robot stops; a forged or an old one could drive it into a wall.
+        points = revolution.points
+        new = self._repeats.is_new(*(points[name].tobytes() for name in ("x", "y", "z", "intensity")))
+        trusted = self._feed.sources.doubt(steady_ns) is None and (new or len(points) == 0)
         self.withheld += not trusted
         return trusted
 
@@ -82,8 +86,10 @@ class LidarReport:
         return Diagnosis("position", Level.OK, f"pulse per second {pps}", {"nmea": position.nmea})
 
     def source(self, steady_ns: int) -> Diagnosis:
-        """Whether the packets come from one sender, in order."""
+        """Whether the packets come from one sender, in order, and each revolution is a new one."""
         doubt, sources = self._feed.sources.doubt(steady_ns), self._feed.sources
+        if doubt is None and self._repeats.copies and not self.blind:
+            doubt = "the sensor repeats the same revolution: restart the sensor. No scan, the robot stands"
         values = {"foreign": sources.foreign, "withheld": self.withheld}
         return Diagnosis("source", Level.ERROR if doubt else Level.OK, doubt or "one sender, in order", values)
 

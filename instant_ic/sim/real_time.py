@@ -82,7 +82,7 @@ class SimulatedDevices:
             if not config.panorama:
                 self._see(config.camera.width, config.camera.height)  # compiles before the clock starts
             source = panorama_file(Path(config.panorama).expanduser()) if config.panorama else self._see
-            self.camera = ThetaServer(config.camera, source)
+            self.camera = ThetaServer(config.camera, source, config.seed)
             log.info("Theta Web API on http://%s:%d", config.camera.host, self.camera.port)
         if config.base.enabled:
             link = serial_folder / SERIAL_LINK
@@ -95,7 +95,7 @@ class SimulatedDevices:
                 device.close()
 
     def _see(self, width: int, height: int) -> npt.NDArray[np.uint8]:
-        """Camera's view; the same array as before if the robot has not moved visibly."""
+        """Camera's view; not rendered again if the robot has not moved visibly."""
         pose, rgb = self._simulation.robot.pose, self._seen
         if rgb.shape != (height, width, 3) or np.abs(pose - self._seen_from).max() > _VISIBLE_MOTION:
             self._seen, self._seen_from = self._simulation.panorama(width, height).rgb, pose

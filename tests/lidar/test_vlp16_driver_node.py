@@ -28,8 +28,12 @@ from instant_ic.msg import (
     LaserScan,
     PointCloud2,
     TFMessage,
+    VelodynePacket,
+    VelodyneScan,
     cloud_array,
+    header,
     stamp_ns,
+    to_time,
     transform_matrix,
     transform_message,
 )
@@ -383,3 +387,26 @@ def test_a_tilted_mount_is_refused(rpy_deg: tuple[float, float, float]) -> None:
 def test_shipped_parameters_are_the_defaults() -> None:
     path = Path(__file__).resolve().parents[2] / "config" / "robot.yaml"
     assert build(Vlp16DriverConfig, load_file(path, "vlp16_driver")) == Vlp16DriverConfig()
+
+
+def test_a_sensor_that_repeats_one_revolution_gives_no_scan_and_no_points() -> None:
+    bus = LockstepBus(start_ns=START)
+    node = bus.add(Vlp16DriverNode, Vlp16DriverConfig(source="topic"))
+    live, again = wall_stream(152, 5.0), wall_stream(76, 4.0)
+    scans = 0
+    for index in range(20 * 76):
+        data = live[index] if index < 152 else again[index % 76]
+        time_us = round(index * PACKET_PERIOD_US).to_bytes(4, "little")  # new stamps, old ranges
+        bus.advance_to(START + round((index + 1) * PACKET_PERIOD_US * 1000.0))
+        packet = VelodynePacket(
+            stamp=to_time(bus.clock.now_ns()), data=np.frombuffer(data[:1200] + time_us + data[1204:], np.uint8)
+        )
+        bus.publish("/lidar/packets", VelodyneScan(header=header("velodyne", bus.clock.now_ns()), packets=[packet]))
+        if index == 152 + 2 * 76:
+            scans = len(bus.messages("/scan"))
+    assert scans >= 3 and len(bus.messages("/scan")) <= scans + 1
+    assert len(bus.messages("/lidar/points")) <= scans + 2
+    node.check()
+    level, text, values = node.diagnoses()["source"]
+    assert level == ERROR and text.startswith("the sensor repeats the same revolution: restart the sensor")
+    assert values["withheld"] >= 15

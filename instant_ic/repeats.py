@@ -1,0 +1,33 @@
+"""Notices a source that sends the same data again: measurements have noise, so equal ones are copies."""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+
+REMEMBERED = 8
+"""Number of different measurements that are remembered: a ring of old buffers repeats several."""
+
+
+class RepeatWatch:
+    """Compares each measurement with the ones before.
+
+    Attributes:
+        copies: number of consecutive measurements that were sent before.
+    """
+
+    def __init__(self) -> None:
+        self.copies = 0
+        self._known: deque[int] = deque(maxlen=REMEMBERED)
+
+    def is_new(self, *parts: bytes) -> bool:
+        """Whether a measurement, given in one or more parts, differs from those before."""
+        digest = 0
+        for part in parts:
+            digest = zlib.crc32(part, digest)
+        if digest in self._known:
+            self.copies += 1
+            return False
+        self._known.append(digest)
+        self.copies = 0
+        return True
