@@ -73,7 +73,9 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.published += 1
 
     def on_event(self, connected: bool, text: str) -> None:
-        self.diagnose("camera", OK if connected else ERROR, text)
+        advice = self.camera.advice if connected else ""
+        level = WARN if advice else OK if connected else ERROR
+        self.diagnose("camera", level, f"{text}. {advice}" if advice else text)
 
     def check(self) -> None:
         """Report silence and the frame rate; each second."""

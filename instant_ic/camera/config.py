@@ -7,7 +7,10 @@ from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Perce
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
 
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
-"""(width, height, frames/s) that the Theta Z1 offers, with firmware 2.21.1."""
+"""(width, height, frames/s) that the Theta Z1 offers, with firmware `FORMATS_FIRMWARE`."""
+FORMATS_FIRMWARE = "2.21.1"
+OLD_PREVIEW_FORMATS = ((1024, 512, 8), (1920, 960, 8))
+"""Formats that every firmware of the Theta Z1 offers."""
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,8 @@ class Camera(Closing):
         """
         self.bad_frames = 0
         """Images dropped because they were truncated or damaged, since the object was created."""
+        self.advice = ""
+        """What the operator should change although images arrive; empty if nothing."""
         self._latency_ns = round(latency_s * 1e9)
         self._now_ns = now_ns
 

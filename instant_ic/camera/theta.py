@@ -12,7 +12,7 @@ from typing import Any
 import requests
 import urllib3
 
-from instant_ic.camera.config import ThetaConfig
+from instant_ic.camera.config import FORMATS_FIRMWARE, OLD_PREVIEW_FORMATS, ThetaConfig
 from instant_ic.camera.http import Session, is_multipart
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.camera.source import Camera, CameraError, Frame
@@ -22,10 +22,18 @@ from instant_ic.pace import current
 
 NEVER = 65535
 """Value of sleepDelay and offDelay that keeps the camera from sleeping or switching itself off."""
+_NEVER_READ = (0, NEVER)
+"""Values that the camera reports for it."""
+
+Format = tuple[int, int, int]
+"""Width, height and frame rate of the preview."""
 
 _CHUNK = 64 << 10
 _MOST_TEXT = 200
 """Characters of a text from the camera that go into logs and diagnostics."""
+_OLD_FIRMWARE = (
+    "The camera refused {}, which needs firmware {} or later; it has {}. Update it with Ricoh's app for computers."
+)
 
 
 class ThetaError(CameraError):
@@ -196,6 +204,8 @@ class ThetaCamera(Camera):
         self.config = client.config
         super().__init__(self.config.latency_s, now_ns)
         self.client = client
+        self._refused: set[tuple[str, Format]] = set()
+        """Firmware and the preview formats that it refused."""
         self._session: Session | None = None
         self._response: requests.Response | None = None
         self._parser = PreviewParser()
@@ -203,25 +213,42 @@ class ThetaCamera(Camera):
     def connect(self) -> str:
         """Set the camera up, if it is not set up already, start its preview, and return model, firmware and format."""
         self._end_preview()
-        config = self.config
         info = self.client.info()
-        wanted = {
-            "sleepDelay": NEVER,
-            "offDelay": NEVER,
-            "previewFormat": {"width": config.width, "height": config.height, "framerate": config.rate_hz},
-        }
-        if self.client.options(list(wanted)) != wanted:
-            self.client.set_options(wanted)
-            # If started sooner, the preview has the previous format or stops at once.
-            self.client.sleep(config.settle_s)
+        model, firmware = (str(info.get(key, "unknown"))[:_MOST_TEXT] for key in ("model", "firmwareVersion"))
+        width, height, rate_hz = chosen = self._set_up(firmware)
+        wanted = (self.config.width, self.config.height, self.config.rate_hz)
+        self.advice = "" if chosen == wanted else _OLD_FIRMWARE.format(_named(wanted), FORMATS_FIRMWARE, firmware)
         self._session, self._response = self.client.open_preview()
         found = re.search(r"boundary=\"?([^\";]+)", self._response.headers.get("Content-Type", ""))
         self._parser = PreviewParser(found.group(1) if found else "")
-        model, firmware = (str(info.get(key, "unknown"))[:_MOST_TEXT] for key in ("model", "firmwareVersion"))
-        return (
-            f"{model} (firmware {firmware}) at {self.client.url}, "
-            f"preview {config.width}x{config.height} at {config.rate_hz} Hz"
-        )
+        return f"{model} (firmware {firmware}) at {self.client.url}, preview {width}x{height} at {rate_hz} Hz"
+
+    def _set_up(self, firmware: str) -> Format:
+        """Set the options that are not set already, and return the preview format.
+
+        A format that the firmware refused is not asked for again: each setting delays the preview.
+        """
+        config = self.config
+        wanted = (config.width, config.height, config.rate_hz)
+        choices = dict.fromkeys([wanted, (config.width, config.height, 8), *OLD_PREVIEW_FORMATS])
+        formats = [choice for choice in choices if (firmware, choice) not in self._refused]
+        found = self.client.options(["sleepDelay", "offDelay", "previewFormat"])
+        awake = all(found.get(name) in _NEVER_READ for name in ("sleepDelay", "offDelay"))
+        # Some cameras report no format, or zeros: the option is set then.
+        if awake and found.get("previewFormat") == _option(formats[0]):
+            return formats[0]
+        for choice in formats:
+            try:
+                self.client.set_options({"sleepDelay": NEVER, "offDelay": NEVER, "previewFormat": _option(choice)})
+            except ThetaError as error:
+                if error.code != "invalidParameterValue" or choice == formats[-1]:
+                    raise
+                self._refused.add((firmware, choice))
+            else:
+                break
+        # If started sooner, the preview has the previous format or stops at once.
+        self.client.sleep(config.settle_s)
+        return choice
 
     def read(self) -> Frame:
         """Return the newest complete image; the camera ends the preview at its button, shooting or change of mode."""
@@ -267,6 +294,14 @@ class ThetaCamera(Camera):
     def _ended(self, reason: str) -> CameraError:
         self._end_preview()
         return CameraError(f"{self.client.url}: preview ended: {reason}")
+
+
+def _option(choice: Format) -> dict[str, int]:
+    return dict(zip(("width", "height", "framerate"), choice, strict=True))
+
+
+def _named(choice: Format) -> str:
+    return "{}x{} at {} Hz".format(*choice)
 
 
 def _number(state: Mapping[str, Any], key: str) -> float | None:

@@ -15,10 +15,11 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic.camera.config import PREVIEW_FORMATS
+from instant_ic.camera.config import FORMATS_FIRMWARE, PREVIEW_FORMATS
 from instant_ic.config.ranges import PositiveInt, Range, check_ranges
 from instant_ic.limits import load_image
 from instant_ic.pace import current
+from instant_ic.sim.theta_options import NEVER, OptionError, ThetaOptions
 
 log = logging.getLogger(__name__)
 
@@ -118,9 +119,9 @@ class ThetaServer:
         self.rate_hz = 0.0
         self.frames = 0
         self.late_s = 0.0
-        self._format = next(f for f in PREVIEW_FORMATS if f[:2] == (config.width, config.height))
+        self._options = ThetaOptions(next(f for f in PREVIEW_FORMATS if f[:2] == (config.width, config.height)))
         # As the driver left them when it last ran: a camera that stays on keeps its options.
-        self._options: dict[str, Any] = {"captureMode": "image", "sleepDelay": 65535, "offDelay": 65535}
+        self._options.set({"sleepDelay": NEVER, "offDelay": NEVER})
         self._options_set_s = -1e9
         self._began_s = time.monotonic()
         self._nonce = secrets.token_hex(16)
@@ -194,7 +195,7 @@ class ThetaServer:
                     due = current().steady_s()
                 if self.stopping:
                     return
-                width, height, promised = self._format
+                width, height, promised = self._options.preview
             began = current().steady_s()
             jpeg = self._jpeg(self.source(width, height))
             self._sleep(began + self.config.latency_s)
@@ -275,7 +276,7 @@ class ThetaServer:
             "manufacturer": "RICOH",
             "model": "RICOH THETA Z1",
             "serialNumber": "YN10000000",
-            "firmwareVersion": "2.21.1",
+            "firmwareVersion": FORMATS_FIRMWARE,
             "supportUrl": "https://theta360.com/en/support/",
             "gps": False,
             "gyro": True,
@@ -300,7 +301,7 @@ class ThetaServer:
                 "_boardTemp": 44,
                 "_cameraError": [],
                 "_captureStatus": "idle",
-                "_captureMode": self._options["captureMode"],
+                "_captureMode": self._options.values["captureMode"],
             },
         }
 
@@ -308,7 +309,7 @@ class ThetaServer:
         """Reply to a command other than the live preview.
 
         Raises:
-            _ApiError: the command is refused.
+            _ApiError, OptionError: the command is refused.
         """
         name = request.get("name") if isinstance(request, dict) else None
         parameters = request.get("parameters", {}) if isinstance(request, dict) else {}
@@ -317,44 +318,16 @@ class ThetaServer:
         if not isinstance(parameters, dict):
             raise _ApiError(400, "invalidParameterValue", "parameters must be an object")
         if name == "camera.setOptions":
-            self._set_options(parameters.get("options"))
+            with self._changed:
+                self._options.set(parameters.get("options"))
+                self._options_set_s = time.monotonic()
             return {"name": name, "state": "done"}
         if name == "camera.getOptions":
             wanted = parameters.get("optionNames")
             if not isinstance(wanted, list):
                 raise _ApiError(400, "missingParameter", "optionNames is missing")
-            return {"name": name, "state": "done", "results": {"options": self._get_options(wanted)}}
+            return {"name": name, "state": "done", "results": {"options": self._options.get(wanted)}}
         raise _ApiError(400, "unknownCommand", f"command {name} is not known")
-
-    def _get_options(self, names: list[Any]) -> dict[str, Any]:
-        width, height, rate = self._format
-        known = {
-            **self._options,
-            "previewFormat": {"width": width, "height": height, "framerate": rate},
-            "previewFormatSupport": [{"width": w, "height": h, "framerate": r} for w, h, r in PREVIEW_FORMATS],
-        }
-        for name in names:
-            if name not in known:
-                raise _ApiError(400, "invalidParameterValue", f"option {name} is not known")
-        return {name: known[name] for name in names}
-
-    def _set_options(self, options: Any) -> None:
-        if not isinstance(options, dict) or not options:
-            raise _ApiError(400, "missingParameter", "options is missing")
-        chosen = self._format
-        for name, value in options.items():
-            if name == "previewFormat":
-                value = value if isinstance(value, dict) else {}
-                asked = (value.get("width"), value.get("height"), value.get("framerate", 8))
-                if asked not in PREVIEW_FORMATS:
-                    raise _ApiError(400, "invalidParameterValue", f"previewFormat {value} is not supported")
-                chosen = next(f for f in PREVIEW_FORMATS if f == asked)
-            elif name not in self._options:
-                raise _ApiError(400, "invalidParameterName", f"option {name} is not known")
-        with self._changed:
-            self._format = chosen
-            self._options.update({k: v for k, v in options.items() if k != "previewFormat"})
-            self._options_set_s = time.monotonic()
 
     def open_preview(self) -> int:
         """Add a viewer and return the number of the newest image, which this viewer does not get.
@@ -420,6 +393,8 @@ class _Handler(BaseHTTPRequestHandler):
                 raise _ApiError(400, "invalidParameterValue", "no command with this id is running")
             else:
                 raise _ApiError(404, "invalidParameterValue", f"{self.path} does not exist")
+        except OptionError as error:
+            self._refuse(_ApiError(400, error.code, str(error)), request.get("name", ""))
         except _ApiError as error:
             self._refuse(error, request.get("name", "") if isinstance(request, dict) else "")
 

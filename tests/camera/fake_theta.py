@@ -10,6 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from instant_ic.sim.theta_options import OptionError, ThetaOptions
+
 REALM, NONCE = "RICOH THETA", "00f1c8c4"
 
 
@@ -37,6 +39,9 @@ class Behaviour:
         busy: how many of the next requests are answered by 503.
         password: digest authentication is asked for where it is set (user "THETAYL00105307").
         chunked: preview in HTTP chunks, as the camera does it; else until the connection ends.
+        firmware: decides which preview formats it offers.
+        options: its options, with the rules of the documents.
+        reported: options that it reports otherwise; None: not at all.
     """
 
     previews: list[list[bytes]] = field(default_factory=list)
@@ -46,9 +51,14 @@ class Behaviour:
     chunked: bool = True
     in_progress: int = 0
     state: dict[str, Any] = field(default_factory=lambda: {"batteryLevel": 0.83, "_batteryTemp": 30, "_boardTemp": 41})
-    options: dict[str, Any] = field(default_factory=dict)
+    firmware: str = "3.10.2"
+    options: ThetaOptions = field(init=False)
+    reported: dict[str, Any] = field(default_factory=dict)
     commands: list[str] = field(default_factory=list)
     unauthorised: int = 0
+
+    def __post_init__(self) -> None:
+        self.options = ThetaOptions(firmware=self.firmware)
 
 
 class FakeTheta:
@@ -90,7 +100,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self._admitted(b""):
-            self._json(200, {"model": "RICOH THETA Z1", "firmwareVersion": "3.10.2", "serialNumber": "YL00105307"})
+            firmware = self.camera.behaviour.firmware
+            self._json(200, {"model": "RICOH THETA Z1", "firmwareVersion": firmware, "serialNumber": "YL00105307"})
 
     def do_POST(self) -> None:
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
@@ -104,17 +115,25 @@ class _Handler(BaseHTTPRequestHandler):
             self._json(200, {"name": "camera.setOptions", "state": "done", "results": {}})
             return
         request = json.loads(body)
-        name = request["name"]
-        behaviour.commands.append(name)
+        behaviour.commands.append(request["name"])
+        try:
+            self._execute(request["name"], request)
+        except OptionError as error:
+            self._error(400, error.code, str(error))
+
+    def _execute(self, name: str, request: dict[str, Any]) -> None:
+        behaviour = self.camera.behaviour
         if name == "camera.setOptions":
-            behaviour.options.update(request["parameters"]["options"])
+            behaviour.options.set(request["parameters"]["options"])
             if behaviour.in_progress:
                 behaviour.in_progress -= 1
                 self._json(200, {"name": name, "state": "inProgress", "id": "7"})
             else:
                 self._json(200, {"name": name, "state": "done"})
         elif name == "camera.getOptions":
-            self._json(200, {"name": name, "state": "done", "results": {"options": behaviour.options}})
+            options = behaviour.options.get(request["parameters"]["optionNames"]) | behaviour.reported
+            options = {key: value for key, value in options.items() if value is not None}
+            self._json(200, {"name": name, "state": "done", "results": {"options": options}})
         elif name == "camera.getLivePreview":
             if behaviour.previews:
                 self._preview(behaviour.previews.pop(0))

@@ -42,11 +42,8 @@ def test_options_are_set_then_a_second_is_waited_then_the_preview_starts() -> No
         camera.close()
         assert theta.behaviour.commands == ["camera.getOptions", "camera.setOptions", "camera.getLivePreview"]
     assert waits == [1.0]
-    assert theta.behaviour.options == {
-        "sleepDelay": NEVER,
-        "offDelay": NEVER,
-        "previewFormat": {"width": 1024, "height": 512, "framerate": 30},
-    }
+    assert theta.behaviour.options.values == {"captureMode": "image", "sleepDelay": NEVER, "offDelay": NEVER}
+    assert theta.behaviour.options.preview == (1024, 512, 30)
     assert text.startswith("RICOH THETA Z1 (firmware 3.10.2)")
 
 
@@ -59,6 +56,67 @@ def test_a_camera_with_the_right_options_starts_its_preview_at_once() -> None:
         camera.close()
         assert theta.behaviour.commands[3:] == ["camera.getOptions", "camera.getLivePreview"]
     assert waits == [1.0]  # of the first connection
+
+
+def connections(behaviour: Behaviour, times: int) -> tuple[list[list[str]], ThetaCamera, str]:
+    """The commands of each of several connections, the camera, and its last description."""
+    behaviour.previews = [[part(FRAMES[0])] for _ in range(times)]
+    commands = []
+    with FakeTheta(behaviour) as theta:
+        camera = ThetaCamera(ThetaClient(theta.url, CONFIG))
+        for _ in range(times):
+            behaviour.commands.clear()
+            text = camera.connect()
+            commands.append([name.removeprefix("camera.") for name in behaviour.commands])
+        camera.close()
+    return commands, camera, text
+
+
+GET, SET, PREVIEW = "getOptions", "setOptions", "getLivePreview"
+
+
+@pytest.mark.parametrize("kept", [{}, {"sleepDelay": NEVER}, {"sleepDelay": NEVER, "offDelay": NEVER}])
+def test_a_camera_that_never_sleeps_reports_0_or_65535_and_is_set_once(kept: dict[str, int]) -> None:
+    """It reads back 0 for 65535: each reconnection set the options again, and waited."""
+    commands, camera, _ = connections(Behaviour(reported=kept), 3)
+    assert commands == [[GET, SET, PREVIEW], [GET, PREVIEW], [GET, PREVIEW]]
+    assert camera.advice == ""
+
+
+@pytest.mark.parametrize("reported", [{"width": 0, "height": 0, "framerate": 0}, None])
+def test_a_preview_format_of_zeros_or_none_is_no_answer(reported: dict[str, int] | None) -> None:
+    commands, _, text = connections(Behaviour(reported={"previewFormat": reported}), 2)
+    assert commands == [[GET, SET, PREVIEW]] * 2
+    assert text.endswith("preview 1024x512 at 30 Hz")
+
+
+def test_old_firmware_gets_a_format_that_it_knows_and_the_operator_the_version_to_install() -> None:
+    """It refuses 30 frames a second with invalidParameterValue: there was never an image."""
+    behaviour = Behaviour(firmware="1.60.1")
+    commands, camera, text = connections(behaviour, 3)
+    assert commands == [[GET, SET, SET, PREVIEW], [GET, PREVIEW], [GET, PREVIEW]]
+    assert behaviour.options.preview == (1024, 512, 8)
+    assert text.endswith("preview 1024x512 at 8 Hz")
+    assert "1024x512 at 30 Hz" in camera.advice and "2.21.1 or later; it has 1.60.1" in camera.advice
+
+
+def test_a_small_preview_of_old_firmware_falls_back_to_a_larger_one() -> None:
+    config = ThetaConfig(640, 320, 8, settle_s=0.0)
+    with FakeTheta(Behaviour(firmware="2.20.1", previews=[[part(FRAMES[0])]])) as theta:
+        with ThetaCamera(ThetaClient(theta.url, config)) as camera:
+            assert theta.behaviour.options.preview == (1024, 512, 8)
+            assert "640x320 at 8 Hz" in camera.advice
+
+
+def test_another_refusal_is_not_taken_for_old_firmware() -> None:
+    with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]])) as theta:
+        theta.behaviour.options.formats = ()
+        with pytest.raises(ThetaError, match=r"previewFormat .* is not supported"):
+            ThetaCamera(ThetaClient(theta.url, CONFIG)).connect()
+        theta.behaviour.options.values.pop("offDelay")
+        with pytest.raises(ThetaError, match="invalidParameterName"):
+            ThetaCamera(ThetaClient(theta.url, CONFIG)).connect()
+        assert theta.behaviour.commands.count("camera.setOptions") == 3 + 1
 
 
 def test_digest_authentication_for_commands_and_preview() -> None:
@@ -95,8 +153,8 @@ def test_refused_command_gives_the_cameras_words() -> None:
 
 def test_command_in_progress_is_waited_for() -> None:
     with FakeTheta(Behaviour(in_progress=1)) as theta:
-        ThetaClient(theta.url, CONFIG, sleep=lambda s: None).set_options({"iso": 100})
-        assert theta.behaviour.options == {"iso": 100}
+        ThetaClient(theta.url, CONFIG, sleep=lambda s: None).set_options({"sleepDelay": 60})
+        assert theta.behaviour.options.values["sleepDelay"] == 60
 
 
 def test_state_with_errors() -> None:

@@ -39,6 +39,16 @@ def test_files_in_lockstep(tmp_path: Path) -> None:
     assert transform_matrix(mount)[:3, 3].tolist() == [0.0, 0.0, 1.2]
 
 
+def test_advice_of_a_connected_camera_is_a_warning(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(jpeg(40))
+    node = LockstepBus().add(ThetaCameraNode, ThetaCameraConfig(source="files", url=str(tmp_path)))
+    node.camera.advice = "Update it."
+    node.on_event(True, "a camera")
+    assert node.diagnoses()["camera"][:2] == (WARN, "a camera. Update it.")
+    node.on_event(False, "no answer")
+    assert node.diagnoses()["camera"][:2] == (ERROR, "no answer")
+
+
 def test_device_in_lockstep_and_missing_files_are_refused_in_words(tmp_path: Path) -> None:
     with pytest.raises(NodeError, match="cannot run in lockstep"):
         LockstepBus().add(ThetaCameraNode, ThetaCameraConfig(source="theta"))
