@@ -174,7 +174,7 @@ def test_options_change_the_preview_after_a_moment(camera: ThetaServer) -> None:
     options = execute(camera, "camera.getOptions", optionNames=["previewFormat", "sleepDelay"]).json()["results"][
         "options"
     ]
-    assert options == {"previewFormat": wanted, "sleepDelay": 65535}
+    assert options == {"previewFormat": wanted, "sleepDelay": 0}  # never: the camera reports 0 for 65535
     deadline = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline:
         head, parts = raw_preview(camera, 1) if _ready(camera) else (b"", [])
@@ -203,7 +203,9 @@ def _ready(camera: ThetaServer) -> bool:
             "invalidParameterValue",
         ),
         ({"name": "camera.setOptions", "parameters": {"options": {"colour": 1}}}, "invalidParameterName"),
-        ({"name": "camera.getOptions", "parameters": {"optionNames": ["colour"]}}, "invalidParameterValue"),
+        ({"name": "camera.getOptions", "parameters": {"optionNames": ["colour"]}}, "invalidParameterName"),
+        ({"name": "camera.setOptions", "parameters": {"options": {"sleepDelay": 59}}}, "invalidParameterValue"),
+        ({"name": "camera.setOptions", "parameters": {"options": {"offDelay": 601}}}, "invalidParameterValue"),
         ({"name": "camera.getOptions", "parameters": 3}, "invalidParameterValue"),
     ],
 )
