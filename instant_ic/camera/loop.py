@@ -44,6 +44,8 @@ class CameraLoop(threading.Thread):
                         self._backoff.succeed()
                         self._on_frame(frame)
                 except Exception as error:  # noqa: BLE001 - nothing else reports an exception of this thread
+                    if self._end.is_set():
+                        break
                     wait_s = self._backoff.fail(time.monotonic())
                     text = str(error) if isinstance(error, CameraError) else f"unexpected {error!r}"
                     self._on_event(False, f"{text.rstrip('.')}. Reconnecting in {wait_s:g} s")
@@ -54,6 +56,7 @@ class CameraLoop(threading.Thread):
     def end(self, timeout_s: float = 3.0) -> bool:
         """Stop reading; return False if the thread does not end in time."""
         self._end.set()
+        self._camera.cancelled.set()
         if self.is_alive():
             self.join(timeout_s)
         return not self.is_alive()

@@ -1,5 +1,6 @@
 """Base class of all cameras."""
 
+import threading
 import time
 from abc import abstractmethod
 from collections.abc import Callable
@@ -47,6 +48,8 @@ class Camera(Closing):
         """
         self.bad_frames = 0
         """Images dropped because they were truncated or damaged, since the object was created."""
+        self.cancelled = threading.Event()
+        """Set by another thread: a call that waits for the device then ends soon, with an error."""
         self.advice = ""
         """What the operator should change although images arrive; empty if nothing."""
         self._latency_ns = round(latency_s * 1e9)

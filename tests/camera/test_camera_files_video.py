@@ -1,5 +1,8 @@
 """Pictures from files and from a video."""
 
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -9,8 +12,10 @@ from fake_theta import jpeg
 
 from instant_ic.camera.config import FilesConfig, VideoConfig
 from instant_ic.camera.files import FileCamera
+from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import CameraError
 from instant_ic.camera.video import VideoCamera
+from instant_ic.reconnect import Backoff
 
 
 def test_folder_in_the_order_of_names_with_jpegs_byte_for_byte(tmp_path: Path) -> None:
@@ -81,6 +86,139 @@ def test_video_frames_come_encoded_and_stamped(tmp_path: Path) -> None:
     assert [(frame.width, frame.height, frame.stamp_ns) for frame in frames] == [(64, 32, 750_000_000)] * 3
     means = [cv2.imdecode(np.frombuffer(frame.jpeg, np.uint8), 1).mean() for frame in frames]
     np.testing.assert_allclose(means, [50, 100, 150], atol=4)
+
+
+class FakeCapture:
+    """A device that opens, sends some images, and then blocks as a driver does: until the test lets it go."""
+
+    def __init__(self, images: int, released: threading.Event) -> None:
+        self.images = images
+        self.let_go = released
+        self.closed = threading.Event()
+
+    def isOpened(self) -> bool:
+        return True
+
+    def set(self, *_: float) -> bool:
+        return True
+
+    def get(self, _: int) -> float:
+        return 32.0
+
+    def getBackendName(self) -> str:
+        return "V4L2"
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self.images -= 1
+        if self.images >= 0:
+            return True, np.full((16, 32, 3), 10 * self.images, np.uint8)
+        self.let_go.wait()
+        return False, None
+
+    def release(self) -> None:
+        self.closed.set()
+
+
+@dataclass
+class Device:
+    """Opens fake captures, each of which sends some images and then blocks."""
+
+    images: int
+    let_go: threading.Event = field(default_factory=threading.Event)
+    opened: list[FakeCapture] = field(default_factory=list)
+
+    def __call__(self, *_: object) -> FakeCapture:
+        self.opened.append(FakeCapture(self.images, self.let_go))
+        return self.opened[-1]
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[Device]:
+    made = Device(1)
+    monkeypatch.setattr(cv2, "VideoCapture", made)
+    yield made
+    made.let_go.set()
+
+
+def readers() -> int:
+    return sum(thread.name == "video" for thread in threading.enumerate())
+
+
+def test_a_device_that_opens_and_sends_nothing_is_given_up_after_the_read_timeout(device: Device) -> None:
+    """OpenCV's read of a device blocked for 10 s; here it never returns by itself."""
+    camera = VideoCamera("0", VideoConfig(read_timeout_s=2.0))
+    assert camera.connect() == "video 0, 32x32 by V4L2"
+    assert camera.read().width == 32
+    with pytest.raises(CameraError, match=r"0: is open, but sends no image for 2 s. Check .* live streaming mode"):
+        camera.read()
+    assert camera.connect()  # the driver still blocks the first read
+    assert camera.read().width == 32
+    camera.close()
+    assert device.opened[1].closed.wait(30.0)
+    assert not device.opened[0].closed.is_set()
+    device.let_go.set()
+    assert device.opened[0].closed.wait(30.0)
+
+
+def test_reads_that_hang_are_bounded_and_the_camera_returns_when_the_driver_does(device: Device) -> None:
+    device.images = 0
+    before = readers()
+    camera = VideoCamera("0", VideoConfig(read_timeout_s=2.0))
+    for _ in range(2):
+        camera.connect()
+        with pytest.raises(CameraError, match="sends no image"):
+            camera.read()
+    for _ in range(5):
+        with pytest.raises(CameraError, match=r"2 reads have not returned: the device's driver hangs. Unplug"):
+            camera.connect()
+    assert (len(device.opened), readers() - before) == (2, 2)
+    device.let_go.set()
+    assert all(capture.closed.wait(30.0) for capture in device.opened)
+    for thread in threading.enumerate():
+        if thread.name == "video":
+            thread.join(30.0)
+    device.images = 1
+    camera.connect()
+    assert camera.read().width == 32
+    camera.close()
+
+
+@pytest.mark.parametrize("opens", [True, False])
+def test_a_camera_ends_while_its_device_blocks(device: Device, opens: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the time-outs: neither opening nor reading can be interrupted."""
+    asked = threading.Event()
+
+    def capture(*arguments: object) -> FakeCapture:
+        asked.set()
+        if not opens:
+            device.let_go.wait()
+        return device(*arguments)
+
+    monkeypatch.setattr(cv2, "VideoCapture", capture)
+    events: list[tuple[bool, str]] = []
+    camera = VideoCamera("0", VideoConfig(read_timeout_s=600.0))
+    frames = threading.Event()
+    loop = CameraLoop(camera, lambda frame: frames.set(), lambda connected, text: events.append((connected, text)))
+    loop.start()
+    assert asked.wait(30.0) and (not opens or frames.wait(30.0))
+    assert loop.end(30.0)
+    assert not device.let_go.is_set()
+    assert [connected for connected, _ in events] == [True] * opens
+
+
+def test_the_loop_reconnects_to_a_device_that_stops_sending(device: Device) -> None:
+    again = threading.Event()
+    events: list[str] = []
+    loop = CameraLoop(
+        VideoCamera("0", VideoConfig(read_timeout_s=2.0)),
+        lambda frame: again.set() if len(device.opened) == 2 else None,
+        lambda connected, text: events.append(text),
+        Backoff(0.01, 0.01),
+    )
+    loop.start()
+    assert again.wait(30.0)
+    assert loop.end(30.0)
+    assert "sends no image for 2 s" in events[1]
 
 
 def test_video_that_cannot_be_opened_is_told(tmp_path: Path) -> None:
