@@ -1,7 +1,7 @@
 # make run    set everything up in .venv/ and start the simulated stack
 # make test   format, lint, types and all tests
 # make check  format, lint, types and the word list (scripts/check_words.py); the page too, where Node.js is installed
-# make lock   write requirements.lock anew after a change of constraints.txt or pyproject.toml (needs network)
+# make lock   write requirements*.lock anew after a change of constraints.txt or pyproject.toml (needs network)
 # make fuzz   a million mutated inputs for each parser of outside bytes: hours (ARGS="--jobs 4 --target glb --count 1000")
 # make clean  take away what these made
 PYTHON ?= python3
@@ -10,14 +10,14 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: run test check fuzz clean install lock chromium
+.PHONY: run test check fuzz clean install install-tests lock chromium
 
 run: $(STAMP)
 	@exec $(BIN)/ic launch sim $(ARGS)
 
 # The system tests start whole stacks, which want the machine for themselves: they run after the others, one by one,
 # and also where one of the others failed.
-test: check chromium
+test: check install-tests chromium
 	@units=passed; systems=passed; \
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not system" --durations 10 || units=FAILED; \
 	$(BIN)/python -m pytest -m system --durations 10 || systems=FAILED; \
@@ -49,6 +49,14 @@ $(STAMP): pyproject.toml constraints.txt requirements.lock scripts/install_torch
 	@scripts/install_torch.sh $(BIN)/python
 	@$(PIP) --no-deps --no-build-isolation -e .
 	@$(BIN)/ic compile
+	@touch $@
+
+# What the tests need and a run does not: triton, 200 MB, which compiles the GPU's kernels without a GPU too.
+TESTS_STAMP := $(VENV)/.installed-tests
+install-tests: $(TESTS_STAMP)
+$(TESTS_STAMP): $(STAMP) requirements-test.lock
+	@echo "  the packages of requirements-test.lock ..."
+	@$(PIP) --require-hashes --only-binary :all: -r requirements-test.lock
 	@touch $@
 
 lock:

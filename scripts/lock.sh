@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Writes requirements.lock: every package in its version from constraints.txt, with the hashes of all its files.
+# Writes requirements.lock: every package in its version from constraints.txt, with the hashes of all its files; and
+# requirements-test.lock: triton, for `make test` alone.
 # torch is excluded: scripts/install_torch.sh installs its CPU build. Needs network access; `make lock` runs this script.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -9,7 +10,9 @@ trap 'rm -rf "$folder"' EXIT
 "$folder/venv/bin/python" -m pip install -q --disable-pip-version-check -c constraints.txt uv
 # Settings of a mirror or of the user must not reach the lock file: uv reads no pip configuration and records no index.
 # pip is locked too, because it installs the other packages.
-echo pip | "$folder/venv/bin/uv" pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
-  --custom-compile-command 'make lock' --extra dev --extra train --constraint constraints.txt --no-emit-package torch \
-  --output-file "$folder/requirements.lock" pyproject.toml -
-mv "$folder/requirements.lock" requirements.lock
+compile=("$folder/venv/bin/uv" pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate
+  --custom-compile-command 'make lock' --constraint constraints.txt)
+echo pip | "${compile[@]}" --extra dev --extra train --no-emit-package torch --output-file "$folder/requirements.lock" \
+  pyproject.toml -
+echo triton | "${compile[@]}" --output-file "$folder/requirements-test.lock" -
+mv "$folder"/requirements*.lock .

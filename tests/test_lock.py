@@ -1,4 +1,4 @@
-"""requirements.lock, constraints.txt, pyproject.toml and the installed packages agree; needs no network."""
+"""Both lock files, constraints.txt, pyproject.toml and the installed packages agree; needs no network."""
 
 import importlib.metadata
 import re
@@ -13,7 +13,8 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[1]
 APART = {"torch", "uv"}
 """Pinned and not locked: torch is installed by scripts/install_torch.sh, uv by scripts/lock.sh alone."""
-ADVICE = "run `make lock` and commit requirements.lock"
+LOCKS = [ROOT / "requirements.lock", ROOT / "requirements-test.lock"]
+ADVICE = "run `make lock` and commit what it wrote"
 
 
 def pinned(requirement):
@@ -33,7 +34,7 @@ def by_name(lines):
 @pytest.fixture(scope="module")
 def everywhere():
     """Name → requirement of every locked package, also of those for another machine or Python; all have hashes."""
-    text = re.sub(r"^#.*\n", "", (ROOT / "requirements.lock").read_text(), flags=re.MULTILINE)
+    text = re.sub(r"^#.*\n", "", "".join(file.read_text() for file in LOCKS), flags=re.MULTILINE)
     entries = [line.split(" --hash=") for line in text.replace("\\\n", " ").splitlines()]
     for words, *hashes in entries:
         assert hashes, f"{words} has no hash: {ADVICE}"
@@ -66,7 +67,7 @@ def test_lock_satisfies_every_dependency_of_the_project(lock, constraints, monke
     extras = project["project"]["optional-dependencies"]
     asked = [*project["project"]["dependencies"], *project["build-system"]["requires"]]
     asked += hatchling.build.get_requires_for_build_editable()
-    asked += [one for extra, some in extras.items() if extra != "triton" for one in some]  # comes with a CUDA torch
+    asked += [one for some in extras.values() for one in some]
     for requirement in map(Requirement, asked):
         if applies(requirement):
             name = canonicalize_name(requirement.name)
@@ -94,7 +95,8 @@ def test_installed_versions_are_the_locked_ones(lock):
 
 
 def test_lock_names_no_address_of_an_index(lock):
-    assert not re.search(r"https?:|file:|--\w*index|find-links", (ROOT / "requirements.lock").read_text())
+    for lock in LOCKS:
+        assert not re.search(r"https?:|file:|--\w*index|find-links", lock.read_text())
 
 
 def test_make_install_takes_packages_from_the_lock_alone():
@@ -104,4 +106,13 @@ def test_make_install_takes_packages_from_the_lock_alone():
     assert installs == [
         "--require-hashes --only-binary :all: -r requirements.lock",
         "--no-deps --no-build-isolation -e .",
+        "--require-hashes --only-binary :all: -r requirements-test.lock",
     ]
+
+
+def test_a_run_does_not_install_what_only_the_tests_need():
+    """Triton is 200 MB: ``make test`` installs it, ``make run`` does not."""
+    assert "triton" not in (ROOT / "requirements.lock").read_text()
+    rules = dict(re.findall(r"^(\w+|\$\(\w+\)):(.*)$", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    assert "install-tests" in rules["test"] and rules["run"].strip() == "$(STAMP)"
+    assert "test.lock" in rules["$(TESTS_STAMP)"] and "test.lock" not in rules["$(STAMP)"]

@@ -20,7 +20,7 @@ def test_both_halves_run_and_either_failure_counts(unit: int, system: int, tmp_p
     )
     python.chmod(0o755)
     made = subprocess.run(
-        ["make", "-o", "check", "-o", "chromium", "test", f"BIN={tmp_path}"],
+        ["make", "-o", "check", "-o", "install-tests", "-o", "chromium", "test", f"BIN={tmp_path}"],
         cwd=ROOT,
         capture_output=True,
         text=True,

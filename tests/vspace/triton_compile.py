@@ -1,15 +1,24 @@
-"""Compiles all Triton kernels for some compute capabilities, which needs no GPU: ``python triton_compile.py 89 90``."""
+"""Compiles the Triton kernels for some compute capabilities, which needs no GPU: ``python triton_compile.py 89 90``.
 
+All of them wholly for the default field; ``gradient``, whose products depend on the GPU, for every corner of
+``FieldConfig`` up to the stage that has refused some.
+"""
+
+import itertools
 import sys
+from contextlib import suppress
 
 import triton
+from triton._C.libtriton import ir
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
+from triton.compiler.compiler import make_backend
 
+from instant_ic.vspace.config import FieldConfig
 from instant_ic.vspace.nerf import triton_kernels
-from instant_ic.vspace.nerf.triton_device import ENTRIES, TILE, TRAIN_BLOCK
+from instant_ic.vspace.nerf.triton_device import ENTRIES, TILE, TRAIN_BLOCK, kernel_shape
 
-FIELD = {"LEVELS": 8, "LP": 8, "F": 4, "HIDDEN": 32, "HP": 32}
+FIELD = kernel_shape(FieldConfig())
 KERNELS = [
     (triton_kernels.sample_rays, {"B": TILE}),
     (triton_kernels.gradient, {**FIELD, "B": TRAIN_BLOCK}),
@@ -35,23 +44,59 @@ def kind_of(kernel, name, constants):
     return KINDS.get(name, "*fp32")
 
 
+def source_of(kernel, constants):
+    signature = {name: kind_of(kernel, name, constants) for name in kernel.arg_names}
+    aligned = [
+        (number,)
+        for number, (name, kind) in enumerate(signature.items())
+        if kind.startswith("*") and name not in ("turn", "step_size")
+    ]
+    attributes = {place: [["tt.divisibility", 16]] for place in aligned}
+    return ASTSource(fn=kernel, signature=signature, constexprs=constants, attrs=attributes)
+
+
+def corners():
+    """Smallest and largest sizes that ``FieldConfig`` allows, found by asking it."""
+    for features in (2, 4):
+        allowed = []
+        for levels, hidden in itertools.product(range(1, 65), range(4, 257, 4)):
+            with suppress(ValueError):
+                allowed.append(FieldConfig(levels=levels, features=features, hidden=hidden))
+        levels = {end(field.levels for field in allowed) for end in (min, max)}
+        hidden = {end(field.hidden for field in allowed) for end in (min, max)}
+        for pair in itertools.product(levels, hidden):
+            yield FieldConfig(levels=pair[0], features=features, hidden=pair[1])
+
+
+def lower(source, target):
+    """Compile up to the GPU's dialect, where layouts for the tensor cores are chosen: a third of the whole."""
+    backend = make_backend(target)
+    options = backend.parse_options({"num_warps": 4})
+    context = ir.context()
+    ir.load_dialects(context)
+    backend.load_dialects(context)
+    functions = backend.get_codegen_implementation(options)
+    module = source.make_ir(target, options, functions, backend.get_module_map(), context)
+    stages = {}
+    backend.add_stages(stages, options, source.language)
+    for stage in ("ttir", "ttgir"):
+        module = stages[stage](module, dict(vars(options)))
+
+
 def main(capabilities):
+    targets = {capability: GPUTarget("cuda", capability, 32) for capability in capabilities}
+    for field in corners():
+        shape = kernel_shape(field)
+        source = source_of(triton_kernels.gradient, {**shape, "B": TRAIN_BLOCK})
+        for capability, target in targets.items():
+            lower(source, target)
+            sys.stdout.write(f"ttgir gradient {capability} {field.levels} {field.features} {field.hidden}\n")
     for kernel, constants in KERNELS:
-        signature = {name: kind_of(kernel, name, constants) for name in kernel.arg_names}
-        aligned = [
-            (number,)
-            for number, (name, kind) in enumerate(signature.items())
-            if kind.startswith("*") and name not in ("turn", "step_size")
-        ]
-        source = ASTSource(
-            fn=kernel,
-            signature=signature,
-            constexprs=constants,
-            attrs={place: [["tt.divisibility", 16]] for place in aligned},
-        )
-        for capability in capabilities:
-            made = triton.compile(source, target=GPUTarget("cuda", capability, 32), options={"num_warps": 4})
-            sys.stdout.write(f"{kernel.fn.__name__} {capability} {len(made.asm['cubin'])}\n")
+        source = source_of(kernel, constants)
+        # `draw` takes 20 s and has no product that `gradient` has not: once, for the newest.
+        for capability in capabilities[-1:] if kernel is triton_kernels.draw else capabilities:
+            made = triton.compile(source, target=targets[capability], options={"num_warps": 4})
+            sys.stdout.write(f"cubin {kernel.fn.__name__} {capability} {len(made.asm['cubin'])}\n")
 
 
 if __name__ == "__main__":

@@ -85,6 +85,17 @@ class _Step:
     graph: Any = field(default=None)
 
 
+def kernel_shape(field: FieldConfig) -> dict[str, int]:
+    """Compile-time arguments of the kernels for a field's size; tiles are powers of two of at least 16."""
+    return {
+        "LEVELS": field.levels,
+        "LP": max(_power_of_two(field.levels), 16 // field.features),
+        "F": field.features,
+        "HIDDEN": field.hidden,
+        "HP": max(_power_of_two(field.hidden), 16),
+    }
+
+
 class TritonDevice:
     """See ``field.Device``. One thread at a time.
 
@@ -102,13 +113,7 @@ class TritonDevice:
         self.on_gpu = device == "cuda"
         self.name = f"{torch.cuda.get_device_name()} (triton)" if self.on_gpu else f"{device} (triton)"
         features, inputs = field.features, field.levels * field.features
-        self._shape = {
-            "LEVELS": field.levels,
-            "LP": max(_power_of_two(field.levels), 16 // features),
-            "F": features,
-            "HIDDEN": field.hidden,
-            "HP": max(_power_of_two(field.hidden), 16),
-        }
+        self._shape = kernel_shape(field)
         self._table_shape = (field.levels, 1 << field.log2_table, features)
         self._network_shapes = ((field.hidden, inputs), (field.hidden,), (4, field.hidden), (4,))
         self._colour_weight, self._distance_weight = (self._tensor(w) for w in sample_weights(train))
