@@ -46,7 +46,7 @@ def test_an_anchor_that_contains_itself_is_refused(text: str) -> None:
 @pytest.mark.parametrize("levels", [101, 5000])
 def test_depth_is_limited(levels: int) -> None:
     assert read_yaml("[" * 100 + "]" * 100) == read_yaml("- " * 99 + "[]")
-    with pytest.raises(yaml.YAMLError, match="too deeply"):
+    with pytest.raises(yaml.YAMLError, match=r"too deeply|nesting depth"):
         read_yaml("[" * (levels + 1) + "]" * (levels + 1))
 
 
