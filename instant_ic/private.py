@@ -43,6 +43,19 @@ def open_file(path: Path, flags: int) -> int:
     return descriptor
 
 
+def sync_folder(path: Path) -> None:
+    """Write the entries of a folder to the disk, so that its new files survive a power failure.
+
+    Raises:
+        OSError: the disk failed.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
 def _restrict(path: Path, present: int, mode: int, change: Callable[[int], None]) -> None:
     if present & 0o777 == mode:
         return

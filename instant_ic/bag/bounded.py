@@ -60,24 +60,22 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
 
 
 def guard_rosbags() -> None:
-    """Add size limits to `rosbags`, which has none: MCAP and ROS 1 chunks, messages, whole files, SQLite values, YAML.
+    """Add size limits to `rosbags`, which has none: ROS 1 chunks, messages, whole files, SQLite values, YAML.
 
     This replaces the decompressor tables and YAML readers of `rosbags`; a test checks that `rosbags` uses the
-    replacements.
+    replacements. ``files.py`` replaces its reader of MCAP files.
     """
     import apsw
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader as ros2
-    from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+    from rosbags.rosbag2 import storage_sqlite3
 
     from instant_ic.bag.metadata import profiles_of
 
     ros2.YAML = _BoundedYaml  # type: ignore[assignment,misc]
-    for module in (ros2, storage_mcap, storage_sqlite3):
+    for module in (ros2, storage_sqlite3):
         module.parse_qos = profiles_of  # type: ignore[attr-defined]
 
-    storage_mcap.DECOMPRESSORS["zstd"] = lambda data, size: decompress(data, "zstd", size)
-    storage_mcap.DECOMPRESSORS["lz4"] = lambda data, size: decompress(data, "lz4", size)
     ros1.decompressors["bz2"] = lambda data: decompress(data, "bz2")
     ros1.decompressors["lz4"] = lambda data: decompress(data, "lz4")
     ros2.zstd = SimpleNamespace(  # type: ignore[assignment]

@@ -13,9 +13,11 @@ from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.reader import DirectoryReader
 
 from instant_ic.bag.bounded import guard_rosbags
 from instant_ic.bag.errors import BagError
+from instant_ic.bag.mcap_source import McapSource
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
@@ -25,6 +27,8 @@ from instant_ic.closing import Closing
 from instant_ic.msg import deserialize
 
 guard_rosbags()
+DirectoryReader.STORAGE_PLUGINS["mcap"] = McapSource  # type: ignore[index]
+Reader.STORAGE_PLUGINS[".mcap"] = McapSource  # type: ignore[index]
 
 
 @dataclass(frozen=True)
@@ -79,8 +83,7 @@ class BagReader(Closing):
         except BagError:
             raise
         except (ReaderError, OSError) as error:
-            hint = "not written by ROS 2; its CDR messages" if "rofile" in str(error) else "if it was cut"
-            raise BagError(f"bag {path} cannot be read: {error}; {hint}: ic bag recover {path}") from None
+            raise BagError(f"bag {path} cannot be read: {error}; if it was cut: ic bag recover {path}") from None
         except Exception as error:  # noqa: BLE001 - a parser may raise anything on bytes that are not a bag
             raise BagError(
                 f"bag {path} cannot be read: {type(error).__name__}: {error}; if it was cut: ic bag recover {path}"
@@ -201,6 +204,13 @@ class BagReader(Closing):
         connections = [c for c in self._reader.connections if topics is None or c.topic in topics]
         if not connections:
             return
+        for connection in connections:
+            encoding = getattr(connection.ext, "serialization_format", "cdr")
+            if encoding != "cdr" and connection.msgcount:
+                raise BagError(
+                    f"bag {self.path}, topic {connection.topic}: its messages are {encoding!r}, not CDR. Choose other "
+                    f"topics, or copy those in CDR: ic bag recover {self.path}"
+                )
         presets = {(c.topic, c.msgtype): _qos(c) for c in connections}
         try:
             with closing(self._raw(connections, start_ns, stop_ns)) as raw:

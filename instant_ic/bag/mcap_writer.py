@@ -134,13 +134,9 @@ class McapWriter:
         Raises:
             OSError: the disk is full.
         """
-        record = _encode(records.Metadata(name=name, metadata=dict(values)))
-        self._metadata.append(records.MetadataIndex(offset=self._offset, length=len(record), name=name))
-        try:
-            self._put([record])
-        except OSError:
-            self._metadata.pop()
-            raise
+        record, offset = _encode(records.Metadata(name=name, metadata=dict(values))), self._offset
+        self._put([record])
+        self._metadata.append(records.MetadataIndex(offset=offset, length=len(record), name=name))
 
     def flush(self) -> None:
         """Write the open chunk. Its messages then survive the end of this process.
@@ -186,8 +182,16 @@ class McapWriter:
         self._put([struct.pack("<BQ", Opcode.CHUNK, len(head) + stored_size), head, *stored, *tail])
         self._chunks.append(_Chunk(entry, {channel: len(entries) for channel, entries in index.items()}))
 
+    def sync(self) -> None:
+        """Wait until all complete chunks are on the disk itself.
+
+        Raises:
+            OSError: the disk failed.
+        """
+        os.fdatasync(self._fd)
+
     def finish(self) -> OSError | None:
-        """Write index and footer and close the file. On a full disk, drop the last chunks to make room for them.
+        """Write index and footer, to the disk itself, and close the file. A full disk drops the last chunks for them.
 
         Returns:
             The disk-full error if messages were dropped; None if everything was written.
@@ -204,12 +208,14 @@ class McapWriter:
             while True:
                 try:
                     self._put(self._summary())
-                    return full
+                    break
                 except OSError as error:
                     full = _if_full(error)
                     if not self._chunks:
                         raise
                     self._cut_back(self._chunks.pop().index.chunk_start_offset)
+            os.fsync(self._fd)
+            return full
         finally:
             self.abandon()
 

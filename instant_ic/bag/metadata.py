@@ -30,7 +30,7 @@ from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.config.yaml_text import dump_yaml, read_yaml
 from instant_ic.msg import MessageError, message_type, type_hash, typestore
-from instant_ic.private import open_file
+from instant_ic.private import open_file, sync_folder
 
 METADATA_FILE = "metadata.yaml"
 REPEATED = "instant_ic.repeated"
@@ -111,7 +111,10 @@ def write_metadata(
     try:
         with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8") as file:
             file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
         scratch.replace(folder / METADATA_FILE)
+        sync_folder(folder)
     except OSError:
         scratch.unlink(missing_ok=True)
         raise

@@ -29,10 +29,13 @@ from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
 from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Positive, PositiveInt, Range
-from instant_ic.diagnosis import Diagnosis, Level, RecentCount
+from instant_ic.diagnosis import Diagnosis, Level
 
 FOREIGN_CLOCK_NS = 10_000_000_000
 """A stamp farther than this from the simulated clock comes from another clock."""
+
+SYNC_S = 5.0
+"""Longest time of the recording that a power failure loses, beside what the disk itself holds back."""
 
 RECORDING, PAUSED, DISK_FULL, FAILED, ENDED = "recording", "paused", "disk full", "failed", "ended"
 
@@ -41,7 +44,6 @@ _LEVEL = 1  # of zstd: it must keep pace
 _FLUSH_S = 1.0
 _KEEP_CUSTOM_S = 10.0
 _SPACE_S = 1.0
-_RECENT_S = 10.0  # losses longer ago are no warning
 _ROOM_AGAIN = 64_000_000  # free space above the reserve before recording restarts
 
 log = logging.getLogger(__name__)
@@ -201,7 +203,6 @@ class Recorder:
         self._missed = LatchedValues()
         self._not_written: deque[BagMessage] = deque()
         self._losses: dict[str, Stats] = {}
-        self._recent_lost, self._recent_dropped = RecentCount(_RECENT_S), RecentCount(_RECENT_S)
         self._qos: dict[str, QoS] = {}
         self._parameters: dict[str, object] = {}
         self._writer: BagWriter | None = None
@@ -328,6 +329,11 @@ class Recorder:
         """Messages lost in transit: topic → publisher → messages."""
         return {topic: dict(counter.lost_by) for topic, counter in list(self._losses.items()) if counter.lost_by}
 
+    def not_written(self) -> Counter[str]:
+        """Messages by topic that were lost because the disk was full, or failed."""
+        with self._counting:
+            return self.dropped.disk_full + (self._writer.lost if self._writer is not None else Counter())
+
     def unknown_types(self) -> dict[str, str]:
         """Types recorded without a definition → one of their topics."""
         return dict(self._writer.unknown_types) if self._writer is not None else {}
@@ -345,6 +351,7 @@ class Recorder:
             "lost": self.lost_by(),
             "overflow": dict(self.dropped.overflow),
             "paused": dict(self.dropped.paused),
+            "disk_full": dict(self.not_written()),
         }
         if writer is not None:
             status |= {"bytes": writer.bytes, "files": writer.parts}
@@ -363,20 +370,19 @@ class Recorder:
 
     def diagnoses(self, fault: str = "") -> Iterator[Diagnosis]:
         """State of the recording; ``fault`` is one of another recording that goes before its own."""
-        lost, now_ns = self.lost(), time.monotonic_ns()
-        overflow, now_lost = self.dropped.overflow, self._recent_lost.rise(sum(lost.values()), now_ns)
-        now_dropped = self._recent_dropped.rise(sum(overflow.values()), now_ns)
+        lost = self.lost()
         if not fault and self.state in (FAILED, DISK_FULL):
-            fault = self.error
-        elif not fault and now_dropped:
+            gone = self.not_written()
+            fault = f"{self.error}; not recorded: {_counts(gone)}" if gone else self.error
+        elif not fault and (overflow := self.dropped.overflow):
             fault = f"{self.summary()}; the disk is too slow, dropped: {_counts(overflow)}"
         if fault:
             yield Diagnosis("bag", Level.ERROR, fault)
+        elif lost:
+            values = {topic.strip("/"): count for topic, count in lost.items()}
+            yield Diagnosis("bag", Level.WARN, f"{self.summary()}; lost: {_counts(lost)}", values)
         else:
-            missing = lost or overflow
-            text = self.summary() + (f"; lost: {_counts(missing)}" if missing else "")
-            values = {"messages": self.count, **{topic.strip("/"): count for topic, count in missing.items()}}
-            yield Diagnosis("bag", Level.WARN if now_lost else Level.OK, text, values)
+            yield Diagnosis("bag", Level.OK, self.summary(), {"messages": self.count})
         if unknown := self.unknown_types():
             named = ", ".join(f"{type_name} ({topic})" for type_name, topic in sorted(unknown.items()))
             yield Diagnosis("types", Level.WARN, f"recorded without type definition, which is unknown here: {named}")
@@ -449,7 +455,7 @@ class Recorder:
 
     def _run(self) -> None:
         next_flush = next_space = 0.0
-        next_custom = time.monotonic() + _KEEP_CUSTOM_S
+        next_custom, next_sync = time.monotonic() + _KEEP_CUSTOM_S, time.monotonic() + SYNC_S
         while True:
             item = self._queue.take(0.0 if self._ending.is_set() else _SPACE_S)
             if item is None and self._ending.is_set():
@@ -472,6 +478,9 @@ class Recorder:
                     next_custom = now + _KEEP_CUSTOM_S
                     self._set_custom(self._writer)
                     self._writer.keep_custom()
+                if now >= next_sync:
+                    next_sync = now + SYNC_S
+                    self._writer.sync()
             except DiskFullError as error:
                 self._stop(DISK_FULL, str(error))
             except BagError as error:
@@ -516,7 +525,11 @@ class Recorder:
                 self._writer.end_part()
             self._stop(DISK_FULL, f"{words}: not recording; the bag is complete up to here")
         elif self._state == DISK_FULL and free >= reserve + _ROOM_AGAIN:
-            log.warning("%s: space is available again; recording continues in a new file", self.path)
+            log.warning(
+                "%s: space is available again; recording continues in a new file. Not recorded so far: %s",
+                self.path,
+                _counts(self.not_written()) or "nothing",
+            )
             self._state, self.error = RECORDING, ""
 
     def _stop(self, state: str, words: str) -> None:
@@ -547,7 +560,7 @@ class Recorder:
             ("lost_by", self.lost_by()),
             ("overflow", self.dropped.overflow),
             ("paused", self.dropped.paused),
-            ("disk_full", self.dropped.disk_full),
+            ("disk_full", self.not_written()),
             ("no_type", self.dropped.no_type),
             ("parameters", self._parameters),
         ):
@@ -559,14 +572,17 @@ class Recorder:
         if self._writer is None:
             self._state = ENDED
             return
-        try:
+        for step in (self._writer.end_part, self._writer.close):  # the second writes what the first has lost
             self._set_custom(self._writer)
-            self._writer.close()
-            if self._state != FAILED:
-                self._state = ENDED
-        except BagError as error:
-            if self._state != FAILED:  # otherwise keep the first reason
-                self._stop(FAILED, str(error))
+            try:
+                step()
+            except BagError as error:
+                if self._state != FAILED:  # otherwise keep the first reason
+                    self._stop(FAILED, str(error))
+        if self._state != FAILED:
+            self._state = ENDED
+        if self.error and (gone := self.not_written()):
+            self.error += f"; not recorded: {_counts(gone)}"
 
 
 def on_disk(path: Path) -> Path:

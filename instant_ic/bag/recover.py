@@ -6,11 +6,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from mcap.reader import make_reader
-from rosbags.rosbag2.storage_mcap import McapReader
-
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_scan import McapScan
+from instant_ic.bag.mcap_source import McapSource
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import PartInfo, Topic, preset_of, preset_of_text, schema_of, with_hash, write_metadata
 from instant_ic.bag.writer import CUSTOM_RECORD, BagWriter
@@ -104,7 +102,7 @@ def reindex(folder: Path) -> tuple[int, int]:
 def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str, str]) -> PartInfo:
     """Summarise one file; its topics and custom data are added to ``topics`` and ``custom``."""
     part = PartInfo(file.name)
-    reader = McapReader(file)
+    reader = McapSource(file)
     reader.open()
     try:
         for connection in reader.connections:
@@ -114,6 +112,7 @@ def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str,
             topics.setdefault(key, (qos, schema_of(connection)))
         if reader.metadata.message_count:
             part.start_ns, part.end_ns = reader.metadata.start_time, reader.metadata.end_time - 1
+        custom.update(reader.definitions.metadata.get(CUSTOM_RECORD, {}))
     finally:
         reader.close()
     for message in McapScan(file).messages():
@@ -121,9 +120,6 @@ def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str,
             break
         part.repeated[message.topic] = part.repeated.get(message.topic, 0) + 1
         part.repeated_ns = message.stamp_ns
-    with file.open("rb") as stream:
-        records = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
-    custom.update(records.get(CUSTOM_RECORD, {}))
     return part
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import PartInfo, Topic, channel_metadata, schema_or_unknown, write_metadata
 from instant_ic.bus.qos import SENSOR, QoS
 from instant_ic.closing import Closing
-from instant_ic.private import make_folder
+from instant_ic.private import make_folder, sync_folder
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -31,8 +32,7 @@ class _Part:
     schemas: dict[str, int] = field(default_factory=dict)
     channels: dict[Topic, int] = field(default_factory=dict)
     first_ns: int | None = None
-    given: int = 0
-    repeats: int = 0
+    given: Counter[str] = field(default_factory=Counter)  # messages by topic, without repetitions
 
 
 class BagWriter(Closing):
@@ -68,6 +68,8 @@ class BagWriter(Closing):
         self.bytes = 0
         self.unknown_types: dict[str, str] = {}
         """Type → topic recorded without a definition because the type is unknown."""
+        self.lost: Counter[str] = Counter()
+        """Messages by topic that were given to :meth:`write` and did not reach the disk; replaced, never changed."""
         self._topics: dict[Topic, tuple[QoS, Schema]] = {}
         self._latched = LatchedValues()
         self._unsure = False
@@ -87,7 +89,7 @@ class BagWriter(Closing):
     def count(self) -> int:
         """Messages so far, without those that a file only repeats."""
         done = sum(part.count - sum(part.repeated.values()) for part in self._done)
-        return done + (self._part.given - self._part.repeats if self._part is not None else 0)
+        return done + (self._part.given.total() if self._part is not None else 0)
 
     @property
     def parts(self) -> int:
@@ -97,7 +99,7 @@ class BagWriter(Closing):
     @property
     def part_is_empty(self) -> bool:
         """Whether the current file has no messages yet."""
-        return self._part is None or self._part.given == 0
+        return self._part is None or not self._part.given
 
     def write(
         self,
@@ -119,24 +121,21 @@ class BagWriter(Closing):
             publisher: name of the publisher; each publisher of a latched topic has its own current value.
 
         Raises:
-            DiskFullError: lost messages are counted; the bag can be closed, or continued once there is room.
-            BagError: the file cannot be written.
+            DiskFullError: lost messages are in ``lost``; the bag can be closed, or continued once there is room.
+            BagError: the file cannot be written; lost messages are in ``lost``.
         """
         if self._closed:
             raise BagError(f"bag {self.path} is closed")
         stamp = max(0, stamp_ns)
-        if self._part is not None and self._is_full(self._part, stamp):
-            self.end_part()
+        part = self._part_for(topic, stamp)
+        part.given[topic] += 1
         if (topic, type_name) not in self._topics:
             self.add_topic(topic, type_name, qos, schema)
         qos = self._topics[topic, type_name][0]
         value = BagMessage(topic, type_name, bytes(payload), stamp, qos, publisher) if qos.latched else None
-        if self._part is None:
-            self._open_part()
-        assert self._part is not None
         try:
-            if self._part.first_ns is None:
-                self._part.first_ns = stamp
+            if part.first_ns is None:
+                part.first_ns = stamp
                 self._repeat(stamp, value)
             self._put(topic, type_name, payload, stamp, stamp)
         except OSError as error:
@@ -183,6 +182,19 @@ class BagWriter(Closing):
             except OSError as error:
                 raise self._failed(error, "flush") from error
 
+    def sync(self) -> None:
+        """Write all flushed messages to the disk itself. They then survive a power failure.
+
+        Raises:
+            BagError: the disk failed.
+        """
+        if self._part is not None:
+            try:
+                self._part.file.sync()
+                sync_folder(self.path)
+            except OSError as error:
+                raise self._failed(error, "sync") from error
+
     def end_part(self) -> None:
         """Complete the current file and list it in ``metadata.yaml``; the next message starts another.
 
@@ -196,9 +208,13 @@ class BagWriter(Closing):
                     part.file.add_metadata(CUSTOM_RECORD, self._custom)
                 full = part.file.finish()
             except OSError as error:
+                self._count_lost(part)
                 raise BagError(
                     f"bag {self.path} cannot be completed: {error.strerror}; try ic bag recover {self.path}"
                 ) from error
+            if not part.file.path.exists():
+                self.lost = self.lost + part.given
+                raise BagError(f"bag {self.path}: {part.info.path} was removed while it was being recorded")
             self._note(part)
             if full is not None:
                 self._write_metadata()
@@ -217,6 +233,19 @@ class BagWriter(Closing):
             self.end_part()
 
     # -- internals -------------------------------------------------------------------------------
+
+    def _part_for(self, topic: str, stamp_ns: int) -> _Part:
+        """Return the file for a message; starts the next one if necessary."""
+        try:
+            if self._part is not None and self._is_full(self._part, stamp_ns):
+                self.end_part()
+            if self._part is None:
+                self._open_part()
+        except BagError:
+            self.lost = self.lost + Counter([topic])
+            raise
+        assert self._part is not None
+        return self._part
 
     def _is_full(self, part: _Part, stamp_ns: int) -> bool:
         if part.first_ns is None:
@@ -244,18 +273,17 @@ class BagWriter(Closing):
         assert self._part is not None
         for value in self._latched.values(but):
             if self._unsure:  # a full disk may have dropped it: better twice than never
+                self._part.given[value.topic] += 1
                 self._put(value.topic, value.type_name, value.payload, stamp_ns, stamp_ns)
                 continue
             self._put(value.topic, value.type_name, value.payload, stamp_ns, value.stamp_ns)
             repeated, self._part.info.repeated_ns = self._part.info.repeated, stamp_ns
             repeated[value.topic] = repeated.get(value.topic, 0) + 1
-            self._part.repeats += 1
         self._unsure = False
 
     def _put(self, topic: str, type_name: str, payload: Buffer, stamp_ns: int, publish_ns: int) -> None:
         assert self._part is not None
         channel = self._channel(self._part, (topic, type_name))
-        self._part.given += 1
         self._part.file.write(channel, stamp_ns, payload, publish_ns)
 
     def _channel(self, part: _Part, topic: Topic) -> int:
@@ -280,16 +308,22 @@ class BagWriter(Closing):
         return BagError(words)
 
     def _note(self, part: _Part) -> None:
-        counts = part.file.counts
-        part.info.counts = {topic: counts[channel] for topic, channel in part.channels.items()}
+        part.info.counts = self._count_lost(part)
         part.info.start_ns, part.info.end_ns = part.file.span_ns
-        if part.given > part.info.count:
-            on_disk = {
-                topic: sum(n for t, n in part.info.counts.items() if t[0] == topic) for topic in part.info.repeated
-            }
-            part.info.repeated = {t: min(n, on_disk[t]) for t, n in part.info.repeated.items() if on_disk[t]}
-            self._unsure = True
         self._done.append(part.info)
+
+    def _count_lost(self, part: _Part) -> dict[Topic, int]:
+        """Return the messages that are on the disk; count the others as lost."""
+        counts = {topic: part.file.counts[channel] for topic, channel in part.channels.items()}
+        by_topic: Counter[str] = Counter()
+        for (name, _), count in counts.items():
+            by_topic[name] += count
+        repeated = Counter(part.info.repeated)  # they come first in the file
+        if part.given + repeated - by_topic:
+            part.info.repeated = dict(repeated & by_topic)
+            self.lost = self.lost + (part.given - (by_topic - repeated))
+            self._unsure = True
+        return counts
 
     def _write_metadata(self) -> None:
         try:

@@ -49,7 +49,7 @@ def _recorder_terminal(node: Node[Any]) -> Terminal:
             words += f"  {status['bytes'] / 1e6:.1f} MB  {status['files']} files   [space] pause"
         else:
             words += f"  last {status['cached_s']:g} s in memory   [s] snapshot [space] pause"
-        left_out = sum(status["overflow"].values())
+        left_out = sum(status["overflow"].values()) + sum(status["disk_full"].values())
         return words + (f"   LEFT OUT {left_out}" if left_out else "") + ("   LOST" if status["lost"] else "")
 
     # The recorder may only be used from the node's thread.

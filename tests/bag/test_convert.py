@@ -113,7 +113,7 @@ def test_sqlite_bag_becomes_ours(tmp_path: Path, mode: CompressionMode) -> None:
 
 
 def test_bare_mcap_of_another_writer(tmp_path: Path) -> None:
-    """foxglove-sdk's file has another profile and no QoS: recover takes its CDR messages."""
+    """foxglove-sdk's file has another profile and no QoS; its CDR messages are read, others are an error."""
     with foxglove.open_mcap(str(tmp_path / "their.mcap")):
         schema = foxglove.Schema(name=SCAN, encoding="ros2msg", data=own_schema(SCAN).text.encode())
         channel = foxglove.Channel("/convert_scan", schema=schema, message_encoding="cdr")
@@ -121,8 +121,11 @@ def test_bare_mcap_of_another_writer(tmp_path: Path) -> None:
         for index in range(3):
             channel.log(scan(index), log_time=(1 + index) * S)
         other.log(b"{}", log_time=S)
-    with pytest.raises(BagError, match=r"not written by ROS 2; its CDR messages: ic bag recover"):
-        BagReader(tmp_path / "their.mcap")
+    with BagReader(tmp_path / "their.mcap") as reader:
+        assert {topic.topic: topic.count for topic in reader.topics} == {"/convert_scan": 3, "/convert_json": 1}
+        assert [m.payload for m in reader.messages({"/convert_scan"})] == [scan(i) for i in range(3)]
+        with pytest.raises(BagError, match=r"/convert_json: its messages are 'json', not CDR.* ic bag recover"):
+            list(reader.messages())
     result = recover(tmp_path / "their.mcap", tmp_path / "new")
     assert result.skipped == {"/convert_json": "encoding 'json'"} and result.stopped_by == ""
     with BagReader(tmp_path / "new") as reader:

@@ -85,7 +85,7 @@ def test_reader_of_a_garbled_file_says_that_it_is_damaged(compressed: bool, flip
             with BagReader(path) as reader:
                 list(reader.messages())
         except BagError as error:
-            assert "ic bag recover" in str(error)
+            assert "ic bag recover" in str(error) or "is not an MCAP file" in str(error)
 
 
 @settings(max_examples=100, deadline=None)

@@ -7,18 +7,20 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from instant_ic.bag import BagError, BagMessage, BagReader, BagWriter
+from instant_ic.bag import recorder as recording
 from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.mcap_scan import McapScan
 from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, RECORDING, BagRecorderConfig, Recorder
 from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
-from instant_ic.diagnosis import Level
 from instant_ic.msg import Bool, serialize
 
 BOOL = "std_msgs/msg/Bool"
@@ -242,26 +244,6 @@ def test_losses_by_publisher_are_in_the_metadata(tmp_path: Path) -> None:
     assert custom(tmp_path / "bag", "lost_by") == {"/scan": {"left": 2, "right": 3}}
 
 
-def test_losses_are_a_warning_only_while_they_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    losses = Losses()
-    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, take: losses)
-    recorder.discover([topic_info("/scan", SENSOR)])
-    second = 0.0
-    monkeypatch.setattr("instant_ic.bag.recorder.time.monotonic_ns", lambda: int(second * S))
-
-    def level() -> int:
-        (found,) = recorder.diagnoses()
-        assert ("lost: /scan 5" in found.text) is (losses.lost == 5), found.text
-        return found.level
-
-    assert level() == Level.OK
-    losses.lost = 5
-    assert level() == Level.WARN
-    second = 11.0
-    assert level() == Level.OK
-    recorder.close()
-
-
 def test_clock_set_back_while_recording(tmp_path: Path) -> None:
     recorder = make(tmp_path / "bag")
     for stamp_s in (100, 101, 40, 41):
@@ -369,3 +351,91 @@ def test_bag_that_exists_is_not_overwritten(tmp_path: Path) -> None:
     BagWriter(tmp_path / "bag").close()
     with pytest.raises(BagError, match="already exists"):
         make(tmp_path / "bag")
+
+
+def on_the_disk(path: Path) -> list[bytes]:
+    """Payloads in all files of a bag, complete or not."""
+    return [message.payload for file in path.glob("*.mcap") for message in McapScan(file).messages()]
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO, errno.EFBIG])
+@pytest.mark.parametrize("size", [100, 300_000])
+@pytest.mark.parametrize("index_fits", [True, False])
+def test_every_message_is_recorded_or_counted_whatever_the_disk_refuses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, size: int, index_fits: bool
+) -> None:
+    """On a full disk the messages of the chunk that was being written were neither."""
+    recorder = make(tmp_path / "bag")
+    refused = threading.Event()
+    writev = os.writev
+
+    def write(fd: int, parts: list[memoryview]) -> int:
+        length = sum(len(part) for part in parts)
+        if refused.is_set() and (length > 2_000 or not index_fits):
+            raise OSError(error, os.strerror(error))
+        return writev(fd, parts)
+
+    monkeypatch.setattr(os, "writev", write)
+    sent = [index.to_bytes(2) * (size // 2) for index in range(120)]
+    for index in range(40):
+        recorder.take("/scan", BOOL, sent[index], index + S)
+    wait_for(lambda: len(on_the_disk(tmp_path / "bag")) >= 20, "the first messages")
+    refused.set()
+    for index in range(40, 80):
+        recorder.take("/scan", BOOL, sent[index], index + S)
+    wait_for(lambda: recorder.error, "the refusal")
+    refused.clear()
+    if recorder.state == DISK_FULL:
+        wait_for(lambda: recorder.state == RECORDING, "room")
+    for index in range(80, 120):
+        recorder.take("/scan", BOOL, sent[index], index + S)
+    with suppress(BagError):
+        recorder.close()
+    found = on_the_disk(tmp_path / "bag")
+    lost = recorder.status()["disk_full"]["/scan"]
+    assert lost > 0 and len(found) + lost == 120 and set(found) <= set(sent)
+    assert custom(tmp_path / "bag", "disk_full") == {"/scan": lost}
+    assert not recorder.error or f"not recorded: /scan {lost}" in recorder.error
+
+
+def test_messages_in_a_file_that_was_removed_are_counted(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "bag")
+    for index in range(5):
+        recorder.take("/scan", BOOL, b"1", index + S)
+    wait_for(lambda: recorder.count == 5, "the messages")
+    (tmp_path / "bag" / "bag.mcap").unlink()
+    with pytest.raises(BagError, match=r"bag\.mcap was removed while it was being recorded; not recorded: /scan 5"):
+        recorder.close()
+    assert custom(tmp_path / "bag", "disk_full") == {"/scan": 5}
+
+
+class Syncs:
+    """What was written to the disk itself: inode → its size then."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.sizes: dict[int, int] = {}
+        for name in ("fsync", "fdatasync"):
+            monkeypatch.setattr(os, name, self._of(getattr(os, name)))
+
+    def _of(self, sync: Callable[[int], None]) -> Callable[[int], None]:
+        def note(fd: int) -> None:
+            sync(fd)
+            self.sizes[os.fstat(fd).st_ino] = os.fstat(fd).st_size
+
+        return note
+
+    def hold(self, path: Path) -> bool:
+        return self.sizes.get(path.stat().st_ino) == path.stat().st_size
+
+
+def test_bag_is_on_the_disk_itself_at_its_end_and_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "SYNC_S", 0.05)
+    syncs = Syncs(monkeypatch)
+    bag = tmp_path / "bag"
+    recorder = make(bag)
+    recorder.take("/scan", BOOL, b"1" * 100, S)
+    wait_for(lambda: len(on_the_disk(bag)) == 1 and syncs.hold(bag / "bag.mcap"), "the message on the disk")
+    assert syncs.hold(bag)  # the folder knows the file
+    recorder.take("/scan", BOOL, b"2" * 100, 2 * S)
+    recorder.close()
+    assert all(syncs.hold(path) for path in (bag, bag / "bag.mcap", bag / "metadata.yaml"))
