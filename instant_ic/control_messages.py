@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from instant_ic.bus import Latest
 from instant_ic.bus.clock import Clock
+from instant_ic.bus.transport import Received
 from instant_ic.contradiction import Contradiction
-from instant_ic.control.arbiter import Decision
+from instant_ic.control.arbiter import STANDS_M_S, STANDS_RAD_S, Decision
 from instant_ic.control.estop import KeptEstop
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import extrapolate
 from instant_ic.control.operator_view import OperatorView, PageReport
+from instant_ic.control.robot_lease import LEASE_S, RELEASED, Lease
 from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Vspace
 from instant_ic.control.states import Mode
 from instant_ic.control.static_map import StaticMap
@@ -32,6 +34,7 @@ from instant_ic.msg import (
     TwistStamped,
     VspaceStatus,
     cloud_array,
+    deserialize,
     grid_message,
     header,
     matrix_from_pose,
@@ -59,9 +62,12 @@ class ArbiterInbox:
     vspace: Latest
     integrity: Latest | None = None
     """Trust in the pose; None: not used."""
+    lease: Lease = field(default_factory=lambda: Lease(LEASE_S))
+    """Who drives the robot."""
     button_ns: int | None = None
     """Last report of the robot's own emergency stop, steady clock."""
     _was_gone: bool = False  # at the page's last report
+    _shown_by: str = ""  # node of that report
 
     def scan(self) -> Scan | None:
         """The newest scan."""
@@ -89,8 +95,40 @@ class ArbiterInbox:
         still = self._twist("command") == NO_MOTION == self._twist("odometry")
         return still and mode in (Mode.REAL, Mode.STOPPED)
 
-    def report_shown(self, message: ShownPictures, mode: Mode) -> bool:
-        """Take a page's report; return whether to step at once: a switch waits for it, or the driver was lost."""
+    def take_command(self, received: Received, timeout_s: float) -> bool:
+        """Take a command if its sender has the robot's lease, or gets it; return whether it was taken.
+
+        Args:
+            received: TwistStamped; its frame names the client of the node that published it.
+            timeout_s: age in seconds above which a command takes no lease.
+        """
+        message = deserialize(received.payload, received.type_name)
+        sender, given_ns = f"{received.publisher}/{message.header.frame_id}", received.given_ns(stamp_ns(message))
+        if sender.endswith(RELEASED):
+            taken = self.lease.release(sender.removesuffix(RELEASED))
+        else:
+            now_ns, moves = self.clock.steady_ns(), twist_values(message) != NO_MOTION
+            refusal = self.lease.refusal(sender, moves, now_ns, self._stands())
+            new = sender == self.lease.holder or now_ns - given_ns <= timeout_s * 1e9
+            taken = refusal is None and new
+            if taken:
+                self.lease.grant(sender, given_ns)
+                if not self._counts(self._shown_by):
+                    self.shown.forget()
+        if taken:
+            self.sources["command"].put(message, received)
+        return taken
+
+    def take_shown(self, received: Received, mode: Mode) -> bool:
+        """Take a page's report; return whether to step at once: a switch waits for it, or the driver was lost.
+
+        While somebody drives, only reports of the node through which he drives count: no other page's images are his.
+        """
+        if not self._counts(received.publisher):
+            return False
+        self._shown_by = received.publisher
+        message = deserialize(received.payload, received.type_name)
+        self.shown.put(message, received)
         wanted = mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
         new = self.view.report(page_report(message), wanted, self.clock.now_ns(), self.clock.steady_ns())
         before, self._was_gone = self._was_gone, self.operator_gone()
@@ -163,6 +201,19 @@ class ArbiterInbox:
             images_late_s=view.delay_s(report),
         )
 
+    def _counts(self, node: str) -> bool:
+        """Whether the images at a node's pages are the driver's."""
+        return not self.lease.holder or self.lease.holder.startswith(f"{node}/")
+
+    @property
+    def command(self) -> tuple[float, float]:
+        """The holder's newest command (m/s, rad/s)."""
+        return self._twist("command")
+
+    def _stands(self) -> bool:
+        linear, angular = self._twist("odometry")
+        return abs(linear) < STANDS_M_S and abs(angular) < STANDS_RAD_S
+
     def _twist(self, key: str) -> tuple[float, float]:
         message = self.sources[key].message
         return (0.0, 0.0) if message is None else twist_values(message)
@@ -190,8 +241,8 @@ def command_message(decision: Decision, now_ns: int) -> TwistStamped:
     return twist_stamped(*decision.command, now_ns, HARD_STOP if decision.hard else "base_link")
 
 
-def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> ControlState:
-    """ControlState of one step of the arbiter."""
+def control_state(decision: Decision, inputs: ArbiterInputs, holder: str, now_ns: int) -> ControlState:
+    """ControlState of one step of the arbiter; ``holder``: who has the robot's lease."""
     return ControlState(
         header=header("map", now_ns),
         mode=int(decision.mode),
@@ -213,6 +264,7 @@ def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> Con
         robot_twist=twist_message(*inputs.robot_velocity),
         vbot_limit_m_s=decision.vbot_limit_m_s,
         reason_code=int(decision.reason_code),
+        holder=holder,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from instant_ic import msg
-from instant_ic.bus import LATCHED, SENSOR, Node, main
+from instant_ic.bus import LATCHED, SENSOR, Latest, Node, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
@@ -51,15 +51,17 @@ class ArbiterNode(Node[ArbiterConfig]):
             "pose": self.latest("/pose", msg.PoseWithCovarianceStamped, 10.0),
             "vbot": self.latest("/vbot/odom", msg.Odometry, 10.0),
             "nav": self.latest("/nav/cmd_vel", msg.TwistStamped, 10.0),
-            "command": self.latest("/operator/cmd_vel", msg.TwistStamped, 10.0, callback=self.on_command),
+            "command": Latest(self.clock, 10.0),
         }
         points = self.latest("/lidar/points", msg.PointCloud2, 10.0) if c.costmap.points.enabled else None
-        shown = self.latest("/view/shown", msg.ShownPictures, 1.0, callback=self.on_shown)
+        shown = Latest(self.clock, 1.0)
         vspace = self.latest("/vspace/status", msg.VspaceStatus, 60.0, qos=LATCHED)
         # A doubt holds until the next report: silence is no trust. A SLAM that is gone is noticed by the age of /pose.
         integrity = self.latest("/slam/integrity", msg.PoseIntegrity, float("inf"))
         self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace, integrity)
         self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
+        self.subscribe_received("/operator/cmd_vel", self.on_command, qos=SENSOR, message_class=msg.TwistStamped)
+        self.subscribe_received("/view/shown", self.on_shown, qos=SENSOR, message_class=msg.ShownPictures)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=msg.Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=msg.Bool)
         # Only its age matters: the image is never decoded here.
@@ -79,8 +81,8 @@ class ArbiterNode(Node[ArbiterConfig]):
 
     def on_estop(self, received: Received) -> None:
         """Obey a press at once; a release only by the rule of ``EstopLatch``."""
-        pressed = bool(msg.deserialize(received.payload, received.type_name).data)
-        if refused := self.latch.hear(pressed, received.publisher, received.publish_ns, self.clock.now_ns()):
+        pressed, holder = bool(msg.deserialize(received.payload, received.type_name).data), self.inbox.lease.holder
+        if refused := self.latch.hear(pressed, received.publisher, received.publish_ns, self.clock.now_ns(), holder):
             self.log.warning("emergency stop: %s", refused)
         self.step_and_save()
 
@@ -98,16 +100,21 @@ class ArbiterNode(Node[ArbiterConfig]):
         finally:  # whatever input the step fails at
             self.diagnose_all(self.latch.save())
 
-    def on_command(self, message: msg.TwistStamped) -> None:
-        if self.times.command_steps(msg.twist_values(message)):
+    def on_command(self, received: Received) -> None:
+        """Obey the holder of the robot's lease, and step at once when his command has changed."""
+        lease, before = self.inbox.lease, self.inbox.lease.holder
+        taken = self.inbox.take_command(received, self.config.timeouts.command)
+        if lease.holder != before:
+            self.log.info("%s", lease.diagnosis.text)
+        if taken and self.times.command_steps(self.inbox.command):
             self.tick()
 
     def on_timer(self) -> None:
         if self.times.timer_steps(self.clock.steady_ns(), self.inbox.rests(self.arbiter.mode)):
             self.tick()
 
-    def on_shown(self, message: msg.ShownPictures) -> None:
-        if self.inbox.report_shown(message, self.arbiter.mode):
+    def on_shown(self, received: Received) -> None:
+        if self.inbox.take_shown(received, self.arbiter.mode):
             self.tick()
 
     def update_costmap(self) -> None:
@@ -136,10 +143,10 @@ class ArbiterNode(Node[ArbiterConfig]):
             self.cancel_extra = self.timer(stale_in_s + STEP_AFTER_S, self.tick).cancel
 
     def publish_decision(self, decision: Decision, inputs: ArbiterInputs, now_ns: int) -> None:
-        self.state.publish(control_state(decision, inputs, now_ns))
+        self.state.publish(control_state(decision, inputs, self.inbox.lease.holder, now_ns))
         if decision.changed:
             self.log.info("%s: %s", decision.mode.label, decision.reason)
-        self.diagnose_all(decision.diagnosis, *self.surroundings.findings.values())
+        self.diagnose_all(decision.diagnosis, self.inbox.lease.diagnosis, *self.surroundings.findings.values())
         if not (self.times.shown or decision.changed):
             return
         if decision.subgoal is not None:

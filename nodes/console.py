@@ -13,6 +13,7 @@ from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed
 from instant_ic.console.recording import RecorderError, RecordingDesk
+from instant_ic.control.robot_lease import RELEASED
 from instant_ic.paths import sign_in_file
 from instant_ic.web_access import AccessError, offer_sign_in
 
@@ -61,6 +62,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.subscribe("/heartbeat", msg.NodeStatus, feed.take_heartbeat, qos=RELIABLE)
         self.timer(1.0, feed.send_health)
         self.page_timers: list[Timer] = []
+        self.server.on_released = self.release_lease
         self.server.on_renders = lambda: self.call_soon(self.feed_layers, True)
         self.server.on_watched = lambda watched: self.call_soon(self.feed_page, watched)
         self.feed_page(self.run_dir is None)  # in lockstep there are no pages that could come
@@ -119,7 +121,11 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_drive(self, linear: float, angular: float) -> None:
         # At once: a detour through the node's thread would add latency.
-        self.command_out.publish(msg.twist_stamped(linear, angular, self.clock.now_ns()))
+        self.command_out.publish(msg.twist_stamped(linear, angular, self.clock.now_ns(), self.server.client))
+
+    def release_lease(self, client: str) -> None:
+        """Give the robot's lease back in the name of a page that drove."""
+        self.command_out.publish(msg.twist_stamped(0.0, 0.0, self.clock.now_ns(), client + RELEASED))
 
     def on_operator(self, there: bool) -> None:
         if not there:

@@ -15,8 +15,11 @@ from instant_ic.bus import ERROR, LATCHED, SENSOR, WARN, Node, NodeError, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.estop import EstopLatch
 from instant_ic.geometry.poses import matrix_from_pose2
-from instant_ic.msg import BatteryState, Bool, Odometry, battery_message, deserialize
+from instant_ic.msg import BatteryState, Bool, ControlState, Odometry, battery_message, deserialize
 from instant_ic.pace import PaceError, current
+
+STATE_S = 1.0
+"""Age in seconds up to which the arbiter's state counts."""
 
 
 class CrawlerBaseNode(Node[CrawlerBaseConfig]):
@@ -47,6 +50,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.loop = loop_class(self.controller, config.rate_hz, self.on_step, self.on_end)
         if self.lockstep:
             self.timer(1.0 / config.rate_hz, self.loop.hurry)
+        self.state = self.latest("/ic/state", ControlState, STATE_S, LATCHED)  # who may release the emergency stop
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/cmd_vel", self.on_command, qos=SENSOR)
@@ -71,7 +75,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def on_estop(self, received: Received) -> None:
         """Obey any client's emergency stop here too, whatever the arbiter does."""
         pressed = bool(deserialize(received.payload, received.type_name).data)
-        refused = self.latch.hear(pressed, received.publisher, received.publish_ns, received.received_ns)
+        holder = None if self.state.message is None else self.state.message.holder
+        refused = self.latch.hear(pressed, received.publisher, received.publish_ns, received.received_ns, holder)
         if refused:
             self.log.warning("emergency stop not released: %s", refused)
         self.obey_latch()

@@ -16,11 +16,12 @@ from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_report import LinkReport
 from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, Ended, Refused, Side, Up
 from instant_ic.bridge.host_topics import parse_rules
-from instant_ic.bus import Node, NodeError, main
-from instant_ic.msg import type_hash
+from instant_ic.bus import LATCHED, Latest, Node, NodeError, main
+from instant_ic.msg import ControlState, type_hash
 
 LOOK_S = 0.5
 LATE_READERS_S = 0.1
+STATE_S = 1.0
 
 
 class HostBridgeNode(Node[HostBridgeConfig]):
@@ -29,6 +30,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
     name = "host_bridge"
     live_parameters = ("driver", "max_offset_ms")
     link: HostLink | None = None
+    state: Latest | None = None
 
     def setup(self) -> None:
         config = self.config
@@ -53,7 +55,9 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             raise NodeError(str(error)) from None
         self.report = LinkReport(self.link, self.diagnose, {*to_station, *to_robot})
         self.outgoing = ExportedTopics(self, exports, self.link, self.report.trouble)
-        self.incoming = ImportedTopics(self, imports, functools.partial(self.call_soon, self.report.trouble))
+        on_trouble = functools.partial(self.call_soon, self.report.trouble)
+        self.state = self.latest("/ic/state", ControlState, STATE_S, LATCHED) if listening else None
+        self.incoming = ImportedTopics(self, imports, on_trouble, self.holder)
         self.next_step_s = 0.0
         self.outgoing.look()
         self.link.start()
@@ -113,6 +117,11 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             case Problem():
                 self.report.problem = event.text
                 self.update()
+
+    def holder(self) -> str:
+        """Who has the robot's lease; empty: nobody, or the arbiter is silent. Any thread may call it."""
+        state = None if self.state is None else self.state.message
+        return "" if state is None else str(state.holder)
 
     def update(self) -> None:
         self.report.update(self.config.max_offset_ms)

@@ -22,13 +22,11 @@ class VirtualRobotConfig(Checked):
 
     Attributes:
         rate_hz: steps and messages on /vbot/odom, per second.
-        command_timeout_s: s; with an older operator's command the v-bot stops.
         state_timeout_s: s without /ic/state after which the v-bot stands still.
         wall_min_length_m: m; as for the arbiter.
     """
 
     rate_hz: Positive = 20.0
-    command_timeout_s: Positive = 0.3
     state_timeout_s: Positive = 0.5
     wall_min_length_m: Positive = 1.5
     limits: MotionLimits = field(default_factory=MotionLimits)
@@ -40,7 +38,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
     """Connects ``VirtualRobot`` to topics."""
 
     name = "virtual_robot"
-    live_parameters = ("vbot", "limits", "command_timeout_s", "state_timeout_s")
+    live_parameters = ("vbot", "limits", "state_timeout_s")
 
     def setup(self) -> None:
         self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
@@ -50,9 +48,8 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", msg.Odometry, qos=SENSOR)
         self.times = StepTimes()
-        timeout_s = self.config.command_timeout_s
-        self.command = self.latest("/operator/cmd_vel", msg.TwistStamped, timeout_s, callback=self.on_command)
-        self.state = self.latest("/ic/state", msg.ControlState, self.config.state_timeout_s, qos=LATCHED)
+        timeout_s = self.config.state_timeout_s
+        self.state = self.latest("/ic/state", msg.ControlState, timeout_s, LATCHED, self.on_state)
         self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
         self.timer(WALL_PERIOD_S, self.walls.update)
         self.timer(1.0 / self.config.rate_hz, self.on_timer)
@@ -60,10 +57,11 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
     def reconfigure(self, config: VirtualRobotConfig) -> None:
         super().reconfigure(config)
         self.robot.config, self.robot.limits = config.vbot, config.limits
-        self.command.max_age_s, self.state.max_age_s = config.command_timeout_s, config.state_timeout_s
+        self.state.max_age_s = config.state_timeout_s
 
-    def on_command(self, message: msg.TwistStamped) -> None:
-        if self.action == VbotAction.DRIVEN and self.times.command_steps(msg.twist_values(message)):
+    def on_state(self, message: msg.ControlState) -> None:
+        """Obey a changed command at once; the arbiter has it from the one operator who has the robot's lease."""
+        if self.action == VbotAction.DRIVEN and self.times.command_steps(msg.twist_values(message.operator_command)):
             self.tick()
 
     def on_timer(self) -> None:
@@ -99,7 +97,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
-            self.times.obeyed = self.operator()
+            self.times.obeyed = msg.twist_values(state.operator_command)
             self.robot.step(self.times.obeyed, robot_pose, dt_s, self.walls.found, float(state.vbot_limit_m_s))
         elif action == VbotAction.HELD:
             self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls.found)
@@ -109,11 +107,6 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
             self.robot.lead_back(robot_pose, dt_s, self.walls.found)
         slowed = f", slowed by {self.robot.slowed_by}" if self.robot.slowed_by else ""
         self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
-
-    def operator(self) -> tuple[float, float]:
-        """The operator's command; zero when stale."""
-        message = self.command.fresh
-        return (0.0, 0.0) if message is None else msg.twist_values(message)
 
 
 if __name__ == "__main__":

@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 
 from instant_ic.config.ranges import Checked, Positive
+from instant_ic.control.robot_lease import Lease
 
-STOP = "/operator/estop"
-COMMANDS = {"/operator/cmd_vel": "geometry_msgs/msg/TwistStamped", STOP: "std_msgs/msg/Bool"}
+DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
+COMMANDS = {DRIVE: "geometry_msgs/msg/TwistStamped", STOP: "std_msgs/msg/Bool"}
 """Topics that a remote operator may send, with their types."""
 
 
@@ -43,9 +44,7 @@ class CommandGate:
     def __init__(self, limits: CommandLimits) -> None:
         self.limits = limits
         self.refused: dict[str, int] = {}
-        self._driver: str | None = None
-        self._driver_ns = 0
-        self._held: dict[str, int] = {}  # sender → time of its last motion that was refused because another drove
+        self._lease = Lease(limits.lease_s)
 
     def check_age(self, source_ns: int, now_ns: int) -> None:
         """Refuse an old command, or one from the future, whose age is unknown."""
@@ -58,41 +57,28 @@ class CommandGate:
     def check_drive(self, sender: str, v: float, w: float, steady_ns: int, sent: tuple[int, int] | None = None) -> None:
         """Refuse implausible values (m/s, rad/s), a second driver, and by ``sent`` an old command (:meth:`check_age`).
 
-        A second driver that takes over must let go first: send zero, or nothing for ``lease_s``. Else the robot would
-        start under a key that was held in vain until then. ``steady_ns`` comes from a clock that is never set, since
-        it measures the lease.
+        ``steady_ns`` comes from a clock that is never set, since it measures the lease (:class:`Lease`).
         """
         if not (math.isfinite(v) and math.isfinite(w)):
             raise self.refuse("not finite", f"v {v}, w {w}: not finite")
         if abs(v) > self.limits.max_linear_mps or abs(w) > self.limits.max_angular_rps:
             limits = f"{self.limits.max_linear_mps:g} m/s, {self.limits.max_angular_rps:g} rad/s"
             raise self.refuse("too fast", f"{v:g} m/s, {w:g} rad/s: beyond {limits}")
-        since_ns, moves = steady_ns - int(self.limits.lease_s * 1e9), (v, w) != (0.0, 0.0)
-        self._held = {other: held_ns for other, held_ns in self._held.items() if held_ns >= since_ns}
-        if not moves:
-            self._held.pop(sender, None)
-        second = self._driver not in (None, sender) and self._driver_ns >= since_ns
-        if moves and (second or sender in self._held):
-            self._held[sender] = steady_ns
+        refusal = self._lease.refusal(sender, (v, w) != (0.0, 0.0), steady_ns)
         if sent is not None:  # only now: an old command too shows that a key is held
             self.check_age(*sent)
-        if second:
-            raise self.refuse("second driver", f"{sender} may not drive while {self._driver} does")
-        if sender in self._held:
-            raise self.refuse("held", f"{sender} must let go of the controls once before it drives")
-        self._driver, self._driver_ns = sender, steady_ns
+        if refusal is not None:
+            raise self.refuse(*refusal)
+        self._lease.grant(sender, steady_ns)
 
     def check_release(self, sender: str, steady_ns: int) -> None:
         """Refuse to release the emergency stop unless the sender is the driver and its commands are current."""
-        if self._driver != sender or steady_ns - self._driver_ns > self.limits.lease_s * 1e9:
+        if not self._lease.holds(sender, steady_ns):
             raise self.refuse("release", f"{sender} does not drive; only the driver may release the emergency stop")
 
     def release(self, sender: str) -> bool:
         """End a sender's lease; return True if it was the driver."""
-        if self._driver != sender:
-            return False
-        self._driver = None
-        return True
+        return self._lease.release(sender)
 
     def refuse(self, reason: str, words: str) -> CommandRefused:
         """Count a refusal by its reason and return the error to raise."""

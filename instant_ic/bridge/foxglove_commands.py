@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from instant_ic.bridge.commands import CommandGate, CommandRefused
+from instant_ic.bridge.commands import DRIVE, STOP, CommandGate, CommandRefused
 from instant_ic.bridge.foxglove_protocol import ClientChannel
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, Node, Publisher
+from instant_ic.control.robot_lease import RELEASED
 from instant_ic.msg import MessageError, deserialize, message_type, stamp_ns, twist_stamped, twist_values
 
-DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
 _COMMAND_TYPES = {DRIVE: ("TwistStamped", "Twist"), STOP: ("Bool",)}
 
 
@@ -48,7 +48,7 @@ class Commands:
         """Handle a client's ``unadvertise``. If the client drove, stop the robot immediately."""
         channel = self._channels.pop((client, channel_id), None)
         if channel is not None and channel.topic == DRIVE and self._gate.release(_name(client)):
-            self._drive.publish(twist_stamped(0.0, 0.0, self._node.clock.now_ns()))
+            self._drive.publish(twist_stamped(0.0, 0.0, self._node.clock.now_ns(), _name(client) + RELEASED))
 
     def left(self, client: int) -> None:
         """Release the channels of a disconnected client."""
@@ -93,7 +93,7 @@ class Commands:
             sent_ns = int(stamp.get("sec", 0)) * 1_000_000_000 + int(stamp.get("nanosec", stamp.get("nsec", 0)))
         # Foxglove's Teleop panel has no clock and sends no stamp: the time of arrival counts
         self._gate.check_drive(_name(client), v, w, time.monotonic_ns(), (sent_ns, now_ns) if sent_ns else None)
-        self._drive.publish(twist_stamped(v, w, sent_ns or now_ns))
+        self._drive.publish(twist_stamped(v, w, sent_ns or now_ns, _name(client)))
         if self._told.pop(client, None) is not None:
             self._node.call_soon(self._node.diagnose, "commands", OK, "commands are accepted")
 

@@ -7,9 +7,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+from instant_ic.bridge.commands import DRIVE, STOP
 from instant_ic.bridge.host_link import HostLink
 from instant_ic.bridge.host_protocol import Announce
 from instant_ic.bridge.host_session import Arrived
@@ -17,6 +18,8 @@ from instant_ic.bridge.host_topics import TopicRule, releases
 from instant_ic.bus import RELIABLE, SENSOR, Node, Publisher, QoS, RegistryError, registry
 from instant_ic.bus.qos import PRESETS
 from instant_ic.bus.transport import Received, TransportError
+from instant_ic.control.robot_lease import sender_name
+from instant_ic.msg import MessageError, deserialize, serialize
 
 BRIDGES = ("host_bridge", "zenoh_gateway")
 """Nodes that republish messages from elsewhere. Their messages are not exported, to avoid echoes."""
@@ -102,10 +105,17 @@ class ImportedTopics:
     Args:
         rules: topics to import, by name without namespace.
         on_trouble: called with topic and error text when a topic cannot be published here.
+        holder: returns who has the robot's lease, as the arbiter reports it; empty: nobody, or unknown.
     """
 
-    def __init__(self, node: Node[Any], rules: dict[str, TopicRule], on_trouble: Callable[[str, str], None]) -> None:
-        self._node, self._rules, self._on_trouble = node, rules, on_trouble
+    def __init__(
+        self,
+        node: Node[Any],
+        rules: dict[str, TopicRule],
+        on_trouble: Callable[[str, str], None],
+        holder: Callable[[], str] = lambda: "",
+    ) -> None:
+        self._node, self._rules, self._on_trouble, self._holder = node, rules, on_trouble, holder
         self._topics: dict[str, _Imported] = {}
         self._next_outdated_s = 0.0
 
@@ -122,6 +132,12 @@ class ImportedTopics:
         """Publish a message of a host; called on the link's thread: commands do not wait for the node's thread."""
         announce = arrived.announce
         topic = self.open(announce)
+        if announce.topic == DRIVE:
+            try:
+                arrived = _signed(peer, arrived)
+            except MessageError as error:
+                self._on_trouble(DRIVE, f"command of {peer} refused: {error}")
+                return
         if topic.type_name != announce.type_name:
             self._on_trouble(
                 announce.topic,
@@ -133,7 +149,10 @@ class ImportedTopics:
             if topic.qos.latched:
                 if self._rules[announce.topic].shared:  # one state set by several hosts: only the latest message counts
                     source, release = (peer, announce.origin), releases(announce.type_name, arrived.payload)
-                    if why := _outdated(topic, source, release, arrived.born_ns):
+                    why = _outdated(topic, source, release, arrived.born_ns)
+                    if not why and release and announce.topic == STOP:
+                        why = self._not_driving(*source)
+                    if why:
                         if time.monotonic() >= self._next_outdated_s:  # a peer must not fill the disk
                             self._next_outdated_s = time.monotonic() + 1.0
                             self._node.log.warning("dropped %s of %s: %s", announce.topic, peer, why)
@@ -153,6 +172,12 @@ class ImportedTopics:
                 topic.waiting.append(arrived)
             else:
                 self._publish(topic.publisher, arrived)
+
+    def _not_driving(self, peer: str, origin: str) -> str:
+        """Why a release by a node of a host does not count: another node of a host drives; empty if it may."""
+        here, holder = f"{self._node.node_name}/", self._holder()
+        theirs = f"{here}{sender_name(peer, origin)}/"
+        return f"only {holder} may release" if holder.startswith(here) and not holder.startswith(theirs) else ""
 
     def _advertise(self, name: str, topic: _Imported) -> None:
         # The bridge itself publishes /diagnostics and the like; the other hosts' messages share that publisher.
@@ -192,6 +217,18 @@ class ImportedTopics:
             publisher.publish_bytes(arrived.payload, arrived.publish_ns)
         except (TransportError, OSError) as error:  # a message that this bus cannot carry must not end the link
             self._on_trouble(arrived.announce.topic, str(error))
+
+
+def _signed(peer: str, arrived: Arrived) -> Arrived:
+    """Return a drive command that names host, node and client that sent it, whatever they claim to be.
+
+    Raises:
+        MessageError: it is not readable.
+    """
+    announce = arrived.announce
+    message = deserialize(arrived.payload, announce.type_name)
+    message.header.frame_id = sender_name(peer, announce.origin, message.header.frame_id)
+    return replace(arrived, payload=bytes(serialize(message)))
 
 
 def _outdated(topic: _Imported, source: tuple[str, str], release: bool, born_ns: int) -> str:

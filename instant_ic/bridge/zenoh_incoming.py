@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from instant_ic.bridge.commands import COMMANDS, STOP, CommandGate, CommandRefused
+from instant_ic.bridge.commands import COMMANDS, DRIVE, STOP, CommandGate, CommandRefused
 from instant_ic.bridge.zenoh_format import Attachment, Token, TopicQoS
 from instant_ic.bridge.zenoh_outgoing import Outgoing
 from instant_ic.bridge.zenoh_session import RosNode, RosSubscription
@@ -23,6 +23,7 @@ from instant_ic.bridge.zenoh_topics import (
 )
 from instant_ic.bus import ERROR, OK, Node, Publisher
 from instant_ic.bus.registry import RegistryError
+from instant_ic.control.robot_lease import RELEASED, sender_name
 from instant_ic.msg import MessageError, deserialize, message_type, serialize, twist_stamped, twist_values, type_hash
 
 _TF = "tf2_msgs/msg/TFMessage"
@@ -94,6 +95,7 @@ class Incoming:
         self._gate_lock = threading.Lock()  # each subscription calls on its own thread
         self._topics: dict[str, _In] = {}
         self._refusing: set[str] = set()
+        self._driver = ""  # sender of the newest drive command, as the arbiter knows it
         self._count_before = 0
         self._patterns, self._types = parse_subscribe(subscribe)
         self._commands = set(commands) & {STOP} if no_commands else set(commands)
@@ -213,7 +215,7 @@ class Incoming:
         def command(payload: bytes, attachment: Attachment) -> None:
             with self._gate_lock:
                 try:
-                    self._check(topic, entry, payload, attachment)
+                    passed = self._check(topic, entry, payload, attachment)
                 except CommandRefused as error:
                     self._refusing.add(topic)
                     self._tell(topic, ERROR, f"command refused: {error}")
@@ -221,11 +223,12 @@ class Incoming:
                 if topic in self._refusing:
                     self._refusing.discard(topic)
                     self._tell(topic, OK, "commands are accepted")
-                publish(payload, attachment.source_ns)
+                publish(passed, attachment.source_ns)
 
         return command if topic in self._commands else plain
 
-    def _check(self, topic: str, entry: _In, payload: bytes, attachment: Attachment) -> None:
+    def _check(self, topic: str, entry: _In, payload: bytes, attachment: Attachment) -> bytes | memoryview:
+        """Return the command to publish; a drive command names its sender, whatever that claims to be."""
         now_ns = time.time_ns()
         try:
             message = deserialize(payload, COMMANDS[topic])
@@ -238,11 +241,13 @@ class Incoming:
                     raise self._gate.refuse("link not secure", f"release: {self._no_commands}")
                 self._gate.check_age(attachment.source_ns, now_ns)
                 self._gate.check_release(attachment.sender, time.monotonic_ns())
-            return
+            return payload
         if not entry.sources:
             raise self._gate.refuse("no sender", "the ROS graph has no publisher of this topic")
         sent = attachment.source_ns, now_ns
         self._gate.check_drive(attachment.sender, *twist_values(message), time.monotonic_ns(), sent)
+        self._driver = message.header.frame_id = sender_name(attachment.sender, message.header.frame_id)
+        return serialize(message)
 
     def _tell(self, topic: str, level: int, words: str) -> None:
         self._node.call_soon(self._node.diagnose, f"in {topic}", level, words)
@@ -254,9 +259,10 @@ class Incoming:
             if entry.sources:
                 return
             entry.gone_s = time.monotonic()
-            if topic == "/operator/cmd_vel" and topic in self._commands:
+            if topic == DRIVE and topic in self._commands:
                 # Stop immediately instead of after the arbiter's timeout.
-                entry.publisher.publish(twist_stamped(0.0, 0.0, time.time_ns()))
+                released = self._driver.removesuffix(RELEASED) + RELEASED
+                entry.publisher.publish(twist_stamped(0.0, 0.0, time.time_ns(), released))
 
     def reconcile(self) -> None:
         """Drop topics whose publishers have been gone for a while."""

@@ -115,6 +115,10 @@ class Latest:
         self._message, self._received_ns = message, received.steady_ns
         self._given_ns = received.given_ns(stamp_ns(message)) if hasattr(message, "header") else received.steady_ns
 
+    def forget(self) -> None:
+        """Drop the message, as before the first."""
+        self._message = None
+
     @property
     def message(self) -> Any:
         """The newest message, or None when there is none younger than ``max_age_s``."""

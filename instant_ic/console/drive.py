@@ -13,6 +13,7 @@ from enum import Enum
 from instant_ic.config.ranges import NotNegative, Positive, check_ranges
 
 RATE_COMMANDS = 200  # newest commands kept to measure the rate
+CONFIRM_S = 1.0  # time in which the robot confirms a press of the emergency stop; until then the press counts
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,8 @@ class DriveGate:
         self.config = config
         self.driver: int | None = None
         self.estop = False
+        self._robot_known = False  # the robot reports its emergency stop
+        self._pressed = -math.inf  # emergency stop pressed here and not confirmed by the robot
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
         self.watchdog_trips = 0
         self.last_age_s: float | None = None
@@ -178,15 +181,29 @@ class DriveGate:
 
     def set_estop(self, now: float) -> None:
         """Latch the emergency stop."""
-        self.estop = True
+        self.estop, self._pressed = True, now
         self.stop(now)
 
-    def release_estop(self, client: int) -> bool:
-        """Release the emergency stop if ``client`` is the driver; return whether it was released."""
+    def may_release_estop(self, client: int) -> bool:
+        """Return whether ``client`` is the driver, who may release the emergency stop.
+
+        The stop ends when the robot reports it (:meth:`follow_estop`), or at once where no robot reports.
+        """
         if client != self.driver:
             return False
-        self.estop = False
+        self.estop = self.estop and self._robot_known
         return True
+
+    def follow_estop(self, pressed: bool | None, now: float) -> bool:
+        """Take over the robot's emergency stop; None: it reports none. Return whether the state has changed."""
+        before, self._robot_known = self.estop, pressed is not None
+        if pressed:
+            self._pressed = -math.inf
+            self.estop = True
+            self.stop(now)
+        elif pressed is not None and now - self._pressed >= CONFIRM_S:
+            self.estop = False
+        return self.estop != before
 
     def take_due(self, now: float) -> tuple[float, float] | None:
         """Return the command to publish now, or None if none is due. Runs the watchdog and the lease time-out."""

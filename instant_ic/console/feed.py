@@ -150,7 +150,8 @@ class PageFeed:
         self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))
 
     def take_control(self, message: ControlState) -> None:
-        """Send a change of mode at once, because both robots keep moving."""
+        """Send a change of mode at once, because both robots keep moving; show who drives, and the emergency stop."""
+        self.server.follow_robot(message.holder, bool(message.estop))
         if self.display.changes_mode(message):
             self.send_state()
 
@@ -186,6 +187,8 @@ class PageFeed:
         self._state_sent_ns = self._clock.steady_ns()
         control, vbot = self._inputs.control.message, self._inputs.vbot.message
         self.display.step(control)
+        if control is None:
+            self.server.follow_robot(None)
         self.server.show(*self.display.foreground)
         self.server.publish("state", page.state_message(self.server.now_ms(), self.display, self.scene, control, vbot))
         self.report_shown()

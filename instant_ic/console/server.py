@@ -12,6 +12,7 @@ import html
 import io
 import json
 import logging
+import secrets
 import threading
 import time
 import zipfile
@@ -40,6 +41,7 @@ from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, short_text, whole
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
+from instant_ic.control.robot_lease import sender_name
 from instant_ic.pace import current
 from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
 
@@ -155,6 +157,8 @@ class ConsoleServer:
         """Called on the server's thread when a page says for the first time that it can render the virtual space."""
         self.on_drawn: Callable[[], None] = lambda: None
         """Called on the server's thread when :meth:`drawn_ms` has changed."""
+        self.on_released: Callable[[str], None] = lambda client: None
+        """Called on the server's thread when a client that drove gives its lease back; see :attr:`client`."""
         self.gate = DriveGate(self.config.drive)
         try:
             self.access = Access(self.config.access, self.config.host)
@@ -173,6 +177,9 @@ class ConsoleServer:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self._operator = False  # whether the backend knows that a driver is present
+        self._instance = secrets.token_hex(4)  # other consoles, and the next start, have clients of the same numbers
+        self._commanding: int | None = None  # client in whose name the backend commands
+        self._holder: str | None = None  # who has the robot's lease; empty: nobody; None: unknown
         self._gate_wake = asyncio.Event()
         self._finish = asyncio.Event()
         self._exporting = asyncio.Lock()
@@ -231,6 +238,14 @@ class ConsoleServer:
         token = self.access.made_token
         return f"{self.url}?token={quote(token)}" if token else self.url
 
+    @property
+    def client(self) -> str:
+        """Name of the client in whose name the backend commands, unique among all pages of all consoles."""
+        return self._name_of(self._commanding or 0)
+
+    def _name_of(self, number: int) -> str:
+        return sender_name(f"page {number} {self._instance}")
+
     @staticmethod
     def now_ms() -> float:
         """Server's clock for the page: monotonic milliseconds."""
@@ -273,6 +288,10 @@ class ConsoleServer:
     def needs_views(self) -> bool:
         """Whether a page does not render the virtual space by itself."""
         return any(session.drawn is None for session in self._sessions.copy().values())
+
+    def follow_robot(self, holder: str | None, estop: bool = False) -> None:
+        """Take over who has the robot's lease (empty: nobody) and its emergency stop; None: no robot reports."""
+        self._call(self._follow, holder, None if holder is None else estop)
 
     def show(self, *kinds: FrameKind) -> None:
         """Set which of PANORAMA and VIEW the page shows or soon will; the other is sent at a low rate."""
@@ -673,6 +692,8 @@ class ConsoleServer:
         age_s = (self.now_ms() - number(message, "time_ms")) / 1000.0 * current().factor
         linear, angular = number(message, "linear"), number(message, "angular")
         verdict = self.gate.receive(session.number, whole(message, "seq"), age_s, linear, angular, now)
+        if verdict is Verdict.ACCEPTED and self._role_of(session.number) == "other":
+            verdict = Verdict.NOT_DRIVER  # published all the same: the robot refuses it, and sees that a key is held
         # A zero needs no permission and is harmless out of order, so only refused motion is reported.
         if verdict is not Verdict.ACCEPTED and (linear, angular) != (0.0, 0.0):
             session.reply({"type": "refused", "reason": verdict.name.lower(), "text": verdict.value})
@@ -707,7 +728,7 @@ class ConsoleServer:
         logger.warning("emergency stop from %s", who)
 
     def _on_estop_release(self, session: Session, message: dict[str, Any], now: float) -> None:
-        if not self.gate.release_estop(session.number):
+        if self._role_of(session.number) == "other" or not self.gate.may_release_estop(session.number):
             session.reply(
                 {"type": "refused", "reason": "not_driver", "text": "only the driver may release the emergency stop"}
             )
@@ -791,8 +812,13 @@ class ConsoleServer:
     def _emit_due(self, *, wake: bool = True) -> None:
         now = current().steady_s()
         command = self.gate.take_due(now)
+        if self._commanding is None:
+            self._commanding = self.gate.driver
         if command is not None:
             self.backend.on_drive(*command)
+        if self._commanding != self.gate.driver:
+            self.on_released(self.client)
+            self._commanding = self.gate.driver
         if (there := self.gate.driver_alive(now)) != self._operator:
             self._operator = there
             self.backend.on_operator(there)
@@ -802,16 +828,41 @@ class ConsoleServer:
     def _send_session(self, only: Session | None = None) -> None:
         """Send the state of the lease to all clients, or to one."""
         for session in list(self._sessions.values()) if only is None else [only]:
-            driver = self.gate.driver
-            role = "none" if driver is None else "you" if driver == session.number else "other"
             message = {
                 "type": "session",
-                "driver": role,
+                "driver": self._role_of(session.number),
+                "door": self._door(),
                 "clients": len(self._sessions),
                 "estop": self.gate.estop,
                 "watchdog_trips": self.gate.watchdog_trips,
             }
             session.put_text("session", json.dumps(message))
+
+    def _role_of(self, number: int) -> str:
+        """Return who drives, as client ``number`` sees it: the robot decides, where one reports."""
+        driver = self.gate.driver
+        if self._holder and not (driver == number and self._holds(number)):
+            return "other"
+        if driver is None or (driver == number and self._holder == ""):
+            return "none"
+        return "you" if driver == number else "other"
+
+    def _holds(self, number: int) -> bool:
+        """Whether client ``number`` has the robot's lease."""
+        return self._holder is not None and self._holder.endswith(f"/{self._name_of(number)}")
+
+    def _door(self) -> str:
+        """Return the node, and host, through which somebody drives who is no client of this server; else empty."""
+        if not self._holder or any(self._holds(number) for number in self._sessions):
+            return ""
+        return self._holder.rpartition("/")[0]
+
+    def _follow(self, holder: str | None, estop: bool | None) -> None:
+        changed = self.gate.follow_estop(estop, current().steady_s()) or holder != self._holder
+        self._holder = holder
+        if changed:
+            self._emit_due()
+            self._send_session()
 
     def _publish(self, kind: str, text: str) -> None:
         self._texts[kind] = text

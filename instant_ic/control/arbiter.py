@@ -28,7 +28,7 @@ from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import wrap_angle
 
 _PASSAGE_PERIOD_S = 0.2
-_STANDS_M_S, _STANDS_RAD_S = 0.03, 0.1
+STANDS_M_S, STANDS_RAD_S = 0.03, 0.1
 """Below this speed a robot counts as standing."""
 
 
@@ -332,7 +332,7 @@ class Arbiter:
         if self._leading_back or s.idle_s >= 3.0 * after_s:
             return True
         linear, angular = s.inputs.robot_velocity
-        return s.agree_s < 0.0 and abs(linear) < _STANDS_M_S and abs(angular) < _STANDS_RAD_S
+        return s.agree_s < 0.0 and abs(linear) < STANDS_M_S and abs(angular) < STANDS_RAD_S
 
     def _against_switch(self, s: Snapshot, now_ns: int) -> Notice | None:
         """Reason against a switch, where the question arises: in REAL, with an obstacle ahead."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from instant_ic import estop_state
+from instant_ic.control.robot_lease import may_release_estop
 from instant_ic.diagnosis import Diagnosis, Level
 
 FUTURE_NS = 500_000_000
@@ -53,7 +54,7 @@ class EstopLatch:
         by = "a button on the robot" if self.button else self.publisher
         return Diagnosis("emergency stop", Level.WARN, f"latched by {by}: release it on the operator's page")
 
-    def hear(self, pressed: bool, publisher: str, publish_ns: int, received_ns: int) -> str:
+    def hear(self, pressed: bool, publisher: str, publish_ns: int, received_ns: int, holder: str | None = None) -> str:
         """Take a message of ``/operator/estop``.
 
         Args:
@@ -61,6 +62,7 @@ class EstopLatch:
             publisher: name of the node that published it.
             publish_ns: when it was published, nanoseconds since the epoch.
             received_ns: when it arrived, by this machine's clock.
+            holder: who has the robot's lease, and alone may release; empty: nobody; None: not known here.
 
         Returns:
             Why a release is refused; empty if the message was obeyed.
@@ -75,6 +77,8 @@ class EstopLatch:
         if self.button:
             return "the button on the robot is pressed. Release the button, then release the stop again."
         advice = "If a clock was set, press stop and release again."
+        if holder is not None and (why := may_release_estop(publisher, holder)):
+            return why
         if publish_ns > received_ns + FUTURE_NS:
             ahead_s = (publish_ns - received_ns) / 1e9
             return f"the release by {publisher} is stamped {ahead_s:.1f} s ahead. {advice}"

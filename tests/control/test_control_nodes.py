@@ -397,6 +397,7 @@ def test_an_old_release_of_one_client_does_not_end_the_emergency_stop_of_another
     for received in (release, stop) if release_first else (stop, release):
         stack.arbiter.on_estop(received)
     assert stack.arbiter.latch.pressed
+    stack.bus.publish("/operator/cmd_vel", twist_stamped(0.0, 0.0, stack.now), publisher="host_bridge")
     stack.arbiter.on_estop(release._replace(publish_ns=3_000))  # its latest word
     assert not stack.arbiter.latch.pressed
 

@@ -61,10 +61,15 @@ class Robot:
         assert isinstance(node, ConsoleNode)
         return node
 
+    def release(self) -> None:
+        """The operator has, or takes, the robot's lease, and releases the stop."""
+        self.console.on_drive(0.0, 0.0)
+        self.console.on_estop(False)
+
     def stopped(self) -> bool:
         """Whether the arbiter says so, and sends nothing but zeros under a commanding operator."""
         now_ns = self.bus.clock.now_ns()
-        self.bus.publish("/operator/cmd_vel", twist_stamped(0.3, 0.0, now_ns))
+        self.bus.publish("/operator/cmd_vel", twist_stamped(0.3, 0.0, now_ns), publisher="console")
         self.bus.advance(0.2)
         state: ControlState = self.bus.last("/ic/state")
         assert twist_values(self.bus.last("/cmd_vel")) == (0.0, 0.0)
@@ -105,7 +110,7 @@ def test_a_pressed_emergency_stop_survives_restarts(robot: Robot, order: tuple[s
         getattr(robot, does)(name)
     assert robot.stopped()
     # Released by hand it is over, and a further restart brings it not back.
-    robot.console.on_estop(False)
+    robot.release()
     robot.bus.advance(0.1)
     assert not robot.bus.last("/ic/state").estop
     robot.kill("arbiter")
@@ -135,7 +140,7 @@ def test_a_release_from_before_the_clock_was_set_back_ends_no_stop_after_a_resta
     robot.bus.route("/operator/estop", type_name(Bool), release, "console", LATCHED, 995 * S)
     robot.bus.advance(0.1)
     assert robot.stopped()
-    robot.console.on_estop(False)
+    robot.release()
     robot.bus.advance(0.1)
     assert not robot.bus.last("/ic/state").estop
     robot.bus.close()
@@ -158,7 +163,7 @@ def test_the_robots_own_button_stays_latched_over_a_restart_of_the_arbiter(robot
     robot.kill("arbiter")
     robot.start("arbiter")
     assert robot.stopped()
-    robot.console.on_estop(False)
+    robot.release()
     robot.bus.advance(0.1)
     assert not robot.bus.last("/ic/state").estop
 
@@ -170,7 +175,7 @@ def test_after_a_run_that_broke_off_the_robot_starts_stopped_and_says_why(run_di
         assert robot.stopped()
         why = "The last run did not end cleanly. Release the emergency stop to continue."
         assert robot.bus.last("/ic/state").reason == why
-        robot.console.on_estop(False)
+        robot.release()
         robot.bus.advance(0.1)
         assert not robot.bus.last("/ic/state").estop
         robot.bus.close()
@@ -201,7 +206,7 @@ def test_a_press_stamped_by_a_clock_that_was_ahead_can_be_released(run_dir: Path
     estop_state.write(run_dir, KeptStop("launch", 9_000 * S))
     robot = Robot()
     assert robot.stopped()
-    robot.console.on_estop(False)
+    robot.release()
     robot.bus.advance(0.1)
     assert not robot.bus.last("/ic/state").estop
     robot.bus.close()

@@ -8,7 +8,7 @@ import { FlatViewer } from "./flatviewer.js";
 import { Gamepads } from "./gamepad.js";
 import * as hud from "./hud.js";
 import { Images } from "./images.js";
-import { Lease, OTHER_DRIVES } from "./lease.js";
+import { Lease } from "./lease.js";
 import { Link, onDetail } from "./link.js";
 import { Look } from "./look.js";
 import { LAYERS, MAP, PANORAMA, VIEW } from "./messages.js";
@@ -85,7 +85,7 @@ onDetail(link, "message", (/** @type {Message} */ message) => {
       lease.take(message);
       break;
     case "refused":
-      if (message.reason === "not_driver") hud.toast(OTHER_DRIVES);
+      if (message.reason === "not_driver") hud.toast(lease.refusal);
       break;
     case "error":
       console.error(`server: ${message.text}`);

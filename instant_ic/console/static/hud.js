@@ -104,11 +104,11 @@ function bar(element, share) {
 }
 
 /** @param {Lease} lease */
-export function showLease({ driver, clients }) {
+export function showLease({ driver, clients, door }) {
   mark("driver", driver);
-  write(byId("lease-text"), texts.leaseText(driver, clients - 1));
+  write(byId("lease-text"), texts.leaseText(driver, clients - 1, door));
   write(byId("take"), driver === "none" ? "Drive" : "Take over");
-  byId("take").hidden = driver === "you";
+  byId("take").hidden = driver === "you" || door !== "";
   byId("yield").hidden = driver !== "you" || clients < 2;
 }
 

@@ -6,6 +6,7 @@
 
 export const WATCH_ONLY = "This sign-in can watch and stop the robot, but not drive it.";
 export const OTHER_DRIVES = "Another operator is driving. Press Take over to drive.";
+export const ELSEWHERE = "Another operator is driving through another connection, and must hand over first.";
 
 /** Event "change" when the server has reported the session. */
 export class Lease extends EventTarget {
@@ -16,6 +17,7 @@ export class Lease extends EventTarget {
     this.mayDrive = true; // false: signed in to watch
     /** @type {Session["driver"]} */
     this.driver = "none";
+    this.door = ""; // through which another operator drives, if not by a page of this server
     this.clients = 0;
     this.estop = false;
     this._handedOver = false; // the operator gave the lease back
@@ -35,6 +37,7 @@ export class Lease extends EventTarget {
     // The lease timed out and was not given back: request it again. Keys must be pressed again.
     if (this.driver === "you" && session.driver === "none" && !this._handedOver) this._request(false);
     this.driver = session.driver;
+    this.door = session.door ?? "";
     this.clients = session.clients;
     this.estop = session.estop;
     this.dispatchEvent(new Event("change"));
@@ -44,7 +47,12 @@ export class Lease extends EventTarget {
   request() {
     if (!this.mayDrive) return WATCH_ONLY;
     if (this.driver === "none") this._request(false);
-    return this.driver === "other" ? OTHER_DRIVES : "";
+    return this.driver === "other" ? this.refusal : "";
+  }
+
+  /** Why this page does not drive while another operator does, and what to do. */
+  get refusal() {
+    return this.door ? ELSEWHERE : OTHER_DRIVES;
   }
 
   takeOver() {

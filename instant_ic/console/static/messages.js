@@ -73,7 +73,7 @@ const pong = object({
   type: oneOf("pong"), client_ms: number, server_ms: number, command_age_ms: optional(number), command_hz: number,
 });
 const session = object({
-  type: oneOf("session"), driver: oneOf("you", "other", "none"), clients: number, estop: flag,
+  type: oneOf("session"), driver: oneOf("you", "other", "none"), clients: number, estop: flag, door: optional(text),
 });
 const state = object({
   type: oneOf("state"),

@@ -52,11 +52,11 @@ export function modeText(state, driver) {
   return { name, reason: sentence(state?.reason) || (mode === "real" && driver === "you" ? "You drive the robot" : usual) };
 }
 
-/** @param {Session["driver"]} driver @param {number} watchers */
-export function leaseText(driver, watchers) {
+/** @param {Session["driver"]} driver @param {number} watchers @param {string} door through which another one drives */
+export function leaseText(driver, watchers, door = "") {
   return {
     you: watchers > 0 ? `You are driving · ${watchers} watching` : "You are driving",
-    other: "Another operator is driving",
+    other: door ? `Another operator is driving through ${door}` : "Another operator is driving",
     none: "Nobody is driving",
   }[driver];
 }

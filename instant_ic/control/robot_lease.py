@@ -1,0 +1,108 @@
+"""Lease of the right to drive: one sender at a time, and no start under a control that was held in vain."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from instant_ic.diagnosis import Diagnosis, Level
+
+RELEASED = " released"
+"""Ending of the name of a sender that gives the lease back; its command is zero."""
+
+LEASE_S = 2.0
+"""Silence in seconds after which the holder of the robot's lease counts as lost."""
+_MOST_CHARACTERS = 64
+
+
+class Refusal(NamedTuple):
+    """Why a sender may not drive: a reason to count by, and a text."""
+
+    reason: str
+    text: str
+
+
+def sender_name(*parts: str) -> str:
+    """Return a sender's name from its gateway, host and client; a part from outside cannot pass for two."""
+    cleaned = ("".join(c if c.isprintable() and c != "/" else "_" for c in part) for part in parts)
+    return "/".join(part[:_MOST_CHARACTERS] for part in cleaned)
+
+
+class Lease:
+    """Right to drive of one sender. Another one gets it after the holder has released it or was silent.
+
+    A sender that takes over must let go of the controls first: send zero, or nothing for ``silent_s``. Else the robot
+    would start under a key that was held in vain until then. Times are nanoseconds of a clock that is never set.
+
+    Args:
+        silent_s: silence in seconds after which the holder counts as lost.
+
+    Attributes:
+        holder: the sender that drives; empty: nobody.
+    """
+
+    def __init__(self, silent_s: float) -> None:
+        self.silent_s = silent_s
+        self.holder = ""
+        self._heard_ns = 0  # last command of the holder
+        self._held: dict[str, int] = {}  # sender -> time of its last motion that was refused
+
+    def refusal(self, sender: str, moves: bool, now_ns: int, stands: bool = True) -> Refusal | None:
+        """Note a command and return why its sender may not drive by it; None if it may (:meth:`grant`).
+
+        Args:
+            sender: name of the sender.
+            moves: whether the command is not zero.
+            now_ns: present time.
+            stands: whether the robot stands; only then does the lease pass to another sender.
+        """
+        since_ns = now_ns - round(self.silent_s * 1e9)
+        self._held = {other: held_ns for other, held_ns in self._held.items() if held_ns >= since_ns}
+        if not moves:
+            self._held.pop(sender, None)
+        second = self.holder not in ("", sender) and self._heard_ns >= since_ns
+        rolls = sender != self.holder and not stands
+        if moves and (second or rolls or sender in self._held):
+            self._held[sender] = now_ns
+        if second:
+            return Refusal("second driver", f"{sender} may not drive while {self.holder} does")
+        if rolls:
+            return Refusal("moving", f"{sender} may drive once the robot stands")
+        if sender in self._held:
+            return Refusal("held", f"{sender} must let go of the controls once before it drives")
+        return None
+
+    def grant(self, sender: str, now_ns: int) -> None:
+        """Give the lease to a sender that was not refused, or prolong it."""
+        self.holder, self._heard_ns = sender, now_ns
+
+    def release(self, sender: str) -> bool:
+        """End a sender's lease; return whether it had it."""
+        if not self.holder or sender != self.holder:
+            return False
+        self.holder = ""
+        return True
+
+    def holds(self, sender: str, now_ns: int) -> bool:
+        """Whether a sender has the lease and is not lost."""
+        return bool(sender) and sender == self.holder and now_ns - self._heard_ns <= self.silent_s * 1e9
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """Who drives; a warning while others try to."""
+        text = f"{self.holder or 'nobody'} drives"
+        if self._held:
+            return Diagnosis("operator", Level.WARN, f"{text}; refused: {', '.join(sorted(self._held)[:3])}")
+        return Diagnosis("operator", Level.OK, text)
+
+
+def may_release_estop(publisher: str, holder: str) -> str:
+    """Return why a node may not release the emergency stop; empty if it may: its client has the robot's lease.
+
+    Args:
+        publisher: name of the node that publishes the release.
+        holder: who has the lease, ``node/client``; empty: nobody.
+    """
+    if holder.startswith(f"{publisher}/"):
+        return ""
+    driver = f"only {holder} may" if holder else "nobody drives: take control of the robot, then release again"
+    return f"the release by {publisher or 'an unknown node'} is refused: {driver}"

@@ -1,0 +1,196 @@
+"""Two doors to one robot: its lease belongs to one operator, and what the others send changes nothing."""
+
+from __future__ import annotations
+
+import math
+from itertools import count
+
+import numpy as np
+import pytest
+from control_world import rectangle
+from test_control_nodes import Stack
+
+from instant_ic.control.robot_lease import LEASE_S, RELEASED
+from instant_ic.control.states import Reason
+from instant_ic.msg import (
+    HARD_STOP,
+    Bool,
+    ControlState,
+    ShownPictures,
+    header,
+    pose_message,
+    to_time,
+    twist_stamped,
+    twist_values,
+)
+
+FIRST = "/base_link"
+"""The stack's own operator, as the arbiter names him."""
+SECOND = "second_console/page 1"
+
+
+def command(stack: Stack, speed: float, sender: str = SECOND) -> None:
+    node, _, client = sender.partition("/")
+    stack.bus.publish("/operator/cmd_vel", twist_stamped(speed, 0.0, stack.now, client), publisher=node)
+
+
+def drive(stack: Stack, seconds: float, first: float | None, second: float | None) -> list[ControlState]:
+    """Both operators command; None: silent."""
+    states = []
+    for _ in range(round(seconds * 20)):
+        if second is not None:
+            command(stack, second)
+        states.append(stack.step(None if first is None else (first, 0.0)))
+    return states
+
+
+def estop(stack: Stack, pressed: bool, node: str) -> None:
+    stack.bus.publish("/operator/estop", Bool(data=pressed), latched=True, publisher=node)
+
+
+def sent(stack: Stack, after: int = 0) -> list[float]:
+    return [twist_values(message)[0] for message in stack.bus.messages("/cmd_vel")[after:]]
+
+
+@pytest.fixture
+def free() -> Stack:
+    """A stack in free space that its own operator can drive."""
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, (0.0, 0.0))
+    return stack
+
+
+def test_idle_zeros_of_a_second_console_do_not_keep_the_robot_driving_in_virtual() -> None:
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    stack.drive(1.5, (0.0, 0.0))
+    assert drive(stack, 6.0, 0.4, 0.0)[-1].mode == ControlState.VIRTUAL
+    assert sent(stack)[-1] > 0.1
+    before, place = len(stack.bus.messages("/cmd_vel")), stack.base.pose[:2].copy()
+    states = drive(stack, 4.0, None, 0.0)
+    stopped = sent(stack, before)
+    assert not any(stopped[round(0.3 * 20) + 2 :])  # the timer's steps, and one more at the time-out
+    assert stack.bus.messages("/cmd_vel")[-1].header.frame_id == HARD_STOP
+    assert math.dist(place, stack.base.pose[:2]) < 0.35  # it was 1.78 m
+    assert states[-1].mode == ControlState.STOPPED
+
+
+def test_opposing_commands_of_two_doors_do_not_alternate(free: Stack) -> None:
+    states = drive(free, 2.0, 0.3, -0.3)
+    assert {state.holder for state in states} == {FIRST}
+    assert min(sent(free)) >= 0.0 and sent(free)[-1] == pytest.approx(0.3)
+    assert free.arbiter.diagnoses()["operator"][1] == f"{FIRST} drives; refused: {SECOND}"
+
+
+def test_a_command_of_who_does_not_drive_refreshes_no_age_and_is_not_shown(free: Stack) -> None:
+    drive(free, 0.5, 0.3, None)
+    states = drive(free, 1.0, None, 0.3)
+    assert free.arbiter.inbox.ages(free.arbiter.config.timeouts)["command"] == pytest.approx(1.0, abs=0.06)
+    assert free.bus.messages("/cmd_vel")[-1].header.frame_id == HARD_STOP
+    assert twist_values(states[-1].operator_command) == (0.0, 0.0)
+
+
+def test_a_node_that_claims_to_be_the_driver_does_not_drive(free: Stack) -> None:
+    command(free, 0.0, "console/page 1")  # in vain: the stack's own operator drives
+    drive(free, LEASE_S + 0.5, None, None)
+    command(free, 0.0, "console/page 1")
+    assert free.step(None).holder == "console/page 1"
+    before = len(free.bus.messages("/cmd_vel"))
+    for _ in range(10):
+        command(free, 0.0, "console/page 1")
+        command(free, 0.3, "liar/page 1")
+        command(free, 0.3, "liar/console/page 1")
+        assert free.step(None).holder == "console/page 1"
+    assert not any(sent(free, before))
+
+
+def test_the_virtual_robot_obeys_only_what_the_arbiter_granted() -> None:
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    stack.drive(1.5, None)
+    assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
+    drive(stack, 1.0, 0.0, 0.4)  # let go; the other one pushes
+    place = stack.bus.last("/vbot/odom").pose.pose.position.x
+    drive(stack, 1.0, 0.0, 0.4)
+    assert stack.bus.last("/vbot/odom").pose.pose.position.x == pytest.approx(place, abs=0.01)
+
+
+def test_the_lease_of_a_lost_driver_is_taken_once_the_robot_stands_by_hands_that_are_off(free: Stack) -> None:
+    drive(free, 0.5, 0.4, 0.3)
+    assert drive(free, LEASE_S - 0.2, None, 0.3)[-1].holder == FIRST
+    states = drive(free, 1.0, None, 0.3)
+    assert states[-1].holder == FIRST  # the key of the second one was held in vain
+    states = drive(free, 0.2, None, 0.0)
+    assert states[-1].holder == SECOND
+    assert twist_values(drive(free, 0.5, 0.4, 0.3)[-1].applied_command)[0] == pytest.approx(0.3)
+
+
+def test_no_lease_passes_while_the_robot_moves(free: Stack) -> None:
+    drive(free, 1.0, 0.4, None)
+    free.silent.add("/wheel/odom")  # as far as known, it moves on
+    assert drive(free, LEASE_S + 1.0, None, 0.0)[-1].holder == FIRST
+    free.silent.clear()
+    assert drive(free, 0.3, None, 0.0)[-1].holder == SECOND
+
+
+def test_a_lease_that_is_given_back_is_free_at_once(free: Stack) -> None:
+    drive(free, 0.2, 0.0, 0.0)
+    command(free, 0.0, FIRST + RELEASED)
+    assert drive(free, 0.1, None, 0.0)[-1].holder == SECOND
+    command(free, 0.0, FIRST + RELEASED)  # by one who has it no longer
+    assert drive(free, 0.5, None, 0.3)[-1].holder == SECOND
+    assert sent(free)[-1] == pytest.approx(0.3)
+
+
+def test_a_driver_who_gives_the_lease_back_while_driving_stops_the_robot(free: Stack) -> None:
+    drive(free, 1.0, 0.4, None)
+    command(free, 0.0, FIRST + RELEASED)
+    assert twist_values(free.bus.last("/cmd_vel")) == (0.0, 0.0)
+    assert drive(free, 0.2, None, 0.0)[-1].holder == ""  # it still rolls
+
+
+def test_anybody_presses_the_emergency_stop_and_only_the_driver_releases_it(free: Stack) -> None:
+    drive(free, 0.5, 0.3, 0.0)
+    estop(free, True, "second_console")
+    assert drive(free, 0.1, 0.0, 0.0)[-1].estop
+    estop(free, False, "second_console")
+    assert drive(free, 0.5, 0.0, 0.0)[-1].estop
+    estop(free, False, "")
+    assert not drive(free, 0.1, 0.0, 0.0)[-1].estop
+
+
+def test_with_the_driver_lost_who_takes_the_lease_releases_the_emergency_stop(free: Stack) -> None:
+    estop(free, True, "")
+    drive(free, LEASE_S + 0.5, None, None)
+    estop(free, False, "second_console")
+    assert drive(free, 0.1, None, None)[-1].estop  # he has not taken it yet
+    assert drive(free, 0.1, None, 0.0)[-1].holder == SECOND
+    estop(free, False, "second_console")
+    assert not drive(free, 0.1, None, 0.0)[-1].estop
+
+
+def test_another_consoles_lost_driver_and_images_are_not_the_drivers(free: Stack) -> None:
+    views = count(1000)
+
+    def report(**values: object) -> None:
+        fields = {
+            "header": header("map", free.now),
+            "picture_stamp": to_time(free.now),
+            "picture_age_s": 0.0,
+            "view_id": next(views),
+            "view_pose": pose_message(np.eye(4)),
+            "view_age_s": 0.0,
+            "view_delay_s": 0.0,
+            "operator_lost": to_time(0),
+        }
+        free.bus.publish("/view/shown", ShownPictures(**fields | values), publisher="second_console")
+
+    drive(free, 1.0, 0.3, None)
+    for _ in range(10):
+        free.step((0.3, 0.0))
+        report(operator_lost=to_time(free.now), picture_age_s=5.0)
+        assert twist_values(free.bus.last("/cmd_vel"))[0] == pytest.approx(0.3)
+    free.silent.add("/camera/image/compressed")  # the driver's page gets none; the robot and the other page do
+    for _ in range(20):
+        free.arbiter.view.camera_image(free.arbiter.clock.steady_ns())
+        state = free.step((0.3, 0.0))
+        report()
+    assert state.reason_code == Reason.CAMERA_STALE
