@@ -153,9 +153,10 @@ class Robot:
         self.vbot = np.eye(4)
         self.mode = -1
         self.views = 0
+        self.operator, self.holder = twist_message(), ""  # newest command, and who sent it
         self.requested = np.eye(4)
         observer.subscribe("/cmd_vel", message_type("TwistStamped"), self.on_moving("cmd_vel"), SENSOR)
-        observer.subscribe("/operator/cmd_vel", message_type("TwistStamped"), self.on_moving("operator"), SENSOR)
+        observer.subscribe("/operator/cmd_vel", message_type("TwistStamped"), self.on_operator, SENSOR)
         observer.subscribe("/vbot/odom", message_type("Odometry"), self.on_vbot, SENSOR)
         observer.subscribe("/view/request", message_type("ViewRequest"), self.on_request, SENSOR)
         observer.subscribe("/vspace/view", message_type("RenderedView"), self.on_view, SENSOR)
@@ -177,6 +178,13 @@ class Robot:
                 self.mark(step)
 
         return on_command
+
+    def on_operator(self, message: Any) -> None:
+        self.on_moving("operator")(message)
+        changed = twist_values(message) != twist_values(self.operator)
+        self.operator, self.holder = message.twist, f"console/{message.header.frame_id}"
+        if self.virtual and changed:
+            self.tell_state(time.time_ns())  # as the arbiter does
 
     def on_vbot(self, message: Any) -> None:
         self.vbot = matrix_from_pose(message)
@@ -246,14 +254,18 @@ class Robot:
                     source="lidar", scale=1.0, quality=1.0, relative_sigma=0.01, fit=True, message="",
                 )
             )  # fmt: skip
+        self.tell_state(now)
+
+    def tell_state(self, now: int) -> None:
         self.out["/ic/state"].publish(
             ControlState(
                 header=header("map", now), mode=ControlState.VIRTUAL, reason="", estop=False, blocked=False,
                 transitions=1, robot_pose=pose_message(self.vbot), vbot_start=pose_message(np.eye(4)),
-                vbot_pose=pose_message(self.vbot), operator_command=twist_message(), applied_command=twist_message(),
+                vbot_pose=pose_message(self.vbot), operator_command=self.operator, applied_command=twist_message(),
                 pose_gap_m=0.0, yaw_gap_rad=0.0, time_to_obstacle_s=float("inf"), shown=ControlState.SHOWN_VIRTUAL,
                 vbot_action=ControlState.VBOT_DRIVEN, vbot_target=pose_message(np.eye(4)), robot_twist=twist_message(),
                 vbot_limit_m_s=0.5, reason_code=ControlState.REASON_DRIVE_VBOT,
+                holder=self.holder,
             )
         )  # fmt: skip
 

@@ -184,10 +184,10 @@ class DriveGate:
         self.estop, self._pressed = True, now
         self.stop(now)
 
-    def may_release_estop(self, client: int) -> bool:
-        """Return whether ``client`` is the driver, who may release the emergency stop.
+    def release_estop(self, client: int) -> bool:
+        """Return whether ``client`` is the driver, who alone may release the emergency stop.
 
-        The stop ends when the robot reports it (:meth:`follow_estop`), or at once where no robot reports.
+        Where a robot reports its state, the stop ends when it says so (:meth:`follow_estop`), else at once.
         """
         if client != self.driver:
             return False

@@ -728,7 +728,7 @@ class ConsoleServer:
         logger.warning("emergency stop from %s", who)
 
     def _on_estop_release(self, session: Session, message: dict[str, Any], now: float) -> None:
-        if self._role_of(session.number) == "other" or not self.gate.may_release_estop(session.number):
+        if self._role_of(session.number) == "other" or not self.gate.release_estop(session.number):
             session.reply(
                 {"type": "refused", "reason": "not_driver", "text": "only the driver may release the emergency stop"}
             )

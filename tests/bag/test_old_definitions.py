@@ -25,7 +25,7 @@ S = 1_000_000_000
 def old_schema() -> Schema:
     """ControlState as it was before ``reason_code``."""
     lines = own_schema(NAME).text.split("\n")
-    lines = [line for line in lines if not line.startswith(("uint8 reason_code", "uint8 REASON_"))]
+    lines = [line for line in lines if not line.startswith(("uint8 reason_code", "uint8 REASON_", "string holder"))]
     return with_hash(Schema(NAME, "ros2msg", "\n".join(lines), ""))
 
 
@@ -36,9 +36,9 @@ def old_payload(mode: int) -> bytes:
     fields |= dict.fromkeys(("pose_gap_m", "yaw_gap_rad", "time_to_obstacle_s", "vbot_limit_m_s"), 0.25)
     message = ControlState(
         header=header("map", 7), mode=mode, reason="stopped: no camera image for 1.6 s", estop=True, blocked=False,
-        transitions=3, shown=0, vbot_action=0, reason_code=74, **fields,
+        transitions=3, shown=0, vbot_action=0, reason_code=74, holder="", **fields,
     )  # fmt: skip
-    return bytes(serialize(message))[:-1]  # its last field is one byte
+    return bytes(serialize(message))[:-9]  # the code, and an aligned empty text
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from live_nodes import LiveNode, cdr, wait_for
 from websockets.exceptions import ConnectionClosed
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
+from instant_ic.control.robot_lease import RELEASED
 from instant_ic.experiments.stack import free_port
 from instant_ic.msg import (
     Bool,
@@ -95,6 +96,7 @@ def empty_state():
         still,
         0.5,
         0,
+        "",
     )
 
 
@@ -301,9 +303,10 @@ def test_commands_in_either_encoding_reach_the_bus_stamped(driving):
     assert last_drive(drives) == (0.2, -0.3)
     assert abs(stamp_ns(deserialize(drives[-1].payload, "TwistStamped")) - time.time_ns()) < 30e9
     client.advertise(DRIVE, "geometry_msgs/msg/TwistStamped", "cdr", 2)
-    command = twist_stamped(0.1, 0.4, time.time_ns())
+    command = twist_stamped(0.1, 0.4, time.time_ns(), "console/page 1")  # its frame is the client's claim
     client.publish(cdr(command), 2)
     listener.wait(lambda: len(drives) == 2, "the CDR command")
+    command.header.frame_id = "client 1"
     assert drives[-1].payload == cdr(command)
     client.advertise(STOP, "std_msgs/msg/Bool", "json", 3)
     client.publish(b'{"data": true}', 3)
@@ -365,6 +368,8 @@ def test_robot_is_told_to_stand_when_its_driver_leaves_and_a_second_one_waits(dr
     with contextlib.suppress(ConnectionClosed):
         client.close()
     listener.wait(lambda: last_drive(drives) == (0.0, 0.0), "a zero command")
+    frames = [deserialize(drive.payload, "TwistStamped").header.frame_id for drive in drives]
+    assert frames == ["client 1", "client 1" + RELEASED]
     second.publish(b'{"linear": {"x": -0.2}, "angular": {"z": 0}}')
     second.until(lambda: bridge.gate.refused == {"second driver": 1, "held": 1}, "the refusal of a held key")
     assert last_drive(drives) == (0.0, 0.0)

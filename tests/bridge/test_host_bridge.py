@@ -294,8 +294,11 @@ class Importer(Node[NoConfig]):
     name = "importer"
 
     def setup(self):
+        self.holder = ""
         rules = {"/operator/estop": TopicRule("/operator/estop", lane="command", shared=True)}
-        self.incoming = ImportedTopics(self, rules, lambda topic, text: pytest.fail(text))
+        rules["/operator/cmd_vel"] = TopicRule("/operator/cmd_vel", lane="command")
+        trouble = lambda topic, text: pytest.fail(text)  # noqa: E731
+        self.incoming = ImportedTopics(self, rules, trouble, lambda: self.holder)
 
 
 @pytest.mark.parametrize("release_ms", [100, 999, 1000, 1999])
@@ -348,6 +351,54 @@ def test_a_hosts_own_stop_is_released_at_once_and_another_hosts_only_a_second_la
     assert hear("host 99", False, 31_097) is True  # the stop of host 98 holds
     assert hear("host 98", False, 31_098) is True  # that of host 99
     assert hear("host 99", False, 31_098) is False
+
+
+def command_of(origin, claims, speed=0.1):
+    word = Announce(1, "/operator/cmd_vel", origin, TwistStamped.__msgtype__, "", "sensor")
+    return Arrived(word, bytes(serialize(twist_stamped(speed, 0.0, 5, claims))), 5, 5)
+
+
+def test_a_command_names_host_node_and_page_whatever_it_claims_to_be():
+    bus = LockstepBus()
+    importer = bus.add(Importer)
+    importer.incoming.open(command_of("console", "").announce)
+    bus.advance(0.1)
+    for peer, origin, claims in [
+        ("station", "console", "page 1"),
+        ("tablet", "console", "page 1"),
+        ("station", "console2", "page 1"),
+        ("tablet", "console", "station/console/page 1"),
+    ]:
+        importer.incoming.take(peer, command_of(origin, claims))
+    bus.advance(0.1)
+    assert [message.header.frame_id for message in bus.messages("/operator/cmd_vel")] == [
+        "station/console/page 1",
+        "tablet/console/page 1",
+        "station/console2/page 1",
+        "tablet/console/station_console_page 1",
+    ]
+
+
+def test_of_two_stations_only_the_one_that_drives_the_robot_releases_the_stop(caplog):
+    bus = LockstepBus()
+    importer = bus.add(Importer)
+    word = Announce(1, "/operator/estop", "console", Bool.__msgtype__, "", "latched")
+
+    def hear(host, pressed, at_s, origin="console"):
+        born_ns = at_s * 1_000_000_000
+        arrived = Arrived(replace(word, origin=origin), bytes(serialize(Bool(data=pressed))), born_ns, born_ns)
+        importer.incoming.take(host, arrived)
+        bus.advance(0.1)
+        return bus.last("/operator/estop").data
+
+    importer.holder = "importer/station/console/page 1"
+    assert hear("station", True, 10)
+    assert hear("tablet", False, 20) and hear("station", False, 21, "console2")
+    assert "only importer/station/console/page 1 may release" in caplog.text
+    assert not hear("station", False, 22)
+    assert hear("tablet", True, 30)
+    importer.holder = "console/page 1"  # an operator at the robot: the arbiter refuses the release, and says so
+    assert not hear("tablet", False, 40)
 
 
 @pytest.mark.parametrize("topic", ["/operator/estop", "/view/shown"])

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from live_nodes import LiveNode, Neighbour, cdr, wait_for
 
-from instant_ic.bridge.zenoh_format import Attachment, TopicQoS, data_key
+from instant_ic.bridge.zenoh_format import SENDER_SIZE, Attachment, TopicQoS, data_key
 from instant_ic.bridge.zenoh_outgoing import Outgoing, _Out
 from instant_ic.bridge.zenoh_session import (
     ROUTER_DEFAULTS,
@@ -334,7 +334,7 @@ def operator(world):
 
 
 def test_fresh_commands_come_in_and_old_or_mad_ones_do_not(operator):
-    gateway, listener, driven, _, command, _, _ = operator
+    gateway, listener, driven, _, command, _, drive = operator
     listener.spin(0.3)  # what the fixture sent is through
     for send, words in [
         (lambda: command(0.3, age_s=1.0), "s old, at most 0.3 s allowed"),
@@ -348,7 +348,9 @@ def test_fresh_commands_come_in_and_old_or_mad_ones_do_not(operator):
         listener.spin(0.1)
         assert driven == []
     listener.wait(lambda: command(0.25) and driven, "a fresh command")
-    assert twist_values(deserialize(driven[-1].payload, TWIST)) == (0.25, 0.0)
+    message = deserialize(driven[-1].payload, TWIST)
+    assert twist_values(message) == (0.25, 0.0)
+    assert message.header.frame_id == f"{drive.gid[:SENDER_SIZE].hex()}/base_link"  # who sent it, and what it claims
     wait_for(lambda: gateway.told("in /operator/cmd_vel") == "commands are accepted", "all clear")
     refused = dict(gateway.node.gate.refused)
     refused.pop("no sender", None)  # what the fixture sent before the graph knew it

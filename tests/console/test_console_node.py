@@ -11,6 +11,7 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.console import FrameKind, Look, ViewConfig
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.layers import PageLayer, PageLayers
+from instant_ic.control.robot_lease import RELEASED
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix
 from instant_ic.msg import (
     BatteryState,
@@ -71,6 +72,9 @@ class FakeServer:
     def show(self, *kinds):
         self.shown = kinds
 
+    def follow_robot(self, holder, estop=False):
+        self.robot = holder, estop
+
     def stop(self):
         pass
 
@@ -107,6 +111,7 @@ def control(bus, mode, **values):
         "robot_twist": twist_message(),
         "vbot_limit_m_s": 0.5,
         "reason_code": 0,
+        "holder": "",
     }
     return ControlState(**(fields | values))
 
@@ -170,6 +175,23 @@ def test_command_and_emergency_stop_go_to_the_bus(setup):
     assert bus.last("/operator/estop").data is True
     node.on_estop(False)
     assert bus.last("/operator/estop").data is False
+
+
+def test_a_command_names_the_page_that_drives_and_its_lease_is_given_back(setup):
+    bus, node, _ = setup
+    node.on_drive(0.3, 0.0)
+    assert bus.last("/operator/cmd_vel").header.frame_id == node.server.client
+    node.release_lease("page 1")
+    assert bus.last("/operator/cmd_vel").header.frame_id == "page 1" + RELEASED
+    assert twist_values(bus.last("/operator/cmd_vel")) == (0.0, 0.0)
+
+
+def test_the_page_follows_the_robots_lease_and_emergency_stop(setup):
+    bus, _, server = setup
+    bus.publish("/ic/state", control(bus, ControlState.STOPPED, holder="console2/page 1", estop=True), latched=True)
+    assert server.robot == ("console2/page 1", True)
+    bus.advance(1.2)  # the arbiter is silent
+    assert server.robot == (None, False)
 
 
 def test_panorama_passes_as_it_came_with_the_cameras_heading_and_age(setup):

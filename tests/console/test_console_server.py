@@ -329,6 +329,62 @@ def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_releases_it(s
     assert backend.commands.count((0.3, 0.0)) >= 1
 
 
+def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(serve):
+    server, backend = serve()
+    released = []
+    server.on_released = released.append
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client, ConsoleClient(server.url) as second:
+            server.follow_robot("host_bridge/tablet/console/page 1 abc", False)
+            await client.send({"type": "lease", "take": False})
+            await in_thread(backend.wait, lambda b: b.commands)  # zeros ask the robot for its lease
+            name = server.client
+            await client.wait_for(lambda c: c.session["door"] == "host_bridge/tablet/console", WAIT_S)
+            assert client.session["driver"] == second.session["driver"] == "other"
+            await client.send_drive(0.3, 0.0)  # published, so that the arbiter sees that a key is held
+            await client.wait_for(lambda c: c.refused == ["not_driver"], WAIT_S)
+            await client.release_estop()
+            await client.wait_for(lambda c: c.refused == ["not_driver"] * 2, WAIT_S)
+            assert backend.estops == []
+            server.follow_robot(f"console/{name}", False)
+            await client.wait_for(lambda c: (c.session["driver"], c.session["door"]) == ("you", ""), WAIT_S)
+            await second.wait_for(lambda c: (c.session["driver"], c.session["door"]) == ("other", ""), WAIT_S)
+            await second.send({"type": "lease", "take": True})
+            await until(lambda: released == [name])
+            await client.wait_for(lambda c: c.session["driver"] == "other", WAIT_S)
+            assert second.session["driver"] == "other"  # until the robot has granted it
+            server.follow_robot(f"console/{server.client}", False)
+            await second.wait_for(lambda c: c.session["driver"] == "you", WAIT_S)
+
+    asyncio.run(scenario())
+
+
+def test_a_page_shows_the_robots_emergency_stop_whoever_pressed_or_released_it(serve):
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            server.follow_robot(f"console/{server.client}", False)
+            await client.estop()
+            await client.wait_for(lambda c: c.session["estop"], WAIT_S)
+            server.follow_robot(f"console/{server.client}", True)
+            server.follow_robot(f"console/{server.client}", False)  # another console has released it
+            await client.wait_for(lambda c: not c.session["estop"], WAIT_S)
+            server.follow_robot(f"console/{server.client}", True)  # and pressed it
+            await client.wait_for(lambda c: c.session["estop"], WAIT_S)
+            await client.release_estop()
+            await in_thread(backend.wait, lambda b: b.estops == [True, False])
+            await client.send_drive(0.3, 0.0)
+            await client.wait_for(lambda c: c.refused == ["stopped"], WAIT_S)  # the robot has not released it
+            assert client.session["estop"]
+            server.follow_robot(f"console/{server.client}", False)
+            await client.wait_for(lambda c: not c.session["estop"], WAIT_S)
+
+    asyncio.run(scenario())
+
+
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "file://"])
 def test_fault_origin_is_unchecked(serve, origin):
     server, _ = serve()

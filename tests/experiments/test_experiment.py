@@ -388,7 +388,7 @@ def test_a_recorded_drive_is_shown(tmp_path) -> None:
                 vbot_pose=pose_message(pose_matrix(x, 0.3)), operator_command=twist_message(0.2, 0.0),
                 applied_command=twist_message(0.2, 0.0), pose_gap_m=0.3, yaw_gap_rad=0.0, time_to_obstacle_s=1.0,
                 shown=int(virtual), vbot_action=0, vbot_target=pose_message(np.eye(4)),
-                robot_twist=twist_message(0.2, 0.0), vbot_limit_m_s=0.4, reason_code=0,
+                robot_twist=twist_message(0.2, 0.0), vbot_limit_m_s=0.4, reason_code=0, holder="",
             )  # fmt: skip
             writer.write("/ic/state", kinds["state"], bytes(serialize(state)), stamp)
             if number % 4 == 0:

@@ -221,7 +221,7 @@ def control_state(pose, speed, stamp_ns):
     numbers |= dict.fromkeys(("pose_gap_m", "yaw_gap_rad", "time_to_obstacle_s", "vbot_limit_m_s"), 0.0)
     return ControlState(
         header=header("map", stamp_ns), mode=ControlState.REAL, shown=ControlState.SHOWN_REAL, reason="", estop=False,
-        blocked=False, operator_command=twist_message(speed, 0.0), **poses, **twists, **numbers,
+        blocked=False, holder="", operator_command=twist_message(speed, 0.0), **poses, **twists, **numbers,
     )  # fmt: skip
 
 

@@ -173,8 +173,8 @@ def control(reason_code):
     twists = dict.fromkeys(("operator_command", "applied_command", "robot_twist"), still)
     zeros = dict.fromkeys(("mode", "transitions", "shown", "vbot_action"), 0)
     gaps = dict.fromkeys(("pose_gap_m", "yaw_gap_rad", "time_to_obstacle_s", "vbot_limit_m_s"), 0.0)
-    flags = {"estop": False, "blocked": False, "reason": "", "header": header("map", 0), "reason_code": reason_code}
-    return ControlState(**poses, **twists, **zeros, **gaps, **flags)
+    flags = {"estop": False, "blocked": False, "header": header("map", 0), "reason_code": reason_code}
+    return ControlState(reason="", holder="", **poses, **twists, **zeros, **gaps, **flags)
 
 
 def test_delays_and_stale_sources_come_from_the_simulated_stack(tmp_path):

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-const { Lease, OTHER_DRIVES, WATCH_ONLY } = await import("../../../instant_ic/console/static/lease.js");
+const { ELSEWHERE, Lease, OTHER_DRIVES, WATCH_ONLY } = await import("../../../instant_ic/console/static/lease.js");
 
 function made() {
   const sent = [], link = Object.assign(new EventTarget(), { sent, send: (message) => sent.push(message) });
@@ -39,6 +39,15 @@ test("another driver is never displaced by a drive key", () => {
   const [lease, link] = made();
   lease.take(session("other"));
   assert.equal(lease.request(), OTHER_DRIVES);
+  assert.deepEqual(link.sent, []);
+});
+
+test("a driver at another connection to the robot cannot be displaced from here, and the operator learns why", () => {
+  const [lease, link] = made();
+  lease.take({ ...session("other"), door: "host_bridge/tablet/console" });
+  assert.equal(lease.request(), ELSEWHERE);
+  assert.equal(lease.door, "host_bridge/tablet/console");
+  assert.ok(!lease.drives);
   assert.deepEqual(link.sent, []);
 });
 

@@ -36,6 +36,7 @@ test("the lease says who drives and who watches", () => {
   assert.equal(texts.leaseText("you", 0), "You are driving");
   assert.equal(texts.leaseText("you", 2), "You are driving · 2 watching");
   assert.equal(texts.leaseText("none", 2), "Nobody is driving");
+  assert.equal(texts.leaseText("other", 1, "foxglove_bridge"), "Another operator is driving through foxglove_bridge");
 });
 
 test("virtual space: state and quality", () => {
