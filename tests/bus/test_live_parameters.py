@@ -42,8 +42,8 @@ def test_arbiter(bus):
 
 def test_virtual_robot_is_slower_at_once(bus):
     node = bus.add(node_class("virtual_robot"))
-    node.set_parameters({"limits": {"max_linear_m_s": 0.1}, "command_timeout_s": 0.2})
-    assert node.robot.limits.max_linear_m_s == 0.1 and node.command.max_age_s == 0.2
+    node.set_parameters({"limits": {"max_linear_m_s": 0.1}, "state_timeout_s": 0.2})
+    assert node.robot.limits.max_linear_m_s == 0.1 and node.state.max_age_s == 0.2
     node.robot.place(np.zeros(3), (5.0, 0.0))
     assert node.robot.velocity[0] == pytest.approx(0.1)
 

@@ -107,9 +107,11 @@ def test_the_virtual_robot_obeys_only_what_the_arbiter_granted() -> None:
     stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
     stack.drive(1.5, None)
     assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
-    drive(stack, 1.0, 0.0, 0.4)  # let go; the other one pushes
+    drive(stack, 1.0, 0.0, None)
     place = stack.bus.last("/vbot/odom").pose.pose.position.x
-    drive(stack, 1.0, 0.0, 0.4)
+    for _ in range(20):
+        stack.step((0.0, 0.0))
+        command(stack, 0.4)
     assert stack.bus.last("/vbot/odom").pose.pose.position.x == pytest.approx(place, abs=0.01)
 
 
