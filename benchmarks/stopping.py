@@ -94,6 +94,10 @@ LAUNCH = """launch:
     - {{name: recorder, value: false}}
     - {{name: console_port, value: {console}}}
     - {{name: simulated, value: true}}
+- node:
+    exec: console
+    name: second_console
+    param: [{{name: server.port, value: {second_console}}}]
 """
 
 
@@ -230,6 +234,7 @@ class Rig:
     packets: PacketRelay
     serial: SerialRelay
     pace: pace.Pace
+    second_port: int
     truth: list[Truth] = field(default_factory=list)
     commands: list[tuple[int, float]] = field(default_factory=list)
     state: Any = None
@@ -276,7 +281,7 @@ Act = Callable[[Rig, ConsoleClient], Awaitable[None] | None]
 
 
 class Fault(NamedTuple):
-    """A fault: functions that cause it and end it, given the rig and the operator's page.
+    """A fault: functions that cause it, end it, and prepare the drive, given the rig and the operator's page.
 
     Most end by themselves: the launcher restarts a killed process, and each drive has its own page.
     """
@@ -284,6 +289,7 @@ class Fault(NamedTuple):
     name: str
     breaks: Act
     mends: Act = lambda rig, page: None
+    prepares: Act = lambda rig, page: None
 
 
 async def act(does: Act, rig: Rig, page: ConsoleClient) -> None:
@@ -303,6 +309,23 @@ def process_faults(node: str) -> list[Fault]:
         Fault(f"{node} frozen", freeze, lambda rig, page: os.kill(frozen[0], signal.SIGCONT)),
         Fault(f"{node} killed", lambda rig, page: os.kill(rig.pid(node), signal.SIGKILL)),
     ]
+
+
+def second_console_fault() -> Fault:
+    """The driver's console freezes while an idle operator at another one would drive, too."""
+    (frozen, _), pages = process_faults("console"), list[ConsoleClient]()
+
+    async def open_page(rig: Rig, page: ConsoleClient) -> None:
+        pages.append(ConsoleClient(f"http://127.0.0.1:{rig.second_port}/"))
+        await pages[-1].connect(5.0)
+        await pages[-1].send({"type": "lease", "take": False})
+
+    async def mend(rig: Rig, page: ConsoleClient) -> None:
+        await act(frozen.mends, rig, page)
+        while pages:
+            await pages.pop().close()
+
+    return Fault("second console idle, the driver's frozen", frozen.breaks, mend, open_page)
 
 
 def link_fault(name: str) -> Fault:
@@ -335,6 +358,7 @@ LINKS: dict[str, tuple[Callable[[Rig], None], Callable[[Rig], None]]] = {
 """Faults of links: functions that cause and end them."""
 FAULTS = [
     *(fault for node in PROCESSES for fault in process_faults(node)),
+    second_console_fault(),
     Fault("emergency stop pressed", lambda rig, page: page.estop(), release_estop),
     Fault("encoder of a track dead", lambda rig, page: setattr(rig.serial, "dead", True), mend_encoder),
     Fault("key let go (no loss; soft ramp)", lambda rig, page: page.stop()),
@@ -348,7 +372,7 @@ FAULTS = [
 def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
     """A started stack with relays at everything that can be cut."""
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
-    ports = {name: free_port() for name in ("camera", "console")}
+    ports = {name: free_port() for name in ("camera", "console", "second_console")}
     ports |= {name: free_port(socket.SOCK_DGRAM) for name in ("lidar", "lidar_link", "position")}
     (run_dir / "dev").mkdir(mode=0o700)
     launch = run_dir / "stopping.yaml"
@@ -361,7 +385,7 @@ def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
         launch.write_text(text.format(**ports, camera_link=camera_link.port, folder=share_dir("launch")))
         stack = ends.enter_context(Stack(str(launch), run_dir, {}, log, pace=factor))
         stack.wait_for(lambda: registry.list_nodes(run_dir), 600, "first node")  # it may compile the kernels
-        made = Rig(stack, run_dir, page_link, camera_link, packets, serial, pace.read(run_dir))
+        made = Rig(stack, run_dir, page_link, camera_link, packets, serial, pace.read(run_dir), ports["second_console"])
         pace.use(made.pace)
         made.watch()
         yield made
@@ -418,6 +442,7 @@ async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> 
 
 async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[str, Any]:
     async with driver(rig) as page:
+        await act(fault.prepares, rig, page)
         cruise = await at_speed(rig, until, page, 0.7 + rng.uniform(0.0, 0.1))  # not in phase with any timer
         lost_ns = rig.pace.now_ns()
         await act(fault.breaks, rig, page)

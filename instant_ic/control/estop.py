@@ -77,14 +77,15 @@ class EstopLatch:
         if self.button:
             return "the button on the robot is pressed. Release the button, then release the stop again."
         advice = "If a clock was set, press stop and release again."
-        if holder is not None and (why := may_release_estop(publisher, holder)):
+        again = old and self.again  # both were judged before this node started
+        if holder is not None and not again and (why := may_release_estop(publisher, holder)):
             return why
         if publish_ns > received_ns + FUTURE_NS:
             ahead_s = (publish_ns - received_ns) / 1e9
             return f"the release by {publisher} is stamped {ahead_s:.1f} s ahead. {advice}"
         if publish_ns < self.pressed_ns:
             return f"the release by {publisher} is older than the stop by {self.publisher}. {advice}"
-        if old and not self.again:
+        if old and not again:
             return f"the release by {publisher} is {(received_ns - publish_ns) / 1e9:.1f} s old. Release again."
         self.pressed = False
         return ""

@@ -79,3 +79,20 @@ def test_a_release_older_than_the_button_press_is_refused() -> None:
     latch.hear_button(False, "crawler_base", 11 * S)
     assert "older" in latch.hear(False, "console", 9 * S, 12 * S)
     assert latch.stopped
+
+
+def test_only_the_node_through_which_the_driver_drives_releases_the_stop() -> None:
+    latch = EstopLatch()
+    latch.hear(True, "foxglove_bridge", 10 * S, 10 * S)
+    assert "only console/page 1 may" in latch.hear(False, "foxglove_bridge", 11 * S, 11 * S, "console/page 1")
+    assert "nobody drives" in latch.hear(False, "console", 11 * S, 11 * S, "")
+    assert latch.stopped
+    assert latch.hear(False, "console", 11 * S, 11 * S, "console/page 1") == ""
+    assert not latch.stopped
+
+
+def test_a_restarted_node_needs_no_driver_to_hear_again_of_a_stop_that_was_released() -> None:
+    latch = EstopLatch()
+    latch.hear(True, "foxglove_bridge", 105 * S, 200 * S)
+    assert latch.hear(False, "console", 110 * S, 200 * S, "") == ""
+    assert not latch.stopped

@@ -15,7 +15,7 @@ import pytest
 
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.experiments.teleop_stack import STEP_S, SimulatedStack, StackConfig
-from instant_ic.msg import HARD_STOP, ControlState, deserialize, twist_values
+from instant_ic.msg import HARD_STOP, Bool, ControlState, deserialize, twist_values
 from instant_ic.sim.worlds import corridor_world
 
 SPEED_M_S = 0.38
@@ -194,6 +194,16 @@ def test_the_emergency_stop_is_a_hard_one(rig: Rig) -> None:
         assert stop.stand_s <= ESTOP_S, (phase, stop)
         assert stop.distance_m <= ESTOP_M, (phase, stop)
         assert stop.frame == HARD_STOP, (phase, stop)
+
+
+def test_a_release_by_who_does_not_drive_ends_the_stop_of_neither_arbiter_nor_base(rig: Rig) -> None:
+    rig.drive()
+    rig.bus.publish("/operator/estop", Bool(data=True), latched=True, publisher="second_console")
+    latches = [rig.stack.nodes[name].latch for name in ("arbiter", "crawler_base")]
+    for publisher, stopped in (("second_console", True), ("console", False)):
+        rig.step()
+        rig.bus.publish("/operator/estop", Bool(data=False), latched=True, publisher=publisher)
+        assert [latch.stopped for latch in latches] == [stopped, stopped]
 
 
 def test_letting_go_of_a_key_keeps_the_soft_ramp(rig: Rig) -> None:
