@@ -97,7 +97,7 @@ LAUNCH = """launch:
 - node:
     exec: console
     name: second_console
-    param: [{{name: server.port, value: {second_console}}}]
+    param: [{{name: server.port, value: {second_console}}}, {{name: server.access.simulated, value: true}}]
 """
 
 
@@ -316,6 +316,7 @@ def second_console_fault() -> Fault:
     (frozen, _), pages = process_faults("console"), list[ConsoleClient]()
 
     async def open_page(rig: Rig, page: ConsoleClient) -> None:
+        await page.wait_for(lambda c: rig.state is not None and rig.state.holder.startswith("console/"), 90.0)
         pages.append(ConsoleClient(f"http://127.0.0.1:{rig.second_port}/"))
         await pages[-1].connect(5.0)
         await pages[-1].send({"type": "lease", "take": False})
@@ -372,7 +373,9 @@ FAULTS = [
 def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
     """A started stack with relays at everything that can be cut."""
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
-    ports = {name: free_port() for name in ("camera", "console", "second_console")}
+    ports = {"camera": 0, "console": 0, "second_console": 0}
+    while len(set(ports.values())) < len(ports):  # a port that was free may be given again
+        ports = {name: free_port() for name in ports}
     ports |= {name: free_port(socket.SOCK_DGRAM) for name in ("lidar", "lidar_link", "position")}
     (run_dir / "dev").mkdir(mode=0o700)
     launch = run_dir / "stopping.yaml"
