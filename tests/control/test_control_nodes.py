@@ -257,7 +257,7 @@ def test_a_doubt_about_the_pose_holds_until_the_next_report() -> None:
     def report(lost_probability: float) -> None:
         stack.send(
             "/slam/integrity",
-            PoseIntegrity(header("map", stack.now), lost_probability, 0.1, 0.1, localized=True, status="tracked"),
+            PoseIntegrity(header("map", stack.now), lost_probability, 0.1, 0.1, True, "tracked", 0, 0),
         )
 
     def speed_m_s(seconds: float) -> float:
