@@ -185,6 +185,7 @@ class ArbiterInbox:
             estop_button=latch.button,
             estop_why=latch.why,
             scan_points=np.zeros((0, 2)) if near is None else near,
+            blind=surroundings.blind,
             moving=surroundings.moving_points(now_ns),
             costmap=surroundings.costmap,
             walls=walls,

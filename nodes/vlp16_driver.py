@@ -7,8 +7,9 @@ from typing import Any
 from instant_ic.bus import SENSOR, Node, NodeError, main
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar.capture import CaptureError
-from instant_ic.lidar.compensation import compensated_scan
+from instant_ic.lidar.compensation import base_pose, compensated_scan
 from instant_ic.lidar.config import Vlp16DriverConfig
+from instant_ic.lidar.cover import CoverWatch
 from instant_ic.lidar.feed import PacketFeed, Packets
 from instant_ic.lidar.flatscan import check_level, warm_up
 from instant_ic.lidar.packets import DATA_PACKET_BYTES
@@ -33,6 +34,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.thread: ReceiverThread | None = None
         self.feed = PacketFeed(config.decoder, config.sensor, self.clock.steady_ns())
         self.report = LidarReport(self.feed)
+        self.cover = CoverWatch()
         self.waiting = 0
         self.base_from_lidar = pose_matrix(*config.lidar_mount.pose)
         try:
@@ -127,8 +129,9 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))
         if self.report.covers(revolution, config.scan.min_coverage):
             ranges, state = compensated_scan(revolution, self.base_from_lidar, config.scan, self.tf)
-            self.diagnose_all(state)
-            self.scan.publish(flat_scan_message(ranges, revolution, config))
+            self.cover.update(revolution, base_pose(self.tf))
+            self.diagnose_all(state, self.cover.diagnosis)
+            self.scan.publish(flat_scan_message(self.cover.withhold(ranges), revolution, config))
 
     def check(self) -> None:
         """Report silence and losses; each second."""

@@ -26,6 +26,7 @@ ADVICE: dict[Reason, str] = {
     Reason.ODOMETRY_STALE: "check crawler_base and its serial port (ic topic info /wheel/odom)",
     Reason.POSE_STALE: "check grid_slam and the CPU load (ic top)",
     Reason.POSE_LOST: "release the controls, then drive on slowly where the map is known, or set /initialpose",
+    Reason.BLIND: "uncover the LiDAR, or drive the other way",
     Reason.CONTRADICTION: "do what the text says, then release the controls; the robot drives slowly until both agree",
     Reason.POSE_UNKNOWN: "check grid_slam and the CPU load (ic top)",
     Reason.CAMERA_STALE: "check the camera and the link to the page (ic topic info /camera/image/compressed)",

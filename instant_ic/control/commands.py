@@ -46,7 +46,12 @@ class CommandRules:
         held = hold(s)
         if held is not None:
             return DriveCommand(NO_MOTION, held, hard=True)
-        return self._virtual(s) if s.mode == Mode.VIRTUAL else self._real(s)
+        sent = self._virtual(s) if s.mode == Mode.VIRTUAL else self._real(s)
+        ahead, behind = s.inputs.blind
+        if (ahead and sent.twist[0] > 0.0) or (behind and sent.twist[0] < 0.0):
+            text = f"the LiDAR sees nothing any more {'ahead' if ahead else 'behind'}: uncover it, or drive another way"
+            return DriveCommand(NO_MOTION, Notice(Reason.BLIND, text), blocked=True, hard=True)
+        return sent
 
     def _virtual(self, s: Snapshot) -> DriveCommand:
         """The path follower's command; the operator drives the v-bot."""

@@ -61,6 +61,8 @@ class ArbiterInputs:
     """Text for the operator of a stop that nobody pressed in this run; empty: the usual text."""
     scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) hits of the newest scan and 3D points in ``base_link``, at the robot's present pose."""
+    blind: tuple[bool, bool] = (False, False)
+    """Whether the LiDAR sees nothing any more ahead and behind, where it did before: it is covered."""
     moving: MovingPoints = NOTHING_MOVES
     """People and other moving things, in ``base_link`` at the robot's present pose."""
     costmap: Costmap | None = None

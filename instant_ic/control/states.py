@@ -65,6 +65,7 @@ class Reason(IntEnum):
     NO_SPACE_BEHIND = 30
     NO_WAY_ROUND = 31
     POSE_DOUBTFUL = 32
+    BLIND = 36
     # Held or stopped: nothing may move
     ESTOP = 50
     ESTOP_BUTTON = 51

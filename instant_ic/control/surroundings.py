@@ -70,6 +70,10 @@ class Cloud:
     """(N,) structured: x, y, z in metres; optionally time in seconds since the first point."""
 
 
+_BLIND_RAD, _LANE_M = math.radians(10.0), 1.0
+"""Width of a run of beams without a measurement that makes blind, and length of the lane that must be seen."""
+
+
 class Surroundings:
     """Places scans and 3D points by the transforms, and updates the costmap with them.
 
@@ -80,6 +84,8 @@ class Surroundings:
         self.config = config
         self.costmap: Costmap | None = None
         self.points_seen = False
+        self.blind = (False, False)
+        """Whether a sector that was measured before is not any more, ahead and behind: the LiDAR is covered."""
         self.findings: dict[str, Diagnosis] = {}
         """By input: scan, points, costmap, pose."""
         if not config.points.enabled:
@@ -87,6 +93,8 @@ class Surroundings:
         else:
             self._find("points", True, "no 3D points yet: low and hanging things are not seen")
         self._tf = tf
+        self._footprint = footprint
+        self._measured = self._unmeasured = np.zeros(0, np.bool_)  # beams so far, and in the newest scan
         self._rolling = RollingCostmap(config, footprint)
         self._map_from_odom: Matrix | None = None
         self._scan_hits: NDArray[np.float64] | None = None  # (N, 2) of the newest scan with a transform, in odom
@@ -220,10 +228,32 @@ class Surroundings:
         except TransformError as error:
             self._find("scan", False, f"scan cannot be placed: {error}")
             return
+        self.blind = self._blind(scan)
         points = scan_points(*scan.beams)
         self._find("scan", True, f"{len(points)} points")
         self._scan_hits = np.asarray(points @ odom_from_lidar[:2, :2].T + odom_from_lidar[:2, 3])
         self._used["scan"] = scan.stamp_ns, scan.arrived_ns
+
+    def _blind(self, scan: Scan) -> tuple[bool, bool]:
+        """Whether beams that earlier scans measured, and the last two did not, cross the lanes ahead and behind."""
+        unmeasured = np.isnan(scan.ranges)
+        if len(unmeasured) != len(self._measured):
+            self._measured = self._unmeasured = np.zeros(len(unmeasured), np.bool_)
+        beams = unmeasured & self._unmeasured & self._measured
+        self._measured, self._unmeasured = self._measured | ~unmeasured, unmeasured
+        width = max(1, math.ceil(_BLIND_RAD / max(abs(scan.angle_increment), 1e-3)))
+        runs = np.all([np.roll(beams, -k) for k in range(width)], axis=0)
+        if not runs.any():
+            return False, False
+        beams = np.any([np.roll(runs, k) for k in range(width)], axis=0)
+        angle = scan.angle_min + scan.angle_increment * np.flatnonzero(beams)
+        base_from_lidar = self._tf.lookup("base_link", scan.frame)
+        reach = np.arange(0.05, self._footprint.circumscribed_radius_m + _LANE_M, 0.05)[:, None, None]
+        rays = reach * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        x, y = np.moveaxis(rays @ base_from_lidar[:2, :2].T + base_from_lidar[:2, 3], -1, 0)
+        front = 0.5 * self._footprint.length_m
+        lane = (np.abs(y) < 0.5 * self._footprint.width_m) & (np.abs(x) > front) & (np.abs(x) < front + _LANE_M)
+        return bool((lane & (x > 0)).any()), bool((lane & (x < 0)).any())
 
     def _take(self, cloud: Cloud) -> int:
         """Sort new 3D points by height, in ``odom``; return their stamp, -1 if they cannot be used."""

@@ -37,6 +37,14 @@ def compensated_scan(
     return flat_scan(revolution, base_from_lidar, config, None), state
 
 
+def base_pose(tf: TransformBuffer) -> NDArray[np.float64]:
+    """Newest pose (3,) of the base in ``odom``; the origin where it is not known."""
+    try:
+        return pose2_from_matrix(tf.lookup("odom", "base_link"))
+    except TransformError:
+        return np.zeros(3)
+
+
 def base_motion(tf: TransformBuffer, start_ns: int, end_ns: int) -> PlanarMotion | None:
     """Poses of the base around a revolution; None where they are not published.
 

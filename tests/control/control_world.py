@@ -165,6 +165,7 @@ class Loop:
         self.vbot = VirtualRobot(VbotConfig(), limits)
         self.base = Base(np.array(start))
         self.pose_lost = 0.0
+        self.blind = (False, False)
         self.contradiction, self.contradictions = Contradiction.NONE, 0
         self.vspace = Vspace(ready=True, position=np.zeros(2), ready_radius_m=100.0)
         self.k = 0
@@ -204,6 +205,7 @@ class Loop:
         inputs = ArbiterInputs(
             robot_pose=robot,
             pose_lost_probability=self.pose_lost,
+            blind=self.blind,
             contradiction=self.contradiction,
             contradictions=self.contradictions,
             robot_velocity=(self.base.v, self.base.w),

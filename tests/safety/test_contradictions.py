@@ -1,4 +1,4 @@
-"""Motion that contradicts the tracks: the robot stops, says why, and can be driven free, slowly.
+"""Motion that contradicts the tracks, and a covered LiDAR: the robot stops, says why, and can be driven free.
 
 Real nodes with the shipped parameters against the simulated robot, in simulated time.
 """
@@ -9,10 +9,12 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
+from instant_ic.bus import ERROR
 from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter_config import PoseTrustConfig
 from instant_ic.control.states import Reason
@@ -109,3 +111,36 @@ def test_tracks_that_slip_on_the_spot_stop_and_the_operator_drives_free_slowly(s
     assert stack.page.state["reason"].startswith(f"{Contradiction.SLIPPING.text}; slow until they agree")
     stack.drive((-0.38, 0.0), 3.0)
     assert abs(robot.tracks).min() > 0.3 and not stack.stopped
+
+
+def covered(packet: bytes, first_deg: float, end_deg: float) -> bytes:
+    """A data packet without the returns between two azimuths, clockwise from ahead."""
+    data = np.frombuffer(packet, np.uint8).copy()
+    for block in data[:1200].reshape(12, 100):
+        azimuth_deg = int(block[2:4].view("<u2")[0]) / 100.0
+        if (azimuth_deg - first_deg) % 360.0 < end_deg - first_deg:
+            block[4:] = 0
+    return data.tobytes()
+
+
+def test_a_lidar_that_is_covered_ahead_stops_the_robot_and_lets_it_turn_and_back_off(stack: Stack) -> None:
+    stack.drive(FORWARD, 2.0)
+    scan = stack.simulation.scan_packets
+    stack.simulation.scan_packets = lambda: [covered(packet, 330.0, 390.0) for packet in scan()]
+    robot = stack.simulation.robot
+    assert stack.drive(FORWARD, 2.0, until=lambda: stack.state.reason_code == Reason.BLIND) <= 0.45
+    stack.drive(FORWARD, 0.6)
+    assert stack.tracks_stand
+    ahead = "the LiDAR sees nothing any more ahead: uncover it, or drive another way"
+    assert stack.page.state["reason"] == ahead
+    level, text, _ = stack.nodes["vlp16_driver"].diagnoses()["cover"]
+    assert level == ERROR and "from 330° on (clockwise from ahead): uncover the sensor" in text
+    stack.drive(TURN, 1.5)
+    assert robot.twist[2] > 0.5
+    stack.drive((-0.2, 0.0), 1.0)
+    assert robot.twist[0] < -0.1
+    stack.drive(FORWARD, 1.0)  # what is covered now was seen before the turn
+    assert stack.tracks_stand and stack.page.state["reason"] == ahead
+    stack.simulation.scan_packets = scan
+    stack.drive(FORWARD, 1.0)
+    assert robot.twist[0] > 0.1
