@@ -55,11 +55,13 @@ class Head:
 
     Attributes:
         blocked: sector without blocks; None if there is none, or not yet known.
+        span: turn from the first to the last block of the newest packet, 0.01 degrees.
     """
 
     def __init__(self, blocked: Sector | None = None) -> None:
         """Start with the blocked sector of the configuration, if it has one."""
         self.blocked = blocked
+        self.span = 0
         self._suspect: Sector | None = None
         self._azimuths: Sequence[int] = ()
         self._step = 0.0
@@ -83,11 +85,10 @@ class Head:
         before, self._azimuths = self._azimuths, azimuths
         between, sent_us = 0, 0.0
         if before and step_us is not None:
-            span = turned(before)
             turn = turn_to(before[0], azimuths[0])
             turns = (self._step * step_us / BLOCK_PERIOD_US - turn) / TURN_CDEG
             turn += TURN_CDEG * max(0, round(turns))
-            between = turn - span
+            between = turn - self.span
             blocked = self.blocked.within(before[0], turn) if self.blocked is not None and turn > 0 else 0.0
             sent_us = step_us * (1.0 - blocked / turn) if turn > 0 else step_us
             self._look_between(before[-1], between)
@@ -95,14 +96,18 @@ class Head:
         return sent_us, between
 
     def _look_inside(self, azimuths: Sequence[int]) -> None:
-        steps = [turn_to(a, b) for a, b in itertools.pairwise(azimuths)]
+        steps = [after - before for before, after in itertools.pairwise(azimuths)]
+        if min(steps) < 0:
+            steps = [turn_to(before, after) for before, after in itertools.pairwise(azimuths)]
+        self.span = sum(steps)
         limit = largest_step(min(steps))
-        near = [step for step in steps if step <= limit]
-        if near:
+        if max(steps) <= limit:
+            self._step = self.span / len(steps)
+        elif near := [step for step in steps if step <= limit]:
             self._step = sum(near) / len(near)
-        for azimuth, step in zip(azimuths, steps, strict=False):
-            if step > limit and near:
-                self.blocked = self._after(azimuth, step)
+            for azimuth, step in zip(azimuths, steps, strict=False):
+                if step > limit:
+                    self.blocked = self._after(azimuth, step)
         if self.blocked is not None and any(self.blocked.contains(azimuth) for azimuth in azimuths):
             self.blocked = None
 
@@ -118,8 +123,3 @@ class Head:
     def _after(self, azimuth: int, turn: int) -> Sector:
         step = round(self._step)
         return Sector((azimuth + step) % TURN_CDEG, max(0, turn - step))
-
-
-def turned(azimuths: Sequence[int]) -> int:
-    """Return the turn from the first to the last of consecutive azimuths, 0.01 degrees."""
-    return sum(turn_to(a, b) for a, b in itertools.pairwise(azimuths))

@@ -145,7 +145,9 @@ class PacketStream:
         device_us = self.clock.take(timestamp_us, received_ns - round(period_us * 1000.0))
         self._payloads.append(payload)
         self._times_us.append(device_us)
-        column = None if self._turned is None else _column_after_cut(azimuths, self._turned + between)
+        column = None
+        if self._turned is not None and self._turned + between + max(0, self.head.span) >= TURN_CDEG:
+            column = _column_after_cut(azimuths, self._turned + between)
         self._turned = (azimuths[-1] - self._cut) % TURN_CDEG
         return done if column is None else self._end_at_cut(column * (2 if dual else 1))
 
