@@ -2,6 +2,7 @@
 # make test   format, lint, types and all tests
 # make check  format, lint, types and the word list (scripts/check_words.py); the page too, where Node.js is installed
 # make lock   write requirements*.lock anew after a change of constraints.txt or pyproject.toml (needs network)
+# make newest the unit tests with the newest version of everything, in .venv-newest/ (PYTHON=; default the newest here)
 # make fuzz   a million mutated inputs for each parser of outside bytes: hours (ARGS="--jobs 4 --target glb --count 1000")
 # make clean  take away what these made
 PYTHON ?= python3
@@ -10,7 +11,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: run test check fuzz clean install install-tests lock chromium
+.PHONY: run test newest check fuzz clean install install-tests lock chromium
 
 run: $(STAMP)
 	@exec $(BIN)/ic launch sim $(ARGS)
@@ -23,6 +24,12 @@ test: check install-tests chromium
 	$(BIN)/python -m pytest -m system --durations 10 || systems=FAILED; \
 	echo "make test: unit tests $$units, system tests $$systems"; \
 	test $$units$$systems = passedpassed
+
+NEWEST := .venv-newest
+newest:
+	@options=$$($(PYTHON) scripts/newest.py $(NEWEST) $(if $(filter file,$(origin PYTHON)),,--python $(PYTHON))) && \
+	$(NEWEST)/bin/ic compile && \
+	$(NEWEST)/bin/python -m pytest -n 2 --dist loadgroup -m "not system" $$options $(ARGS)
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .
@@ -67,5 +74,5 @@ chromium:
 	@scripts/ensure_chromium.sh
 
 clean:
-	rm -rf $(VENV) tests/console/js/node_modules build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(NEWEST) tests/console/js/node_modules build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,83 @@
+#!/usr/bin/env python3
+"""Makes an environment with the newest version of everything, without pins; `make newest` runs the unit tests in it.
+
+    python scripts/newest.py FOLDER [--python PYTHON]    # default: the newest of 3.11 to 3.14 here
+
+Torch is installed where it has a CPU build for that Python; its CUDA build of several gigabytes never is. Prints the
+options that pytest needs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+VERSIONS = ("3.14", "3.13", "3.12", "3.11")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def newest_python() -> str:
+    """Return the newest interpreter on PATH or in pyenv.
+
+    Raises:
+        SystemExit: there is none.
+    """
+    for version in VERSIONS:
+        for python in (shutil.which(f"python{version}"), *_of_pyenv(version)):
+            # A shim of pyenv is on PATH whether or not its version is selected.
+            if python and subprocess.run([python, "-c", ""], capture_output=True).returncode == 0:
+                return python
+    sys.exit(f"none of Python {', '.join(VERSIONS)} is here: make newest PYTHON=PATH")
+
+
+def _of_pyenv(version: str) -> list[str]:
+    if shutil.which("pyenv") is None:
+        return []
+    root = subprocess.run(["pyenv", "root"], capture_output=True, text=True, check=True).stdout.strip()
+    return sorted(str(python) for python in Path(root, "versions").glob(f"{version}.*/bin/python"))
+
+
+def requirements() -> list[str]:
+    """Return what the project and its tests need, without torch and triton."""
+    extras = PROJECT["project"]["optional-dependencies"]
+    asked = [
+        *PROJECT["project"]["dependencies"],
+        *extras["dev"],
+        *extras["train"],
+        *PROJECT["build-system"]["requires"],
+    ]
+    (torch,) = PROJECT["tool"]["uv"]["dependency-metadata"]
+    return [one for one in asked if not re.match(r"torch\b", one)] + torch["requires-dist"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="the environment, made again each time")
+    parser.add_argument("--python", default="", help="interpreter; default the newest of 3.11 to 3.14 here")
+    args = parser.parse_args()
+    python = args.python or newest_python()
+    subprocess.run([python, "-m", "venv", "--clear", args.folder], check=True)
+    inside = str(args.folder / "bin" / "python")
+    pip = [inside, "-m", "pip", "install", "-q", "--disable-pip-version-check", "--progress-bar", "off"]
+    no_torch = args.folder / "no-torch.txt"
+    no_torch.write_text("torch<0\n", encoding="utf-8")  # a package that asks for torch fails instead of fetching CUDA's
+    subprocess.run([*pip, "--only-binary", ":all:", "-c", no_torch, "--upgrade", "pip", *requirements()], check=True)
+    install = [str(ROOT / "scripts" / "install_torch.sh"), inside]
+    torch = any(subprocess.run([*install, *spec], stdout=sys.stderr).returncode == 0 for spec in (["torch"], []))
+    if torch:
+        subprocess.run([*pip, "--only-binary", ":all:", "triton"], check=True)
+    else:
+        print("torch has no CPU build for this Python here: what needs it is skipped", file=sys.stderr)
+    subprocess.run([*pip, "--no-deps", "--no-build-isolation", "-e", "."], cwd=ROOT, check=True)
+    # The pins are for the other environment.
+    print("--ignore=tests/test_lock.py" + ("" if torch else " --without-torch"))
+
+
+if __name__ == "__main__":
+    main()
