@@ -56,6 +56,20 @@ def sync_folder(path: Path) -> None:
         os.close(descriptor)
 
 
+def read_secret(path: Path) -> str:
+    """Return the text of a file that only its owner can read, without white space around it.
+
+    Raises:
+        PermissionError: others may read the file; the text says what to do.
+        OSError: it cannot be read.
+        UnicodeDecodeError: it is no text.
+    """
+    with path.open(encoding="utf-8") as file:
+        if os.fstat(file.fileno()).st_mode & 0o077:
+            raise PermissionError(f"{path} is readable by others: run `chmod 600 {path}`")
+        return file.read().strip()
+
+
 def _restrict(path: Path, present: int, mode: int, change: Callable[[int], None]) -> None:
     if present & 0o777 == mode:
         return

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from instant_ic.safe_text import direct
+
 SIGN_IN = ("auto", "always", "never")
 logger = logging.getLogger(__name__)
 
@@ -46,7 +48,7 @@ def offer_sign_in(address: str, file: Path) -> None:
         raise AccessError(f"cannot write the address with the token to {file}: {error.strerror}") from error
     logger.info("the address with the token is in %s", file)
     if sys.stdout.isatty():  # `ic run`; the launcher shows the address itself
-        sys.stdout.write(f"sign in at {address}\n")
+        direct(sys.stdout).write(f"sign in at {address}\n")
         sys.stdout.flush()
 
 

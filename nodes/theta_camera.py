@@ -26,7 +26,10 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.last_ns = self.started_ns = self.clock.steady_ns()
         self.published = self.published_told = 0
         self.images = LiveImages()
-        self.camera = open_camera(config, self.clock.now_ns)
+        try:
+            self.camera = open_camera(config, self.clock.now_ns)
+        except CameraError as error:
+            raise NodeError(str(error)) from None
         self.diagnose("camera", WARN, f"connecting to {config.url}")
         self.timer(1.0, self.check)
         if self.lockstep:

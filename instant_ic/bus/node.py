@@ -40,6 +40,7 @@ from instant_ic.msg import (
     type_name,
 )
 from instant_ic.pace import current
+from instant_ic.safe_text import masked
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of a diagnosis, as in diagnostic_msgs/DiagnosticStatus."""
@@ -407,6 +408,7 @@ class Node(Generic[ConfigT]):
     def diagnose(self, name: str, level: int, message: str, **values: Any) -> None:
         """Set a named diagnosis; it is published until the next one of that name."""
         before = self._diagnoses.get(name)
+        message = masked(message)
         self._diagnoses[name] = (level, message, values)
         if level >= WARN and (before is None or before[0] != level):
             self._log_diagnosis(name, level, message)
@@ -706,7 +708,7 @@ class Node(Generic[ConfigT]):
         """Log an exception with its traceback, and count it."""
         self._faults += 1
         self.log.error("%s: %s: %s", what, type(error).__name__, error, exc_info=error)
-        self._diagnoses[what] = (ERROR, f"{type(error).__name__}: {error}", {"faults": self._faults})
+        self._diagnoses[what] = (ERROR, masked(f"{type(error).__name__}: {error}"), {"faults": self._faults})
         if self.lockstep:
             raise error
 
@@ -858,7 +860,7 @@ class _RosoutHandler(logging.Handler):
                     stamp=to_time(int(record.created * 1e9)),
                     level=self._LEVELS.get(record.levelno, 50),
                     name=self.node.node_name,
-                    msg=record.getMessage().encode(errors="replace").decode(),
+                    msg=masked(record.getMessage()).encode(errors="replace").decode(),
                     file=record.pathname,
                     function=record.funcName or "",
                     line=record.lineno,

@@ -22,6 +22,7 @@ from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import Node, NodeError
 from instant_ic.config import params
 from instant_ic.msg import MessageError
+from instant_ic.safe_text import masked, visible
 
 _SETUP_ENDS_S = 1.0
 """How long a signal waits for a node's ``setup``; the launcher sends the next one after 2.5 s."""
@@ -115,15 +116,21 @@ def leave(status: int) -> NoReturn:
     os._exit(status)
 
 
+class SafeFormatter(logging.Formatter):
+    """Formats log lines without control characters of strangers and without passwords."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return masked(visible(super().format(record)))
+
+
 def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     """Like :func:`main`, but returns the exit status."""
     args = argument_parser(node_class).parse_args(argv)
-    logging.basicConfig(
-        level=logging.INFO,  # debug output of other packages would flood the node's own
-        format=f"%(asctime)s.%(msecs)03d %(levelname)-7s {args.name}: %(message)s",
-        datefmt="%H:%M:%S",
-        stream=sys.stderr,
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    text = f"%(asctime)s.%(msecs)03d %(levelname)-7s {args.name}: %(message)s"
+    handler.setFormatter(SafeFormatter(text, datefmt="%H:%M:%S"))
+    # Debug output of other packages would flood the node's own.
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     log = logging.getLogger(args.name)
     for logger in (log, logging.getLogger("instant_ic")):
         logger.setLevel(args.log_level.upper())

@@ -5,6 +5,7 @@ from typing import Literal
 
 from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Percent, Positive, PositiveInt, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
+from instant_ic.safe_text import holds_password
 
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
 """(width, height, frames/s) that the Theta Z1 offers, with firmware `FORMATS_FIRMWARE`."""
@@ -87,7 +88,9 @@ class ThetaCameraConfig:
 
     Attributes:
         source: ``theta`` (Web API), ``video`` (device, RTSP address or video file), ``files``.
-        url: address of the Theta; device, address or path for the other sources.
+        url: address of the Theta; device, address or path for the other sources. It must not hold a password.
+        password_file: file with USER:PASSWORD of the Theta or the stream, mode 0600; empty: none, for the Theta as in
+            INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD.
         frame_id: the camera's frame.
         camera_mount: the camera's pose on base_link.
         silence_s: seconds without an image that cause a warning; four times as long is an error.
@@ -99,6 +102,7 @@ class ThetaCameraConfig:
 
     source: Literal["theta", "video", "files"] = "theta"
     url: str = "http://192.168.1.1"
+    password_file: str = ""
     frame_id: str = "camera"
     camera_mount: Mount = CAMERA_MOUNT
     silence_s: Positive = 2.0
@@ -111,3 +115,8 @@ class ThetaCameraConfig:
         check_ranges(self)
         if not self.url:
             raise ValueError("url must not be empty")
+        if holds_password(self.url):
+            raise ValueError(
+                "url must not hold a password, which ps, logs, parameters and bags would show: write USER:PASSWORD "
+                "into a file, run chmod 600 on it, and set password_file"
+            )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from pathlib import Path
 
 from instant_ic.camera.config import ThetaCameraConfig
 from instant_ic.camera.files import FileCamera
@@ -11,6 +12,7 @@ from instant_ic.camera.source import Camera, CameraError
 from instant_ic.camera.theta import ThetaCamera, ThetaClient
 from instant_ic.camera.video import VideoCamera
 from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.private import read_secret
 
 USER_VARIABLE = "INSTANT_IC_THETA_USER"
 PASSWORD_VARIABLE = "INSTANT_IC_THETA_PASSWORD"
@@ -21,13 +23,33 @@ _BOARD_HOT_C = 70.0
 
 
 def open_camera(config: ThetaCameraConfig, now_ns: Callable[[], int]) -> Camera:
-    """The camera of ``config.source``, not connected yet; ``now_ns`` stamps its images."""
+    """The camera of ``config.source``, not connected yet; ``now_ns`` stamps its images.
+
+    Raises:
+        CameraError: the password file cannot be used.
+    """
+    user, password = _credentials(config.password_file)
     if config.source == "theta":
-        user, password = os.environ.get(USER_VARIABLE, ""), os.environ.get(PASSWORD_VARIABLE, "")
+        if not config.password_file:
+            user, password = os.environ.get(USER_VARIABLE, ""), os.environ.get(PASSWORD_VARIABLE, "")
         return ThetaCamera(ThetaClient(config.url, config.theta, user, password), now_ns)
     if config.source == "video":
-        return VideoCamera(config.url, config.video, now_ns)
+        return VideoCamera(config.url, config.video, now_ns, user, password)
     return FileCamera(config.url, config.files, now_ns)
+
+
+def _credentials(file: str) -> tuple[str, str]:
+    """Return user and password of a file; both empty without one."""
+    if not file:
+        return "", ""
+    path = Path(file).expanduser()
+    try:
+        user, colon, password = read_secret(path).partition(":")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CameraError(f"password_file {path}: {getattr(error, 'strerror', None) or error}") from error
+    if not colon:
+        raise CameraError(f"password_file {path}: must hold USER:PASSWORD in one line")
+    return user, password
 
 
 def health(client: ThetaClient) -> Diagnosis:

@@ -329,7 +329,7 @@ def _refusal(where: str, body: Mapping[str, Any] | None, status: int, reply: Map
     command = f" {body['name']}" if body and "name" in body else ""
     hint = ""
     if status == 401:
-        hint = ". Set INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD (serial number, and its digits)."
+        hint = ". Set password_file, or INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD (serial number, digits)."
     elif 300 <= status < 400:
         hint = ". The reply redirects, which a Theta never does: check the address."
     elif status == 503:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import quote
 
 from instant_ic.camera.config import VideoConfig
 from instant_ic.camera.source import Camera, CameraError, Frame
@@ -29,8 +30,18 @@ class VideoCamera(Camera):
     read in its driver cannot be interrupted. Reads run on a thread of their own, which is abandoned if it hangs.
     """
 
-    def __init__(self, url: str, config: VideoConfig | None = None, now_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(
+        self,
+        url: str,
+        config: VideoConfig | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        user: str = "",
+        password: str = "",
+    ) -> None:
         self.url = url
+        scheme, separator, rest = url.partition("://")
+        signed_in = f"{scheme}://{quote(user, safe='')}:{quote(password, safe='')}@{rest}"
+        self._source = signed_in if user and separator else url  # shown nowhere
         self.config = config or VideoConfig()
         super().__init__(self.config.latency_s, now_ns)
         self._reader: _Reader | None = None
@@ -89,7 +100,7 @@ class VideoCamera(Camera):
         """Open the source, and return its capture and its description; runs on the reader's thread."""
         import cv2
 
-        source: int | str = int(self.url) if self.url.isdigit() else self.url
+        source: int | str = int(self.url) if self.url.isdigit() else self._source
         if isinstance(source, str) and source.startswith("/dev/") and not os.access(source, os.R_OK | os.W_OK):
             why = "is not readable (join the group video)" if os.path.exists(source) else "does not exist"  # noqa: PTH110
             raise CameraError(f"{source} {why}; 'v4l2-ctl --list-devices' lists the devices")

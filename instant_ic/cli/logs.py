@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
+from instant_ic.safe_text import masked, visible
+
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 _ALIASES = {"warn": "WARNING", "fatal": "CRITICAL"}
 _LINE = re.compile(r"(\d\d):(\d\d):(\d\d)\.(\d{3}) (DEBUG|INFO|WARNING|ERROR|CRITICAL) +([^\s:]+): (.*)")
@@ -83,11 +85,12 @@ def parse(text: str, node: str, end_s: float) -> list[LogLine]:
 def show(line: LogLine, colour: bool) -> str:
     """Format a line for the terminal."""
     stamp = datetime.fromtimestamp(line.stamp_s).strftime("%H:%M:%S.%f")[:-3]
+    node, text = visible(line.node), visible(masked(line.text))
     if not colour:
-        return f"{stamp} {line.level:<7} {line.node}: {line.text}"
+        return f"{stamp} {line.level:<7} {node}: {text}"
     code = _COLOURS.get(line.level, "")
     start, end = (f"\x1b[{code}m", "\x1b[0m") if code else ("", "")
-    return f"\x1b[2m{stamp}\x1b[0m {start}{line.level:<7}{end} \x1b[1m{line.node}\x1b[0m: {start}{line.text}{end}"
+    return f"\x1b[2m{stamp}\x1b[0m {start}{line.level:<7}{end} \x1b[1m{node}\x1b[0m: {start}{text}{end}"
 
 
 class LogFile:

@@ -14,12 +14,15 @@ import pkgutil
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from types import FrameType
+from typing import IO, cast
 
 from instant_ic.cli import commands
 from instant_ic.cli.arguments import Parser
 from instant_ic.cli.errors import UserError
 from instant_ic.closing import on_end_signal
+from instant_ic.safe_text import VisibleStream
 
 _DESCRIPTION = "Instant IC: teleoperation that switches between a real robot and an instantly built virtual one."
 _EPILOG = """examples:
@@ -87,6 +90,13 @@ def _main(argv: Sequence[str] | None) -> int:
 
 
 def _call(args: argparse.Namespace) -> int:
+    """Run the command; whatever it prints of bags, peers and files cannot control the terminal."""
+    out, err = cast("IO[str]", VisibleStream(sys.stdout)), cast("IO[str]", VisibleStream(sys.stderr))
+    with redirect_stdout(out), redirect_stderr(err):
+        return _status(args)
+
+
+def _status(args: argparse.Namespace) -> int:
     try:
         return int(args.func(args) or 0)
     except UserError as error:

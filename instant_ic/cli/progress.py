@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from instant_ic.safe_text import direct
+
 _QUIET_S = 5.0  # a command that ends within this time prints no lines
 _DAY_S = 86400.0
 
@@ -19,7 +21,7 @@ def progress(what: str) -> Iterator[Callable[..., None]]:
         from rich.progress import Progress
 
         # A drive takes minutes on a slow core: the remaining time follows from all drives, not from the last 30 s.
-        with Progress(console=Console(stderr=True), speed_estimate_period=_DAY_S) as bar:
+        with Progress(console=Console(file=direct(sys.stderr)), speed_estimate_period=_DAY_S) as bar:
             task, shown = bar.add_task(what, total=1.0), 0.0
 
             def show(share: float, text: str = what) -> None:

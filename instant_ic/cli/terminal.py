@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from typing import Any, TextIO
 
+from instant_ic.safe_text import direct, visible
+
 ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[C": "right", "\x1b[D": "left"}
 _KEY = re.compile(r"\x1b\[[0-9;]*[A-Za-z~]|.", re.DOTALL)
 _CLEAR_LINE = "\r\x1b[K"
@@ -51,7 +53,7 @@ class Terminal:
         """Take over the terminal if stdin and stderr are terminals and this process is in the foreground."""
         if not (sys.stdin.isatty() and sys.stderr.isatty()) or not self._in_front():
             return
-        self._restore.callback(sys.stderr.write, _CLEAR_LINE)
+        self._restore.callback(direct(sys.stderr).write, _CLEAR_LINE)
         self._restore.enter_context(single_keys())
         for handler in logging.getLogger().handlers:
             if isinstance(handler, logging.StreamHandler) and handler.stream is sys.stderr:
@@ -76,7 +78,7 @@ class Terminal:
         while not self._stop.is_set():
             with self._lock:
                 width = os.get_terminal_size(sys.stderr.fileno()).columns or 80
-                sys.stderr.write(_CLEAR_LINE + self._line()[: max(1, width - 1)])
+                direct(sys.stderr).write(_CLEAR_LINE + visible(self._line())[: max(1, width - 1)])
                 sys.stderr.flush()
             # Reading would stop a process in the background.
             if not self._in_front():
@@ -103,7 +105,7 @@ class _AboveTheLine:
 
     def write(self, text: str) -> int:
         with self._lock:
-            return self._stream.write((_CLEAR_LINE if text.strip() else "") + text)
+            return direct(self._stream).write((_CLEAR_LINE if text.strip() else "") + visible(text))
 
     def flush(self) -> None:
         self._stream.flush()

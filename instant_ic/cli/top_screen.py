@@ -15,6 +15,7 @@ from rich.text import Text
 
 from instant_ic.cli.terminal import single_keys
 from instant_ic.cli.top import HEADINGS, SORT_KEYS, NodeRow, TopicRow, cells, rate_words
+from instant_ic.safe_text import direct, visible
 
 _STATE_COLOURS = {"running": "green", "starting": "yellow", "degraded": "dark_orange", "stopping": "dim"}
 _KEYS = {"c": "cpu", "m": "memory", "n": "name", "l": "lost"}
@@ -40,7 +41,7 @@ def table(rows: Sequence[NodeRow], sort: str, inputs: bool = False) -> Group:
         words[7] = Text(str(words[7]), style="bold red" if row.lost else "dim")
         words[8] = _flows(row.outputs)
         words[9] = _flows(row.inputs)
-        words[10] = Text(row.message, style="yellow" if row.message else "")
+        words[10] = Text(visible(row.message), style="yellow" if row.message else "")
         shown.add_row(*(word for heading, word in zip(HEADINGS, words, strict=True) if heading != "IN Hz" or inputs))
     cpu = sum(row.cpu_percent for row in rows if row.cpu_percent == row.cpu_percent)
     memory = sum(row.rss_mb for row in rows if row.rss_mb == row.rss_mb)
@@ -58,7 +59,7 @@ def _flows(rows: Sequence[TopicRow]) -> Text:
     for row in rows:
         if row.rate_hz > 0 or row.fault:
             rate = f"\u00a0{rate_words(row)}"  # a no-break space keeps the rate beside its topic
-            text.append(row.topic, style="dim").append(rate, style="red" if row.fault else "").append("  ")
+            text.append(visible(row.topic), style="dim").append(rate, style="red" if row.fault else "").append("  ")
     return text
 
 
@@ -71,7 +72,10 @@ def run(rows: Callable[[float], list[NodeRow]], period_s: float, sort: str) -> i
     """
     inputs = False
     newest = rows(0.7)
-    with single_keys(), Live(table(newest, sort), console=Console(), screen=True, auto_refresh=False) as live:
+    with (
+        single_keys(),
+        Live(table(newest, sort), console=Console(file=direct(sys.stdout)), screen=True, auto_refresh=False) as live,
+    ):
         next_s = 0.0
         while True:
             if time.monotonic() >= next_s:

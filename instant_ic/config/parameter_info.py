@@ -13,6 +13,7 @@ from typing import Any, get_args, get_type_hints
 
 from instant_ic.config.params import field_default
 from instant_ic.config.ranges import ranges
+from instant_ic.safe_text import masked
 
 
 @dataclass(frozen=True)
@@ -80,10 +81,10 @@ def _type_words(hint: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON: tuples become lists, paths become strings."""
+    """A value as JSON: tuples become lists, paths become strings; passwords of addresses are masked."""
     if isinstance(value, (tuple, list)):
         return [plain(part) for part in value]
-    return str(value) if isinstance(value, Path) else value
+    return masked(str(value)) if isinstance(value, str | Path) else value
 
 
 @functools.cache

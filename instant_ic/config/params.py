@@ -27,6 +27,7 @@ import yaml
 from instant_ic.config.ranges import Checked, Range, range_of
 from instant_ic.config.scalars import READERS, is_null
 from instant_ic.config.yaml_text import compose_yaml, read_spelled, resolved, spelled
+from instant_ic.safe_text import masked, masked_values
 
 ConfigT = TypeVar("ConfigT")
 
@@ -123,7 +124,7 @@ def gather(
         except ParameterError as error:
             problems += error.problems
     for text in overrides:
-        where = (places or {}).get(text, f"-p {text}")
+        where = (places or {}).get(text, f"-p {masked(text)}")
         try:
             key, value = parse_override(text)
             values[key] = dataclasses.replace(value, where=where)
@@ -430,7 +431,12 @@ def _coerce_sequence(value: list[Any], origin: Any, arguments: tuple[Any, ...], 
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Configuration as nested plain values, for ``ic param`` and the registry."""
+    """Configuration as nested plain values for ``ic param``, registry and bags; passwords of addresses are masked."""
+    masked_config: dict[str, Any] = masked_values(_plain_dict(config))
+    return masked_config
+
+
+def _plain_dict(config: Any) -> dict[str, Any]:
     return {key: str(value) if isinstance(value, Path) else value for key, value in dataclasses.asdict(config).items()}
 
 
@@ -449,7 +455,7 @@ def change(
     """
     flat = {key: Value(value, where) for key, value in flatten(values).items()}
     changed = build(type(config), flat, config)
-    before, after = flatten(to_dict(config)), flatten(to_dict(changed))
+    before, after = flatten(_plain_dict(config)), flatten(_plain_dict(changed))
     different = {key: value for key, value in after.items() if value != before[key]}
     if fixed := sorted(key for key in different if not is_live(key)):
         raise ParameterError(f"{where}: {', '.join(fixed)} takes effect at start: restart the node with the new value")

@@ -10,7 +10,6 @@ import hmac
 import math
 import secrets
 import ssl
-import stat
 from collections import OrderedDict, deque
 from dataclasses import dataclass
 from enum import Enum
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Annotated
 
 from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.private import read_secret
 from instant_ic.web_access import SIGN_IN, AccessError, is_loopback, sign_in_needed
 
 COOKIE = "instant_ic_session"
@@ -78,12 +78,9 @@ def read_token(file: str) -> str:
     """
     path = Path(file).expanduser()
     try:
-        mode = path.stat().st_mode
-        text = path.read_text(encoding="utf-8").strip()
+        text = read_secret(path)
     except (OSError, UnicodeDecodeError) as error:
         raise AccessError(f"token file {path}: {getattr(error, 'strerror', None) or error}") from error
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise AccessError(f"token file {path} is readable by others: run `chmod 600 {path}`")
     if len(text) < MIN_TOKEN or not text.isascii() or any(c.isspace() for c in text):
         raise AccessError(
             f"token file {path}: a token must have at least {MIN_TOKEN} ASCII characters and no spaces; make one with "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,6 +13,8 @@ from rich.live import Live
 from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
+
+from instant_ic.safe_text import direct, masked, visible
 
 _COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_green", "bright_magenta")
 _STATE_STYLES = {
@@ -98,7 +101,7 @@ class Screen:
         console: Console | None = None,
         verbose: bool = False,
     ) -> None:
-        self._console = console or Console(highlight=False, soft_wrap=True)
+        self._console = console or Console(file=direct(sys.stdout), highlight=False, soft_wrap=True)
         self._colours = {node: _COLOURS[index % len(_COLOURS)] for index, node in enumerate(nodes)}
         self._width = max([len(node) for node in nodes] + [6])
         self._live = Live(console=self._console, auto_refresh=False, transient=True) if live else None
@@ -147,10 +150,11 @@ class Screen:
     def _print_line(self, node: str, text: str) -> None:
         prefix = (f"{node:>{self._width}} │ ", self._colours.get(node, "white"))
         style = next((style for word, style in _LINE_STYLES.items() if word in text), "")
-        self._console.print(Text.assemble(prefix, Text.from_ansi(text, style=style)))
+        shown = visible(masked(text), colours=True)
+        self._console.print(Text.assemble(prefix, Text.from_ansi(shown, style=style)))
 
     def event(self, text: str, bad: bool = False) -> None:
-        self._console.print(Text(f"{'launch':>{self._width}} │ {text}", style="bold red" if bad else "bold"))
+        self._console.print(Text(f"{'launch':>{self._width}} │ {visible(text)}", style="bold red" if bad else "bold"))
 
     def refresh(self, view: View) -> None:
         """Print what has changed since the last view, and render the table again."""
@@ -230,10 +234,10 @@ class Screen:
             state.append(f" ↻{row.starts}", style="yellow")
         last = Text()
         if row.text:
-            last.append(row.text, style="yellow" if row.state in _STATE_STYLES else "red")
+            last.append(visible(row.text), style="yellow" if row.state in _STATE_STYLES else "red")
         for topic, rate_hz, right in row.sends:
             last.append("  " if last else "")
-            last.append(f"{topic.lstrip('/')} ", style="dim")
+            last.append(f"{visible(topic).lstrip('/')} ", style="dim")
             last.append(f"{rate_hz:.1f}", style="" if right else "yellow")
         return (
             Text(row.label, style=self._colours.get(row.label, "white")),

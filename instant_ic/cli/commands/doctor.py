@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.cli.arguments import verb
+from instant_ic.safe_text import direct, masked, visible
 
 
 def add_parser(subparsers: Any) -> None:
@@ -40,7 +41,8 @@ def run(args: argparse.Namespace) -> int:
         level = f"{finding.level:<4}"
         if finding.level in colours:
             level = f"\033[{colours[finding.level]}m{level}\033[0m"
-        print(f"{level}  {finding.subject}: {finding.words}", flush=True)
+        text = visible(masked(f"{finding.subject}: {finding.words}"))
+        print(f"{level}  {text}", file=direct(sys.stdout), flush=True)
         if finding.advice and finding.level != OK:
             print(f"      → {finding.advice}", flush=True)
     print(f"{counts[OK]} ok, {counts[WARN]} warnings, {counts[FAIL]} failures")

@@ -8,12 +8,14 @@ from __future__ import annotations
 import argparse
 import importlib
 import pkgutil
+import sys
 from pathlib import Path
 from typing import Any
 
 from instant_ic.cli import commands
 from instant_ic.cli.arguments import group, verb
 from instant_ic.cli.evaluations import print_figures
+from instant_ic.safe_text import direct
 
 
 def add_parser(subparsers: Any) -> None:
@@ -46,7 +48,7 @@ def evaluate_recordings(args: argparse.Namespace) -> int:
 
     from instant_ic.experiments.recordings import evaluate_recordings as run
 
-    console = Console(stderr=True, soft_wrap=True)  # the end of a log is not broken at 80 columns
+    console = Console(file=direct(sys.stderr), soft_wrap=True)  # the end of a log is not broken at 80 columns
     with console.status("starting") as status:
 
         def show_progress(text: str) -> None:

@@ -12,6 +12,7 @@ from instant_ic.cli.arguments import check_files, positive, positive_int, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user, print_figures
 from instant_ic.cli.progress import progress
+from instant_ic.safe_text import direct
 
 if TYPE_CHECKING:
     from instant_ic.experiments.slam import LogResult
@@ -99,7 +100,7 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         if args.faults:
             faults = FAULTS if args.faults == "all" else tuple(args.faults.split(","))
-            with Console(stderr=True).status("") as status:
+            with Console(file=direct(sys.stderr)).status("") as status:
                 report = evaluate_faults(
                     entries, config, places=args.places, seed=args.seed, noise_seeds=args.noise_seeds,
                     relations=relations, faults=faults, on_step=status.update,

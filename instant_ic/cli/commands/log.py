@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import Any
 
 from instant_ic.cli import completion
 from instant_ic.cli.arguments import not_negative, seconds, verb
 from instant_ic.cli.errors import UserError
+from instant_ic.safe_text import direct
 
 _POLL_S = 0.2
 
@@ -30,7 +32,6 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    import sys
     import time
 
     from instant_ic import paths
@@ -52,7 +53,7 @@ def show(args: argparse.Namespace) -> int:
     lines = list(chosen(folder.new_lines(), level, time.time() - args.since if args.since else 0.0))
     count = args.lines if args.lines is not None else len(lines) if args.since else 30
     for line in lines[max(0, len(lines) - count) :]:
-        print(line_words(line, colour))
+        print(line_words(line, colour), file=direct(sys.stdout))
     silent = [name for name, started in running.items() if not folder.has(name, started)]
     silent = [name for name in silent if not args.nodes or name in args.nodes]
     if not args.follow:
@@ -95,7 +96,7 @@ def _follow(folder: Any, nodes: set[str], level: int, colour: bool) -> int:
                 if (not nodes or line.node in nodes) and not folder.has(line.node, started.get(line.node, float("inf")))
             ]
             for line in chosen(sorted([*folder.new_lines(), *live], key=lambda one: one.stamp_s), level):
-                print(line_words(line, colour), flush=True)
+                print(line_words(line, colour), file=direct(sys.stdout), flush=True)
     return 0
 
 
