@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -31,3 +32,34 @@ class Diagnosis:
     level: Level
     text: str
     values: Mapping[str, Any] = field(default_factory=dict)
+
+
+class RecentCount:
+    """Counts the events of the last ``window_s`` seconds; the caller supplies the time.
+
+    ``total`` is the newest argument of :meth:`rise`. A total since the start is no diagnosis: what counts is whether it
+    still grows.
+    """
+
+    def __init__(self, window_s: float) -> None:
+        self.window_s = window_s
+        self._events: deque[tuple[int, int]] = deque()
+        self.total = 0
+
+    def add(self, events: int, now_ns: int) -> None:
+        """Add events at ``now_ns``; zero adds none."""
+        if events > 0:
+            self._events.append((now_ns, events))
+
+    def rise(self, total: int, now_ns: int) -> int:
+        """Add what a running total has grown by since the last call; return the number of events in the window."""
+        self.add(total - self.total, now_ns)
+        self.total = total
+        return self.count(now_ns)
+
+    def count(self, now_ns: int) -> int:
+        """Number of events in the window that ends at ``now_ns``."""
+        oldest_ns = now_ns - int(self.window_s * 1e9)
+        while self._events and self._events[0][0] <= oldest_ns:
+            self._events.popleft()
+        return sum(events for _, events in self._events)

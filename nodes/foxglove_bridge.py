@@ -13,11 +13,12 @@ from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, Ser
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.bus.registry import TopicWatch
 from instant_ic.config.ranges import Range
+from instant_ic.diagnosis import RecentCount
 from instant_ic.paths import sign_in_file
 from instant_ic.web_access import AccessError, is_loopback, offer_sign_in
 
 _TIME_S = 0.05
-_REFUSED_S = 1.0
+REFUSED_S = 10.0  # a refusal is a warning for this long
 _LEAST_S = 0.02
 
 
@@ -66,7 +67,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             self.diagnose("access", WARN, text)
         elif not (local or config.tls_cert):
             self.diagnose("access", WARN, "token and data go over the network unencrypted; set tls_cert and tls_key")
-        self._refused, self._next_refused_s = 0, 0.0
+        self._refused = RecentCount(REFUSED_S)
         # A thread, not a timer: with simulated time the timers may stand still while messages already arrive.
         self._look_thread = threading.Thread(target=self._look, name="discovery", daemon=True)
         self._look_thread.start()
@@ -114,9 +115,10 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             dropped=self.server.dropped,
             **refused,
         )
-        if self.server.refused != self._refused and time.monotonic() >= self._next_refused_s:  # must not fill the log
-            self._refused, self._next_refused_s = self.server.refused, time.monotonic() + _REFUSED_S
-            self.diagnose("door", WARN, f"refused: {self.server.refusal}", requests=self.server.refused)
+        if self.server.refused:
+            lately = self._refused.rise(self.server.refused, time.monotonic_ns())
+            text = f"refused: {self.server.refusal}" if lately else "nobody refused lately"
+            self.diagnose("door", WARN if lately else OK, text, requests=self.server.refused)
 
     def teardown(self) -> None:
         if self.server is not None:

@@ -29,7 +29,7 @@ from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
 from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Positive, PositiveInt, Range
-from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.diagnosis import Diagnosis, Level, RecentCount
 
 FOREIGN_CLOCK_NS = 10_000_000_000
 """A stamp farther than this from the simulated clock comes from another clock."""
@@ -44,6 +44,7 @@ _LEVEL = 1  # of zstd: it must keep pace
 _FLUSH_S = 1.0
 _KEEP_CUSTOM_S = 10.0
 _SPACE_S = 1.0
+_RECENT_S = 10.0  # losses longer ago are no warning
 _ROOM_AGAIN = 64_000_000  # free space above the reserve before recording restarts
 
 log = logging.getLogger(__name__)
@@ -203,6 +204,7 @@ class Recorder:
         self._missed = LatchedValues()
         self._not_written: deque[BagMessage] = deque()
         self._losses: dict[str, Stats] = {}
+        self._recent_lost, self._recent_dropped = RecentCount(_RECENT_S), RecentCount(_RECENT_S)
         self._qos: dict[str, QoS] = {}
         self._parameters: dict[str, object] = {}
         self._writer: BagWriter | None = None
@@ -370,19 +372,21 @@ class Recorder:
 
     def diagnoses(self, fault: str = "") -> Iterator[Diagnosis]:
         """State of the recording; ``fault`` is one of another recording that goes before its own."""
-        lost = self.lost()
+        lost, now_ns = self.lost(), time.monotonic_ns()
+        overflow, now_lost = self.dropped.overflow, self._recent_lost.rise(sum(lost.values()), now_ns)
+        now_dropped = self._recent_dropped.rise(sum(overflow.values()), now_ns)
         if not fault and self.state in (FAILED, DISK_FULL):
             gone = self.not_written()
             fault = f"{self.error}; not recorded: {_counts(gone)}" if gone else self.error
-        elif not fault and (overflow := self.dropped.overflow):
+        elif not fault and now_dropped:
             fault = f"{self.summary()}; the disk is too slow, dropped: {_counts(overflow)}"
         if fault:
             yield Diagnosis("bag", Level.ERROR, fault)
-        elif lost:
-            values = {topic.strip("/"): count for topic, count in lost.items()}
-            yield Diagnosis("bag", Level.WARN, f"{self.summary()}; lost: {_counts(lost)}", values)
         else:
-            yield Diagnosis("bag", Level.OK, self.summary(), {"messages": self.count})
+            missing = lost or overflow
+            text = self.summary() + (f"; lost: {_counts(missing)}" if missing else "")
+            values = {"messages": self.count, **{topic.strip("/"): count for topic, count in missing.items()}}
+            yield Diagnosis("bag", Level.WARN if now_lost else Level.OK, text, values)
         if unknown := self.unknown_types():
             named = ", ".join(f"{type_name} ({topic})" for type_name, topic in sorted(unknown.items()))
             yield Diagnosis("types", Level.WARN, f"recorded without type definition, which is unknown here: {named}")

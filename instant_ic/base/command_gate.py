@@ -6,8 +6,7 @@ import math
 from collections.abc import Callable
 
 from instant_ic.base.config import CrawlerBaseConfig
-from instant_ic.base.recent import RecentCount
-from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.diagnosis import Diagnosis, Level, RecentCount
 
 
 class CommandGate:

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 from instant_ic.base.config import CrawlerBaseConfig
 from instant_ic.base.controller import BaseController, Health
-from instant_ic.base.recent import RecentCount
-from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.diagnosis import Diagnosis, Level, RecentCount
 
 _CONNECT_GRACE_S = 5.0  # after the start, for which a missing controller is not an error yet
 
@@ -26,7 +25,6 @@ class BaseReport:
         self._controller = controller
         self._started_ns = started_ns
         self._linked = False  # connected once since the start
-        self._retries = self._rejected = 0
         self._repeats, self._jumps = RecentCount(config.recent_s), RecentCount(config.recent_s)
 
     def link(self, connected: bool, text: str, steady_ns: int) -> Diagnosis:
@@ -38,9 +36,7 @@ class BaseReport:
     def recent(self, steady_ns: int) -> Iterator[Diagnosis]:
         """Repeated commands and impossible encoder readings of the last ``recent_s``."""
         counters, recent = self._controller.roboclaw.counters, f"the last {self.config.recent_s:g} s"
-        self._repeats.add(counters.retries - self._retries, steady_ns)
-        self._retries = counters.retries
-        repeated = self._repeats.count(steady_ns)
+        repeated = self._repeats.rise(counters.retries, steady_ns)
         values = {
             "repeated": counters.retries,
             "timeouts": counters.timeouts,
@@ -51,9 +47,7 @@ class BaseReport:
         text = f"{repeated} commands repeated in {recent}" if repeated else "no command had to be repeated"
         yield Diagnosis("replies", Level.WARN if repeated else Level.OK, text, values)
         rejected = self._controller.odometry.rejected
-        self._jumps.add(rejected - self._rejected, steady_ns)
-        self._rejected = rejected
-        jumps = self._jumps.count(steady_ns)
+        jumps = self._jumps.rise(rejected, steady_ns)
         text = f"impossible jumps of {recent}, left out: {jumps}" if jumps else "plausible"
         yield Diagnosis("encoders", Level.WARN if jumps else Level.OK, text, {"rejected": rejected})
 

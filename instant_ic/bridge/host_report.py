@@ -7,11 +7,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from instant_ic.base.recent import RecentCount
 from instant_ic.bridge.host_link import HostLink, PeerStatus
 from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_topics import TopicCounts
 from instant_ic.bus import ERROR, OK, WARN
+from instant_ic.diagnosis import RecentCount
 
 RECENT_S = 10.0
 UNLISTED = "of no list"
@@ -35,7 +35,6 @@ class LinkReport:
         self._link, self._diagnose, self._listed = link, diagnose, listed
         self._strangers = RecentCount(RECENT_S)
         self._misses = RecentCount(RECENT_S)
-        self._missed = 0
         self._clocks: set[str] = set()
         self._troubled: set[str] = set()
 
@@ -54,7 +53,7 @@ class LinkReport:
 
     def stranger(self) -> None:
         """Count a refused host."""
-        self._strangers.add(1, time.time_ns())
+        self._strangers.add(1, time.monotonic_ns())
 
     def update(self, max_offset_ms: float) -> None:
         """Report link, clocks, topics and refused hosts."""
@@ -71,13 +70,11 @@ class LinkReport:
         self._clocks = {peer.name for peer in peers}
         out, into = self._link.counts()
         bad = sum(counts.bad for counts in (*out.values(), *into.values()))
-        self._misses.add(bad - self._missed, time.time_ns())
-        self._missed = bad
-        recent = self._misses.count(time.time_ns())
+        recent = self._misses.rise(bad, time.monotonic_ns())
         text = f"{recent} messages missed in the last {RECENT_S:g} s" if recent else "nothing missed lately"
         self._diagnose("topics", WARN if recent else OK, text, **_counts("out", out), **_counts("in", into))
         if isinstance(self._link, ListeningLink):
-            strangers = self._strangers.count(time.time_ns())
+            strangers = self._strangers.count(time.monotonic_ns())
             text = "refused a host without an allowed key" if strangers else "no host refused recently"
             self._diagnose("door", WARN if strangers else OK, text, tries=self._link.strangers)
 

@@ -160,7 +160,7 @@ class LocalSubscription:
                     part = receive(_NOBLOCK)
                     if part.startswith(MAGIC) and part[4:5] < bytes([VERSION]):  # the header was a part of its own
                         text = f"wire format {part[4]}, not {VERSION}: start all nodes again with one Instant IC"
-                self.stats.rejected += 1
+                self._reject(text)
                 self._complain(text[:40], f"{text}; the message is dropped")
             if one:
                 return
@@ -272,11 +272,15 @@ class LocalSubscription:
             "through the socket, which is slower"
         )
 
-    def _refuse(self, source: _Source) -> None:
+    def _reject(self, why: str) -> None:
         self.stats.rejected += 1
+        self.stats.rejected_why = why
+
+    def _refuse(self, source: _Source) -> None:
         same = source.type_name == self.type_name
         why = f"{source.type_name} with other fields" if same else f"{source.type_name}, {self.type_name} expected"
-        self._complain(source.info.id, f"node {source.node} sends {why}; its messages are refused and counted")
+        self._reject(f"node {source.node} sends {why}")
+        self._complain(source.info.id, f"{self.stats.rejected_why}; its messages are refused and counted")
 
     def _complain(self, what: object, text: str) -> None:
         """Log an error once."""

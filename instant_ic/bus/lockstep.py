@@ -223,9 +223,8 @@ class LockstepBus(Closing):
         """Put a message into the queue of one subscription."""
         if subscription.type_name not in (None, record.type_name):
             subscription.stats.rejected += 1
-            logging.getLogger(__name__).error(
-                "%s: %s comes, %s expected; refused", record.topic, record.type_name, subscription.type_name
-            )
+            subscription.stats.rejected_why = f"{record.type_name} comes, {subscription.type_name} expected"
+            logging.getLogger(__name__).error("%s: %s; refused", record.topic, subscription.stats.rejected_why)
             return
         now = self.clock.now_ns()
         steady = self.clock.steady_ns()

@@ -18,6 +18,7 @@ from typing import Any, ClassVar, Generic, TypeVar, get_args
 import numpy as np
 
 from instant_ic.bus.clock import Clock, JumpDetector, ManualClock
+from instant_ic.bus.flow_report import RECENT_S, FlowReport
 from instant_ic.bus.parameter_event import TOPIC as PARAMETER_EVENTS
 from instant_ic.bus.parameter_event import parameter_event
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
@@ -282,6 +283,8 @@ class Node(Generic[ConfigT]):
         back as JSON; a ``ValueError`` or :class:`NodeError` goes back as the reason of a refusal."""
         self._clock_in: Subscription | None = None
         self._began_s = time.monotonic()
+        self._flows = FlowReport(time.monotonic_ns())
+        self._failed_at: dict[str, float] = {}  # callback or timer -> monotonic time of its newest exception
         self._well: set[str] = set()  # diagnoses that have been OK before
         self._waiting: set[str] = set()  # diagnoses never OK so far, logged as information only
         self._running: tuple[str, float] | None = None
@@ -637,7 +640,9 @@ class Node(Generic[ConfigT]):
         ran = False
         while self._soon:
             function, args = self._soon.popleft()
-            self._guard(getattr(function, "__qualname__", "callback"), function, *args)
+            label = getattr(function, "__qualname__", "callback")
+            self._guard(label, function, *args)
+            self._failed_at.pop(label, None)  # called once: that another call succeeds mends nothing
             ran = True
         pending: list[tuple[int, Subscription, Received]] = []
         for subscription in self._inputs():
@@ -693,11 +698,15 @@ class Node(Generic[ConfigT]):
         return bool(self._soon) or (timer_ns is not None and timer_ns <= self.clock.steady_ns())
 
     def _guard(self, what: str, function: Callable[..., None], *args: Any) -> None:
-        self._running = (what, time.monotonic())
+        self._running = (what, started_s := time.monotonic())
         try:
             function(*args)
+            if what in self._failed_at and started_s > self._failed_at[what] + RECENT_S:
+                del self._failed_at[what]
+                self.diagnose(what, OK, f"no exception in the last {RECENT_S:g} s", faults=self._faults)
         except NodeError as error:
             self._faults += 1
+            self._failed_at[what] = time.monotonic()
             self.diagnose(what, ERROR, str(error))
         except Exception as error:  # noqa: BLE001 - one bad message must not end a node that moves a robot
             self.fault(what, error)
@@ -707,6 +716,7 @@ class Node(Generic[ConfigT]):
     def fault(self, what: str, error: Exception) -> None:
         """Log an exception with its traceback, and count it."""
         self._faults += 1
+        self._failed_at[what] = time.monotonic()
         self.log.error("%s: %s: %s", what, type(error).__name__, error, exc_info=error)
         self._diagnoses[what] = (ERROR, masked(f"{type(error).__name__}: {error}"), {"faults": self._faults})
         if self.lockstep:
@@ -776,29 +786,15 @@ class Node(Generic[ConfigT]):
         )
 
     def _publish_diagnostics(self) -> None:
-        found = [(name, *diagnosis) for name, diagnosis in self._diagnoses.items()]
-        now = self.clock.steady_ns()
+        flows: list[Diagnosis] = []
+        now, report_ns = self.clock.steady_ns(), time.monotonic_ns()
         for subscription in self.subscriptions:
-            stats = subscription.raw.stats
-            if not (stats.lost or stats.rejected or stats.overwritten):
-                continue
-            values = {
-                "lost": stats.lost,
-                **{f"lost from {node}": n for node, n in sorted(stats.lost_by.items())},
-                "refused": stats.rejected,
-                "overwritten": stats.overwritten,
-                "rate_hz": round(stats.rate_hz(now), 2),
-                "age_s": round(stats.age_s(now), 3),
-            }
-            level = ERROR if stats.rejected or stats.overwritten else WARN
-            text = f"{stats.lost} messages lost, {stats.rejected} refused"
-            found.append((f"input {subscription.raw.topic}", level, text, values))
+            stats, topic = subscription.raw.stats, subscription.raw.topic
+            values = {"rate_hz": round(stats.rate_hz(now), 2), "age_s": round(stats.age_s(now), 3)}
+            flows += self._flows.input(topic, stats, values, report_ns)
         for publisher in self.publishers:
-            sent = publisher.raw.stats
-            if sent.not_shared:
-                text = f"{sent.not_shared} large messages without shared memory: {sent.not_shared_why}"
-                values = {"not_shared": sent.not_shared, "sent": sent.count}
-                found.append((f"output {publisher.topic}", WARN, text, values))
+            flows += self._flows.output(publisher.topic, publisher.raw.stats, report_ns)
+        found = self._diagnoses | {flow.name: (int(flow.level), flow.text, dict(flow.values)) for flow in flows}
         status, key_value = message_type("DiagnosticStatus"), message_type("diagnostic_msgs/KeyValue")
         entries = [
             status(
@@ -808,7 +804,7 @@ class Node(Generic[ConfigT]):
                 hardware_id="",
                 values=[key_value(key=str(key), value=str(value)) for key, value in values.items()],
             )
-            for name, level, text, values in found
+            for name, (level, text, values) in found.items()
         ]
         self._diagnostics.publish(message_type("DiagnosticArray")(header=header("", time.time_ns()), status=entries))
 

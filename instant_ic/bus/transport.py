@@ -65,6 +65,7 @@ class Stats:
         self.count = 0
         self.lost_by: dict[str, int] = {}
         self.rejected = 0
+        self.rejected_why = ""  # of the newest one
         self.overwritten = 0
         self.newest_ns = 0
         self._arrivals: deque[int] = deque(maxlen=50)

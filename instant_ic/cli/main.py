@@ -40,6 +40,19 @@ _EPILOG = """examples:
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
+class _Version(argparse.Action):
+    """``--version``; looked up only when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib import metadata
+
+        try:
+            print(f"ic {metadata.version('instant-ic')}")
+        except metadata.PackageNotFoundError:
+            parser.error("the package instant-ic is not installed, so that its version is unknown: run make install")
+        parser.exit()
+
+
 def build_parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="ic", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -47,6 +60,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--run-dir", dest="stack", metavar="DIR", help="run directory of the stack (default: $INSTANT_IC_RUN_DIR)"
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version and exit")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for info in sorted(pkgutil.iter_modules(commands.__path__), key=lambda info: info.name):
         module = importlib.import_module(f"{commands.__name__}.{info.name}")

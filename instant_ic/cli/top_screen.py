@@ -38,7 +38,7 @@ def table(rows: Sequence[NodeRow], sort: str, inputs: bool = False) -> Group:
         words: list[str | Text] = list(cells(row))
         words[2] = Text(row.state, style=_STATE_COLOURS.get(row.state, "bold red"))
         words[3] = Text(str(words[3]), style="bold red" if row.over_budget else "bold" if row.cpu_percent > 80 else "")
-        words[7] = Text(str(words[7]), style="bold red" if row.lost else "dim")
+        words[7] = Text(str(words[7]), style="" if row.lost else "dim")  # a total: the start-up's losses count too
         words[8] = _flows(row.outputs)
         words[9] = _flows(row.inputs)
         words[10] = Text(visible(row.message), style="yellow" if row.message else "")

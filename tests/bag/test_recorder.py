@@ -21,6 +21,7 @@ from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
+from instant_ic.diagnosis import Level
 from instant_ic.msg import Bool, serialize
 
 BOOL = "std_msgs/msg/Bool"
@@ -242,6 +243,26 @@ def test_losses_by_publisher_are_in_the_metadata(tmp_path: Path) -> None:
     recorder.close()
     assert custom(tmp_path / "bag", "lost") == {"/scan": 5}
     assert custom(tmp_path / "bag", "lost_by") == {"/scan": {"left": 2, "right": 3}}
+
+
+def test_losses_are_a_warning_only_while_they_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    losses = Losses()
+    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, take: losses)
+    recorder.discover([topic_info("/scan", SENSOR)])
+    second = 0.0
+    monkeypatch.setattr("instant_ic.bag.recorder.time.monotonic_ns", lambda: int(second * S))
+
+    def level() -> int:
+        (found,) = recorder.diagnoses()
+        assert ("lost: /scan 5" in found.text) is (losses.lost == 5), found.text
+        return found.level
+
+    assert level() == Level.OK
+    losses.lost = 5
+    assert level() == Level.WARN
+    second = 11.0
+    assert level() == Level.OK
+    recorder.close()
 
 
 def test_clock_set_back_while_recording(tmp_path: Path) -> None:

@@ -17,13 +17,14 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from instant_ic.bag.metadata import own_schema
 from instant_ic.bridge import foxglove_server
 from instant_ic.bridge.parameter_guard import never_set
-from instant_ic.bus import LATCHED, RELIABLE
+from instant_ic.bus import LATCHED, OK, RELIABLE
 from instant_ic.bus.control import NodeControl
 from instant_ic.bus.node import Node
 from instant_ic.bus.node_files import node_class
 from instant_ic.msg import String, deserialize
 from instant_ic.paths import node_names, sign_in_file
 from instant_ic.web_access import is_loopback, refusal
+from nodes import foxglove_bridge
 
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
 
@@ -47,6 +48,14 @@ def test_a_foreign_web_page_does_not_get_in(world, origin):
     assert refused.value.response.status_code == 403
     assert b"allowed_origins" in refused.value.response.body
     wait_for(lambda: origin in bridge.diagnoses().get("door", (0, "", {}))[1], "the diagnosis")
+
+
+def test_a_refusal_is_a_warning_only_for_a_while(world, monkeypatch):
+    monkeypatch.setattr(foxglove_bridge, "REFUSED_S", 0.0)
+    bridge = world.bridge()
+    with pytest.raises(InvalidStatus):
+        world.client(origin="https://evil.example")
+    wait_for(lambda: bridge.diagnoses().get("door") == (OK, "nobody refused lately", {"requests": 1}), "the diagnosis")
 
 
 @pytest.mark.parametrize("origin", [None, "https://app.foxglove.dev", "file://", "http://localhost:3000"])

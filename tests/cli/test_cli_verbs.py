@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -99,6 +100,13 @@ def ic(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
         status = int(end.code or 0)
     captured = capsys.readouterr()
     return status, captured.out, captured.err
+
+
+def test_the_version_is_printed(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"ic {metadata.version('instant-ic')}\n"
 
 
 def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str]) -> None:
