@@ -305,8 +305,12 @@ def process_faults(node: str) -> list[Fault]:
         frozen[:] = [rig.pid(node)]
         os.kill(frozen[0], signal.SIGSTOP)
 
+    def thaw(rig: Rig, page: ConsoleClient) -> None:
+        with contextlib.suppress(ProcessLookupError):  # the launcher has restarted it meanwhile
+            os.kill(frozen[0], signal.SIGCONT)
+
     return [
-        Fault(f"{node} frozen", freeze, lambda rig, page: os.kill(frozen[0], signal.SIGCONT)),
+        Fault(f"{node} frozen", freeze, thaw),
         Fault(f"{node} killed", lambda rig, page: os.kill(rig.pid(node), signal.SIGKILL)),
     ]
 
