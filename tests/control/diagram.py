@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import groupby
+
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.states import ACTIONS, GUARDS, SOURCES, STATES, TRANSITIONS, Mode
 
 
 def state_diagram() -> str:
-    """The state machine as a Mermaid diagram."""
+    """The state machine as a Mermaid diagram; neighbouring rows that differ in the guard alone are one arrow."""
     lines = ["stateDiagram-v2", "    [*] --> STOPPED"]
-    lines += [f"    {row.source.name} --> {row.target.name}: {row.guard} / {row.action}" for row in TRANSITIONS]
+    for (source, target, action), rows in groupby(TRANSITIONS, lambda row: (row.source, row.target, row.action)):
+        guards = ", ".join(row.guard for row in rows)
+        lines.append(f"    {source.name} --> {target.name}: {guards} / {action}")
     return "\n".join(lines)
 
 
