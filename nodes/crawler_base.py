@@ -9,7 +9,7 @@ from instant_ic.base.config import CrawlerBaseConfig, RoboclawConfig
 from instant_ic.base.controller import BaseController, BaseState, ControllerThread, Health, SteppedController
 from instant_ic.base.pace import refuse_pace
 from instant_ic.base.report import BaseReport
-from instant_ic.base.roboclaw import SerialPort, open_serial
+from instant_ic.base.roboclaw import SerialPort, Status, open_serial
 from instant_ic.base_messages import estimate_message, read_command
 from instant_ic.bus import ERROR, LATCHED, SENSOR, WARN, Node, NodeError, main
 from instant_ic.bus.transport import Received
@@ -38,7 +38,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.gate = CommandGate(config, lambda publisher: self.log.warning(also, publisher))
         self.report = BaseReport(config, self.controller, self.clock.steady_ns())
         self.latch = EstopLatch()
-        self.button: bool | None = None  # state of the controller's emergency stop input
+        self.button: bool | None = None  # whether the controller, or a faulty track, holds the base stopped
+        self.status: Status | None = None  # the controller's newest; read by the serial thread alone
         self.hard = False  # the newest command is a hard stop
         self.odometry = self.publisher("/wheel/odom", Odometry, qos=SENSOR)
         self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)
@@ -94,6 +95,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         if self.latch.stopped:
             self.loop.hurry()
         else:
+            self.report.release()
             self.diagnose_all(self.report.tracks())
         self.diagnose_all(self.latch.diagnosis)
 
@@ -104,7 +106,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.odometry.publish(message)
             matrix, stamp = matrix_from_pose2(state.odometry.pose), state.odometry.stamp_ns
             self.tf_broadcast(self.config.odom_frame, self.config.base_frame, matrix, stamp)
-        if state.link or state.fault or state.health is not None:
+        changed, self.status = state.status != self.status, state.status
+        if state.link or state.fault or changed or state.health is not None:
             self.call_soon(self.on_state, state)
 
     def on_state(self, state: BaseState) -> None:
@@ -112,6 +115,9 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.diagnose_all(self.report.link(state.connected, state.link, self.clock.steady_ns()))
         if state.health is not None:
             self.publish_health(state.health)
+        if state.status is not None:
+            self.diagnose_all(self.report.controller(state.status))
+            self.press(bool(state.status.faults))
         if state.fault:
             self.press(True)
             found = self.report.tracks(state.fault)
@@ -119,14 +125,13 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.diagnose_all(found)
 
     def publish_health(self, health: Health) -> None:
-        """Publish the battery message, the controller's faults and its emergency stop input."""
+        """Publish the battery message."""
         charge = self.report.charge(health)
         self.battery.publish(battery_message(health.battery_v, charge, self.config.base_frame, health.stamp_ns))
-        self.diagnose_all(*self.report.health(health))
-        self.press(health.status.estop)
+        self.diagnose_all(self.report.battery(health))
 
     def press(self, pressed: bool) -> None:
-        """Report the robot's emergency stop button; a faulty track presses it until the next health."""
+        """Report the robot's stop button; a fault of the controller presses it too, a faulty track for a moment."""
         if pressed != self.button:
             self.button = pressed
             self.button_out.publish(Bool(data=pressed))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from instant_ic.base.protocol import BAUD_RATES
+from instant_ic.base.protocol import BAUD_RATES, CYCLE_BYTES, PINS
 from instant_ic.config.ranges import Checked, NotNegativeInt, Positive, Range, check_ranges, require
 from instant_ic.config.robot import MotionLimits
 
@@ -64,6 +64,8 @@ class RoboclawConfig:
         reply_timeout_s: longest wait for a reply; then the motors are stopped before the command is repeated.
         retries: repeats of a command before the link counts as lost.
         watchdog_s: the controller itself stops the motors after this time without a packet; steps of 0.1 s.
+        estop_pin: the controller's pin to which the robot's stop button is wired, S3, S4 or S5, which must be set to
+            E-Stop (latching); empty: the robot has no such button.
     """
 
     port: str = "/dev/ttyACM0"
@@ -72,11 +74,13 @@ class RoboclawConfig:
     reply_timeout_s: Positive = 0.1
     retries: NotNegativeInt = 2
     watchdog_s: Annotated[float, Range(0.1, 1)] = 0.3
+    estop_pin: str = "S3"
 
     def __post_init__(self) -> None:
         check_ranges(self)
         require(self, "port", self.port != "", "the path of a serial device")
         require(self, "baud", self.baud in BAUD_RATES, f"one of {BAUD_RATES}")
+        require(self, "estop_pin", self.estop_pin in ("", *PINS), f"one of {PINS}, or empty without a button")
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ class ControllerConfig(Checked):
         limits: speeds and accelerations.
         command_timeout_s: largest age of a command; older commands are dropped, and without a newer one the base
             stops hard.
-        health_period_s: time between reads of battery, status and the controller's watchdog.
+        health_period_s: time between reads of battery and the controller's watchdog.
     """
 
     roboclaw: RoboclawConfig = field(default_factory=RoboclawConfig)
@@ -101,6 +105,8 @@ class ControllerConfig(Checked):
 
 _LEAST_PERIODS = 3
 """Commands that may be missing before the controller's watchdog stops the motors."""
+_BITS = 10
+"""Bits of a byte on the serial line, with start and stop."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +140,12 @@ class CrawlerBaseConfig(ControllerConfig):
             raise ValueError(
                 "battery_empty_v must be > 0 and below battery_full_v "
                 f"(got {self.battery_empty_v}, {self.battery_full_v})"
+            )
+        line_s = CYCLE_BYTES * _BITS / self.roboclaw.baud
+        if line_s > 1.0 / self.rate_hz:
+            raise ValueError(
+                f"a cycle takes {line_s:.3f} s on the line at roboclaw.baud {self.roboclaw.baud}: raise it, or lower "
+                f"rate_hz to {int(1.0 / line_s)} (got {self.rate_hz})"
             )
         if self.roboclaw.watchdog_s < _LEAST_PERIODS / self.rate_hz:
             raise ValueError(

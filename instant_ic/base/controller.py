@@ -17,6 +17,8 @@ from instant_ic.reconnect import Backoff
 
 _COUNTED_SINCE_M = 0.2
 """Largest count, in metres of track, that a restarted controller can reach before the next reading."""
+_RUNAWAY = 1.2
+"""Error of a track's speed, as a share of the fastest command, at which the controller itself stops the motor."""
 _RECONNECT_MIN_S, RECONNECT_MAX_S = 0.2, 2.0
 """Waits before the port is reopened; see :class:`Backoff`."""
 _SURE_WITHIN_S = 0.025
@@ -27,11 +29,10 @@ _UNSURE_AFTER_S = 0.2
 
 @dataclass(frozen=True)
 class Health:
-    """Battery and status that the controller reported at one instant."""
+    """Battery of the controller at one instant."""
 
     stamp_ns: int
     battery_v: float
-    status: Status
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ class BaseState:
         link: text of the link event in this step; empty without one.
         fault: which track does not follow its command, so that the base has stopped; empty otherwise.
         odometry: new estimate, if any.
-        health: battery and status, if they were read in this step.
+        status: faults and warnings of the controller, if it was read; with a fault the base has stopped.
+        health: battery, if it was read in this step.
         command_fresh: whether a command within the time-out was available.
         v: speed sent to the motors, m/s.
         w: turn rate sent to the motors, rad/s.
@@ -53,6 +55,7 @@ class BaseState:
     link: str = ""
     fault: str = ""
     odometry: OdometryEstimate | None = None
+    status: Status | None = None
     health: Health | None = None
     command_fresh: bool = False
     v: float = 0.0
@@ -99,8 +102,10 @@ class BaseController:
         self._command: _Command | None = None
         self._stopped = False
         self._encoders: NDArray[np.int64] | None = None
-        self._watch = TrackWatch(simulated=not current().real)
-        self._watched: NDArray[np.int64] | None = None  # the last counts that it judged
+        limits = config.limits
+        self._fastest_m_s = limits.max_linear_m_s + 0.5 * config.geometry.effective_width * limits.max_angular_rad_s
+        self._watch = TrackWatch(self._fastest_m_s, simulated=not current().real)
+        self._watched: tuple[NDArray[np.int64], int] | None = None  # the last counts that it judged, and their time
         self._sent: tuple[NDArray[np.float64], int] | None = None  # speeds of the tracks, and until when it has them
         self._last_step_ns: int | None = None
         self._placed_ns: int | None = None  # the last reading that the odometry took
@@ -121,7 +126,7 @@ class BaseController:
             self._command = _Command(v, w, hard, given_ns)
 
     def emergency_stop(self, stopped: bool) -> None:
-        """Set the motors to speed zero without a ramp and hold them there while ``stopped``.
+        """Take the power off the motors, which brakes them, while ``stopped``.
 
         The current command is discarded: after the release the base stands until a new command arrives.
         """
@@ -131,7 +136,10 @@ class BaseController:
             self._stopped = stopped
 
     def step(self) -> BaseState:
-        """Send the motor speeds, read the encoders and, every ``health_period_s``, the health."""
+        """Send the motor speeds, read encoders, power, currents and status and, every ``health_period_s``, the health.
+
+        The base stops as in an emergency when a track does not follow or the controller reports a fault.
+        """
         now_ns = self._steady_ns()
         if not self.roboclaw.connected:
             return self._connect(now_ns)
@@ -150,14 +158,19 @@ class BaseController:
             encoders_ns, stamp_ns = self._steady_ns(), self._now_ns()
             self._note_speeds(v, w, asked_ns, encoders_ns)
             self._check_counts(encoders)
+            power, current_a = self.roboclaw.pwm(), self.roboclaw.currents_a()
+            status = self.roboclaw.status()
             if now_ns >= self._next_health_ns:
                 self.roboclaw.check_watchdog()
-                health = Health(self._now_ns(), self.roboclaw.battery_v(), self.roboclaw.status())
+                health = Health(self._now_ns(), self.roboclaw.battery_v())
                 self._next_health_ns = now_ns + int(self.config.health_period_s * 1e9)
             rejected, estimate, fault = self.odometry.rejected, None, ""
             if self._sure(asked_ns, encoders_ns):
                 estimate = self.odometry.update(encoders, encoders_ns)
-                fault = self._check_tracks(encoders)
+                fault = self._check_tracks(encoders, power, current_a, encoders_ns)
+            if (fault or status.faults) and not self._stopped:
+                self.emergency_stop(True)
+                self.roboclaw.stop()
             if self.odometry.rejected != rejected and self._near_zero(encoders):
                 raise ControllerRestarted(f"{self.config.roboclaw.port}: the encoder counts jumped to {encoders}")
         except LinkError as error:
@@ -174,6 +187,7 @@ class BaseController:
             fault=fault,
             # Speeds use the steady clock, the stamp uses the system clock.
             odometry=None if estimate is None else replace(estimate, stamp_ns=stamp_ns),
+            status=status,
             health=health,
             command_fresh=command is not None,
             v=v,
@@ -206,15 +220,22 @@ class BaseController:
             self.roboclaw.stop()
             return 0.0, 0.0
         half_width = 0.5 * geometry.effective_width
+        stands = not (self.limiter.v or self.limiter.w)
         if command is None or command.hard:
+            v, w = self.limiter.brake(limits.hard_decel_m_s2, limits.hard_decel_m_s2 / half_width, dt_s)
             # The controller ramps down by itself, so the ramp ends even if no packet follows. The limiter tracks it.
-            self.roboclaw.drive([0.0, 0.0], geometry.pulses_per_metre * limits.hard_decel_m_s2)
-            return self.limiter.brake(limits.hard_decel_m_s2, limits.hard_decel_m_s2 / half_width, dt_s)
-        v, w = self.limiter.step(command.v, command.w, dt_s)
-        # The limiter shapes the twist; the controller's ramp allows both parts at once on one track.
-        ramp = limits.max_linear_accel_m_s2 + half_width * limits.max_angular_accel_rad_s2
-        speeds = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
-        self.roboclaw.drive(speeds.tolist(), geometry.pulses_per_metre * ramp)
+            speeds, ramp = np.zeros(2), limits.hard_decel_m_s2
+        else:
+            v, w = self.limiter.step(command.v, command.w, dt_s)
+            speeds = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
+            # The limiter shapes the twist; the controller's ramp allows both parts at once on one track.
+            ramp = limits.max_linear_accel_m_s2 + half_width * limits.max_angular_accel_rad_s2
+        if stands and not (v or w):
+            # A speed loop at zero could still drive a track whose encoder is dead or reversed.
+            self._forget_motion()
+            self.roboclaw.stop()
+        else:
+            self.roboclaw.drive(speeds, geometry.pulses_per_metre * ramp)
         return v, w
 
     def _forget_motion(self) -> None:
@@ -232,16 +253,19 @@ class BaseController:
             self._watch.commanded(speeds, (now_ns - sent_ns) * 1e-9)
         self._sent = speeds, now_ns
 
-    def _check_tracks(self, encoders: NDArray[np.int64]) -> str:
-        """Stop as in an emergency if a track does not follow; returns why, or an empty text."""
-        last, self._watched = self._watched, encoders
-        if last is None:
+    def _check_tracks(
+        self, encoders: NDArray[np.int64], power: NDArray[np.float64], current_a: NDArray[np.float64], read_ns: int
+    ) -> str:
+        """Return why a track does not follow what drives it; empty if both do."""
+        last, self._watched = self._watched, (encoders, read_ns)
+        if last is None or self._sent is None:
             return ""
-        fault = self._watch.counted(self.odometry.kinematics.tracks_from_motors(unwrap_counts(last, encoders)))
-        if fault:
-            self.emergency_stop(True)
-            self.roboclaw.stop()
-        return fault
+        kinematics = self.odometry.kinematics
+        moved = kinematics.tracks_from_motors(unwrap_counts(last[0], encoders))
+        per_metre = self.config.geometry.pulses_per_metre
+        powers = kinematics.tracks_from_motors(power * per_metre)
+        currents = kinematics.tracks_from_motors(current_a * per_metre)
+        return self._watch.judge(moved, powers, currents, (read_ns - last[1]) * 1e-9)
 
     def _check_counts(self, encoders: NDArray[np.int64]) -> None:
         """Check the watchdog when both counts jump to zero: the controller may have restarted."""
@@ -277,6 +301,8 @@ class BaseController:
             return BaseState(connected=False)
         try:
             version = self.roboclaw.connect()
+            per_metre = self.config.geometry.pulses_per_metre
+            limited = self.roboclaw.limit_speed_error(_RUNAWAY * self._fastest_m_s * per_metre)
         except LinkError as error:
             self._lost(now_ns, self._backoff.fail(now_ns * 1e-9))
             return BaseState(connected=False, link=str(error))
@@ -285,7 +311,8 @@ class BaseController:
         self._encoders = None
         self._backoff.succeed()
         self._last_step_ns = now_ns
-        return BaseState(connected=True, link=f"connected to {version} at {self.config.roboclaw.port}")
+        without = "" if limited else ", whose firmware has no speed error limit"
+        return BaseState(connected=True, link=f"connected to {version} at {self.config.roboclaw.port}{without}")
 
     def _lost(self, now_ns: int, wait_s: float) -> None:
         self.roboclaw.close()

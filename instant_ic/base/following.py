@@ -1,80 +1,115 @@
-"""Notices a track that does not follow its command: a dead or reversed encoder, a stalled motor."""
+"""Notices a track that does not follow what drives it: a dead or reversed encoder, a stalled motor.
+
+The controller regulates the speed by the encoders: without counts it powers the track up as far as it can, whatever the
+command. The watch therefore judges the power, not the command. For each track and reading:
+
+1. ``_load``: power that the load needs. A motor that stands draws the stall current for its power; one that turns draws
+   less. The stall current for each share of power is learned from readings of healthy motion.
+2. The rest of the power drives the track. At full power, it is at least as fast as the fastest command.
+3. Motion that the counts lack of that speed adds up; counts in the power's direction take it back. Above a distance,
+   the track is at fault.
+"""
 
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-_LAG_S = 0.1
-"""Usual time from a set point to the track's motion."""
 _LEAST_SHARE = 0.25
-"""Share of the commanded motion that a sound track does, whatever its load."""
-_MISSING_M, _MISSING_S = 0.03, 0.15
-"""Distance, and time at the commanded speed, that the counts of a track at fault lack."""
-_RECENT_S = 0.3
-"""The commanded speed of so long ago counts too: the motion may lack since before the robot slowed down."""
-_DOUBT = 2.0
-"""Factor on what may lack if no other track shows that the counts are up to date."""
-_MOVING_M_S = 0.02
-"""The other track shows it when commanded to be faster than this."""
-_SILENCE_S = 0.1
-"""If readings show that neither track has counted for longer, the counts were late: a track that counts again is sound.
-Readings that are late themselves show nothing."""
-_SIMULATED = 2.0
-"""Factor on what may lack while neither track counts, in a simulation, which pauses on a busy machine."""
+"""Share of the speed by its power that a healthy track has."""
+_MISSING_M, _MISSING_SIMULATED_M = 0.02, 0.04
+"""Motion that the counts of a track at fault lack; a simulation may be late on a busy machine."""
+_CHANGING_S = 0.25
+"""More may lack, by this time at a change of the command: the power brakes a track before it turns it round."""
+_LAG_S, _RECENT_S = 0.1, 0.3
+"""Time from a command to its motion, and time for which a change of the command counts."""
+_BLANKED_POWER = 0.2
+"""Up to this power the controller may blank its currents, and report none."""
+_LEAST_A, _LEAST_POWER = 0.2, 0.03
+"""Smaller currents and powers show nothing."""
+_MARGIN, _MARGIN_POWER = 1.3, 0.05
+"""Factor on the load by its current, for resistance and battery, and power added to it."""
+_MOST_LOAD = 0.5
+"""A track that stands at more power is blocked, if its encoder is not dead."""
 
 
 class TrackWatch:
-    """Compares the commanded motion of both tracks with their counts.
-
-    The controller regulates the speed by the encoders: without counts it speeds the track up as far as it can, whatever
-    the command.
+    """Compares the power on both tracks with their counts.
 
     Args:
-        simulated: whether the tracks are those of a simulation.
+        fastest_m_s: speed of a track at the fastest command.
+        simulated: whether the tracks are those of a simulation, which pauses on a busy machine.
     """
 
-    def __init__(self, simulated: bool = False) -> None:
-        self._silence = _DOUBT * (_SIMULATED if simulated else 1.0)
+    def __init__(self, fastest_m_s: float, simulated: bool = False) -> None:
+        self._fastest_m_s = fastest_m_s
+        self._simulated = simulated
+        self._missing_limit_m = _MISSING_SIMULATED_M if simulated else _MISSING_M
+        self._stall_a = np.zeros(2)  # for full power; largest seen
         self.reset()
 
     def reset(self) -> None:
-        """Start again: the tracks were stopped, or their counts were lost."""
-        self._speeds = np.zeros(2)  # after the lag
-        self._recent = np.zeros(2)  # largest of the last time
-        self._due_m = np.zeros(2)  # since the last counts
-        self._missing_m = np.zeros(2)  # before that
-        self._since_s = self._silent_s = 0.0  # since the last counts: now, and at the last reading without counts
+        """Start again: the motors were switched off, or their counts were lost."""
+        self._command = np.zeros(2)
+        self._lagged = np.zeros(2)  # command after the lag
+        self._change = np.zeros(2)  # of the command, recently
+        self._missing_m = np.zeros(2)
+        self._power = np.zeros(2)  # at the last reading
+        self._current_a = np.zeros(2)
+        self._moved_once = np.zeros(2, bool)  # since the reset
 
     def commanded(self, speeds: NDArray[np.float64], dt_s: float) -> None:
         """Note that the tracks, left and right, were commanded ``speeds`` (2,), m/s, for the last ``dt_s`` seconds."""
-        decay = math.exp(-dt_s / _LAG_S)
-        # The integral of the lagged set point.
-        self._due_m = self._due_m + speeds * dt_s + (self._speeds - speeds) * _LAG_S * (1.0 - decay)
-        self._speeds = speeds + (self._speeds - speeds) * decay
-        self._recent = np.maximum(np.abs(self._speeds), self._recent * math.exp(-dt_s / _RECENT_S))
-        self._since_s += dt_s
+        self._command = speeds
+        recent = np.maximum(np.abs(speeds - self._lagged), self._change * math.exp(-dt_s / _RECENT_S))
+        self._lagged = speeds + (self._lagged - speeds) * math.exp(-dt_s / _LAG_S)
+        self._change = recent
 
-    def counted(self, moved: NDArray[np.float64]) -> str:
-        """Judge both tracks by their motion (2,), m, since the last call.
+    def judge(
+        self, moved: NDArray[np.float64], power: NDArray[np.float64], current_a: NDArray[np.float64], dt_s: float
+    ) -> str:
+        """Judge both tracks, left and right, by a reading.
+
+        Args:
+            moved: motion since the last reading by the counts, metres, (2,).
+            power: power now, -1 to 1, (2,).
+            current_a: currents now, amperes, (2,); the sign is not used.
+            dt_s: time since the last reading, seconds.
 
         Returns:
             What is wrong, for the operator; empty if both tracks follow.
         """
-        doubt = np.full(2, self._silence)
-        if moved.any():
-            done = np.maximum(0.0, moved * np.sign(self._due_m))
-            missing = np.maximum(0.0, self._missing_m + np.abs(self._due_m) - done / _LEAST_SHARE)
-            self._missing_m = np.where((self._silent_s > _SILENCE_S) & (moved != 0.0), 0.0, missing)
-            self._due_m, self._since_s, self._silent_s = np.zeros(2), 0.0, 0.0
-            follows = (self._missing_m == 0.0) & (np.abs(self._speeds) > _MOVING_M_S)
-            doubt = np.where(follows[::-1], 1.0, _DOUBT)
-        else:
-            self._silent_s = self._since_s
-        missing = self._missing_m + np.abs(self._due_m)
-        for track in np.flatnonzero(missing > doubt * (_MISSING_M + _MISSING_S * self._recent)):
+        current_a = np.abs(current_a)
+        still = not moved.any() and bool((power == self._power).all() and (current_a == self._current_a).all())
+        if self._simulated and still:
+            return ""  # the simulation pauses: in any other case at least the noise of the currents changes
+        self._learn(moved, power, current_a)
+        # Between two readings the power is known to be the smaller one only.
+        least = np.where(power * self._power > 0.0, np.minimum(np.abs(power), np.abs(self._power)), 0.0)
+        load = self._load(np.maximum(current_a, self._current_a))
+        due_m = np.maximum(0.0, least - load) * self._fastest_m_s * dt_s
+        done_m = np.maximum(0.0, moved * np.sign(power))
+        self._missing_m = np.maximum(0.0, self._missing_m + due_m - done_m / _LEAST_SHARE)
+        self._power, self._current_a = power, current_a
+        self._moved_once |= moved != 0.0
+        for track in np.flatnonzero(self._missing_m > self._missing_limit_m + _CHANGING_S * self._change):
             return (
-                f"the {('left', 'right')[track]} track does not follow its command of {self._speeds[track]:.2f} m/s: "
-                "check its encoder, the encoder's cable and direction, and whether the track is blocked"
+                f"the {('left', 'right')[track]} track does not follow its command of {self._command[track]:.2f} m/s "
+                f"(power {abs(power[track]):.0%}): check its encoder, the encoder's cable and direction, and whether "
+                "the track is blocked"
             )
         return ""
+
+    def _load(self, current_a: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Power that the loads of the tracks need at most, (2,), by the currents, amperes, (2,)."""
+        known = (current_a >= _LEAST_A) & (self._stall_a > 0.0)
+        share = current_a / np.maximum(self._stall_a, _LEAST_A)
+        return np.where(known, np.minimum(_MARGIN * share + _MARGIN_POWER, _MOST_LOAD), _BLANKED_POWER)
+
+    def _learn(self, moved: NDArray[np.float64], power: NDArray[np.float64], current_a: NDArray[np.float64]) -> None:
+        """Learn the stall currents from tracks that start or follow, and do not brake."""
+        size = np.abs(power)
+        faster = (self._command * power > 0.0) & (np.abs(self._command) >= np.abs(self._lagged) - 1e-3)
+        follows = (moved * power > 0.0) | ~self._moved_once
+        shown = faster & follows & (size >= _LEAST_POWER) & (current_a >= _LEAST_A)
+        self._stall_a = np.maximum(self._stall_a, np.where(shown, current_a / np.maximum(size, _LEAST_POWER), 0.0))

@@ -23,16 +23,31 @@ class Command(IntEnum):
     READ_MAIN_BATTERY = 24
     SPEED_BOTH = 37
     SPEED_ACCELERATION_BOTH = 40
+    READ_PWM = 48
+    READ_CURRENTS = 49
+    DUTY_ACCELERATION_BOTH = 54
+    READ_PIN_FUNCTIONS = 75
     READ_ENCODERS = 78
     READ_STATUS = 90
+    SET_SPEED_ERROR_LIMITS = 109
+    READ_SPEED_ERROR_LIMITS = 110
 
 
 WRITE_DATA_BYTES: dict[int, int] = {
     Command.SET_TIMEOUT: 1,
     Command.SPEED_BOTH: 8,
     Command.SPEED_ACCELERATION_BOTH: 12,
+    Command.DUTY_ACCELERATION_BOTH: 12,
+    Command.SET_SPEED_ERROR_LIMITS: 8,
 }
 """Write commands (acknowledged with 0xFF) and the number of data bytes in each."""
+CYCLE_BYTES = 64
+"""Bytes on the line in a control cycle with health: commands 40, 78, 48, 49, 90, 15 and 24 with their replies."""
+
+PINS = ("S3", "S4", "S5")
+MOTORS_OFF = struct.pack(">hIhI", 0, 655359, 0, 655359)
+"""Data of command 54: no power on both motors, with the steepest ramp (full power to none in 50 ms)."""
+PWM_MAX = 32767
 
 STATUS_FAULTS: dict[int, str] = {
     0x0001: "emergency stop",
@@ -43,8 +58,14 @@ STATUS_FAULTS: dict[int, str] = {
     0x0020: "logic voltage low",
     0x0040: "driver fault M1",
     0x0080: "driver fault M2",
+    0x0100: "speed error M1",
+    0x0200: "speed error M2",
+    0x0400: "position error M1",
+    0x0800: "position error M2",
     0x1000: "over-current M1",
     0x2000: "over-current M2",
+    0x4000: "main voltage low",
+    0x8000: "main voltage high (not recovered)",
 }
 """Error bits of the 4-byte status (command 90)."""
 STATUS_WARNING_MASK = 0xFFFF0000
@@ -130,8 +151,16 @@ def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str
             [text for bit, text in named if bit & _WARNINGS_2_BYTES],
         )
     faults = [text for bit, text in STATUS_FAULTS.items() if status & bit]
-    unnamed = status & ~STATUS_WARNING_MASK & ~sum(STATUS_FAULTS)
-    if unnamed:
-        faults.append(f"error bits 0x{unnamed:04x}")
     warning = status & STATUS_WARNING_MASK
     return faults, [f"warning bits 0x{warning:08x}"] if warning else []
+
+
+def latches(mode: int, pin: str, status_bytes: int) -> bool:
+    """Whether a mode of command 75 makes a pin a latching emergency stop.
+
+    Args:
+        mode: function of the pin.
+        pin: S3, S4 or S5. In the packet serial modes, S3 is a latching emergency stop by default.
+        status_bytes: length of the status; firmware with the short one numbers the modes in another way.
+    """
+    return mode == (0x81 if status_bytes == 4 else 0x01) or (mode == 0 and pin == "S3")

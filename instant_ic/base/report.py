@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from instant_ic.base.config import CrawlerBaseConfig
 from instant_ic.base.controller import BaseController, Health
+from instant_ic.base.roboclaw import Status
 from instant_ic.diagnosis import Diagnosis, Level, RecentCount
 
 _CONNECT_GRACE_S = 5.0  # after the start, for which a missing controller is not an error yet
@@ -25,6 +26,7 @@ class BaseReport:
         self._controller = controller
         self._started_ns = started_ns
         self._linked = False  # connected once since the start
+        self._fault = ""  # newest faults of the controller that nobody released
         self._repeats, self._jumps = RecentCount(config.recent_s), RecentCount(config.recent_s)
 
     def link(self, connected: bool, text: str, steady_ns: int) -> Diagnosis:
@@ -56,15 +58,26 @@ class BaseReport:
         stopped = f"{fault}. The robot has stopped; release the emergency stop to try again"
         return Diagnosis("tracks", Level.ERROR if fault else Level.OK, stopped if fault else "both follow")
 
-    def health(self, health: Health) -> Iterator[Diagnosis]:
+    def battery(self, health: Health) -> Diagnosis:
         empty_v = self.config.battery_empty_v
         low = health.battery_v < empty_v
         text = f"{health.battery_v:.1f} V" + (f", below {empty_v} V: charge it" if low else "")
-        yield Diagnosis("battery", Level.WARN if low else Level.OK, text)
-        faults, warnings = health.status.faults, health.status.warnings
-        level = Level.ERROR if faults else Level.WARN if warnings else Level.OK
-        values = {"status": f"0x{health.status.value:0{2 * health.status.size}x}"}
-        yield Diagnosis("controller", level, ", ".join(faults + warnings) or "no faults", values)
+        return Diagnosis("battery", Level.WARN if low else Level.OK, text)
+
+    def controller(self, status: Status) -> Diagnosis:
+        """Faults and warnings of the controller; a fault until the stop is released, under its name."""
+        faults, warnings = ", ".join(status.faults), ", ".join(status.warnings)
+        self._fault = faults or self._fault
+        values = {"status": f"0x{status.value:0{2 * status.size}x}"}
+        if self._fault:
+            advice = "remove the cause, then" if faults else "it is over;"
+            text = f"{self._fault}. The robot has stopped: {advice} release the emergency stop"
+            return Diagnosis("controller", Level.ERROR, text, values)
+        return Diagnosis("controller", Level.WARN if warnings else Level.OK, warnings or "no faults", values)
+
+    def release(self) -> None:
+        """Forget a fault of the controller: the operator has released the stop."""
+        self._fault = ""
 
     def charge(self, health: Health) -> float:
         """Charge of the battery by its voltage, 0-1."""

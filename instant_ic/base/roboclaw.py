@@ -15,10 +15,14 @@ from instant_ic.base.protocol import (
     ACKNOWLEDGE,
     ESTOP_BITS,
     INTER_BYTE_GAP_S,
+    MOTORS_OFF,
+    PINS,
+    PWM_MAX,
     Command,
     ProtocolError,
     decode_reply,
     describe_status,
+    latches,
     read_request,
     write_frame,
 )
@@ -118,7 +122,8 @@ def open_serial(config: RoboclawConfig) -> SerialPort:
         ) from error
 
 
-_MOVING = (Command.SPEED_BOTH, Command.SPEED_ACCELERATION_BOTH)
+_DRAIN_READS = 20
+"""Reads after which a line that is never quiet is used all the same."""
 
 
 def _tenths(timeout_s: float) -> int:
@@ -139,8 +144,10 @@ class Roboclaw:
     """One controller with one method per command; each command is repeated up to ``retries`` times.
 
     Every valid packet feeds the controller's watchdog, so a request sent while replies are missing could keep the
-    motors running. After a missing reply, and on each `connect`, the driver sends only speed zero until the controller
-    has acknowledged it.
+    motors running. After a missing reply, and on each `connect`, the driver sends only stops until the controller
+    has acknowledged one. Acknowledgements have no number, so the driver first waits until the line is quiet: a late one
+    must not acknowledge the next command. A stop takes the power off the motors. A set point of zero would leave it to
+    the speed loop, which drives on when an encoder is dead or reversed.
 
     Example:
         >>> with closing(Roboclaw(RoboclawConfig(port="/dev/ttyACM0"))) as roboclaw:   # doctest: +SKIP
@@ -159,7 +166,8 @@ class Roboclaw:
         self.restarted = False
         """Whether the controller had lost the watchdog setting of an earlier connection at the last `connect`."""
         self._was_set = False
-        self._stop_frame = write_frame(config.address, Command.SPEED_BOTH, struct.pack(">ii", 0, 0))
+        self._stop_frame = write_frame(config.address, Command.DUTY_ACCELERATION_BOTH, MOTORS_OFF)
+        self._has_limits = True  # until the firmware does not answer
         self._open_port = open_port
         self._sleep = sleep
         self._port: SerialPort | None = None
@@ -170,24 +178,27 @@ class Roboclaw:
         return self._port is not None
 
     def connect(self) -> str:
-        """Open the port, stop the motors, read the firmware version and set the controller's watchdog.
+        """Open the port, stop the motors, read the firmware version, set the watchdog and check the stop button's pin.
 
         Returns:
             Firmware version.
 
         Raises:
-            LinkError: the port cannot be opened, no controller answers, or the watchdog cannot be set.
+            LinkError: the port cannot be opened, no controller answers, the watchdog cannot be set, or the pin of the
+                stop button does not latch.
         """
         self.close()
         self._port = self._open_port(self.config)
         self._status_size = None
         try:
             self._stop_blind()
+            self._drain(self._port)
             self.stop()
             version = self.version()
             self.restarted = self._was_set and not self._watchdog_holds(self.watchdog_s())
             self.set_watchdog(self.config.watchdog_s)
             self.check_watchdog()
+            self.check_button()
             self._was_set = True
         except LinkError:
             self.close()
@@ -207,8 +218,8 @@ class Roboclaw:
         self._write(Command.SPEED_ACCELERATION_BOTH, struct.pack(">Iii", round(acceleration_pps2), m1, m2))
 
     def stop(self) -> None:
-        """Set both motors to speed zero without a ramp (command 37)."""
-        self._transact(Command.SPEED_BOTH, _acknowledged, self._stop_frame)
+        """Take the power off both motors, which brakes them whatever the encoders count (command 54)."""
+        self._transact(Command.DUTY_ACCELERATION_BOTH, _acknowledged, self._stop_frame)
 
     def set_watchdog(self, timeout_s: float) -> None:
         """Make the controller stop the motors after this time without a packet; rounded down to 0.1 s (command 14)."""
@@ -232,6 +243,60 @@ class Roboclaw:
         """Watchdog time of the controller, seconds; 0 is off (command 15)."""
         return self._read(Command.READ_TIMEOUT, 1)[0] * 0.1
 
+    def check_button(self) -> None:
+        """Check that the pin of the robot's stop button is a latching emergency stop (command 75).
+
+        Raises:
+            LinkError: it is not, or its mode cannot be read.
+        """
+        pin, port = self.config.estop_pin, self.config.port
+        if not pin:
+            return
+        advice = (
+            f"The robot does not drive. Set {pin} to E-Stop (latching) with the manufacturer's tool and save it in the "
+            "controller, or set roboclaw.estop_pin to the button's pin, to '' without a button."
+        )
+        size = self.status().size
+        try:
+            modes = self._transact(Command.READ_PIN_FUNCTIONS, self._reply(3, 5))
+        except LinkError as error:
+            raise LinkError(f"{port}: mode of the stop button's pin {pin} unknown: {error} {advice}") from error
+        mode = modes[PINS.index(pin)]
+        if not latches(mode, pin, size):
+            raise LinkError(f"{port}: mode 0x{mode:02x} of the stop button's pin {pin} is no latching stop. {advice}")
+
+    def limit_speed_error(self, limit_pps: float) -> bool:
+        """Make the controller itself stop a motor whose measured speed is farther from its set point (command 109).
+
+        Args:
+            limit_pps: largest difference, pulses/s; read back afterwards.
+
+        Returns:
+            Whether the firmware has such a limit and took it.
+        """
+        if not self._has_limits:
+            return False
+        try:
+            kept = self._transact(Command.READ_SPEED_ERROR_LIMITS, self._reply(4, 8))
+        except LinkError:
+            if not self.connected:
+                raise
+            self._has_limits = False
+            return False
+        width = len(kept) // 2  # bytes of a limit; firmware versions differ
+        wanted = 2 * min(round(limit_pps), 256**width - 1).to_bytes(width, "big")
+        if kept != wanted:
+            self._write(Command.SET_SPEED_ERROR_LIMITS, wanted)
+        return self._read(Command.READ_SPEED_ERROR_LIMITS, len(wanted)) == wanted
+
+    def pwm(self) -> NDArray[np.float64]:
+        """Power on M1 and M2, -1 to 1, (2,) (command 48)."""
+        return np.array(struct.unpack(">hh", self._read(Command.READ_PWM, 4))) / PWM_MAX
+
+    def currents_a(self) -> NDArray[np.float64]:
+        """Currents of M1 and M2, amperes, (2,) (command 49)."""
+        return np.array(struct.unpack(">hh", self._read(Command.READ_CURRENTS, 4))) * 0.01
+
     def encoders(self) -> NDArray[np.int64]:
         """Counts of M1 and M2 modulo 2^32, (2,) (command 78)."""
         return np.array(struct.unpack(">II", self._read(Command.READ_ENCODERS, 8)), np.int64)
@@ -247,7 +312,7 @@ class Roboclaw:
         until the next connect, so that old firmware does not cost a time-out on each call.
         """
         size = self._status_size
-        data = self._transact(Command.READ_STATUS, self._status_reply if size is None else self._reply(size))
+        data = self._transact(Command.READ_STATUS, self._reply(2, 4) if size is None else self._reply(size))
         self._status_size = len(data)
         return Status(int.from_bytes(data, "big"), len(data))
 
@@ -258,8 +323,14 @@ class Roboclaw:
     def _watchdog_holds(self, found_s: float) -> bool:
         return round(found_s * 10) == _tenths(self.config.watchdog_s)
 
+    def _drain(self, port: SerialPort) -> None:
+        """Drop what still arrives, until nothing has for ``reply_timeout_s``."""
+        for _ in range(_DRAIN_READS):
+            if not port.read(64):
+                return
+
     def _stop_blind(self) -> None:
-        """Write speed zero twice without awaiting a reply; the first frame may be lost behind a damaged one."""
+        """Write a stop twice without awaiting a reply; the first frame may be lost behind a damaged one."""
         if self._port is None:
             return
         try:
@@ -277,22 +348,16 @@ class Roboclaw:
     def _read(self, command: int, size: int) -> bytes:
         return self._transact(command, self._reply(size))
 
-    def _reply(self, size: int) -> Callable[[SerialPort, int], bytes]:
-        """Reader of a reply with ``size`` bytes of data."""
+    def _reply(self, *sizes: int) -> Callable[[SerialPort, int], bytes]:
+        """Reader of a reply with one of ``sizes`` bytes of data, which depend on the firmware; ascending."""
 
         def read(port: SerialPort, command: int) -> bytes:
-            received = port.read(size + 2)
-            if len(received) < size + 2:
-                raise TimeoutError(f"command {command}: received {len(received)} of {size + 2} bytes")
+            received = port.read(sizes[-1] + 2)
+            if len(received) - 2 not in sizes:
+                raise TimeoutError(f"command {command}: received {len(received)} of {sizes[-1] + 2} bytes")
             return decode_reply(self.config.address, command, received)
 
         return read
-
-    def _status_reply(self, port: SerialPort, command: int) -> bytes:
-        received = port.read(6)
-        if len(received) not in (4, 6):
-            raise TimeoutError(f"command {command}: received {len(received)} bytes instead of 4 or 6")
-        return decode_reply(self.config.address, command, received)
 
     def _version_reply(self, port: SerialPort, command: int) -> bytes:
         """Read text up to its null byte, then the CRC; the length is not known in advance."""
@@ -327,11 +392,13 @@ class Roboclaw:
                 # After this gap the controller drops the remains of a damaged frame.
                 self._sleep(1.5 * INTER_BYTE_GAP_S)
             try:
+                if silent:
+                    self._drain(port)
                 port.reset_input_buffer()
                 if silent:
                     port.write(self._stop_frame)
-                    _acknowledged(port, Command.SPEED_BOTH)
-                    if command in _MOVING:
+                    _acknowledged(port, Command.DUTY_ACCELERATION_BOTH)
+                    if command == Command.SPEED_ACCELERATION_BOTH:
                         return ACKNOWLEDGE
                     silent = False
                     port.reset_input_buffer()

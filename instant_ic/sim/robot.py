@@ -12,6 +12,7 @@ from instant_ic.base.kinematics import SkidSteer
 from instant_ic.config.ranges import Checked, NotNegative, Positive, Range
 from instant_ic.config.robot import Rectangle
 from instant_ic.sim.contact import OccupancyMask
+from instant_ic.sim.motors import TrackMotors
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -56,7 +57,7 @@ class TrackedRobot:
     Attributes:
         pose: (3,) x, y, yaw (unwrapped) in the world's frame.
         twist: (3,) true v_x, v_y, yaw rate in the robot's frame.
-        tracks: (2,) speeds of the left and right track at the sprockets, m/s, which the encoders measure.
+        motors: motors of the tracks.
         contact: whether the robot pushes against something.
         contacts: number of contacts so far.
     """
@@ -74,13 +75,12 @@ class TrackedRobot:
         self.kinematics = SkidSteer(geometry)
         self.pose: FloatArray = np.asarray(pose, float)
         self.twist: FloatArray = np.zeros(3)
-        self.tracks: FloatArray = np.zeros(2)
+        self.motors = TrackMotors(config, seed)
         self.contact = False
         self.contacts = 0
         self._mask = mask
         self._rng = np.random.default_rng([31, seed])
         self._slip: FloatArray = np.zeros(3)
-        self._travelled: FloatArray = np.zeros(2)
         self._jitter: FloatArray = np.zeros(2)
         self._held_at: FloatArray = self.pose
         self._outline = _outline(footprint.length_m, footprint.width_m, mask.cell_m)
@@ -88,14 +88,19 @@ class TrackedRobot:
             raise ValueError(f"the start pose x={pose[0]:.2f}, y={pose[1]:.2f} collides with the world")
 
     @property
+    def tracks(self) -> FloatArray:
+        """(2,) speeds of the left and right track at the sprockets, m/s."""
+        return self.motors.speeds
+
+    @property
     def encoder_pulses(self) -> FloatArray:
         """(2,) encoder counts of the motors M1 and M2 since the start, not rounded."""
-        return self.kinematics.motors_from_tracks(self._travelled) + self._jitter
+        return self.kinematics.motors_from_tracks(self.motors.counted) + self._jitter
 
     @property
     def motor_speed_pps(self) -> FloatArray:
-        """(2,) speeds of the motors M1 and M2, pulses/s."""
-        return self.kinematics.motors_from_tracks(self.tracks)
+        """(2,) speeds of the motors M1 and M2 as their encoders measure them, pulses/s."""
+        return self.kinematics.motors_from_tracks(self.motors.encoders * self.motors.speeds)
 
     def touches(self, pose: npt.ArrayLike) -> bool:
         """Whether the footprint's outline at a pose (x, y, yaw) touches something."""
@@ -114,18 +119,16 @@ class TrackedRobot:
             raise ValueError(f"the pose x={pose[0]:.2f}, y={pose[1]:.2f} collides with the world")
         self.pose, self.contact = np.asarray(pose, float), False
 
-    def step(self, setpoint_pps: npt.ArrayLike, dt_s: float) -> None:
-        """Advance the robot by ``dt_s`` (at most about 20 ms) with motor set points (2,) in pulses/s."""
+    def step(self, setpoint_pps: npt.ArrayLike, dt_s: float, closed_loop: bool = True) -> None:
+        """Advance the robot by ``dt_s`` (at most about 20 ms).
+
+        Args:
+            setpoint_pps: set points of the motors (2,), pulses/s.
+            dt_s: seconds.
+            closed_loop: whether the speed loops regulate; otherwise the set points are power.
+        """
         config = self.config
-        wanted = self.kinematics.tracks_from_motors(setpoint_pps)
-        follow = (wanted - self.tracks) * (1 - math.exp(-dt_s / config.motor_lag_s))
-        most = config.track_acceleration * dt_s
-        before = self.tracks.copy()
-        self.tracks += np.clip(follow, -most, most)
-        braked = np.sign(self.tracks) * np.maximum(np.abs(self.tracks) - config.rolling_resistance * dt_s, 0.0)
-        self.tracks = np.where(wanted == 0, braked, self.tracks)
-        mean = 0.5 * (before + self.tracks)
-        self._travelled += mean * dt_s
+        mean = self.motors.step(self.kinematics.tracks_from_motors(setpoint_pps), dt_s, closed_loop)
         moving = np.abs(mean) > 1e-4
         if config.encoder_noise_pulses > 0:
             noise = self._rng.normal(0, config.encoder_noise_pulses, 2)

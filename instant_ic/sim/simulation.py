@@ -118,9 +118,7 @@ class Simulation:
             part = dt_s / count
             with self.lock:
                 self.controller.advance(part)
-                self.robot.step(self.controller.setpoint_pps, part)
-                self.controller.encoder[:] = self.robot.encoder_pulses
-                self.controller.speed_pps[:] = self.robot.motor_speed_pps
+                drive(self.robot, self.controller, part)
                 load = float(np.abs(self.robot.tracks).mean())
                 used = self.time_s / 3600.0 * 0.4
                 self.controller.battery_v = max(20.0, BATTERY_V - used - 0.6 * load)
@@ -134,6 +132,7 @@ class Simulation:
         with self.lock:
             self.controller.target_speed_pps[:] = pulses
             self.controller.acceleration_pps2 = 0.0
+            self.controller.closed_loop = True
 
     def put_down(self, pose: tuple[float, float, float]) -> None:
         """Lift the robot and put it down at another pose (x, y, yaw); tracks and encoders do not notice.
@@ -167,6 +166,17 @@ class Simulation:
     def _remember(self) -> None:
         # A new array instead of a shift in place, because another thread may be reading the old one.
         self._history = np.vstack([self._history[1:], [self.time_s, *self.robot.pose]])
+
+
+def drive(robot: TrackedRobot, controller: RoboclawEmulator, dt_s: float) -> None:
+    """Advance the robot by what its controller demands, and report to the controller what it measures."""
+    motors, kinematics = robot.motors, robot.kinematics
+    motors.battery_v = controller.battery_v
+    robot.step(controller.setpoint_pps, dt_s, controller.closed_loop)
+    controller.encoder[:] = robot.encoder_pulses
+    controller.speed_pps[:] = robot.motor_speed_pps
+    controller.power[:] = kinematics.motors_from_tracks(motors.power) / kinematics.config.pulses_per_metre
+    controller.currents_a[:] = kinematics.motors_from_tracks(motors.currents_a) / kinematics.config.pulses_per_metre
 
 
 def warm_up() -> None:

@@ -154,7 +154,8 @@ def test_low_battery_and_faults_are_told(bench: Bench) -> None:
     bench.emulator.status = 0x0040
     bench.run(1.5)
     assert bench.node.diagnoses()["battery"][:2] == (WARN, "20.4 V, below 21.0 V: charge it")
-    assert bench.node.diagnoses()["controller"][:2] == (ERROR, "driver fault M1")
+    level, text, _ = bench.node.diagnoses()["controller"]
+    assert level == ERROR and text.startswith("driver fault M1. The robot has stopped")
     assert bench.bus.last("/battery").percentage == 0.0
 
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.protocol import (
+    MOTORS_OFF,
     Command,
     ProtocolError,
     crc16,
@@ -34,6 +35,7 @@ def test_crc_has_the_check_value_of_xmodem() -> None:
 @pytest.mark.parametrize(
     ("command", "data", "frame"),
     [
+        (Command.DUTY_ACCELERATION_BOTH, MOTORS_OFF, "80 36 00 00 00 09 ff ff 00 00 00 09 ff ff 93 b5"),
         (Command.SPEED_BOTH, struct.pack(">ii", 0, 0), "80 25 00 00 00 00 00 00 00 00 34 04"),
         (Command.SPEED_BOTH, struct.pack(">ii", 1000, -1000), "80 25 00 00 03 e8 ff ff fc 18 82 90"),
         (Command.SET_TIMEOUT, bytes((5,)), "80 0e 05 48 f0"),
@@ -150,6 +152,16 @@ def test_driver_tells_two_and_four_byte_status_apart() -> None:
     assert new.status().faults == ["logic voltage low"]
 
 
+@pytest.mark.parametrize("limit_bytes", [0, 2, 4])
+def test_the_speed_error_limit_is_set_and_read_back_in_each_firmwares_form(limit_bytes: int) -> None:
+    emulator = RoboclawEmulator()
+    emulator.limit_bytes = limit_bytes
+    roboclaw, _ = connected(emulator)
+    for limit_pps, kept in ((3840.0, 3840), (1e6, 65535 if limit_bytes == 2 else 1_000_000)):
+        assert roboclaw.limit_speed_error(limit_pps) is bool(limit_bytes)
+        assert emulator.speed_error_limits == ([kept, kept] if limit_bytes else [0, 0])
+
+
 def test_driver_repeats_damaged_replies_and_counts_them() -> None:
     emulator = RoboclawEmulator()
     damages = iter([True, True, False])
@@ -244,5 +256,15 @@ def test_vendors_library_understands_the_emulator(pty_controller: PtyController)
         assert pty_controller.emulator.acceleration_pps2 == 4000.0
         assert vendor.SetTimeout(0x80, 0.5)
         assert pty_controller.emulator.timeout_s == pytest.approx(0.5)
+        emulator = pty_controller.emulator
+        emulator.power[:], emulator.currents_a[:] = (0.5, -1.0), (1.5, -0.02)
+        assert vendor.ReadPWMs(0x80) == (True, 16384, -32767)
+        assert vendor.ReadCurrents(0x80) == (True, 150, -2)
+        assert vendor.ReadPinFunctions(0x80) == (True, 0, 0, 0, 0, 0)
+        assert vendor.DutyAccelM1M2(0x80, 655359, 0, 655359, 0)
+        assert not emulator.closed_loop and emulator.target_speed_pps.tolist() == [0.0, 0.0]
+        emulator.limit_bytes = 2
+        assert vendor.SetSpeedErrorLimit(0x80, 3840, 3840)
+        assert vendor.GetSpeedErrorLimit(0x80) == (True, 3840, 3840)
     finally:
         vendor.close()

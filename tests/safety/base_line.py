@@ -19,8 +19,9 @@ from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.msg import Bool, twist_stamped
 from instant_ic.sim.contact import OccupancyMask
-from instant_ic.sim.roboclaw_emulator import MAX_SPEED_PPS, RoboclawEmulator
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
+from instant_ic.sim.simulation import drive
 from nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 
 TICK_S = 0.001
@@ -33,11 +34,11 @@ class Line:
     Attributes:
         forward: what becomes of bytes on their way to the controller.
         back: what becomes of replies.
+        late_s: seconds until the next reply arrives; replies arrive in order.
         opened: how often the port was opened.
         moved_s: when the tracks moved last, seconds.
         written: every frame and when it was written, seconds.
-        encoders: what each encoder counts of its motor's motion, (2,): 0 when dead, -1 when reversed.
-        stalled: whether the motors are held fast.
+        motors: motors of the robot.
     """
 
     def __init__(self, config: RoboclawConfig, ideal_motors: bool = False) -> None:
@@ -51,12 +52,13 @@ class Line:
         self.moved_s = 0.0
         self.forward: Callable[[bytes], bytes] = bytes
         self.back: Callable[[bytes], bytes] = bytes
+        self.late_s: Callable[[], float] = float
         self.opened = 0
         self.closed = True
         self.written: list[tuple[float, bytes]] = []
-        self.encoders = np.ones(2)
-        self.stalled = False
+        self.motors = self.robot.motors
         self._received = bytearray()
+        self._coming: list[tuple[float, bytes]] = []  # replies on their way, and when they arrive
 
     @property
     def time_s(self) -> float:
@@ -71,43 +73,42 @@ class Line:
     @property
     def travelled_m(self) -> float:
         """Of the faster track since the start."""
-        return float(np.abs(self.robot.encoder_pulses).max()) / 4000.0
+        return float(np.abs(self.motors.travelled).max())
 
     def advance(self, seconds: float) -> None:
         for _ in range(max(1, round(seconds / TICK_S))):
             self.emulator.advance(TICK_S)
             if not self.ideal_motors:
-                # The speed loop of a motor whose encoder does not count drives it as fast as it can.
-                wanted = self.emulator.setpoint_pps
-                wanted = np.where(self.encoders > 0, wanted, np.sign(wanted) * MAX_SPEED_PPS)
-                before = self.robot.encoder_pulses
-                self.robot.step(np.zeros(2) if self.stalled else wanted, TICK_S)
-                self.emulator.encoder += self.encoders * (self.robot.encoder_pulses - before)
-                self.emulator.speed_pps[:] = self.robot.motor_speed_pps
+                drive(self.robot, self.emulator, TICK_S)
             self.ticks += 1
             if self.speed > 0.0:
                 self.moved_s = self.time_s
 
     def brown_out(self) -> None:
-        """The controller restarts: motors off, counts and watchdog gone."""
-        self.emulator.encoder[:] = 0.0
-        self.emulator.target_speed_pps[:] = 0.0
-        self.emulator.setpoint_pps[:] = 0.0
-        self.emulator.timeout_s = 0.0
+        """The controller restarts: motors off, counts and settings gone."""
+        self.emulator.restart()
+        self.robot.motors.counted = np.zeros(2)
 
     # -- the port
 
     def open(self, config: RoboclawConfig) -> Line:
         self.opened += 1
         self.closed = False
-        self._received.clear()
+        self.reset_input_buffer()
         return self
 
     def write(self, data: bytes, /) -> int:
         assert not self.closed
         self.written.append((self.time_s, bytes(data)))
-        self._received += self.back(self.emulator.feed(self.forward(bytes(data))))
+        reply = self.back(self.emulator.feed(self.forward(bytes(data))))
+        before_s = self._coming[-1][0] if self._coming else 0.0
+        self._coming.append((max(before_s, self.time_s + self.late_s()), reply))
+        self._arrive()
         return len(data)
+
+    def _arrive(self) -> None:
+        while self._coming and self._coming[0][0] <= self.time_s:
+            self._received += self._coming.pop(0)[1]
 
     def read(self, size: int = 1, /) -> bytes:
         assert not self.closed
@@ -115,11 +116,13 @@ class Line:
             if len(self._received) >= size:
                 break
             self.advance(TICK_S)
+            self._arrive()
         taken = bytes(self._received[:size])
         del self._received[:size]
         return taken
 
     def reset_input_buffer(self) -> None:
+        self._arrive()
         self._received.clear()
 
     def close(self) -> None:

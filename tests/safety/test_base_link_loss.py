@@ -4,12 +4,13 @@ import random
 from collections.abc import Callable
 
 import pytest
-from base_line import Base
+from base_line import Base, Line
 
 from instant_ic.base.config import ControllerConfig, RoboclawConfig
-from instant_ic.base.protocol import Command
+from instant_ic.base.protocol import MOTORS_OFF, Command, write_frame
+from instant_ic.base.roboclaw import LinkError, Roboclaw
 
-STOP = bytes.fromhex("80 25 00 00 00 00 00 00 00 00 34 04")
+STOP = write_frame(0x80, Command.DUTY_ACCELERATION_BOTH, MOTORS_OFF)
 LOST: Callable[[bytes], bytes] = lambda data: b""  # noqa: E731 - a line, not a function
 
 
@@ -129,3 +130,41 @@ def test_unplugged_while_driving_the_watchdog_stops_the_tracks() -> None:
     base.line.forward = gone
     stand_s, _ = base.until_standing(0.5)
     assert stand_s <= 0.3 + 0.26
+
+
+def late_line(seed: int) -> tuple[Roboclaw, Line, list[int]]:
+    """A line at 38400 baud whose replies come up to 110 ms late and whose frames are lost now and then."""
+    line, rng, understood = Line(RoboclawConfig(port="memory", baud=38400), ideal_motors=True), random.Random(seed), []
+    roboclaw = Roboclaw(line.config, line.open, line.advance)
+    roboclaw.connect()
+
+    def forward(data: bytes) -> bytes:
+        if rng.random() < 0.2:
+            return b""
+        understood.append(data[1])
+        return data
+
+    line.forward, line.late_s = forward, lambda: rng.choice([0.002, 0.002, 0.11])
+    return roboclaw, line, understood
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_acknowledgement_110_ms_late_never_acknowledges_the_next_command(seed: int) -> None:
+    """The controller has understood each command that counts as acknowledged; a command to drive, or a stop for it."""
+    roboclaw, line, understood = late_line(seed)
+    acknowledged = 0
+    for number in range(30):
+        understood.clear()
+        moves = number % 3 != 0
+        try:
+            if moves:
+                roboclaw.drive([100.0, 100.0], 4000.0)
+            else:
+                roboclaw.set_watchdog(0.3)
+        except LinkError:
+            line.advance(0.3)
+            continue
+        acknowledged += 1
+        wanted = {Command.SPEED_ACCELERATION_BOTH, Command.DUTY_ACCELERATION_BOTH} if moves else {Command.SET_TIMEOUT}
+        assert wanted & set(understood)
+    assert acknowledged > 5

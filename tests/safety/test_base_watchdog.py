@@ -48,13 +48,16 @@ def test_counts_that_jump_to_zero_force_a_reconnect_at_once(driven_s: float) -> 
     base.run(driven_s, 0.4)
     poses = [state.odometry.pose[0] for state in base.states if state.odometry is not None]
     base.line.brown_out()
+    base.line.motors.blocked[:] = True  # so that the counts are still zero when they are read
     lost_s = base.line.time_s
     while base.line.opened < 2 and base.line.time_s < lost_s + 10.0:
         base.run(0.01, 0.4)
-    assert base.line.time_s - lost_s <= 3.0 / RATE_HZ + 0.03
+    stops_s = [at_s for at_s, frame in base.line.written if frame[1] == Command.DUTY_ACCELERATION_BOTH]
+    assert min(at_s for at_s in stops_s if at_s > lost_s) - lost_s <= 3.0 / RATE_HZ + 0.03
+    base.line.motors.blocked[:] = False
     assert base.line.emulator.timeout_s == pytest.approx(0.3)
     restarted = [frame[1] for at_s, frame in base.line.written if at_s >= lost_s]
-    stops = restarted.index(Command.SPEED_BOTH)
+    stops = restarted.index(Command.DUTY_ACCELERATION_BOTH)
     assert stops < restarted.index(Command.SET_TIMEOUT), "stopped before it is set up"
     base.run(0.2, 0.4)
     after = [state.odometry.pose[0] for state in base.states if state.odometry is not None]
@@ -64,9 +67,8 @@ def test_counts_that_jump_to_zero_force_a_reconnect_at_once(driven_s: float) -> 
 
 def test_counts_of_zero_on_the_way_are_no_restart() -> None:
     base = Base()
-    base.run(0.2)
-    base.line.emulator.encoder -= 300.0  # the counts begin at -300 and pass zero
-    base.run(0.2)
+    base.line.motors.counted = base.line.motors.counted - 0.075  # the counts begin at -300 and pass zero
+    base.run(0.4)
     base.run(2.0, 0.4)
     assert base.line.opened == 1
 

@@ -1,0 +1,110 @@
+"""Track motors under the speed loops of the controller, with their power, current and encoders.
+
+A healthy loop is tuned: the track follows its set point with the lag and the acceleration of ``RobotConfig``. The loop
+regulates what the encoder counts. What the encoder does not count of that motion is an error, which the loop integrates
+(wind-up) until the power saturates: a dead encoder lets the track run away, a reversed one drives it away at once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from instant_ic.sim.robot import RobotConfig
+
+FloatArray = npt.NDArray[np.float64]
+
+FULL_SPEED_M_S = 1.0
+"""Speed of a track at full power and nominal voltage, without load."""
+NOMINAL_V = 24.0
+STALL_A = 30.0
+"""Current of a blocked motor at full power and nominal voltage."""
+_NOISE_A = 0.05
+_STANDS_M_S = 1e-3
+
+
+class TrackMotors:
+    """Motors of the left and the right track.
+
+    Args:
+        config: lag, acceleration and friction of a track.
+        seed: seed of the noise of the currents.
+
+    Attributes:
+        speeds: track speeds, m/s, (2,).
+        travelled: distances of the tracks since the start, metres, (2,).
+        counted: distances that the encoders counted, metres, (2,).
+        power: share of full power that each motor gets, -1 to 1, (2,).
+        currents_a: currents that the controller measures, amperes, (2,).
+        encoders: what each encoder counts of its track's motion, (2,): 1 healthy, 0 dead, -1 reversed.
+        blocked: whether each track is held fast, (2,).
+        load: power that each track needs beyond that of a free run, (2,).
+        stiction: power below which a standing track does not start, (2,).
+        battery_v: voltage of the main battery.
+        gain, integral_gain: of the speed loop; m/s per m/s, and m/s per metre.
+    """
+
+    def __init__(self, config: RobotConfig, seed: int = 0) -> None:
+        self.config = config
+        self.speeds: FloatArray = np.zeros(2)
+        self.travelled: FloatArray = np.zeros(2)
+        self.counted: FloatArray = np.zeros(2)
+        self.power: FloatArray = np.zeros(2)
+        self.currents_a: FloatArray = np.zeros(2)
+        self.encoders: FloatArray = np.ones(2)
+        self.blocked: npt.NDArray[np.bool_] = np.zeros(2, bool)
+        self.load: FloatArray = np.zeros(2)
+        self.stiction: FloatArray = np.zeros(2)
+        self.battery_v = NOMINAL_V
+        self.gain, self.integral_gain = 2.0, 30.0
+        self._healthy: FloatArray = np.zeros(2)  # speeds of healthy tracks without load
+        self._integral: FloatArray = np.zeros(2)
+        self._rng = np.random.default_rng([37, seed])
+
+    def step(self, setpoint_m_s: FloatArray, dt_s: float, closed_loop: bool = True) -> FloatArray:
+        """Advance the motors.
+
+        Args:
+            setpoint_m_s: set points of the speed loops (2,), or with ``closed_loop`` False the speeds that the power
+                gives without load.
+            dt_s: seconds.
+
+        Returns:
+            Mean speeds of the tracks during the step, m/s, (2,).
+        """
+        top = FULL_SPEED_M_S * self.battery_v / NOMINAL_V
+        before, driven = self.speeds, setpoint_m_s
+        if closed_loop:
+            self._healthy = self._follow(self._healthy, setpoint_m_s, dt_s)
+            error = self._healthy - self.encoders * self.speeds
+            self._integral = np.clip(self._integral + self.integral_gain * error * dt_s, -top, top)
+            driven = setpoint_m_s + self.gain * error + self._integral
+        driven = np.clip(driven, -top, top)
+        moving = np.abs(self.speeds) > _STANDS_M_S
+        resisted = driven - np.sign(np.where(moving, self.speeds, driven)) * np.minimum(self.load, np.abs(driven))
+        stuck = self.blocked | (~moving & (np.abs(driven) < self.stiction))
+        self.speeds = np.where(stuck, 0.0, self._follow(before, np.where(stuck, 0.0, resisted), dt_s))
+        if not closed_loop:
+            self._healthy, self._integral = self.speeds, np.zeros(2)
+        mean = 0.5 * (before + self.speeds)
+        self.travelled = self.travelled + mean * dt_s
+        self.counted = self.counted + self.encoders * mean * dt_s
+        friction = self.config.rolling_resistance * self.config.motor_lag_s
+        self.power = np.clip((driven + np.sign(driven) * friction) / top, -1.0, 1.0)
+        stalled = self.power * self.battery_v / NOMINAL_V - self.speeds / FULL_SPEED_M_S
+        noise = _NOISE_A * self._rng.standard_normal(2)
+        self.currents_a = np.where(self.power == 0.0, 0.0, STALL_A * stalled + noise)
+        return mean
+
+    def _follow(self, speeds: FloatArray, wanted: FloatArray, dt_s: float) -> FloatArray:
+        """Speeds after ``dt_s`` of tracks that follow ``wanted``; at zero, friction ends the motion."""
+        config = self.config
+        most = config.track_acceleration * dt_s
+        follow = (wanted - speeds) * (1 - math.exp(-dt_s / config.motor_lag_s))
+        followed = speeds + np.clip(follow, -most, most)
+        braked = np.sign(followed) * np.maximum(np.abs(followed) - config.rolling_resistance * dt_s, 0.0)
+        return np.where(wanted == 0, braked, followed)

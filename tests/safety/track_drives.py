@@ -1,0 +1,146 @@
+"""Random drives of two tracks under their speed loops, watched as the base does it, in simulated time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from instant_ic.base.config import LimitsConfig, SkidSteerConfig
+from instant_ic.base.following import TrackWatch
+from instant_ic.base.kinematics import SkidSteer
+from instant_ic.base.limits import TwistLimiter
+from instant_ic.sim.motors import TrackMotors
+from instant_ic.sim.robot import RobotConfig
+
+TICK_S = 0.005
+PERIOD_S = 1.0 / 30.0
+PULSES = 4000.0
+LIMITS, GEOMETRY = LimitsConfig(), SkidSteerConfig()
+HALF_WIDTH_M = 0.5 * GEOMETRY.effective_width
+FASTEST_M_S = LIMITS.max_linear_m_s + HALF_WIDTH_M * LIMITS.max_angular_rad_s
+RAMP_M_S2 = LIMITS.max_linear_accel_m_s2 + HALF_WIDTH_M * LIMITS.max_angular_accel_rad_s2
+INSTANT = 1e6
+"""Gain of a speed loop that saturates at any error: the worst case of a runaway."""
+
+
+class Drive:
+    """Tracks with random motors, load, stiction and battery.
+
+    Args:
+        seed: of everything random.
+        late: share of steps that come up to 0.25 s late.
+        pauses: whether the simulation pauses for up to 0.4 s now and then, as on a busy machine.
+    """
+
+    def __init__(self, seed: int, late: float = 0.0, pauses: bool = False) -> None:
+        self.rng = rng = np.random.default_rng([53, seed])
+        self.late, self.pauses = late, pauses
+        self.motors = motors = TrackMotors(RobotConfig(motor_lag_s=rng.uniform(0.03, 0.12)), seed)
+        motors.battery_v = rng.uniform(20.0, 25.2)
+        motors.gain, motors.integral_gain = rng.uniform(1.0, 3.0), float(np.exp(rng.uniform(np.log(5), np.log(60))))
+        motors.load = rng.uniform(0.0, 0.25, 2) * rng.integers(0, 2)
+        motors.stiction = motors.load + rng.uniform(0.0, 0.12, 2) * rng.integers(0, 2)
+        self.watch = TrackWatch(FASTEST_M_S, simulated=pauses)
+        self.limiter, self.kinematics = TwistLimiter(LIMITS), SkidSteer(GEOMETRY)
+        self.wanted, self.setpoint = np.zeros(2), np.zeros(2)
+        self.on = False
+        self.time_s = self.read_s = 0.0
+        self.counts = np.zeros(2)
+        self.frozen_s = 0.0
+
+    def advance(self, seconds: float) -> None:
+        """Move the tracks; a paused simulation moves later, 0.25 s at most at once."""
+        self.time_s += seconds
+        if self.pauses:
+            self.frozen_s += seconds
+            if self.rng.random() > 0.97:
+                self.pause_s = self.rng.uniform(0.1, 0.4)
+            if self.frozen_s < getattr(self, "pause_s", 0.0):
+                return
+            seconds, self.frozen_s, self.pause_s = min(self.frozen_s, 0.25), 0.0, 0.0
+        for _ in range(max(1, round(seconds / TICK_S))):
+            step = RAMP_M_S2 * TICK_S
+            self.setpoint = self.setpoint + np.clip(self.wanted - self.setpoint, -step, step)
+            self.motors.step(self.setpoint if self.on else np.zeros(2), TICK_S, closed_loop=self.on)
+
+    def step(self, v: float, w: float, stop: bool = False) -> str:
+        """A control cycle; returns the fault that the watch finds."""
+        dt_s = PERIOD_S + (self.rng.uniform(0.0, 0.25) if self.rng.random() < self.late else 0.0)
+        self.advance(dt_s)
+        before_v, before_w = self.limiter.v, self.limiter.w
+        v, w = self.limiter.step(v, w, dt_s)
+        if stop or not (v or w or before_v or before_w):
+            self.limiter.reset()
+            self.watch.reset()
+            self.on, self.wanted, self.setpoint = False, np.zeros(2), np.zeros(2)
+        else:
+            self.on, self.wanted = True, self.kinematics.tracks_from_twist(v, w)
+        counts, before_s = np.floor(self.motors.counted * PULSES) / PULSES, self.read_s
+        self.read_s = self.time_s + self.rng.uniform(0.0, 0.025)  # as the base stamps it
+        self.advance(TICK_S)  # power and currents are read after the counts
+        self.watch.commanded(self.wanted, dt_s)
+        moved, self.counts = counts - self.counts, counts
+        power = np.round(self.motors.power * 32767) / 32767
+        return self.watch.judge(moved, power, np.round(self.motors.currents_a, 2), self.read_s - before_s)
+
+    def command(self, least: float = 0.005) -> tuple[float, float]:
+        """A random command: straight, turning on the spot, or both."""
+        speed = float(np.exp(self.rng.uniform(np.log(least), np.log(0.5)))) * self.rng.choice([-1.0, 1.0])
+        kind = self.rng.integers(0, 3)
+        turn = float(np.exp(self.rng.uniform(np.log(least / HALF_WIDTH_M), 0.0))) * self.rng.choice([-1.0, 1.0])
+        return (0.0 if kind == 1 else speed), (0.0 if kind == 0 else turn)
+
+
+def healthy(seed: int, late: float, pauses: bool = False, commands: int = 12) -> str:
+    """Drive healthy tracks by random commands; returns the first fault found, with its time."""
+    drive = Drive(seed, late, pauses)
+    for _ in range(commands):
+        v, w = drive.command()
+        stop = drive.rng.random() < 0.1
+        if drive.rng.random() < 0.2:
+            v = w = 0.0
+        for _ in range(drive.rng.integers(3, 90)):
+            if fault := drive.step(v, w, stop):
+                return f"seed {seed}, {drive.time_s:.2f} s, {v:.3f} m/s, {w:.3f} rad/s: {fault}"
+    return ""
+
+
+def runaway(seed: int, pauses: bool = False) -> tuple[float, float, float, float]:
+    """Let one or both encoders die or turn round in a drive.
+
+    Returns:
+        Seconds and metres from the fault until both tracks stand; seconds since a track was 0.1 m/s faster than its
+        command; largest speed, m/s.
+    """
+    drive = Drive(seed, 0.0, pauses)
+    rng, motors = drive.rng, drive.motors
+    v, w = drive.command()
+    for _ in range(rng.integers(1, 90)):
+        drive.step(v, w)
+    rng.random()
+    for _ in range(rng.integers(0, 7)):
+        drive.advance(TICK_S)
+    which = [[0], [1], [0, 1]][rng.integers(0, 3)]
+    # Of two tracks in a turn one may hardly be commanded: the requirement begins at 0.005 m/s.
+    which = [one for one in which if abs(drive.kinematics.tracks_from_twist(v, w)[one]) >= 0.005] or [
+        int(np.argmax(np.abs(drive.kinematics.tracks_from_twist(v, w))))
+    ]
+    motors.encoders[which] = rng.choice([0.0, -1.0])
+    if rng.random() < 0.5:
+        motors.gain = INSTANT
+    start_s, start_m = drive.time_s, motors.travelled.copy()
+    away_s, fastest, fault = None, 0.0, ""
+    while drive.time_s < start_s + 10.0:
+        if not fault:
+            fault = drive.step(v, w)
+        else:
+            drive.on = False
+            drive.advance(TICK_S)
+        speed = np.abs(motors.speeds).max()
+        fastest = max(fastest, float(speed))
+        if away_s is None and (np.abs(motors.speeds) > np.abs(drive.wanted) + 0.1).any():
+            away_s = drive.time_s
+        if fault and speed == 0.0:
+            distance = float(np.abs(motors.travelled - start_m).max())
+            since_s = 0.0 if away_s is None else drive.time_s - away_s
+            return drive.time_s - start_s, distance, since_s, fastest
+    return np.inf, np.inf, np.inf, fastest
