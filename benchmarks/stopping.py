@@ -32,6 +32,7 @@ import shutil
 import signal
 import socket
 import statistics
+import struct
 import sys
 import tempfile
 import threading
@@ -47,7 +48,8 @@ import numpy as np
 from reporting import parser_of, report
 
 from instant_ic import pace
-from instant_ic.base.protocol import Command, encode_reply, read_request
+from instant_ic.base.config import SkidSteerConfig
+from instant_ic.base.protocol import ESTOP_BITS, Command, encode_reply, read_request, write_frame
 from instant_ic.bus import LATCHED, registry
 from instant_ic.closing import Closing
 from instant_ic.console.client import ConsoleClient
@@ -58,9 +60,10 @@ from instant_ic.experiments.stack import Stack, StackError, free_port
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState, message_type, pose2_from_message, stamp_ns, twist_values
 from instant_ic.paths import share_dir
-from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
+from instant_ic.sim.roboclaw_emulator import MAX_SPEED_PPS, RoboclawEmulator
 
 SPEED_M_S = 0.38
+HALF_WIDTH_M = 0.5 * SkidSteerConfig().effective_width
 STANDS_M_S = 0.01
 STANDS_S = 0.3
 """Seconds below the limit that count as standing."""
@@ -102,7 +105,7 @@ LAUNCH = """launch:
 
 
 class Truth(NamedTuple):
-    """The robot's true motion at one moment of the stack's time."""
+    """The robot's true motion at one moment of the stack's time; the speed is that of its faster track."""
 
     at_ns: int
     x: float
@@ -146,7 +149,9 @@ class SerialRelay(Closing):
         self.mute = False
         """True: the controller's replies are dropped."""
         self.dead = False
-        """True: the left motor's count stays as it is."""
+        """True: the left motor's count stays as it is, and its speed loop drives it as fast as it can."""
+        self.pressed = False
+        """True: the status reports a pressed stop button, which does not latch in the controller."""
         self._request, self._count = b"", bytes(4)
         self.speeds: list[tuple[int, float]] = []
         """Each request that changes the commanded speed: machine time in ns, encoder counts per second."""
@@ -202,11 +207,14 @@ class SerialRelay(Closing):
             self._listen(data)
             self._request = data
             if self._far >= 0:
-                os.write(self._far, data)
+                os.write(self._far, self._run_away(data) if self.dead else data)
         if self._far in ready:
             data = os.read(self._far, 4096)
             if self._request == read_request(self._listener.address, Command.READ_ENCODERS) and len(data) == 10:
                 data = self._with_count(data)
+            if self._request == read_request(self._listener.address, Command.READ_STATUS) and len(data) == 6:
+                status = int.from_bytes(data[:4], "big") | self.pressed * ESTOP_BITS[4]
+                data = encode_reply(self._listener.address, Command.READ_STATUS, status.to_bytes(4, "big"))
             if self._master >= 0 and not self.mute:
                 os.write(self._master, data)
 
@@ -215,6 +223,14 @@ class SerialRelay(Closing):
         if not self.dead:
             self._count = reply[:4]
         return encode_reply(self._listener.address, Command.READ_ENCODERS, self._count + reply[4:8])
+
+    def _run_away(self, data: bytes) -> bytes:
+        """Frame of a command to drive, with the left motor at full speed in its direction, without a ramp."""
+        if len(data) != 16 or data[1] != Command.SPEED_ACCELERATION_BOTH:
+            return data
+        _, left, right = struct.unpack(">Iii", data[2:-2])
+        full = round(math.copysign(MAX_SPEED_PPS, left)) if left else 0
+        return write_frame(data[0], data[1], struct.pack(">Iii", 0, full, right))
 
     def _listen(self, data: bytes) -> None:
         self._listener.feed(data)
@@ -248,11 +264,12 @@ class Rig:
 
     def _on_truth(self, message: Any) -> None:
         x, y, yaw = pose2_from_message(message)
-        linear = message.twist.twist.linear
-        self.truth.append(Truth(stamp_ns(message), x, y, yaw, math.hypot(linear.x, linear.y)))
+        linear, turn = message.twist.twist.linear, abs(message.twist.twist.angular.z)
+        self.truth.append(Truth(stamp_ns(message), x, y, yaw, math.hypot(linear.x, linear.y) + HALF_WIDTH_M * turn))
 
     def _on_command(self, message: Any) -> None:
-        self.commands.append((stamp_ns(message), abs(twist_values(message)[0])))
+        v, w = twist_values(message)
+        self.commands.append((stamp_ns(message), abs(v) + HALF_WIDTH_M * abs(w)))
 
     def _on_state(self, message: Any) -> None:
         self.state = message
@@ -284,12 +301,20 @@ class Fault(NamedTuple):
     """A fault: functions that cause it, end it, and prepare the drive, given the rig and the operator's page.
 
     Most end by themselves: the launcher restarts a killed process, and each drive has its own page.
+
+    Attributes:
+        name: row of the table.
+        breaks, mends: cause and end it.
+        prepares: prepares the drive.
+        speed, turn: motion before it, m/s and rad/s.
     """
 
     name: str
     breaks: Act
     mends: Act = lambda rig, page: None
     prepares: Act = lambda rig, page: None
+    speed: float = SPEED_M_S
+    turn: float = 0.0
 
 
 async def act(does: Act, rig: Rig, page: ConsoleClient) -> None:
@@ -343,9 +368,19 @@ async def release_estop(rig: Rig, page: ConsoleClient) -> None:
     await page.release_estop()
 
 
+def kill_encoder(rig: Rig, page: ConsoleClient) -> None:
+    rig.serial.dead = True
+
+
 async def mend_encoder(rig: Rig, page: ConsoleClient) -> None:
     rig.serial.dead = False
     await release_estop(rig, page)
+
+
+async def press_shortly(rig: Rig, page: ConsoleClient) -> None:
+    rig.serial.pressed = True
+    await asyncio.sleep(rig.pace.wait_s(0.06))
+    rig.serial.pressed = False
 
 
 def silence_page(rig: Rig, page: ConsoleClient) -> None:
@@ -365,7 +400,12 @@ FAULTS = [
     *(fault for node in PROCESSES for fault in process_faults(node)),
     second_console_fault(),
     Fault("emergency stop pressed", lambda rig, page: page.estop(), release_estop),
-    Fault("encoder of a track dead", lambda rig, page: setattr(rig.serial, "dead", True), mend_encoder),
+    *(
+        Fault(f"encoder of a track dead at {speed:g} m/s", kill_encoder, mend_encoder, speed=speed)
+        for speed in (0.01, 0.02, 0.05, 0.1, SPEED_M_S)
+    ),
+    Fault("encoder of a track dead while turning", kill_encoder, mend_encoder, speed=0.0, turn=0.4),
+    Fault("robot's stop button pressed for 0.06 s", press_shortly, release_estop),
     Fault("key let go (no loss; soft ramp)", lambda rig, page: page.stop()),
     Fault("page closed", lambda rig, page: page.close()),
     Fault("page silent", silence_page),
@@ -419,8 +459,10 @@ async def driver(rig: Rig) -> AsyncIterator[ConsoleClient]:
             await asyncio.wait_for(page.close(), 5.0)
 
 
-async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> float:
-    """Drive on the corridor's centre line until the speed has been steady for ``wait_s``; return that speed, m/s."""
+async def at_speed(rig: Rig, until: Any, page: ConsoleClient, fault: Fault, wait_s: float) -> float:
+    """Drive on the corridor's centre line, or turn, until the speed has been steady for ``wait_s``; return it, m/s."""
+    wanted = fault.speed + HALF_WIDTH_M * fault.turn
+    reached, kept = (0.97, 0.9) if wanted == SPEED_M_S else (0.85, 0.7)  # slip shows more when slow or turning
     for _ in range(_TRIES):
         await until(rig.ready, 90, "robot that can be driven")
         sign = 1.0 if rig.truth[-1].x < 5.0 else -1.0
@@ -428,12 +470,13 @@ async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> 
         def fast(sign: float = sign) -> bool:
             truth = rig.truth[-1]
             # Back to the centre line, as far as the drive allows.
-            page.drive(sign * SPEED_M_S, max(-0.3, min(0.3, -truth.yaw - sign * 0.5 * truth.y)))
-            return truth.speed > 0.97 * SPEED_M_S
+            steer = max(-0.3, min(0.3, -truth.yaw - sign * 0.5 * truth.y)) if wanted == SPEED_M_S else fault.turn
+            page.drive(sign * fault.speed, steer)
+            return truth.speed > reached * wanted
 
         try:
             await until(fast, 5, "full speed")
-            page.drive(sign * SPEED_M_S, 0.0)
+            page.drive(sign * fault.speed, fault.turn)
             began_ns = rig.pace.now_ns()
             await asyncio.sleep(rig.pace.wait_s(wait_s))
         except StackError:  # a sensor was late on a busy machine: release and drive again, as an operator does
@@ -441,7 +484,7 @@ async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> 
             continue
         steady = [truth.speed for truth in rig.truth if truth.at_ns > began_ns]
         sent = [speed for at_ns, speed in rig.commands if at_ns > began_ns]
-        if steady and sent and min(*steady, *sent) > 0.9 * SPEED_M_S:
+        if steady and sent and min(*steady, *sent) > kept * wanted:
             return statistics.median(steady)
         await page.stop()
     raise StackError(f"no steady speed in {_TRIES} drives:\n{rig.stack.log_tail()}")
@@ -450,7 +493,7 @@ async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> 
 async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[str, Any]:
     async with driver(rig) as page:
         await act(fault.prepares, rig, page)
-        cruise = await at_speed(rig, until, page, 0.7 + rng.uniform(0.0, 0.1))  # not in phase with any timer
+        cruise = await at_speed(rig, until, page, fault, 0.7 + rng.uniform(0.0, 0.1))  # not in phase with any timer
         lost_ns = rig.pace.now_ns()
         await act(fault.breaks, rig, page)
         try:

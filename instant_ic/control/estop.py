@@ -51,7 +51,7 @@ class EstopLatch:
         """Whether the emergency stop is latched, by whom, and how to release it."""
         if not self.stopped:
             return Diagnosis("emergency stop", Level.OK, "released")
-        by = "a button on the robot" if self.button else self.publisher
+        by = "the robot (its button, or a fault of its motor controller)" if self.button else self.publisher
         return Diagnosis("emergency stop", Level.WARN, f"latched by {by}: release it on the operator's page")
 
     def hear(self, pressed: bool, publisher: str, publish_ns: int, received_ns: int, holder: str | None = None) -> str:
@@ -75,7 +75,8 @@ class EstopLatch:
         if not self.stopped:
             return ""
         if self.button:
-            return "the button on the robot is pressed. Release the button, then release the stop again."
+            cause = "the button on the robot is pressed, or its motor controller reports a fault"
+            return f"{cause}. Release the button or remove the fault, then release the stop again."
         advice = "If a clock was set, press stop and release again."
         again = old and self.again  # both were judged before this node started
         if holder is not None and not again and (why := may_release_estop(publisher, holder)):
