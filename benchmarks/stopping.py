@@ -38,6 +38,7 @@ import tempfile
 import threading
 import time
 import tty
+from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,6 +71,8 @@ STANDS_S = 0.3
 LONGEST_S = 4.0
 AFTER_S = 1.0
 _TRIES = 5
+_REVOLUTION = 76
+"""Packets of a revolution of the LiDAR."""
 PROCESSES = ("arbiter", "crawler_base", "console", "grid_slam", "vlp16_driver", "theta_camera")
 LAUNCH = """launch:
 - node:
@@ -115,10 +118,14 @@ class Truth(NamedTuple):
 
 
 class PacketRelay(Closing):
-    """Forwards UDP packets between two ports of this machine, unless it is cut."""
+    """Forwards UDP packets between two ports of this machine, unless it is cut, or repeats the last revolution."""
 
     def __init__(self, source: int, target: int) -> None:
         self.cut = False
+        self.repeats = ""
+        """"copies": the last revolution is sent again, with new stamps; "noise": with noise of 2 mm too."""
+        self._recent: deque[bytes] = deque(maxlen=_REVOLUTION)
+        self._rng = np.random.default_rng(0)
         self._target = ("127.0.0.1", target)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", source))
@@ -132,9 +139,21 @@ class PacketRelay(Closing):
             try:
                 data = self._socket.recv(2048)
                 if not self.cut:
-                    self._socket.sendto(data, self._target)
+                    self._socket.sendto(self._repeated(data), self._target)
             except (TimeoutError, ConnectionRefusedError):  # no sender, or the driver is not running
                 continue
+
+    def _repeated(self, data: bytes) -> bytes:
+        """A packet itself, or one of the last revolution with its stamp."""
+        if not self.repeats:
+            self._recent.append(data)
+            return data
+        old = np.frombuffer(self._recent[0], np.uint8).copy()
+        self._recent.rotate(-1)
+        if self.repeats == "noise":
+            returns = old[:1200].reshape(12, 100)[:, 4:].reshape(12, 32, 3)
+            returns[..., 0] ^= self._rng.integers(0, 2, (12, 32), np.uint8) & (returns[..., :2].max(axis=2) > 1)
+        return old[:1200].tobytes() + data[1200:1204] + old[1204:].tobytes()
 
     def close(self) -> None:
         self._ends.set()
@@ -392,6 +411,14 @@ LINKS: dict[str, tuple[Callable[[Rig], None], Callable[[Rig], None]]] = {
     "page link cut": (lambda rig: rig.page_link.cut(), lambda rig: rig.page_link.mend()),
     "camera link cut": (lambda rig: rig.camera_link.cut(), lambda rig: rig.camera_link.mend()),
     "LiDAR packets cease": (lambda r: setattr(r.packets, "cut", True), lambda r: setattr(r.packets, "cut", False)),
+    "LiDAR repeats a revolution": (
+        lambda rig: setattr(rig.packets, "repeats", "copies"),
+        lambda rig: setattr(rig.packets, "repeats", ""),
+    ),
+    "contradiction (tracks turn, LiDAR sees no motion)": (
+        lambda rig: setattr(rig.packets, "repeats", "noise"),
+        lambda rig: setattr(rig.packets, "repeats", ""),
+    ),
     "serial replies lost": (lambda r: setattr(r.serial, "mute", True), lambda r: setattr(r.serial, "mute", False)),
     "serial cable pulled": (lambda rig: rig.serial.pull(), lambda rig: rig.serial.plug()),
 }
