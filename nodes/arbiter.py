@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from instant_ic import msg
-from instant_ic.bus import LATCHED, SENSOR, Latest, Node, main
+from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
@@ -40,6 +40,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         if self.latch.pressed:
             self.log.warning("emergency stop: %s", self.latch.why or "still pressed from before this start")
         self.times = StepTimes()
+        self.warn_of_protection()
         self.cmd_vel = self.publisher("/cmd_vel", msg.TwistStamped, qos=SENSOR)
         self.state = self.publisher("/ic/state", msg.ControlState, qos=LATCHED)
         self.subgoal = self.publisher("/ic/subgoal", msg.PoseStamped, qos=SENSOR)
@@ -74,6 +75,15 @@ class ArbiterNode(Node[ArbiterConfig]):
     def reconfigure(self, config: ArbiterConfig) -> None:
         self.arbiter.reconfigure(config)
         super().reconfigure(config)
+        self.warn_of_protection()
+
+    def warn_of_protection(self) -> None:
+        """Warn as long as a protection is off."""
+        if off := self.config.unprotected_by:
+            text = "the robot does not stop before an obstacle. Switch it on and restart with unprotected: false"
+            self.diagnose("protection", WARN, f"Protection is off ({', '.join(off)}): {text}")
+        else:
+            self.diagnose("protection", OK, "on")
 
     def teardown(self) -> None:
         if hasattr(self, "cmd_vel"):

@@ -45,6 +45,9 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
         self.diagnose("link", WARN, f"connecting to {config.roboclaw.port}")
+        if config.unprotected_by:
+            text = f"Protection is off ({', '.join(config.unprotected_by)}): commands of any node or age move the robot"
+            self.diagnose("protection", WARN, text)
         self.diagnose_all(self.latch.diagnosis, self.gate.publishers, self.report.tracks())
         self.timer(1.0, self.watch)
         loop_class = SteppedController if self.lockstep else ControllerThread

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from instant_ic import msg
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
-from instant_ic.config.ranges import Checked, Positive
+from instant_ic.config.ranges import Checked, Plausible
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
@@ -32,11 +32,11 @@ class NavigatorConfig(Checked):
         state_timeout_s: s; with an older /ic/state nothing is published.
     """
 
-    controller_frequency: Positive = 20.0
-    replan_period_s: Positive = 0.2
-    subgoal_timeout_s: Positive = 0.5
-    costmap_timeout_s: Positive = 1.0
-    state_timeout_s: Positive = 0.3
+    controller_frequency: Annotated[float, Plausible(2, 200)] = 20.0
+    replan_period_s: Annotated[float, Plausible(0.02, 10)] = 0.2
+    subgoal_timeout_s: Annotated[float, Plausible(0.05, 5)] = 0.5
+    costmap_timeout_s: Annotated[float, Plausible(0.05, 10)] = 1.0
+    state_timeout_s: Annotated[float, Plausible(0.05, 2)] = 0.3
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     planner: PlannerConfig = field(default_factory=PlannerConfig)

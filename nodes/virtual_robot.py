@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from instant_ic import msg
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
-from instant_ic.config.ranges import Checked, Positive
+from instant_ic.config.ranges import Checked, Plausible
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.states import VbotAction
@@ -26,9 +27,9 @@ class VirtualRobotConfig(Checked):
         wall_min_length_m: m; as for the arbiter.
     """
 
-    rate_hz: Positive = 20.0
-    state_timeout_s: Positive = 0.5
-    wall_min_length_m: Positive = 1.5
+    rate_hz: Annotated[float, Plausible(2, 200)] = 20.0
+    state_timeout_s: Annotated[float, Plausible(0.05, 2)] = 0.5
+    wall_min_length_m: Annotated[float, Plausible(0.2, 20)] = 1.5
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     vbot: VbotConfig = field(default_factory=VbotConfig)

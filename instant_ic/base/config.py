@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from instant_ic.base.protocol import BAUD_RATES, CYCLE_BYTES, PINS
-from instant_ic.config.ranges import Checked, NotNegativeInt, Positive, Range, check_ranges, require
+from instant_ic.config.ranges import Checked, Plausible, Range, check_ranges, require, require_protection
 from instant_ic.config.robot import MotionLimits
 
 
@@ -23,10 +23,10 @@ class SkidSteerConfig(Checked):
         invert_right: whether the right motor's positive direction drives backwards.
     """
 
-    track_width: Positive = 0.40
+    track_width: Annotated[float, Plausible(0.05, 3)] = 0.40
     track_width_multiplier: Annotated[float, Range(0.5, 5)] = 1.5
     x_icr: Annotated[float, Range(-10, 10)] = 0.0
-    pulses_per_metre: Positive = 4000.0
+    pulses_per_metre: Annotated[float, Plausible(50, 1000000)] = 4000.0
     left_motor: Annotated[int, Range(1, 2)] = 1
     invert_left: bool = False
     invert_right: bool = False
@@ -45,7 +45,7 @@ class LimitsConfig(MotionLimits):
         hard_decel_m_s2: m/s²; deceleration of each track when commands stop or a command asks for a hard stop.
     """
 
-    hard_decel_m_s2: Positive = 4.0
+    hard_decel_m_s2: Annotated[float, Plausible(0.5, 20)] = 4.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,8 +71,8 @@ class RoboclawConfig:
     port: str = "/dev/ttyACM0"
     baud: Annotated[int, Range(2400, 460800)] = 115200
     address: Annotated[int, Range(128, 135)] = 0x80
-    reply_timeout_s: Positive = 0.1
-    retries: NotNegativeInt = 2
+    reply_timeout_s: Annotated[float, Plausible(0.005, 2)] = 0.1
+    retries: Annotated[int, Plausible(0, 5)] = 2
     watchdog_s: Annotated[float, Range(0.1, 1)] = 0.3
     estop_pin: str = "S3"
 
@@ -99,8 +99,8 @@ class ControllerConfig(Checked):
     roboclaw: RoboclawConfig = field(default_factory=RoboclawConfig)
     geometry: SkidSteerConfig = field(default_factory=SkidSteerConfig)
     limits: LimitsConfig = field(default_factory=LimitsConfig)
-    command_timeout_s: Annotated[float, Range(above=0, high=2)] = 0.25
-    health_period_s: Positive = 0.25
+    command_timeout_s: Annotated[float, Plausible(0.05, 1)] = 0.25
+    health_period_s: Annotated[float, Plausible(0.02, 1)] = 0.25
 
 
 _LEAST_PERIODS = 3
@@ -122,20 +122,26 @@ class CrawlerBaseConfig(ControllerConfig):
         recent_s: seconds for which repeats, dropped commands and impossible readings remain a warning.
         command_source: name of the only node whose commands are obeyed; empty: any node.
         accept_unstamped: also obey commands without a stamp, with their arrival time as stamp.
+        unprotected: allows an empty command_source and accept_unstamped, with a permanent warning.
     """
 
     rate_hz: Annotated[float, Range(5, 200)] = 30.0
     odom_frame: str = "odom"
     base_frame: str = "base_link"
-    battery_full_v: Positive = 25.2
-    battery_empty_v: Positive = 21.0
-    recent_s: Positive = 10.0
+    battery_full_v: Annotated[float, Plausible(3, 100)] = 25.2
+    battery_empty_v: Annotated[float, Plausible(3, 100)] = 21.0
+    recent_s: Annotated[float, Plausible(1, 600)] = 10.0
     command_source: str = "arbiter"
     accept_unstamped: bool = False
+    unprotected: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_ranges(self)
+        rule = f"at most roboclaw.watchdog_s = {self.roboclaw.watchdog_s:g} s, when the controller stops by itself"
+        require(self, "command_timeout_s", self.command_timeout_s <= self.roboclaw.watchdog_s, rule)
+        if self.roboclaw.reply_timeout_s > self.roboclaw.watchdog_s:
+            raise ValueError(f"roboclaw.reply_timeout_s must be {rule} (got {self.roboclaw.reply_timeout_s})")
+        require_protection(self.unprotected, self.unprotected_by, "commands of any node or of any age move the robot")
         if not 0.0 < self.battery_empty_v < self.battery_full_v:
             raise ValueError(
                 "battery_empty_v must be > 0 and below battery_full_v "
@@ -152,3 +158,9 @@ class CrawlerBaseConfig(ControllerConfig):
                 f"roboclaw.watchdog_s must span {_LEAST_PERIODS} periods of rate_hz "
                 f"(got {self.roboclaw.watchdog_s} s at {self.rate_hz} Hz)"
             )
+
+    @property
+    def unprotected_by(self) -> list[str]:
+        """Names of the parameters that switch a protection off."""
+        off = {"command_source": not self.command_source, "accept_unstamped": self.accept_unstamped}
+        return [name for name, is_off in off.items() if is_off]

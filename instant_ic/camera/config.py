@@ -1,9 +1,9 @@
 """Parameters of the cameras."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Percent, Positive, PositiveInt, check_ranges
+from instant_ic.config.ranges import Checked, NotNegativeInt, Percent, Plausible, PositiveInt, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
 from instant_ic.safe_text import holds_password
 
@@ -33,12 +33,12 @@ class ThetaConfig:
     width: PositiveInt = 1024
     height: PositiveInt = 512
     rate_hz: PositiveInt = 30
-    latency_s: NotNegative = 0.20
-    read_timeout_s: Positive = 2.0
-    connect_timeout_s: Positive = 5.0
-    settle_s: NotNegative = 1.0
-    busy_retries: NotNegativeInt = 5
-    busy_wait_s: Positive = 0.25
+    latency_s: Annotated[float, Plausible(0, 2)] = 0.20
+    read_timeout_s: Annotated[float, Plausible(0.1, 60)] = 2.0
+    connect_timeout_s: Annotated[float, Plausible(0.1, 60)] = 5.0
+    settle_s: Annotated[float, Plausible(0, 10)] = 1.0
+    busy_retries: Annotated[int, Plausible(0, 50)] = 5
+    busy_wait_s: Annotated[float, Plausible(0.001, 10)] = 0.25
 
     def __post_init__(self) -> None:
         wanted = (self.width, self.height, self.rate_hz)
@@ -60,8 +60,8 @@ class VideoConfig(Checked):
         height: height requested from a device, pixels; 0 keeps the device's setting.
     """
 
-    latency_s: NotNegative = 0.25
-    read_timeout_s: Positive = 2.0
+    latency_s: Annotated[float, Plausible(0, 2)] = 0.25
+    read_timeout_s: Annotated[float, Plausible(0.1, 60)] = 2.0
     quality: Percent = 90
     width: NotNegativeInt = 0
     height: NotNegativeInt = 0
@@ -77,7 +77,7 @@ class FilesConfig(Checked):
         quality: JPEG quality for files in other formats, 1-100.
     """
 
-    rate_hz: Positive = 5.0
+    rate_hz: Annotated[float, Plausible(0.01, 200)] = 5.0
     loop: bool = True
     quality: Percent = 90
 
@@ -105,8 +105,8 @@ class ThetaCameraConfig:
     password_file: str = ""
     frame_id: str = "camera"
     camera_mount: Mount = CAMERA_MOUNT
-    silence_s: Positive = 2.0
-    health_period_s: Positive = 10.0
+    silence_s: Annotated[float, Plausible(0.1, 60)] = 2.0
+    health_period_s: Annotated[float, Plausible(0.05, 600)] = 10.0
     theta: ThetaConfig = field(default_factory=ThetaConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     files: FilesConfig = field(default_factory=FilesConfig)

@@ -394,7 +394,7 @@ def _coerce(value: Any, hint: Any, key: str) -> Any:
         plain = _coerce(value, get_args(hint)[0], key)
         bounds = range_of(hint)
         if bounds is not None and plain is not None and plain not in bounds:
-            raise _RefusedError(f"{key} {bounds.words} (got {value})")
+            raise _RefusedError(f"{key} {bounds.refusal(plain, value)}")
         return plain
     if origin in (typing.Union, UnionType):
         options = get_args(hint)

@@ -17,8 +17,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Annotated, Any, Literal, TypeAlias, get_args, get_origin, get_type_hints
 
 
@@ -58,6 +59,31 @@ class Range:
     def words(self) -> str:
         """Text for error messages: ``must lie in 0..19``, ``must be > 0``."""
         return f"must lie in {self}" if ".." in str(self) else f"must be {str(self).replace(', ', ' and ')}"
+
+    def refusal(self, value: float, shown: object = None) -> str:
+        """Text of the error for a value outside: ``must lie in 0..19 (got 33)``.
+
+        Args:
+            shown: the value in its spelling; None: as Python writes it.
+        """
+        return f"{self.words} (got {value if shown is None else shown})"
+
+
+@dataclass(frozen=True)
+class Plausible(Range):
+    """Values that make sense for a tracked robot; the error guesses a slipped decimal point or millimetres.
+
+    >>> print(Plausible(0.05, 3).refusal(3.8))
+    must lie in 0.05..3 (got 3.8); did you mean 0.38?
+    """
+
+    def refusal(self, value: float, shown: object = None) -> str:
+        text = super().refusal(value, shown)
+        powers = (-1, -2, -3) if self.high is not None and value > self.high else (1, 2, 3)
+        # In decimals: 0.1 times 3.8 is not quite 0.38 in floating point.
+        guesses = (float(Decimal(str(value)).scaleb(power)) for power in powers) if abs(value) < 1e15 else ()
+        meant = next((guess for guess in guesses if guess in self), None)
+        return text if meant is None else f"{text}; did you mean {meant:g}?"
 
 
 Positive: TypeAlias = Annotated[float, Range(above=0)]
@@ -116,7 +142,7 @@ def check_ranges(config: Any) -> None:
     for name, bounds in ranges(type(config)).items():  # type: ignore[arg-type]
         for value in _numbers(getattr(config, name)):
             if value not in bounds:
-                raise ValueError(f"{name} {bounds.words} (got {value})")
+                raise ValueError(f"{name} {bounds.refusal(value)}")
 
 
 class Checked:
@@ -124,6 +150,19 @@ class Checked:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+
+
+def require_protection(unprotected: bool, off: Sequence[str], danger: str) -> None:
+    """Raise ValueError where a protection is off and ``unprotected`` does not say that this is meant.
+
+    Args:
+        off: names of the parameters that switch a protection off.
+        danger: what may happen.
+    """
+    if off and not unprotected:
+        raise ValueError(
+            f"{', '.join(off)}: protection is off, so that {danger}: switch it on, or set unprotected: true"
+        )
 
 
 def require(config: Any, name: str, condition: bool, rule: str) -> None:

@@ -9,9 +9,11 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from instant_ic.config.ranges import Checked, Positive, Range
+from instant_ic.config.ranges import Checked, Plausible, Range, check_ranges
 from instant_ic.geometry.twists import clip_twist
 
+MOST_STOPPING_M = 3.0
+"""Longest way on which a robot may come to a stand: farther away low obstacles are not seen."""
 Metres = Annotated[float, Range(-100, 100)]
 Degrees = Annotated[float, Range(-360, 360)]
 
@@ -25,8 +27,8 @@ class Rectangle(Checked):
         width_m: m; along y.
     """
 
-    length_m: Positive = 0.60
-    width_m: Positive = 0.50
+    length_m: Annotated[float, Plausible(0.1, 3)] = 0.60
+    width_m: Annotated[float, Plausible(0.1, 3)] = 0.50
 
 
 @dataclass(frozen=True)
@@ -41,10 +43,19 @@ class MotionLimits(Checked):
         max_angular_accel_rad_s2: rad/s²; largest change of the turn rate.
     """
 
-    max_linear_m_s: Positive = 0.5
-    max_angular_rad_s: Positive = 1.0
-    max_linear_accel_m_s2: Positive = 0.8
-    max_angular_accel_rad_s2: Positive = 2.0
+    max_linear_m_s: Annotated[float, Plausible(0.02, 3)] = 0.5
+    max_angular_rad_s: Annotated[float, Plausible(0.05, 6)] = 1.0
+    max_linear_accel_m_s2: Annotated[float, Plausible(0.05, 10)] = 0.8
+    max_angular_accel_rad_s2: Annotated[float, Plausible(0.1, 30)] = 2.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        distance = self.max_linear_m_s**2 / (2 * self.max_linear_accel_m_s2)
+        if distance > MOST_STOPPING_M:
+            raise ValueError(
+                f"max_linear_accel_m_s2 must stop the robot from max_linear_m_s within {MOST_STOPPING_M:g} m "
+                f"(got {self.max_linear_accel_m_s2}: {distance:.1f} m from {self.max_linear_m_s} m/s)"
+            )
 
     def clip(self, linear: float, angular: float) -> tuple[float, float]:
         """The twist within the speed limits, with the same curvature; zero if it is not finite."""

@@ -155,7 +155,7 @@ for _dumper in (_Dumper, _FastDumper):
 def one_line(value: object) -> str:
     """A value as one line of YAML."""
     text = dump_yaml(value, default_flow_style=True, allow_unicode=True, width=1 << 20)
-    return text.removesuffix("...\n").rstrip("\n")
+    return text.rstrip("\n").removesuffix("\n...").rstrip("\n")
 
 
 def _most_levels(text: str) -> int:

@@ -9,8 +9,9 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from enum import Enum
+from typing import Annotated
 
-from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+from instant_ic.config.ranges import Plausible, check_ranges
 
 RATE_COMMANDS = 200  # newest commands kept to measure the rate
 CONFIRM_S = 1.0  # time in which the robot confirms a press of the emergency stop; until then the press counts
@@ -34,15 +35,15 @@ class DriveConfig:
         lease_timeout_s: silence of the driver's page after which it loses the lease.
     """
 
-    max_linear_mps: Positive = 0.4
-    max_angular_rps: Positive = 0.8
-    rate_hz: Positive = 20.0
-    watchdog_s: Positive = 0.25
-    max_command_age_s: Positive = 0.3
-    stop_repeat_s: NotNegative = 0.3
-    keep_alive_hz: Positive = 10.0
-    beat_timeout_s: Positive = 0.25
-    lease_timeout_s: Positive = 2.0
+    max_linear_mps: Annotated[float, Plausible(0.02, 3)] = 0.4
+    max_angular_rps: Annotated[float, Plausible(0.05, 6)] = 0.8
+    rate_hz: Annotated[float, Plausible(5, 200)] = 20.0
+    watchdog_s: Annotated[float, Plausible(0.02, 1)] = 0.25
+    max_command_age_s: Annotated[float, Plausible(0.02, 1)] = 0.3
+    stop_repeat_s: Annotated[float, Plausible(0, 5)] = 0.3
+    keep_alive_hz: Annotated[float, Plausible(1, 100)] = 10.0
+    beat_timeout_s: Annotated[float, Plausible(0.02, 2)] = 0.25
+    lease_timeout_s: Annotated[float, Plausible(0.05, 120)] = 2.0
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -5,17 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import Checked, NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import Checked, Plausible, Range, check_ranges, require_protection
 from instant_ic.control.costmap import CostmapConfig
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.passage import PassageConfig
 from instant_ic.control.planner import PlannerConfig
-from instant_ic.control.prediction import PredictionConfig
-from instant_ic.control.safety import CollisionMonitorConfig
+from instant_ic.control.prediction import PredictionConfig, stopping_distance
+from instant_ic.control.safety import CollisionMonitorConfig, contains
 from instant_ic.control.subgoal import SubgoalConfig
 
+MOST_BLIND_M = 1.0
+"""Longest way at full speed until a source that is lost stops the robot."""
 _Probability: TypeAlias = Annotated[float, Range(above=0, high=1)]
 
 
@@ -48,26 +50,26 @@ class SwitchConfig(Checked):
         require_view: false: nobody shows the virtual space; views are not waited for and may be missing.
     """
 
-    position_m: Positive = 0.15
-    yaw_deg: Positive = 10.0
-    return_dwell_s: NotNegative = 0.5
-    return_near_m: Positive = 0.05
-    return_patience_s: NotNegative = 1.5
-    picture_position_m: Positive = 0.02
-    picture_yaw_deg: Positive = 0.5
-    return_picture_m: Positive = 0.015
-    return_picture_yaw_deg: Positive = 0.3
-    return_turn_rad_s: Positive = 0.2
-    enter_timeout_s: Positive = 2.0
-    return_timeout_s: Positive = 8.0
-    min_virtual_s: NotNegative = 1.0
-    min_real_s: NotNegative = 1.0
-    return_margin_m: Positive = 0.5
-    neutral_return_s: NotNegative = 3.0
-    lead_back_after_s: NotNegative = 6.0
-    stop_margin_m: NotNegative = 0.15
-    min_expected_psnr_db: NotNegative = 12.0
-    ready_hold_s: NotNegative = 2.0
+    position_m: Annotated[float, Plausible(0.01, 1)] = 0.15
+    yaw_deg: Annotated[float, Plausible(0.5, 45)] = 10.0
+    return_dwell_s: Annotated[float, Plausible(0, 10)] = 0.5
+    return_near_m: Annotated[float, Plausible(0.005, 1)] = 0.05
+    return_patience_s: Annotated[float, Plausible(0, 30)] = 1.5
+    picture_position_m: Annotated[float, Plausible(0.001, 0.5)] = 0.02
+    picture_yaw_deg: Annotated[float, Plausible(0.05, 20)] = 0.5
+    return_picture_m: Annotated[float, Plausible(0.001, 0.5)] = 0.015
+    return_picture_yaw_deg: Annotated[float, Plausible(0.05, 20)] = 0.3
+    return_turn_rad_s: Annotated[float, Plausible(0.01, 6)] = 0.2
+    enter_timeout_s: Annotated[float, Plausible(0.1, 60)] = 2.0
+    return_timeout_s: Annotated[float, Plausible(0.5, 120)] = 8.0
+    min_virtual_s: Annotated[float, Plausible(0, 60)] = 1.0
+    min_real_s: Annotated[float, Plausible(0, 60)] = 1.0
+    return_margin_m: Annotated[float, Plausible(0.05, 5)] = 0.5
+    neutral_return_s: Annotated[float, Plausible(0, 600)] = 3.0
+    lead_back_after_s: Annotated[float, Plausible(0, 600)] = 6.0
+    stop_margin_m: Annotated[float, Plausible(0, 2)] = 0.15
+    min_expected_psnr_db: Annotated[float, Plausible(0, 60)] = 12.0
+    ready_hold_s: Annotated[float, Plausible(0, 60)] = 2.0
     require_view: bool = True
 
 
@@ -84,11 +86,11 @@ class PoseTrustConfig:
         jump_deg: degrees; as jump_m, for the heading.
     """
 
-    slow: _Probability = 0.1
-    stop: _Probability = 0.5
-    speed_m_s: Positive = 0.15
-    jump_m: Positive = 0.4
-    jump_deg: Positive = 25.0
+    slow: Annotated[float, Plausible(0.01, 0.95)] = 0.1
+    stop: Annotated[float, Plausible(0.01, 0.95)] = 0.5
+    speed_m_s: Annotated[float, Plausible(0.02, 0.5)] = 0.15
+    jump_m: Annotated[float, Plausible(0.05, 2)] = 0.4
+    jump_deg: Annotated[float, Plausible(2, 90)] = 25.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -107,6 +109,7 @@ class ArbiterConfig(Checked):
             if longer.
         rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
         wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
+        unprotected: allows that the collision monitor's polygons stop and approach are off, with a permanent warning.
     """
 
     limits: MotionLimits = field(default_factory=MotionLimits)
@@ -119,6 +122,54 @@ class ArbiterConfig(Checked):
     switch: SwitchConfig = field(default_factory=SwitchConfig)
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     pose_trust: PoseTrustConfig = field(default_factory=PoseTrustConfig)
-    rate_hz: Positive = 20.0
-    wall_min_length_m: Positive = 1.5
+    rate_hz: Annotated[float, Plausible(5, 200)] = 20.0
+    wall_min_length_m: Annotated[float, Plausible(0.2, 20)] = 1.5
     costmap: CostmapConfig = field(default_factory=CostmapConfig)
+    unprotected: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        require_protection(self.unprotected, self.unprotected_by, "the robot does not stop before an obstacle")
+        self._check_polygons()
+        self._check_distances()
+
+    @property
+    def unprotected_by(self) -> list[str]:
+        """Names of the polygons that do not protect: switched off, or with an action that does not stop."""
+        polygons = {"stop": self.collision_monitor.stop, "approach": self.collision_monitor.approach}
+        return [
+            f"collision_monitor.{name}"
+            for name, polygon in polygons.items()
+            if not polygon.enabled or polygon.action_type != name
+        ]
+
+    def _check_polygons(self) -> None:
+        for name, polygon in self.collision_monitor.polygons().items():
+            if polygon.points and not contains(polygon.corners(self.footprint), self.footprint.corners()):
+                raise ValueError(
+                    f"collision_monitor.{name}.points must contain the footprint of {self.footprint.length_m:g} x "
+                    f"{self.footprint.width_m:g} m (got {polygon.points})"
+                )
+        braking_s = self.limits.max_linear_m_s / self.limits.max_linear_accel_m_s2
+        approach = self.collision_monitor.approach
+        if approach.enabled and approach.time_before_collision < braking_s:
+            raise ValueError(
+                f"collision_monitor.approach.time_before_collision must be at least {braking_s:.2g} s, to brake "
+                f"from max_linear_m_s by max_linear_accel_m_s2 (got {approach.time_before_collision})"
+            )
+
+    def _check_distances(self) -> None:
+        speed = self.limits.max_linear_m_s
+        for name in ("scan", "odometry", "pose", "command"):
+            if (blind_m := getattr(self.timeouts, name) * speed) > MOST_BLIND_M:
+                raise ValueError(
+                    f"timeouts.{name} must be at most {MOST_BLIND_M / speed:.2g} s: at max_linear_m_s the robot drives "
+                    f"{blind_m:.2g} m without it (got {getattr(self.timeouts, name)})"
+                )
+        needed_m = stopping_distance(speed, self.limits, self.prediction.latency_s) + 0.5 * self.footprint.length_m
+        seen_m = min(self.costmap.obstacle_max_range, 0.5 * self.costmap.width)
+        if needed_m > seen_m:
+            raise ValueError(
+                f"limits.max_linear_accel_m_s2 must stop the robot within {seen_m:.2g} m, which the costmap sees (got "
+                f"{self.limits.max_linear_accel_m_s2}: {needed_m:.2g} m from {speed:g} m/s)"
+            )

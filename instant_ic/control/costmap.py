@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Percent, Positive, Range, check_ranges
+from instant_ic.config.ranges import Percent, Plausible, Range, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import HeightConfig, HeightLayer, SortedPoints, shifted
 from instant_ic.control.static_map import StaticMap
@@ -52,14 +52,14 @@ class CostmapConfig:
         points: low and hanging things, from /lidar/points.
     """
 
-    width: Positive = 12.0
-    resolution: Positive = 0.05
-    update_frequency: Positive = 20.0
-    publish_frequency: Positive = 5.0
-    inflation_radius: NotNegative = 0.70
-    cost_scaling_factor: Positive = 3.0
-    obstacle_max_range: Positive = 8.0
-    raytrace_max_range: Positive = 8.5
+    width: Annotated[float, Plausible(2, 100)] = 12.0
+    resolution: Annotated[float, Plausible(0.01, 0.25)] = 0.05
+    update_frequency: Annotated[float, Plausible(0.5, 100)] = 20.0
+    publish_frequency: Annotated[float, Plausible(0.1, 100)] = 5.0
+    inflation_radius: Annotated[float, Plausible(0, 5)] = 0.70
+    cost_scaling_factor: Annotated[float, Plausible(0.1, 100)] = 3.0
+    obstacle_max_range: Annotated[float, Plausible(1, 100)] = 8.0
+    raytrace_max_range: Annotated[float, Plausible(1, 100)] = 8.5
     inf_is_valid: bool = False
     lethal_cost_threshold: Percent = 65
     footprint_clearing_enabled: bool = True

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.config.ranges import Plausible, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
@@ -57,9 +58,9 @@ class FollowerConfig:
         max_lookahead_dist: m; longest distance of the carrot.
     """
 
-    desired_linear_vel: Positive = 0.5
-    min_lookahead_dist: Positive = 0.30
-    max_lookahead_dist: Positive = 0.70
+    desired_linear_vel: Annotated[float, Plausible(0.02, 3)] = 0.5
+    min_lookahead_dist: Annotated[float, Plausible(0.05, 5)] = 0.30
+    max_lookahead_dist: Annotated[float, Plausible(0.05, 5)] = 0.70
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -8,10 +8,12 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import Checked, Positive, Range
+from instant_ic.config.ranges import Checked, Plausible
 
-_Timeout: TypeAlias = Annotated[float, Range(above=0, high=10)]
-"""More than 10 s is no time-out: a robot must not drive on such old data or commands."""
+_Timeout: TypeAlias = Annotated[float, Plausible(0.05, 2)]
+"""Beyond 2 s it is no time-out: a robot must not drive on such old data or commands."""
+_ImageTimeout: TypeAlias = Annotated[float, Plausible(0.05, 10)]
+"""Images may be rare where the robot is slow: ``image_travel_m`` bounds its way."""
 
 IMAGES = ("camera", "view")
 """Sources that show the operator the robot's place."""
@@ -52,18 +54,18 @@ class TimeoutConfig(Checked):
     points: _Timeout = 0.3
     odometry: _Timeout = 0.3
     pose: _Timeout = 0.3
-    camera: _Timeout = 0.3
-    view: _Timeout = 0.3
+    camera: _ImageTimeout = 0.3
+    view: _ImageTimeout = 0.3
     vbot: _Timeout = 0.3
     nav: _Timeout = 0.3
     command: _Timeout = 0.3
-    estop_input: Annotated[float, Range(0, 10)] = 0.0
-    vspace: _Timeout = 2.0
-    late_s: _Timeout = 0.1
-    slowest_image_s: _Timeout = 1.1
-    image_travel_m: Positive = 0.33
-    stop_after_s: _Timeout = 1.5
-    recover_s: _Timeout = 0.5
+    estop_input: Annotated[float, Plausible(0, 10)] = 0.0
+    vspace: _ImageTimeout = 2.0
+    late_s: Annotated[float, Plausible(0.01, 2)] = 0.1
+    slowest_image_s: _ImageTimeout = 1.1
+    image_travel_m: Annotated[float, Plausible(0.02, 2)] = 0.33
+    stop_after_s: Annotated[float, Plausible(0.1, 10)] = 1.5
+    recover_s: Annotated[float, Plausible(0.05, 10)] = 0.5
 
     def allowed_s(self, key: str, usual_s: float | None = None) -> float:
         """Allowed age of source ``key`` in seconds, if its usual age is ``usual_s`` when the next message arrives.

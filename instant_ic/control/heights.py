@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import Plausible, check_ranges
 
 Cell = TypeVar("Cell", bound=np.generic)
 
@@ -54,12 +54,12 @@ class HeightConfig:
     """
 
     enabled: bool = True
-    min_obstacle_height: Annotated[float, Range(-10, 10)] = 0.05
-    max_obstacle_height: Annotated[float, Range(-10, 10)] = 1.30
-    ground_tilt_deg: NotNegative = 0.8
-    obstacle_min_range: NotNegative = 0.45
-    obstacle_max_range: Positive = 6.0
-    mark_threshold: Annotated[int, Range(1, 250)] = 2
+    min_obstacle_height: Annotated[float, Plausible(0.01, 0.5)] = 0.05
+    max_obstacle_height: Annotated[float, Plausible(0.2, 5)] = 1.30
+    ground_tilt_deg: Annotated[float, Plausible(0, 20)] = 0.8
+    obstacle_min_range: Annotated[float, Plausible(0, 2)] = 0.45
+    obstacle_max_range: Annotated[float, Plausible(1, 100)] = 6.0
+    mark_threshold: Annotated[int, Plausible(1, 50)] = 2
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Checked, NotNegative
+from instant_ic.config.ranges import Checked, Plausible
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
@@ -32,9 +33,9 @@ class PredictionConfig(Checked):
         padding_m: m round the footprint.
     """
 
-    latency_s: NotNegative = 0.2
-    margin_m: NotNegative = 0.6
-    padding_m: NotNegative = 0.03
+    latency_s: Annotated[float, Plausible(0, 1)] = 0.2
+    margin_m: Annotated[float, Plausible(0, 5)] = 0.6
+    padding_m: Annotated[float, Plausible(0, 0.5)] = 0.03
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Checked, NotNegative, Positive, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import Checked, Plausible, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.moving import MOST_SPEED_M_S, NOTHING_MOVES, MovingPoints
@@ -49,14 +49,14 @@ class PolygonConfig:
     enabled: bool = True
     action_type: ActionType = "approach"
     points: str = ""
-    padding_m: NotNegative = 0.04
-    min_points: PositiveInt = 2
-    slowdown_ratio: Annotated[float, Range(above=0, high=1)] = 0.6
-    linear_limit: Positive = 0.25
-    angular_limit: Positive = 0.5
-    time_before_collision: Positive = 1.2
-    stop_time_s: NotNegative = 0.1
-    moving_stop_time_s: NotNegative = 0.6
+    padding_m: Annotated[float, Plausible(0, 2)] = 0.04
+    min_points: Annotated[int, Plausible(1, 50)] = 2
+    slowdown_ratio: Annotated[float, Plausible(0.05, 1)] = 0.6
+    linear_limit: Annotated[float, Plausible(0.01, 3)] = 0.25
+    angular_limit: Annotated[float, Plausible(0.02, 6)] = 0.5
+    time_before_collision: Annotated[float, Plausible(0.2, 10)] = 1.2
+    stop_time_s: Annotated[float, Plausible(0, 5)] = 0.1
+    moving_stop_time_s: Annotated[float, Plausible(0, 5)] = 0.6
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -92,6 +92,13 @@ def parse_polygon(text: str) -> NDArray[np.float64]:
     return corners if bend[0] > 0 else corners[::-1].copy()
 
 
+def contains(polygon: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
+    """Whether a convex polygon, counter-clockwise (N, 2), contains all points (M, 2); its edge counts as inside."""
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    offsets = points[:, None] - polygon
+    return bool((edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0] >= -1e-9).all())
+
+
 @dataclass(frozen=True)
 class CollisionMonitorConfig(Checked):
     """Polygons, of which the most restrictive wins, and the largest age of their points.
@@ -106,9 +113,9 @@ class CollisionMonitorConfig(Checked):
         approach: footprint makes contact within time_before_collision: slowed in proportion.
     """
 
-    source_timeout: Positive = 0.5
-    blind_radius_m: NotNegative = 0.45
-    memory_range_m: NotNegative = 2.5
+    source_timeout: Annotated[float, Plausible(0.05, 2)] = 0.5
+    blind_radius_m: Annotated[float, Plausible(0, 2)] = 0.45
+    memory_range_m: Annotated[float, Plausible(0, 10)] = 2.5
     stop: PolygonConfig = field(default_factory=lambda: PolygonConfig(action_type="stop", padding_m=0.02))
     slowdown: PolygonConfig = field(default_factory=lambda: PolygonConfig(action_type="slowdown", padding_m=0.10))
     limit: PolygonConfig = field(

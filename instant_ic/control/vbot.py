@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import Plausible, Range, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, accelerate, move
 from instant_ic.control.walls import WallMap
@@ -38,12 +38,12 @@ class VbotConfig:
         ease_deg_s: as ease_m_s, for the heading, in degrees/s.
     """
 
-    max_lead_m: Positive = 3.0
-    slow_lead_m: NotNegative = 1.0
+    max_lead_m: Annotated[float, Plausible(0.2, 30)] = 3.0
+    slow_lead_m: Annotated[float, Plausible(0, 30)] = 1.0
     trail_slow: Annotated[float, Range(0, 0.5)] = 0.1
-    trail_m: Positive = 0.15
-    ease_m_s: Positive = 0.035
-    ease_deg_s: Positive = 6.0
+    trail_m: Annotated[float, Plausible(0.01, 5)] = 0.15
+    ease_m_s: Annotated[float, Plausible(0.001, 1)] = 0.035
+    ease_deg_s: Annotated[float, Plausible(0.1, 90)] = 6.0
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -23,12 +23,15 @@ from typing import TYPE_CHECKING, Any
 
 from instant_ic import paths
 from instant_ic.launch.description import NodeSpec
+from instant_ic.launch.robot_parameters import RELATED, Driving, disagreements
 
 if TYPE_CHECKING:
     from instant_ic.config.params import Values
 
 _CHECK_TIMEOUT_S = 120.0
 _MOST_REMEMBERED = 500
+_TOGETHER = ""
+"""Label of problems that several nodes have together."""
 
 
 class ParameterCheckError(RuntimeError):
@@ -48,6 +51,8 @@ class _Node:
     """Value as YAML, place and file of each parameter that a ``/**`` section sets for this run directory."""
     own_programs: bool
     """Whether the stack has nodes that are not checked."""
+    group: str = ""
+    """Run directory within the stack's: the robot of a fleet."""
 
 
 def _checkable(nodes: Sequence[NodeSpec]) -> list[_Node]:
@@ -64,6 +69,7 @@ def _checkable(nodes: Sequence[NodeSpec]) -> list[_Node]:
             places=dict(spec.places),
             shared=shared[spec.group],
             own_programs=own_programs,
+            group=spec.group,
         )
         for spec in shipped
     ]
@@ -137,8 +143,14 @@ def _shared(specs: Sequence[NodeSpec]) -> dict[str, dict[str, tuple[str, str, st
 
 
 def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
-    """Check all nodes for unknown parameters, wrong types and values out of range; returns one text per problem."""
-    return list(dict.fromkeys(problem for node in _checkable(nodes) for problem in _problems(node)))
+    """Check all nodes for unknown parameters, wrong types and values out of range, and against each other.
+
+    Returns:
+        One text per problem.
+    """
+    checkable = _checkable(nodes)
+    found = [problem for node in checkable for problem in _problems(node)]
+    return list(dict.fromkeys(found + _disagreements([node for node in checkable if node.exec in RELATED])))
 
 
 def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = None) -> list[str]:
@@ -156,11 +168,15 @@ def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = Non
     keys = {node: _key(node, package) for node in map(_frozen, _checkable(nodes))}
     known = _remembered(cache)
     unknown = [json.loads(node) for node, key in keys.items() if key not in known]
-    if not unknown:
+    related = {node: key for node, key in keys.items() if json.loads(node)["exec"] in RELATED}
+    together = hashlib.sha256("".join(related.values()).encode()).hexdigest()
+    compared = [json.loads(node) for node in related] if len(related) > 1 and together not in known else []
+    if not unknown and not compared:
         return []
-    problems = _check_apart(unknown)
+    problems = _check_apart(unknown, compared)
     bad = {label for label, _ in problems}
     good = [key for node, key in keys.items() if json.loads(node)["label"] not in bad]
+    good += [together] if compared and _TOGETHER not in bad else []
     _remember(cache, [*(key for key in known if key not in good), *good])
     return list(dict.fromkeys(text for _, text in problems))
 
@@ -216,12 +232,12 @@ def _remember(cache: Path, keys: Sequence[str]) -> None:
         scratch.replace(cache)
 
 
-def _check_apart(nodes: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Label and text of each problem."""
+def _check_apart(nodes: Sequence[dict[str, Any]], related: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Label and text of each problem of some nodes, and of some together."""
     command = [sys.executable, "-m", "instant_ic.launch.parameters"]
     try:
         done = subprocess.run(
-            command, input=json.dumps(nodes), capture_output=True, text=True, timeout=_CHECK_TIMEOUT_S
+            command, input=json.dumps([nodes, related]), capture_output=True, text=True, timeout=_CHECK_TIMEOUT_S
         )
     except subprocess.TimeoutExpired:
         raise ParameterCheckError(
@@ -300,6 +316,24 @@ def _contradictions(node: _Node, values: Values, config: Any) -> list[str]:
     return problems
 
 
+def _disagreements(nodes: Sequence[_Node]) -> list[str]:
+    """Values of nodes that drive one robot and do not fit together; nodes with problems of their own are left out."""
+    from instant_ic.bus.node_files import NodeFileError, node_class
+    from instant_ic.bus.process import argument_parser
+    from instant_ic.config.params import ParameterError, configure, gather
+
+    robots: dict[str, dict[str, Driving]] = {}
+    for node in nodes:
+        with suppress(ParameterError, NodeFileError, SystemExit):  # the check of the node reports it
+            found = node_class(node.exec)
+            args = argument_parser(found).parse_args(node.words)
+            values = gather(args.name, args.params_file, args.param, node.places)
+            config = configure(found.config_class(), values)[0]
+            meant = {key for key, value in values.items() if value.file is None}
+            robots.setdefault(node.group, {})[node.exec] = Driving(node.at, config, meant | node.shared.keys())
+    return [text for robot in robots.values() for text in disagreements(robot)]
+
+
 def _undeclared(node: _Node, values: Values) -> list[str]:
     """Shared values that no node has a parameter for: a typing error, or of a program that is not checked."""
     left = {key: value for key, value in values.items() if value.shared}
@@ -322,8 +356,11 @@ def _declared_by_none(values: Values, nodes: Sequence[str]) -> list[str]:
 
 def main() -> None:
     """Entry point of the separate process: nodes on standard input, problems on standard output."""
-    nodes = [_Node(**{**entry, "words": tuple(entry["words"])}) for entry in json.load(sys.stdin)]
+    nodes, related = (
+        [_Node(**{**entry, "words": tuple(entry["words"])}) for entry in entries] for entries in json.load(sys.stdin)
+    )
     report = [(node.label, problem) for node in nodes for problem in _problems(node)]
+    report += [(_TOGETHER, problem) for problem in _disagreements(related)]
     json.dump(report, sys.stdout)
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
+from instant_ic.config.ranges import Plausible, Range, Share, check_ranges
 from instant_ic.config.robot import LIDAR_MOUNT, Mount
 from instant_ic.lidar.head import TURN_CDEG, Sector
 from instant_ic.lidar.receiver import ReceiverConfig
@@ -24,8 +24,8 @@ class DecoderConfig:
     """
 
     cut_angle_deg: Annotated[float, Range(0, below=360)] = 180.0
-    min_range: NotNegative = 0.4
-    max_range: Annotated[float, Range(above=0, high=131.07)] = 130.0
+    min_range: Annotated[float, Plausible(0, 5)] = 0.4
+    max_range: Annotated[float, Plausible(1, 131.07)] = 130.0
     fov_start_deg: Azimuth = 0.0
     fov_end_deg: Azimuth = 360.0
 
@@ -56,11 +56,11 @@ class FlatScanConfig:
         min_coverage: smallest measured share of the circle for a scan, 0-1.
     """
 
-    min_height: Annotated[float, Range(-10, 10)] = 0.10
-    max_height: Annotated[float, Range(-10, 10)] = 1.30
+    min_height: Annotated[float, Plausible(-1, 1)] = 0.10
+    max_height: Annotated[float, Plausible(0.05, 5)] = 1.30
     beams: Annotated[int, Range(4, 7200)] = 720
-    range_min: NotNegative = 0.4
-    range_max: Positive = 100.0
+    range_min: Annotated[float, Plausible(0, 5)] = 0.4
+    range_max: Annotated[float, Plausible(1, 150)] = 100.0
     min_coverage: Share = 0.75
 
     def __post_init__(self) -> None:
@@ -89,11 +89,11 @@ class Vlp16DriverConfig(ReceiverConfig):
 
     source: Literal["udp", "pcap", "topic"] = "udp"
     pcap: str = ""
-    rate: Positive = 1.0
+    rate: Annotated[float, Plausible(0.01, 1000)] = 1.0
     loop: bool = False
     frame_id: str = "velodyne"
     lidar_mount: Mount = LIDAR_MOUNT
-    silence_s: Positive = 2.0
+    silence_s: Annotated[float, Plausible(0.2, 60)] = 2.0
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     scan: FlatScanConfig = field(default_factory=FlatScanConfig)
 

@@ -103,7 +103,7 @@ def test_old_and_senseless_commands_are_dropped_and_told(bench: Bench) -> None:
 
 
 def test_unstamped_twist_is_refused_or_counts_from_its_arrival() -> None:
-    bench = Bench(accept_unstamped=True)
+    bench = Bench(accept_unstamped=True, unprotected=True)
     bench.run(0.1)
     zero = Vector3(x=0.0, y=0.0, z=0.0)
     bench.command(Twist(linear=Vector3(x=0.2, y=0.0, z=0.0), angular=zero))

@@ -36,7 +36,7 @@ def test_arbiter(bus):
     assert arbiter.predictor.config.latency_s == 0.3
     with pytest.raises(ParameterError, match=r"footprint\.length_m takes effect at start"):
         node.set_parameters({"footprint.length_m": 0.7})
-    with pytest.raises(ParameterError, match=r"timeouts\.scan must be > 0 and <= 10 \(got 60\)"):
+    with pytest.raises(ParameterError, match=r"timeouts\.scan must lie in 0.05..2 \(got 60\)"):
         node.set_parameters({"timeouts.scan": 60})  # a watchdog is not switched off by a parameter
 
 

@@ -196,7 +196,7 @@ def test_a_camera_ends_while_its_device_blocks(device: Device, opens: bool, monk
 
     monkeypatch.setattr(cv2, "VideoCapture", capture)
     events: list[tuple[bool, str]] = []
-    camera = VideoCamera("0", VideoConfig(read_timeout_s=600.0))
+    camera = VideoCamera("0", VideoConfig(read_timeout_s=60.0))
     frames = threading.Event()
     loop = CameraLoop(camera, lambda frame: frames.set(), lambda connected, text: events.append((connected, text)))
     loop.start()

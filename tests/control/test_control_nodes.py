@@ -55,11 +55,16 @@ CONFIG = Path(__file__).resolve().parents[2] / "config" / "control.yaml"
 STEP_NS = 50_000_000
 
 
-def test_parameters_that_cannot_be_used_change_nothing() -> None:
+def test_parameters_that_cannot_be_used_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     arbiter = LockstepBus().add(ArbiterNode)
     before = arbiter.config
-    with pytest.raises(MemoryError):
-        arbiter.set_parameters({"limits.max_linear_m_s": 5.0, "prediction.padding_m": 1e15})
+
+    def too_large(*arguments: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched, pytest.raises(MemoryError):
+        patched.setattr("instant_ic.control.arbiter.Predictor", too_large)
+        arbiter.set_parameters({"limits.max_linear_m_s": 0.4, "prediction.padding_m": 0.1})
     assert arbiter.config is before and arbiter.arbiter.config is before
     assert arbiter.set_parameters({"switch.min_real_s": 2.0}) == {"switch.min_real_s": 2.0}
 

@@ -56,7 +56,7 @@ def test_nothing_starts_while_a_parameter_is_wrong(stack: Path, capsys: pytest.C
 def test_what_is_known_to_be_good_is_not_checked_again(stack: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     checked: list[list[str]] = []
 
-    def check(nodes: list[dict[str, str]]) -> list[tuple[str, str]]:
+    def check(nodes: list[dict[str, str]], related: list[dict[str, str]]) -> list[tuple[str, str]]:
         checked.append([node["label"] for node in nodes])
         return [("other", "bad")] if "other" in checked[-1] else []
 
@@ -87,7 +87,7 @@ def test_a_broken_cache_costs_time_and_nothing_else(stack: Path, content: str) -
 
 
 def test_a_cache_that_cannot_be_written(stack: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parameters, "_check_apart", lambda nodes: [])
+    monkeypatch.setattr(parameters, "_check_apart", lambda nodes, related: [])
     assert check_parameters_quickly(read_launch_file(stack).nodes, Path("/proc/no/cache.json")) == []
 
 

@@ -49,7 +49,7 @@ def test_a_bag_of_plain_twists_beside_a_running_stack_with_the_stop_latched_driv
 
 
 def test_any_source_is_obeyed_only_if_the_parameter_says_so_and_two_are_warned_of() -> None:
-    bench = NodeBench(command_source="")
+    bench = NodeBench(command_source="", unprotected=True)
     bench.run(1.0, v=0.3, publisher="script")
     assert bench.line.speed == pytest.approx(0.3, abs=0.01)
     assert bench.diagnosis("publishers")[0] == OK
@@ -59,7 +59,7 @@ def test_any_source_is_obeyed_only_if_the_parameter_says_so_and_two_are_warned_o
 
 def test_nothing_drives_while_the_stop_is_latched_not_even_the_arbiter_nor_any_source() -> None:
     for source in ("arbiter", ""):
-        bench = NodeBench(command_source=source)
+        bench = NodeBench(command_source=source, unprotected=True)
         bench.run(0.5)
         bench.estop(True)
         bench.run(1.0, v=0.4)

@@ -1,0 +1,85 @@
+"""Rules between the parameters of the nodes that drive one robot; each node's own rules are in its configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+RELATED = ("arbiter", "crawler_base", "navigator", "virtual_robot", "console")
+"""Nodes that have something to agree on."""
+_MISSED = 2
+"""Messages that may be missing before a time-out."""
+
+
+@dataclass(frozen=True)
+class Driving:
+    """A node that drives.
+
+    Attributes:
+        at: its place, ``launch/full.yaml:12``.
+        config: its configuration.
+        meant: keys that may differ: set by its own entry of the launch file, or compared with a ``/**`` section.
+    """
+
+    at: str
+    config: Any
+    meant: Collection[str] = ()
+
+    def value(self, key: str) -> Any:
+        """Value of a dotted key; None if the node has no such parameter."""
+        found = self.config
+        for name in key.split("."):
+            found = getattr(found, name, None)
+        return found
+
+
+_SAME = tuple(
+    f"limits.max_{kind}" for kind in ("linear_m_s", "angular_rad_s", "linear_accel_m_s2", "angular_accel_rad_s2")
+) + ("footprint.length_m", "footprint.width_m")
+_SPANS = (
+    ("crawler_base", "command_timeout_s", "arbiter", "rate_hz", 10.0),  # at rest the arbiter sends at most 10 a second
+    ("arbiter", "timeouts.nav", "navigator", "controller_frequency", 1e9),
+    ("arbiter", "timeouts.vbot", "virtual_robot", "rate_hz", 1e9),
+    ("arbiter", "timeouts.odometry", "crawler_base", "rate_hz", 1e9),
+    ("arbiter", "timeouts.command", "console", "server.drive.keep_alive_hz", 1e9),
+    ("arbiter", "timeouts.command", "console", "server.drive.rate_hz", 1e9),
+    ("navigator", "state_timeout_s", "arbiter", "rate_hz", 1e9),
+    ("virtual_robot", "state_timeout_s", "arbiter", "rate_hz", 1e9),
+)
+"""Node and time-out; node and rate of the messages, at most the last number."""
+
+
+def disagreements(robot: Mapping[str, Driving]) -> Iterator[str]:
+    """Contradictions between the nodes of one robot, one text each.
+
+    Args:
+        robot: node → its configuration; a node that is elsewhere is missing.
+    """
+    for key in _SAME:
+        yield from _differing(robot, key)
+    for name, timeout, source, rate, most_hz in _SPANS:
+        if name in robot and source in robot:
+            node, hz = robot[name], min(robot[source].value(rate), most_hz)
+            if node.value(timeout) * hz < _MISSED:
+                yield (
+                    f"{node.at}: node {name}: {timeout} must span {_MISSED} messages of {source}: "
+                    f"{_MISSED / hz:.2g} s at {rate} {hz:g} (got {node.value(timeout)})"
+                )
+    if (arbiter := robot.get("arbiter")) and (base := robot.get("crawler_base")):
+        tracks, width = base.value("geometry.track_width"), arbiter.value("footprint.width_m")
+        if tracks > width:
+            rule = f"geometry.track_width must be within footprint.width_m {width}"
+            yield f"{base.at}: node crawler_base: {rule} (got {tracks})"
+
+
+def _differing(robot: Mapping[str, Driving], key: str) -> Iterator[str]:
+    having = {name: node for name, node in robot.items() if node.value(key) is not None and key not in node.meant}
+    first = next(iter(having), "")
+    for name, node in having.items():
+        wanted = having[first].value(key)
+        if node.value(key) != wanted:
+            yield (
+                f"{node.at}: node {name}: {key} is {node.value(key)}, but {wanted} in node {first}: set it for all "
+                "nodes in the /** section of one file"
+            )
