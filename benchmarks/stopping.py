@@ -17,6 +17,9 @@ motion:
                 gone to STOPPED (``timeouts.stop_after_s``), as a camera driver that starts fast: the key is still held
     again_s     to that motion
 
+For a process that is thawed after 2 s, ``after_m`` is the motion from the stand until 3 s after the end of the freeze:
+zero, although the key is held all the time.
+
 All times are seconds of the stack, which runs at the pace of the machine (``--pace``, 1.0 on one that is fast enough).
 """
 
@@ -74,6 +77,10 @@ _TRIES = 5
 _REVOLUTION = 76
 """Packets of a revolution of the LiDAR."""
 PROCESSES = ("arbiter", "crawler_base", "console", "grid_slam", "vlp16_driver", "theta_camera")
+CONTROL = ("arbiter", "crawler_base", "console", "navigator", "virtual_robot")
+"""The last two are not needed in REAL."""
+FROZEN_S, AFTER_THAW_S = 2.0, 3.0
+"""Seconds of a freeze under the held key, and seconds watched after its end."""
 LAUNCH = """launch:
 - node:
     exec: simulator
@@ -326,6 +333,7 @@ class Fault(NamedTuple):
         breaks, mends: cause and end it.
         prepares: prepares the drive.
         speed, turn: motion before it, m/s and rad/s.
+        frozen_s: seconds of the stack until ``mends`` ends it under the held key; 0: after the drive.
     """
 
     name: str
@@ -334,6 +342,7 @@ class Fault(NamedTuple):
     prepares: Act = lambda rig, page: None
     speed: float = SPEED_M_S
     turn: float = 0.0
+    frozen_s: float = 0.0
 
 
 async def act(does: Act, rig: Rig, page: ConsoleClient) -> None:
@@ -342,19 +351,26 @@ async def act(does: Act, rig: Rig, page: ConsoleClient) -> None:
         await pending
 
 
-def process_faults(node: str) -> list[Fault]:
+def freeze(name: str, nodes: Sequence[str], frozen_s: float = 0.0) -> Fault:
+    """Fault of processes that are frozen."""
     frozen: list[int] = []
 
-    def freeze(rig: Rig, page: ConsoleClient) -> None:
-        frozen[:] = [rig.pid(node)]
-        os.kill(frozen[0], signal.SIGSTOP)
+    def breaks(rig: Rig, page: ConsoleClient) -> None:
+        frozen[:] = [rig.pid(node) for node in nodes]
+        for pid in frozen:
+            os.kill(pid, signal.SIGSTOP)
 
-    def thaw(rig: Rig, page: ConsoleClient) -> None:
-        with contextlib.suppress(ProcessLookupError):  # the launcher has restarted it meanwhile
-            os.kill(frozen[0], signal.SIGCONT)
+    def mends(rig: Rig, page: ConsoleClient) -> None:
+        while frozen:
+            with contextlib.suppress(ProcessLookupError):  # on a slow machine the launcher takes it for hung
+                os.kill(frozen.pop(), signal.SIGCONT)
 
+    return Fault(name, breaks, mends, frozen_s=frozen_s)
+
+
+def process_faults(node: str) -> list[Fault]:
     return [
-        Fault(f"{node} frozen", freeze, thaw),
+        freeze(f"{node} frozen", [node]),
         Fault(f"{node} killed", lambda rig, page: os.kill(rig.pid(node), signal.SIGKILL)),
     ]
 
@@ -426,6 +442,8 @@ LINKS: dict[str, tuple[Callable[[Rig], None], Callable[[Rig], None]]] = {
 FAULTS = [
     *(fault for node in PROCESSES for fault in process_faults(node)),
     second_console_fault(),
+    *(freeze(f"{node} thawed after {FROZEN_S:g} s", [node], FROZEN_S) for node in CONTROL[:3]),
+    freeze(f"all thawed after {FROZEN_S:g} s", CONTROL, FROZEN_S),
     Fault("emergency stop pressed", lambda rig, page: page.estop(), release_estop),
     *(
         Fault(f"encoder of a track dead at {speed:g} m/s", kill_encoder, mend_encoder, speed=speed)
@@ -524,6 +542,10 @@ async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[st
         lost_ns = rig.pace.now_ns()
         await act(fault.breaks, rig, page)
         try:
+            if fault.frozen_s:
+                await asyncio.sleep(rig.pace.wait_s(fault.frozen_s))
+                await act(fault.mends, rig, page)
+                await asyncio.sleep(rig.pace.wait_s(AFTER_THAW_S))
 
             def over() -> bool:
                 stand_ns = stands_ns(rig.truth, lost_ns)

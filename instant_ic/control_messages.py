@@ -16,6 +16,7 @@ from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter import STANDS_M_S, STANDS_RAD_S, Decision
 from instant_ic.control.estop import KeptEstop
 from instant_ic.control.freshness import TimeoutConfig
+from instant_ic.control.interruptions import WATCHED
 from instant_ic.control.kinematics import extrapolate
 from instant_ic.control.operator_view import OperatorView, PageReport
 from instant_ic.control.robot_lease import LEASE_S, RELEASED, Lease
@@ -200,6 +201,8 @@ class ArbiterInbox:
             ages=ages,
             usual=view.usual(with_page=report is not None),
             images_late_s=view.delay_s(report),
+            suspended_ns=self.clock.suspended_ns(),
+            instances={(key, node): i for key in WATCHED for node, i in self.sources[key].instances.items()},
         )
 
     def _counts(self, node: str) -> bool:

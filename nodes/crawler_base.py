@@ -17,6 +17,10 @@ from instant_ic.control.estop import EstopLatch
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import BatteryState, Bool, ControlState, Odometry, battery_message, deserialize
 from instant_ic.pace import PaceError, current
+from instant_ic.step_gap import BRIEF_S
+
+OWN_STEP_S = 0.1
+"""Period at which the node's thread shows the serial thread that it runs."""
 
 STATE_S = 1.0
 """Age in seconds up to which the arbiter's state counts."""
@@ -33,7 +37,11 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             refuse_pace(current(), config.roboclaw.port, self.run_dir)
         except PaceError as error:
             raise NodeError(str(error)) from None
-        self.controller = BaseController(config, self.clock.now_ns, self.clock.steady_ns, type(self).open_port)
+        clock = self.clock
+        self.controller = BaseController(
+            config, clock.now_ns, clock.steady_ns, type(self).open_port, clock.suspended_ns
+        )
+        self.stepped_ns = clock.steady_ns()  # by the node's thread
         also = "/cmd_vel is also published by %s; it must be the arbiter alone"
         self.gate = CommandGate(config, lambda publisher: self.log.warning(also, publisher))
         self.report = BaseReport(config, self.controller, self.clock.steady_ns())
@@ -50,6 +58,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.diagnose("protection", WARN, text)
         self.diagnose_all(self.latch.diagnosis, self.gate.publishers, self.report.tracks())
         self.timer(1.0, self.watch)
+        self.timer(OWN_STEP_S, self.note_step)
         loop_class = SteppedController if self.lockstep else ControllerThread
         self.loop = loop_class(self.controller, config.rate_hz, self.on_step, self.on_end)
         if self.lockstep:
@@ -104,7 +113,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
 
     def on_step(self, state: BaseState) -> None:
         """Publish the result of a controller step, the odometry at once; called on the serial thread."""
-        if state.odometry is not None:
+        # Without the node's thread no command arrives: the arbiter must see this as the loss of the base.
+        if state.odometry is not None and self.clock.steady_ns() - self.stepped_ns <= BRIEF_S * 1e9:
             message = estimate_message(state.odometry, self.config.odom_frame, self.config.base_frame)
             self.odometry.publish(message)
             matrix, stamp = matrix_from_pose2(state.odometry.pose), state.odometry.stamp_ns
@@ -112,6 +122,10 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         changed, self.status = state.status != self.status, state.status
         if state.link or state.fault or changed or state.health is not None:
             self.call_soon(self.on_state, state)
+
+    def note_step(self) -> None:
+        """Note a step of the node's own thread."""
+        self.stepped_ns = self.clock.steady_ns()
 
     def on_state(self, state: BaseState) -> None:
         if state.link:

@@ -18,6 +18,7 @@ from instant_ic.control.navigator import Navigator, moving_subgoal
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
+from instant_ic.step_gap import StepGap
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.speed = 0.0
         self.grid: tuple[Any, Any] = (None, None)  # the newest costmap's message, and the costmap
         self.follow_timer: Any = None  # runs while the operator drives the v-bot
+        self.gap = StepGap()
         self.cmd_vel = self.publisher("/nav/cmd_vel", msg.TwistStamped, qos=SENSOR)
         self.path = self.publisher("/nav/path", msg.Path, qos=SENSOR)
         self.subgoal = self.latest("/ic/subgoal", msg.PoseStamped, c.subgoal_timeout_s)
@@ -86,6 +88,7 @@ class NavigatorNode(Node[NavigatorConfig]):
             self.follow_timer.cancel()
             self.follow_timer = None
             self.navigator.reset()
+        self.gap.pause()
         self.speed = 0.0
         self.diagnose("follow", OK, "waiting: the operator drives the robot")
 
@@ -94,7 +97,10 @@ class NavigatorNode(Node[NavigatorConfig]):
         if state is None:
             self.rest()
             return
-        command = self.command(state)
+        now_ns = self.clock.steady_ns()
+        if self.gap.step(now_ns, self.clock.suspended_ns()):
+            self.navigator.reset()
+        command = (0.0, 0.0) if self.gap.settles(now_ns) else self.command(state)
         self.speed = command[0]
         self.cmd_vel.publish(msg.twist_stamped(*command, self.clock.now_ns()))
 

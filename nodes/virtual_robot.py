@@ -15,6 +15,7 @@ from instant_ic.control.step_times import StepTimes
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WALL_PERIOD_S, WallSearch
 from instant_ic.geometry.poses import matrix_from_pose2
+from instant_ic.step_gap import StepGap
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.walls.submit = self.background(self.walls.find, self.walls.on_found).submit
         self.action: VbotAction | None = None
         self.stepped_ns = self.clock.steady_ns()
+        self.gap = StepGap()
         self.odom = self.publisher("/vbot/odom", msg.Odometry, qos=SENSOR)
         self.times = StepTimes()
         timeout_s = self.config.state_timeout_s
@@ -71,6 +73,8 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
 
     def tick(self) -> None:
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
+        if self.gap.step(steady_ns, self.clock.suspended_ns()):
+            self.robot.velocity = (0.0, 0.0)
         # A late timer must not make the view jump.
         dt_s = min((steady_ns - self.stepped_ns) / 1e9, 0.2)
         self.stepped_ns = steady_ns
@@ -98,7 +102,8 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
-            self.times.obeyed = msg.twist_values(state.operator_command)
+            stood_still = self.gap.settles(self.stepped_ns)
+            self.times.obeyed = (0.0, 0.0) if stood_still else msg.twist_values(state.operator_command)
             self.robot.step(self.times.obeyed, robot_pose, dt_s, self.walls.found, float(state.vbot_limit_m_s))
         elif action == VbotAction.HELD:
             self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls.found)

@@ -14,6 +14,7 @@ from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_cou
 from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
 from instant_ic.pace import current
 from instant_ic.reconnect import Backoff
+from instant_ic.step_gap import StepGap, suspended_ns
 
 _COUNTED_SINCE_M = 0.2
 """Largest count, in metres of track, that a restarted controller can reach before the next reading."""
@@ -83,6 +84,7 @@ class BaseController:
         now_ns: Callable[[], int],
         steady_ns: Callable[[], int],
         open_port: Callable[[RoboclawConfig], SerialPort] = open_serial,
+        suspended_ns: Callable[[], int] = suspended_ns,
     ) -> None:
         """Create the controller without opening the port: the first `step` connects.
 
@@ -91,6 +93,7 @@ class BaseController:
             now_ns: clock of the stamps, nanoseconds since the epoch; the system may set this clock at any time.
             steady_ns: monotonic clock of every age, period and time-out.
             open_port: opens the serial port.
+            suspended_ns: time for which the machine was suspended.
         """
         self.config = config
         self.roboclaw = Roboclaw(config.roboclaw, open_port)
@@ -98,6 +101,9 @@ class BaseController:
         self.limiter = TwistLimiter(config.limits)
         self._now_ns = now_ns
         self._steady_ns = steady_ns
+        self._suspended_ns = suspended_ns
+        self._gap = StepGap()
+        self._awake_ns = 0  # older commands are from before the last gap
         self._lock = threading.Lock()
         self._command: _Command | None = None
         self._stopped = False
@@ -141,11 +147,14 @@ class BaseController:
         The base stops as in an emergency when a track does not follow or the controller reports a fault.
         """
         now_ns = self._steady_ns()
+        gap_s = self._gap.step(now_ns, self._suspended_ns())
+        if gap_s:
+            self._awake_ns = now_ns
         if not self.roboclaw.connected:
             return self._connect(now_ns)
         dt_s = 0.0 if self._last_step_ns is None else max(0.0, (now_ns - self._last_step_ns) * 1e-9)
         self._last_step_ns = now_ns
-        if dt_s > self.config.roboclaw.watchdog_s:
+        if gap_s or dt_s > self.config.roboclaw.watchdog_s:
             # The controller's watchdog has stopped the motors in the meantime.
             self._forget_motion()
             dt_s = 0.0
@@ -209,7 +218,8 @@ class BaseController:
             command = self._command
             if command is not None:
                 age_s = (self._steady_ns() - command.given_ns) * 1e-9
-                if not 0.0 <= age_s <= self.config.command_timeout_s:
+                fresh = command.given_ns >= self._awake_ns and 0.0 <= age_s <= self.config.command_timeout_s
+                if not fresh:
                     command = self._command = None
             return command
 

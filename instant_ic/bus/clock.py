@@ -10,6 +10,7 @@ import time
 from typing import Protocol
 
 from instant_ic import pace
+from instant_ic.step_gap import suspended_ns
 
 
 class Clock(Protocol):
@@ -23,6 +24,10 @@ class Clock(Protocol):
         """Nanoseconds since an arbitrary origin; only differences are meaningful."""
         ...
 
+    def suspended_ns(self) -> int:
+        """Nanoseconds for which the machine was suspended since it started; the steady clock stood still then."""
+        ...
+
 
 class SystemClock:
     """The machine's clock, at this process's pace (:mod:`instant_ic.pace`), which :func:`pace.use` sets before.
@@ -30,12 +35,14 @@ class SystemClock:
     Attributes:
         now_ns: returns nanoseconds since the epoch.
         steady_ns: returns nanoseconds of a clock that never jumps, even when somebody sets the machine's clock.
+        suspended_ns: :func:`instant_ic.step_gap.suspended_ns`.
     """
 
     def __init__(self) -> None:
         current = pace.current()
         self.now_ns = time.time_ns if current.real else current.now_ns
         self.steady_ns = time.monotonic_ns if current.real else current.steady_ns
+        self.suspended_ns = suspended_ns
 
 
 class ManualClock:
@@ -43,6 +50,7 @@ class ManualClock:
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
+        self._suspended_ns = 0
 
     def now_ns(self) -> int:
         """The time that was set last."""
@@ -51,6 +59,14 @@ class ManualClock:
     def steady_ns(self) -> int:
         """The same value as ``now_ns``: time-outs also run in simulated time."""
         return self._now_ns
+
+    def suspended_ns(self) -> int:
+        """The sum of all :meth:`suspend`."""
+        return self._suspended_ns
+
+    def suspend(self, seconds: float) -> None:
+        """Let the machine have been suspended for a time."""
+        self._suspended_ns += round(seconds * 1e9)
 
     def set(self, now_ns: int) -> None:
         """Set the time. It may go back, for example when a player loops."""

@@ -187,11 +187,11 @@ class LocalSubscription:
             store_progress(self._page, source.place, publisher, sequence)
         if payload is None:
             return
-        node, steady = source.node, self._steady_ns()
+        node, steady, order = source.node, self._steady_ns(), self._next_order()
         # A publisher's type is that of the subscription, or what the registry says.
         message = _new(
             Received,
-            (self.topic, source.type_name, payload, publish_ns, self._now_ns(), self._next_order(), node, steady),
+            (self.topic, source.type_name, payload, publish_ns, self._now_ns(), order, node, steady, publisher),
         )
         with self._lock:
             queue = self._queue

@@ -35,12 +35,15 @@ class Record:
     stamp_ns: int
     node: str
     qos: QoS
+    instance: bytes = b""
+    """Identity of the publisher; empty for a message from outside."""
 
 
 class _Publisher:
     def __init__(self, bus: LockstepBus, node: str, topic: str, name: str, qos: QoS) -> None:
         self._bus = bus
         self._node = node
+        self._instance = bus.new_instance()
         self.topic, self.type_name, self.qos = topic, name, qos
         self.stats = PublisherStats()
 
@@ -51,7 +54,7 @@ class _Publisher:
     def send(self, payload: Payload, publish_ns: int | None = None) -> None:
         data = bytes(joined(payload))
         self.stats.add(self._bus.clock.steady_ns())
-        self._bus.route(self.topic, self.type_name, data, self._node, self.qos, publish_ns)
+        self._bus.route(self.topic, self.type_name, data, self._node, self.qos, publish_ns, self._instance)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
         data = bytearray(size)
@@ -129,6 +132,7 @@ class LockstepBus(Closing):
         self._keep = keep
         self._on_record = on_record
         self._orders = itertools.count()
+        self._instances = itertools.count(1)
 
     def add(
         self,
@@ -207,9 +211,23 @@ class LockstepBus(Closing):
 
     # -- for publishers and subscriptions --------------------------------------------------------
 
-    def route(self, topic: str, name: str, payload: bytes, node: str, qos: QoS, publish_ns: int | None = None) -> None:
+    def new_instance(self) -> bytes:
+        """Identity of a new publisher."""
+        return next(self._instances).to_bytes(8)
+
+    def route(
+        self,
+        topic: str,
+        name: str,
+        payload: bytes,
+        node: str,
+        qos: QoS,
+        publish_ns: int | None = None,
+        instance: bytes = b"",
+    ) -> None:
         """Deliver a message to every subscription of its topic."""
-        record = Record(topic, name, payload, self.clock.now_ns() if publish_ns is None else publish_ns, node, qos)
+        stamp_ns = self.clock.now_ns() if publish_ns is None else publish_ns
+        record = Record(topic, name, payload, stamp_ns, node, qos, instance)
         if self._keep:
             self._records[topic].append(record)
         if qos.latched:
@@ -240,6 +258,7 @@ class LockstepBus(Closing):
                 next(self._orders),
                 record.node,
                 steady,
+                record.instance,
             )
         )
 

@@ -111,10 +111,13 @@ class Latest:
         self._message: Any = None
         self._received_ns = 0  # on the steady clock, so that setting the machine's clock changes no age
         self._given_ns = 0
+        self.instances: dict[str, bytes] = {}
+        """Publishers by the name of their node, as in :class:`Received`."""
 
     def put(self, message: Any, received: Received) -> None:
         """Store a newer message with its reception data."""
         self._message, self._received_ns = message, received.steady_ns
+        self.instances[received.publisher] = received.instance
         self._given_ns = received.given_ns(stamp_ns(message)) if hasattr(message, "header") else received.steady_ns
 
     def forget(self) -> None:

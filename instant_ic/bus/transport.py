@@ -37,6 +37,8 @@ class Received(NamedTuple):
     """Name of the node that published it."""
     steady_ns: int = 0
     """Time of arrival on the node's steady clock, for ages."""
+    instance: bytes = b""
+    """Identity of the publisher; a node that is started again has another one. Empty: unknown."""
 
     def given_ns(self, stamp_ns: int) -> int:
         """Time on the node's steady clock when the content was measured or commanded; all ages count from it.

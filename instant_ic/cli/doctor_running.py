@@ -20,6 +20,7 @@ ADVICE: dict[Reason, str] = {
     Reason.ESTOP_BUTTON: "release the button on the robot, then release the stop on the operator's page",
     Reason.STARTING: "wait for every sensor, or check the nodes (ic top)",
     Reason.RELEASE_CONTROLS: "release all keys, the joystick and the pad once",
+    Reason.INTERRUPTED: "release all keys; if it comes again, check the CPU load and memory (ic top)",
     Reason.OPERATOR_LOST: "open the operator's page, or check its network (ic topic info /operator/cmd_vel)",
     Reason.SCAN_STALE: "check the VLP-16's cable and network (ic topic info /scan)",
     Reason.POINTS_STALE: "check the VLP-16's driver (ic topic info /lidar/points)",

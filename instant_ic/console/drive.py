@@ -12,9 +12,14 @@ from enum import Enum
 from typing import Annotated
 
 from instant_ic.config.ranges import Plausible, check_ranges
+from instant_ic.step_gap import StepGap
 
 RATE_COMMANDS = 200  # newest commands kept to measure the rate
 CONFIRM_S = 1.0  # time in which the robot confirms a press of the emergency stop; until then the press counts
+LOOK_S = 0.1
+"""Longest time between two steps of the server while there is a driver."""
+LONG_GAP_S = 1.5
+"""After a longer gap between two steps, the driver must let go of the controls; as ``stop_after_s`` of the arbiter."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,7 @@ class Verdict(Enum):
     OUT_OF_ORDER = "sequence number not newer"
     OLD = "command too old"
     STOPPED = "emergency stop is set"
+    HELD = "the console stood still for too long: let go of the controls, then drive on"
 
 
 class DriveGate:
@@ -87,6 +93,23 @@ class DriveGate:
         self._stopped_at = -math.inf
         self._emitted = -math.inf
         self._emitted_command: tuple[float, float] | None = None
+        self._gap = StepGap()
+        self._held = False  # an interrupted drive: the controls must be released first
+        self._let_go_since = -math.inf  # the driver's page is present and commands no motion
+
+    def look(self, now: float, suspended_ns: int = 0) -> None:
+        """Note a step of the server, at least every ``LOOK_S`` while there is a driver; before any message is handled.
+
+        After a gap the command is zero and the driver lost. After a long one, or if the machine was suspended, the
+        driver must first let go of the controls for ``watchdog_s``: the page has sent the held key all the time.
+        """
+        gap_s = self._gap.step(round(now * 1e9), suspended_ns)
+        if self.driver is None:
+            self._gap.pause()
+        elif gap_s:
+            self.stop(now)
+            self._driver_beat, self._let_go_since = -math.inf, now
+            self._held |= gap_s > LONG_GAP_S
 
     @property
     def command(self) -> tuple[float, float]:
@@ -106,7 +129,7 @@ class DriveGate:
             return False
         self.stop(now)
         self.driver = client
-        self._driver_seen = self._driver_beat = now
+        self._driver_seen = self._driver_beat = self._let_go_since = now
         return True
 
     def leave(self, client: int, now: float) -> None:
@@ -128,6 +151,8 @@ class DriveGate:
         if self.driver != client:
             return False
         was_there = self.driver_alive(now)
+        if not was_there:
+            self._let_go_since = now
         self._driver_seen = now
         self._driver_beat = -math.inf if away else now  # absent at once, without the time-out
         if away:
@@ -140,7 +165,11 @@ class DriveGate:
 
     def receive(self, client: int, sequence: int, age_s: float, linear: float, angular: float, now: float) -> Verdict:
         """Handle a drive command (m/s, rad/s; clamped to the limits) and return the result."""
-        verdict = self._judge(client, sequence, age_s)
+        moves = (linear, angular) != (0.0, 0.0)
+        if client == self.driver and moves:
+            self._held &= now - self._let_go_since < self.config.watchdog_s
+            self._let_go_since = now
+        verdict = self._judge(client, sequence, age_s, moves)
         self.counts[verdict] += 1
         if verdict is not Verdict.ACCEPTED:
             return verdict
@@ -160,7 +189,7 @@ class DriveGate:
             self._received = self._driver_beat = now
         return verdict
 
-    def _judge(self, client: int, sequence: int, age_s: float) -> Verdict:
+    def _judge(self, client: int, sequence: int, age_s: float, moves: bool) -> Verdict:
         if client != self.driver:
             return Verdict.NOT_DRIVER
         if sequence <= self._sequence.get(client, -1):
@@ -168,7 +197,9 @@ class DriveGate:
         # A stamp in the future proves no freshness either.
         if abs(age_s) > self.config.max_command_age_s:
             return Verdict.OLD
-        return Verdict.STOPPED if self.estop else Verdict.ACCEPTED
+        if self.estop:
+            return Verdict.STOPPED
+        return Verdict.HELD if self._held and moves else Verdict.ACCEPTED
 
     def rate_hz(self, now: float) -> float:
         """Commands accepted within the last second."""

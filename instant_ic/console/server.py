@@ -35,7 +35,7 @@ from instant_ic.console.connections import (
     Listener,
     network_of,
 )
-from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.console.drive import LOOK_S, DriveConfig, DriveGate, Verdict
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, short_text, whole
@@ -43,6 +43,7 @@ from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
 from instant_ic.control.robot_lease import sender_name
 from instant_ic.pace import current
+from instant_ic.step_gap import suspended_ns
 from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
 
 STATIC = Path(__file__).parent / "static"
@@ -639,6 +640,7 @@ class ConsoleServer:
 
     def _take(self, session: Session, text: str, now: float, *, only_a_stop: bool) -> None:
         """Handle one message; an emergency stop is handled even above the message limit."""
+        self._look(now)
         try:
             message = parse_text(text)
             if not only_a_stop or message["type"] == "estop":
@@ -797,7 +799,10 @@ class ConsoleServer:
         pace = current()
         while True:
             driver, trips = self.gate.driver, self.gate.watchdog_trips
-            deadline = self.gate.next_deadline(current().steady_s())
+            now = pace.steady_s()
+            deadline = self.gate.next_deadline(now)
+            if driver is not None and deadline is not None:  # the gate looks at the time between its steps
+                deadline = min(deadline, now + LOOK_S)
             self._gate_wake.clear()
             with contextlib.suppress(TimeoutError):
                 delay = None if deadline is None else max(pace.wait_s(deadline - pace.steady_s()), 0.001)
@@ -809,8 +814,13 @@ class ConsoleServer:
             if (self.gate.driver, self.gate.watchdog_trips) != (driver, trips):
                 self._send_session()
 
+    def _look(self, now: float) -> None:
+        """Let the gate look whether this process has stood still, before it handles anything."""
+        self.gate.look(now, suspended_ns())
+
     def _emit_due(self, *, wake: bool = True) -> None:
         now = current().steady_s()
+        self._look(now)
         command = self.gate.take_due(now)
         if self._commanding is None:
             self._commanding = self.gate.driver

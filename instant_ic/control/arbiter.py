@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.commands import CommandRules
 from instant_ic.control.guards import GUARD_FUNCTIONS, against_switch, estop_pressed, hold, images_agree, stop_notice
+from instant_ic.control.interruptions import Interruptions
 from instant_ic.control.passage import find_passage
 from instant_ic.control.planner import HybridPlanner
 from instant_ic.control.prediction import Prediction, Predictor
@@ -95,7 +96,10 @@ class Arbiter:
         self._poses_before: dict[str, tuple[NDArray[np.float64], int]] = {}  # by robot, and when: the previous step
         self._contradictions = 0  # those that the robot has been stopped for
         self._stopped_by = Notice(Reason.STARTING, "waiting for the sensors")
-        self._awaits_operator = False  # STOPPED because the operator's link was lost
+        self._awaits_operator = False  # STOPPED until an operator's command shows that no key is held
+        self._let_go_since_ns: int | None = None
+        self._interruptions = Interruptions()
+        self._interrupted: Notice | None = None  # since the previous step
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
         self._passage: tuple[Notice | None, int] | None = None  # reason against it, and when it was looked for
         self._actions: dict[str, Callable[[Snapshot, int], None]] = {
@@ -120,6 +124,12 @@ class Arbiter:
         """Take at most one transition, then return the command of the resulting state."""
         if self._since_ns is None:
             self._since_ns = now_ns
+        longest_s = self.config.timeouts.stop_after_s
+        self._interrupted = self._interruptions.step(now_ns, inputs.suspended_ns, inputs.instances, longest_s)
+        if self._interrupted is not None or self._interruptions.gap_s:
+            # Nobody has looked meanwhile.
+            self._fresh_since_ns = self._agree_since_ns = self._slow_since_ns = self._let_go_since_ns = None
+        self._awaits_operator |= self._interrupted is not None
         snapshot = self._assess(inputs, now_ns)
         rows = (row for row in TRANSITIONS if row.source == self.mode)
         row = next((row for row in rows if GUARD_FUNCTIONS[row.guard](snapshot)), None)
@@ -179,7 +189,8 @@ class Arbiter:
         self._stopped_by = stop_notice(snapshot)
         self._stopped_for_pose |= snapshot.pose_lost
         lost = () if estop_pressed(snapshot) else snapshot.lost
-        self._awaits_operator = any(stale.source.reason == Reason.OPERATOR_LOST for stale in lost)
+        left = any(stale.source.reason == Reason.OPERATOR_LOST for stale in lost)
+        self._awaits_operator = left or self._interrupted is not None
 
     def _place_vbot(self, snapshot: Snapshot, now_ns: int) -> None:
         self._vbot_start = snapshot.vbot_pose.copy()
@@ -203,6 +214,7 @@ class Arbiter:
         if command != NO_MOTION:
             self._driven = (command, now_ns)
         last_command, driven_ns = self._driven or (NO_MOTION, self._since_ns)
+        self._let_go_since_ns = _kept(self._let_go_since_ns, now_ns) if fresh and command == NO_MOTION else None
         if inputs.vspace.ready:
             self._ready = (inputs.vspace, now_ns)
         stale = self._sources.stale(inputs, self.mode, *self._durations_s(now_ns))
@@ -246,6 +258,9 @@ class Arbiter:
             since_return_s=self._since_s(self._returned_ns, now_ns, math.inf),
             awaits_operator=self._awaits_operator,
             slow_s=self._since_s(self._slow_since_ns, now_ns, 0.0),
+            let_go_s=self._since_s(self._let_go_since_ns, now_ns, -1.0),
+            interrupted=self._interrupted,
+            settles=self._interruptions.gap.settles(now_ns),
             pose_lost=lost >= trust.stop and not self._stopped_for_pose,
             pose_jumped=self._jumps("r-bot", inputs.robot_pose, now_ns),
             contradicted=inputs.contradictions > self._contradictions,
@@ -383,6 +398,6 @@ def _vbot_action(s: Snapshot) -> VbotAction:
         return VbotAction.EASED
     if s.mode != Mode.VIRTUAL:
         return VbotAction.WITH_ROBOT
-    if any(stale.source.key in ("view", "command") for stale in s.stale):
+    if s.settles or any(stale.source.key in ("view", "command") for stale in s.stale):
         return VbotAction.HELD  # nobody sees it, or nobody drives it
     return VbotAction.LED_BACK if s.leading_back else VbotAction.DRIVEN

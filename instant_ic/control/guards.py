@@ -19,11 +19,15 @@ RETURN_SIDE_M = 0.12
 """Width beside the footprint, on each side, that must be free for a return."""
 _LET_GO_S, _SILENT_S = 0.1, 1.0
 """Hands are off after such a time of zeros, or of silence: a link that pauses says nothing about a held key, and the
-console's last zero is followed at once by its report of the loss."""
+console's last zero is followed at once by its report of the loss. Silence after a held key shows nothing."""
 
 
 def estop_pressed(s: Snapshot) -> bool:
     return s.inputs.estop or s.inputs.estop_button
+
+
+def interrupted(s: Snapshot) -> bool:
+    return s.interrupted is not None
 
 
 def source_lost(s: Snapshot) -> bool:
@@ -124,7 +128,8 @@ def may_resume(s: Snapshot) -> bool:
         return False
     if (s.awaits_operator and not s.fresh) or images_too_rare(s.inputs, s.config):
         return False
-    if s.idle_s < (_LET_GO_S if s.fresh else _SILENT_S):
+    silent = s.idle_s >= _SILENT_S and (s.inputs.operator_command == NO_MOTION or s.inputs.operator_gone)
+    if interrupted(s) or s.settles or not (s.let_go_s >= _LET_GO_S if s.fresh else silent):
         return False
     return s.fresh_s >= s.config.timeouts.recover_s
 
@@ -135,6 +140,8 @@ GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {name: globals()[name] 
 
 def hold(s: Snapshot) -> Notice | None:
     """Reason why nothing may move in this state; None when it may."""
+    if s.settles:
+        return Notice(Reason.INTERRUPTED, "stopped: the robot's control stood still for a moment")
     if s.stale:
         return stale_notice(s.stale).prefixed("stopped: ")
     if s.inputs.robot_pose is None:
@@ -207,6 +214,8 @@ def stop_notice(s: Snapshot) -> Notice:
     """Reason of a transition to STOPPED."""
     if estop_pressed(s):
         return Notice(Reason.ESTOP, "emergency stop")
+    if s.interrupted is not None:
+        return s.interrupted
     if s.lost:
         return stale_notice(s.lost)
     if s.pose_lost:

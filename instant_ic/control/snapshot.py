@@ -86,6 +86,10 @@ class ArbiterInputs:
     estop_input from their first message on."""
     usual: dict[str, float] = field(default_factory=dict)
     """Usual age of a source in seconds when its next message arrives (``freshness.Rhythm``)."""
+    suspended_ns: int = 0
+    """Time for which the machine was suspended (``Clock.suspended_ns``)."""
+    instances: dict[tuple[str, str], bytes] = field(default_factory=dict)
+    """Identity of each publisher (``Received.instance``) by source and node."""
     images_late_s: float = 0.0
     """Seconds until the operator has an image, from its exposure, or from the view's request if that takes longer."""
 
@@ -142,6 +146,12 @@ class Snapshot:
     """STOPPED because the operator's link was lost."""
     slow_s: float
     """Seconds for which the v-bot has driven slower than commanded."""
+    let_go_s: float
+    """Seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
+    interrupted: Notice | None = None
+    """What has happened since the step before that the controls must be released for."""
+    settles: bool = False
+    """The arbiter itself stood still, less than ``SETTLE_S`` ago."""
     pose_lost: bool = False
     """The SLAM is lost, and the robot has not been stopped for it yet."""
     pose_jumped: bool = False

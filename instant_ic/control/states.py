@@ -77,6 +77,7 @@ class Reason(IntEnum):
     VSPACE_FAILED = 57
     VSPACE_LOST = 58
     POSE_LOST = 59
+    INTERRUPTED = 60
     CONTRADICTION = 64
     # Held or stopped: a source is stale
     SCAN_STALE = 70
@@ -135,11 +136,13 @@ class Transition:
 
 TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.REAL, Mode.STOPPED, "estop_pressed", "stop"),
+    Transition(Mode.REAL, Mode.STOPPED, "interrupted", "stop"),
     Transition(Mode.REAL, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.REAL, Mode.STOPPED, "pose_lost", "stop"),
     Transition(Mode.REAL, Mode.STOPPED, "contradicted", "stop"),
     Transition(Mode.REAL, Mode.ENTERING, "obstacle_and_ready", "call_vbot"),
     Transition(Mode.ENTERING, Mode.STOPPED, "estop_pressed", "stop"),
+    Transition(Mode.ENTERING, Mode.STOPPED, "interrupted", "stop"),
     Transition(Mode.ENTERING, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.ENTERING, Mode.STOPPED, "pose_lost", "stop"),
     Transition(Mode.ENTERING, Mode.STOPPED, "contradicted", "stop"),
@@ -148,12 +151,14 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.ENTERING, Mode.REAL, "way_free", "hand_back"),
     Transition(Mode.ENTERING, Mode.VIRTUAL, "view_fits", "place_vbot"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "estop_pressed", "stop"),
+    Transition(Mode.VIRTUAL, Mode.STOPPED, "interrupted", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "pose_lost", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "contradicted", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "vspace_lost", "stop"),
     Transition(Mode.VIRTUAL, Mode.RETURNING, "rejoined", "ease_vbot"),
     Transition(Mode.RETURNING, Mode.STOPPED, "estop_pressed", "stop"),
+    Transition(Mode.RETURNING, Mode.STOPPED, "interrupted", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "pose_lost", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "contradicted", "stop"),
@@ -168,6 +173,8 @@ GUARDS: dict[str, str] = {
     "estop_pressed": "the emergency stop is latched",
     "source_lost": "a source that this state needs has been silent for stop_after_s (camera, views: for twice their "
     "time-out, if that is longer)",
+    "interrupted": "the arbiter has not stepped for stop_after_s, its machine was suspended, or crawler_base, "
+    "navigator, virtual_robot or the console restarted",
     "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more, or the pose (or the shown v-bot's) "
     "has jumped by pose_trust.jump_m or jump_deg; once the operator has let go, the r-bot may drive, slowly until its "
     "place is recognized",
@@ -188,8 +195,8 @@ GUARDS: dict[str, str] = {
     "faster than return_turn_rad_s, and view and image agree as closely (after return_timeout_s the first is enough, "
     "after twice that nothing is required)",
     "may_resume": "the emergency stop is released, every source has been fresh for recover_s, images arrive at least "
-    "every slowest_image_s, the command has been zero for 0.1 s or silent for 1 s, and a lost operator's link that "
-    "caused the stop is back",
+    "every slowest_image_s, the command has been zero for 0.1 s (or silent for 1 s, no key held before), and the "
+    "operator's link is back if `interrupted` or its loss caused the stop",
 }
 
 ACTIONS: dict[str, str] = {

@@ -49,9 +49,12 @@ class Inbox:
         self.event = threading.Event()
         self.raw = transport.subscribe(topic, "std_msgs/msg/String", qos, self.event.set)
         self.texts: list[str] = []
+        self.instances: list[bytes] = []
 
     def poll(self) -> list[str]:
-        self.texts += [deserialize(m.payload, m.type_name).data for m in self.raw.take()]
+        taken = self.raw.take()
+        self.texts += [deserialize(m.payload, m.type_name).data for m in taken]
+        self.instances += [m.instance for m in taken]
         return self.texts
 
 
@@ -109,6 +112,8 @@ def test_publisher_killed_and_restarted_is_heard_again(transport, talker, run_di
     talker("-p", "text:=again")
     wait_for(lambda: [t for t in inbox.poll()[heard:] if t.startswith("again")])
     assert inbox.raw.stats.lost == 0
+    assert len(set(inbox.instances)) == 2, "a process that is started again is another publisher"
+    assert inbox.instances[0] != inbox.instances[-1]
 
 
 @pytest.mark.parametrize("said_before", [["known"], []])

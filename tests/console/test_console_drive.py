@@ -241,3 +241,71 @@ def test_deadlines():
 def test_bad_parameters_are_refused_by_name(key, value):
     with pytest.raises(ValueError, match="watchdog_s" if key == "rate_hz" else key):
         DriveConfig(**{key: value})
+
+
+def frozen(gate, seconds, at=1.0, suspended_s=0.0):
+    """Hold the key until ``at``, then freeze the console; return the time of its end."""
+    for i in range(round(at / 0.05)):
+        look_and_drive(gate, i * 0.05, 2 + i)
+    assert gate.moving
+    gate.look(at + seconds, round(suspended_s * 1e9))
+    return at + seconds
+
+
+def look_and_drive(gate, now, sequence, linear=0.3, suspended_s=0.0):
+    """One message of the driver's page; return what becomes of it."""
+    gate.look(now, round(suspended_s * 1e9))
+    gate.touch(1, now)
+    verdict = gate.receive(1, sequence, 0.0, linear, 0.0, now)
+    gate.take_due(now)
+    return verdict
+
+
+@pytest.mark.parametrize(("seconds", "suspended_s"), [(1.6, 0.0), (8.0, 0.0), (0.02, 5.0)])
+def test_a_console_that_stood_still_waits_for_a_release(seconds, suspended_s):
+    """Frozen or suspended under a held key, which the page has sent all the time and goes on sending."""
+    gate = driving_gate()
+    now = frozen(gate, seconds, suspended_s=suspended_s)
+    assert not gate.moving and not gate.driver_alive(now)
+    verdicts = {look_and_drive(gate, now + i * 0.05, 100 + i, suspended_s=suspended_s) for i in range(60)}
+    assert verdicts == {Verdict.HELD}
+    assert not gate.moving
+    for i in range(6):  # released: beats alone, and the page's zero
+        assert look_and_drive(gate, now + 3.0 + i * 0.05, 200 + i, 0.0, suspended_s) is Verdict.ACCEPTED
+    assert look_and_drive(gate, now + 3.3, 300, suspended_s=suspended_s) is Verdict.ACCEPTED
+    assert gate.moving
+
+
+def test_after_a_short_freeze_of_the_console_the_held_key_drives_on():
+    gate = driving_gate()
+    now = frozen(gate, 0.8)
+    assert not gate.moving and not gate.driver_alive(now)
+    assert look_and_drive(gate, now, 100) is Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("first", ["beat", "old command", "timer", "new lease"])
+def test_what_a_thawed_console_handles_first_does_not_matter(first):
+    gate = driving_gate()
+    now = frozen(gate, 2.5)
+    if first == "timer":
+        assert gate.take_due(now) == (0.0, 0.0)
+        assert gate.driver is None  # the lease has run out
+    elif first == "old command":
+        assert gate.receive(1, 99, 2.0, 0.3, 0.0, now) is Verdict.OLD
+    elif first == "new lease":
+        gate.leave(1, now)
+    gate.request(1, now)
+    gate.touch(1, now)
+    assert look_and_drive(gate, now + 0.01, 100) is Verdict.HELD
+    assert look_and_drive(gate, now + 0.24, 101) is Verdict.HELD
+    assert look_and_drive(gate, now + 0.6, 102) is Verdict.HELD  # silence is no release: no page was heard
+    gate.touch(1, now + 0.7)
+    assert look_and_drive(gate, now + 0.86, 103) is Verdict.ACCEPTED
+
+
+def test_a_console_without_a_driver_may_rest():
+    gate = DriveGate(CONFIG)
+    gate.look(0.0)
+    gate.look(60.0)
+    gate.request(1, 60.0)
+    assert look_and_drive(gate, 60.0, 1) is Verdict.ACCEPTED

@@ -116,10 +116,14 @@ class Stack:
         now = self.now
         self.sense()
         if command is not None:
-            self.send("/operator/cmd_vel", twist_stamped(*command, now))
+            self.operate(command)
         self.bus.advance_to(now + STEP_NS)
         self.move()
         return self.bus.last("/ic/state")
+
+    def operate(self, command: tuple[float, float], ahead_s: float = 0.0) -> None:
+        """The operator's command, with a stamp ``ahead_s`` ahead of the clock."""
+        self.send("/operator/cmd_vel", twist_stamped(*command, self.now + round(ahead_s * 1e9)))
 
     def sense(self) -> None:
         """All but the operator's command."""

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from instant_ic import estop_state
-from instant_ic.bus import LATCHED
+from instant_ic.bus import ERROR, LATCHED
 from instant_ic.bus.lockstep import LockstepBus, _Transport
 from instant_ic.console import ConsoleServer
 from instant_ic.estop_state import EstopStateError, KeptStop, RunMark
@@ -233,6 +233,26 @@ def test_a_state_that_cannot_be_kept_is_an_error_that_says_what_to_do(tmp_path: 
     (tmp_path / "file").write_text("")
     with pytest.raises(EstopStateError, match="INSTANT_IC_RUN_DIR"):
         estop_state.write(tmp_path / "file" / "below", KeptStop("console", 5))
+
+
+def test_a_stop_whose_state_cannot_be_written_holds_and_is_an_error(robot: Robot, run_dir: Path) -> None:
+    (run_dir / "estop.part").mkdir()  # in the way of the file, for root too
+    robot.console.on_estop(True)
+    robot.bus.advance(1.0)
+    assert robot.stopped()
+    level, text, _ = robot.nodes["arbiter"].diagnoses()["estop"]
+    assert level == ERROR
+    assert "state cannot be kept" in text and "Free the disk, or set INSTANT_IC_RUN_DIR" in text
+    assert not (run_dir / "estop.json").exists()
+    robot.console.on_estop(False)
+    robot.bus.advance(0.1)
+    assert not robot.bus.last("/ic/state").estop
+
+
+def test_a_stack_whose_state_cannot_be_written_is_not_started(tmp_path: Path) -> None:
+    (tmp_path / "run.part").mkdir()
+    with pytest.raises(EstopStateError, match="Free the disk"), RunMark(tmp_path):
+        pytest.fail("the launcher starts its nodes")
 
 
 def test_the_default_run_directory_keeps_its_state_where_a_power_cut_leaves_it(

@@ -1,0 +1,48 @@
+"""Interruptions after which the operator must release the controls, although every source is fresh again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from instant_ic.control.reasons import Notice
+from instant_ic.control.states import Reason
+from instant_ic.step_gap import StepGap
+
+WATCHED = {"odometry": "base driver", "nav": "navigator", "vbot": "virtual robot", "command": "operator's console"}
+"""Sources whose restart stops the robot, with the names of their nodes for the operator."""
+
+
+class Interruptions:
+    """Looks for what ends the operator's right to drive on under a held key: a long gap, a suspended or new process."""
+
+    def __init__(self) -> None:
+        self.gap = StepGap()
+        self.gap_s = 0.0
+        """Gap that ends with the present step."""
+        self._instances: dict[tuple[str, str], bytes] = {}
+
+    def step(
+        self, steady_ns: int, suspended_ns: int, instances: Mapping[tuple[str, str], bytes], longest_s: float
+    ) -> Notice | None:
+        """Note a step of the arbiter.
+
+        Args:
+            steady_ns, suspended_ns: as for :meth:`StepGap.step`.
+            instances: publishers of the sources, as in ``ArbiterInputs``.
+            longest_s: a longer gap is an interruption.
+
+        Returns:
+            What has happened since the step before; None for nothing.
+        """
+        self.gap_s = self.gap.step(steady_ns, suspended_ns)
+        new = [key for key, instance in instances.items() if self._instances.get(key, instance) != instance]
+        self._instances |= instances
+        if math.isinf(self.gap_s):
+            return Notice(Reason.INTERRUPTED, "this computer was suspended")
+        if self.gap_s > longest_s:
+            return Notice(Reason.INTERRUPTED, f"the robot's control stood still for {self.gap_s:.1f} s")
+        if new:
+            names = ", ".join(sorted({f"the {WATCHED[key]} ({publisher})" for key, publisher in new}))
+            return Notice(Reason.INTERRUPTED, f"{names} was restarted")
+        return None
