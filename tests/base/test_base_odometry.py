@@ -147,7 +147,7 @@ def test_limiter_never_exceeds_its_limits(commands: list[tuple[float, float, flo
 @pytest.mark.parametrize(
     ("make", "key"),
     [
-        (lambda: SkidSteerConfig(track_width=-0.3), "track_width must be > 0 \\(got -0.3\\)"),
+        (lambda: SkidSteerConfig(track_width=-0.3), "track_width must lie in 0.05..3 \\(got -0.3\\)"),
         (lambda: SkidSteerConfig(left_motor=3), "left_motor"),
         (lambda: LimitsConfig(max_angular_rad_s=0.0), "max_angular_rad_s"),
         (lambda: RoboclawConfig(baud=12345), "baud"),
