@@ -93,7 +93,7 @@ class Vlp16DriverConfig(ReceiverConfig):
     loop: bool = False
     frame_id: str = "velodyne"
     lidar_mount: Mount = LIDAR_MOUNT
-    silence_s: Annotated[float, Plausible(0.2, 60)] = 2.0
+    silence_s: Annotated[float, Plausible(0.05, 60)] = 2.0
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     scan: FlatScanConfig = field(default_factory=FlatScanConfig)
 

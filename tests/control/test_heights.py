@@ -278,7 +278,7 @@ def test_standing_beside_a_remembered_thing_does_not_wipe_it_out() -> None:
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"min_obstacle_height": 2.0}, "min_obstacle_height must be below"),
+        ({"min_obstacle_height": 0.4, "max_obstacle_height": 0.3}, "min_obstacle_height must be below"),
         ({"mark_threshold": 0}, "mark_threshold"),
         ({"obstacle_max_range": -1.0}, "obstacle_max_range"),
     ],
