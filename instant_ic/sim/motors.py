@@ -1,20 +1,14 @@
 """Track motors under the speed loops of the controller, with their power, current and encoders.
 
-A healthy loop is tuned: the track follows its set point with the lag and the acceleration of ``RobotConfig``. The loop
+A healthy loop is tuned: the track follows its set point with its lag and acceleration. The loop
 regulates what the encoder counts. What the encoder does not count of that motion is an error, which the loop integrates
 (wind-up) until the power saturates: a dead encoder lets the track run away, a reversed one drives it away at once.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-
-if TYPE_CHECKING:
-    from instant_ic.sim.robot import RobotConfig
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -31,7 +25,9 @@ class TrackMotors:
     """Motors of the left and the right track.
 
     Args:
-        config: lag, acceleration and friction of a track.
+        acceleration: largest acceleration of a track by its motor, m/s².
+        lag_s: time constant with which a track follows its set point, seconds.
+        resistance: deceleration of a track by friction, m/s².
         seed: seed of the noise of the currents.
 
     Attributes:
@@ -48,8 +44,8 @@ class TrackMotors:
         gain, integral_gain: of the speed loop; m/s per m/s, and m/s per metre.
     """
 
-    def __init__(self, config: RobotConfig, seed: int = 0) -> None:
-        self.config = config
+    def __init__(self, acceleration: float, lag_s: float, resistance: float, seed: int = 0) -> None:
+        self.acceleration, self.lag_s, self.resistance = acceleration, lag_s, resistance
         self.speeds: FloatArray = np.zeros(2)
         self.travelled: FloatArray = np.zeros(2)
         self.counted: FloatArray = np.zeros(2)
@@ -93,7 +89,7 @@ class TrackMotors:
         mean = 0.5 * (before + self.speeds)
         self.travelled = self.travelled + mean * dt_s
         self.counted = self.counted + self.encoders * mean * dt_s
-        friction = self.config.rolling_resistance * self.config.motor_lag_s
+        friction = self.resistance * self.lag_s
         self.power = np.clip((driven + np.sign(driven) * friction) / top, -1.0, 1.0)
         stalled = self.power * self.battery_v / NOMINAL_V - self.speeds / FULL_SPEED_M_S
         noise = _NOISE_A * self._rng.standard_normal(2)
@@ -102,9 +98,8 @@ class TrackMotors:
 
     def _follow(self, speeds: FloatArray, wanted: FloatArray, dt_s: float) -> FloatArray:
         """Speeds after ``dt_s`` of tracks that follow ``wanted``; at zero, friction ends the motion."""
-        config = self.config
-        most = config.track_acceleration * dt_s
-        follow = (wanted - speeds) * (1 - math.exp(-dt_s / config.motor_lag_s))
+        most = self.acceleration * dt_s
+        follow = (wanted - speeds) * (1 - math.exp(-dt_s / self.lag_s))
         followed = speeds + np.clip(follow, -most, most)
-        braked = np.sign(followed) * np.maximum(np.abs(followed) - config.rolling_resistance * dt_s, 0.0)
+        braked = np.sign(followed) * np.maximum(np.abs(followed) - self.resistance * dt_s, 0.0)
         return np.where(wanted == 0, braked, followed)

@@ -75,7 +75,7 @@ class TrackedRobot:
         self.kinematics = SkidSteer(geometry)
         self.pose: FloatArray = np.asarray(pose, float)
         self.twist: FloatArray = np.zeros(3)
-        self.motors = TrackMotors(config, seed)
+        self.motors = TrackMotors(config.track_acceleration, config.motor_lag_s, config.rolling_resistance, seed)
         self.contact = False
         self.contacts = 0
         self._mask = mask

@@ -9,7 +9,6 @@ from instant_ic.base.following import TrackWatch
 from instant_ic.base.kinematics import SkidSteer
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.sim.motors import TrackMotors
-from instant_ic.sim.robot import RobotConfig
 
 TICK_S = 0.005
 PERIOD_S = 1.0 / 30.0
@@ -34,7 +33,7 @@ class Drive:
     def __init__(self, seed: int, late: float = 0.0, pauses: bool = False) -> None:
         self.rng = rng = np.random.default_rng([53, seed])
         self.late, self.pauses = late, pauses
-        self.motors = motors = TrackMotors(RobotConfig(motor_lag_s=rng.uniform(0.03, 0.12)), seed)
+        self.motors = motors = TrackMotors(2.0, rng.uniform(0.03, 0.12), 0.5, seed)
         motors.battery_v = rng.uniform(20.0, 25.2)
         motors.gain, motors.integral_gain = rng.uniform(1.0, 3.0), float(np.exp(rng.uniform(np.log(5), np.log(60))))
         motors.load = rng.uniform(0.0, 0.25, 2) * rng.integers(0, 2)
