@@ -84,7 +84,7 @@ def test_nothing_depends_on_the_pace_of_the_process(world: Callable[..., RateWor
     ]
 
 
-@pytest.mark.parametrize("camera_hz", [1, 2, 5, 10, 30])
+@pytest.mark.parametrize("camera_hz", [1, 2, 3, 5, 10, 30])
 def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_distance(
     world: Callable[..., RateWorld], camera_hz: float
 ) -> None:
@@ -102,7 +102,7 @@ def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_di
     made.silent.add("camera")
     began_s, began_x = made.time_s, made.base.pose[0]
     assert made.run(2.0, lambda: twist_values(made.state.applied_command) == NOTHING)
-    assert made.time_s - began_s <= 1.0 / camera_hz + 0.3 + 0.06
+    assert made.time_s - began_s <= TimeoutConfig().allowed_s("camera", 1.0 / camera_hz) + 0.06  # a step
     assert made.state.reason_code == ControlState.REASON_CAMERA_STALE
     assert made.run(3.0, lambda: made.modes[-1] == "STOPPED")
     # What is driven on one image, and then the base's latency and its braking.

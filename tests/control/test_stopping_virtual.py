@@ -13,7 +13,7 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.sources import SourceMonitor
-from instant_ic.control.states import SOURCES, Mode
+from instant_ic.control.states import SOURCES, Mode, Reason
 from instant_ic.msg import HARD_STOP, ControlState, twist_values
 from nodes.navigator import NavigatorNode
 from nodes.virtual_robot import VirtualRobotNode
@@ -56,6 +56,11 @@ def test_each_loss_in_virtual_commands_a_hard_zero_within_0_3_s(loss: str) -> No
     stopped = [(record.stamp_ns, message) for record, message in sent if record.stamp_ns > max(moving, default=0)]
     assert (stopped[0][0] - began_ns) / 1e9 <= 0.3
     assert {message.header.frame_id for _, message in stopped} == {HARD_STOP}
+    assert stack.drive(1.4, (0.4, 0.0))[-1].mode == ControlState.STOPPED
+    before = len(stack.bus.records("/cmd_vel"))
+    stack.silent.clear()  # back, under the held key
+    assert stack.drive(1.5, (0.4, 0.0))[-1].reason_code == Reason.RELEASE_CONTROLS
+    assert {twist_values(message) for message in stack.bus.messages("/cmd_vel")[before:]} == {(0.0, 0.0)}
 
 
 @pytest.mark.parametrize(("late_s", "drives"), [(0.0, True), (0.55, False)])

@@ -80,7 +80,7 @@ def test_no_command_given_before_the_release_drives_after_it() -> None:
     assert bench.line.travelled_m > 0.1
 
 
-def test_an_old_release_of_another_client_does_not_end_the_stop() -> None:
+def test_an_old_release_of_another_client_does_not_end_the_stop(caplog: pytest.LogCaptureFixture) -> None:
     bench = NodeBench()
     bench.estop(False, "foxglove_bridge")
     bench.run(0.5)
@@ -89,6 +89,7 @@ def test_an_old_release_of_another_client_does_not_end_the_stop() -> None:
     bench.bus.deliver(bench.bus.subscriptions["/operator/estop"][0], kept)  # the bridge connects again
     bench.run(1.0, v=0.4)
     assert bench.line.travelled_m == 0.0
+    assert "emergency stop not released: the release by foxglove_bridge is older" in caplog.text
 
 
 def test_a_restarted_base_takes_the_latched_stop_over() -> None:

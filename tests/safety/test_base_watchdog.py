@@ -27,15 +27,18 @@ def test_the_watchdog_is_never_longer_than_asked_for(asked_s: float, tenths: int
     assert base.line.emulator.timeout_s == pytest.approx(tenths / 10)
 
 
-def test_a_watchdog_that_was_cleared_is_noticed_and_set_again() -> None:
+@pytest.mark.parametrize("phase_s", [0.0, 0.1, 0.2])
+def test_a_watchdog_that_was_cleared_stops_the_tracks_and_is_set_again(phase_s: float) -> None:
     base = Base()
-    base.run(2.0, 0.4)
+    base.run(2.0 + phase_s, 0.4)
     base.line.emulator.timeout_s = 0.0
-    cleared_s = base.line.time_s
+    cleared_s, before = base.line.time_s, len(base.line.written)
     while base.line.emulator.timeout_s == 0.0 and base.line.time_s < cleared_s + 10.0:
         base.run(0.01, 0.4)
-    # One period of health, two steps.
-    assert base.line.time_s - cleared_s <= base.config.health_period_s + 2.0 / RATE_HZ + 0.03
+    stops_s = [at_s for at_s, frame in base.line.written[before:] if frame[1] == Command.DUTY_ACCELERATION_BOTH]
+    assert stops_s[0] - cleared_s <= base.config.health_period_s + 1.0 / RATE_HZ
+    assert base.line.time_s - cleared_s <= 0.55
+    assert base.line.speed < 0.1  # it has braked since
     assert any("watchdog is 0.0 s instead of 0.3 s" in state.link for state in base.states)
     assert base.line.opened == 2
     base.run(1.0, 0.4)

@@ -15,6 +15,7 @@ import pytest
 from instant_ic import estop_state
 from instant_ic.bus import ERROR, LATCHED
 from instant_ic.bus.lockstep import LockstepBus, _Transport
+from instant_ic.cli.main import main
 from instant_ic.console import ConsoleServer
 from instant_ic.estop_state import EstopStateError, KeptStop, RunMark
 from instant_ic.msg import (
@@ -118,7 +119,9 @@ def test_a_pressed_emergency_stop_survives_restarts(robot: Robot, order: tuple[s
     assert not robot.bus.last("/ic/state").estop
 
 
-def test_a_console_that_starts_with_a_latched_release_ends_no_stop(robot: Robot) -> None:
+def test_a_console_that_starts_with_a_latched_release_ends_no_stop(
+    robot: Robot, caplog: pytest.LogCaptureFixture
+) -> None:
     released_ns = robot.bus.clock.now_ns()
     robot.bus.advance(1.0)
     robot.console.on_estop(True)
@@ -130,6 +133,8 @@ def test_a_console_that_starts_with_a_latched_release_ends_no_stop(robot: Robot)
     robot.bus.route("/operator/estop", type_name(Bool), release, "second_console", LATCHED, released_ns)
     robot.bus.advance(0.1)
     assert robot.stopped()
+    refusals = [record for record in caplog.records if record.levelname == "WARNING" and "release" in record.message]
+    assert refusals and "second_console" in refusals[-1].message
 
 
 def test_a_release_from_before_the_clock_was_set_back_ends_no_stop_after_a_restart(run_dir: Path) -> None:
@@ -159,7 +164,10 @@ def test_a_press_is_kept_even_if_the_arbiter_cannot_step(robot: Robot, run_dir: 
 
 def test_the_robots_own_button_stays_latched_over_a_restart_of_the_arbiter(robot: Robot) -> None:
     robot.bus.publish("/robot/estop", Bool(data=True), publisher="crawler_base")
+    robot.release()
+    assert robot.stopped()  # no release while it is pressed
     robot.bus.publish("/robot/estop", Bool(data=False), publisher="crawler_base")
+    assert robot.stopped()
     robot.kill("arbiter")
     robot.start("arbiter")
     assert robot.stopped()
@@ -249,10 +257,18 @@ def test_a_stop_whose_state_cannot_be_written_holds_and_is_an_error(robot: Robot
     assert not robot.bus.last("/ic/state").estop
 
 
-def test_a_stack_whose_state_cannot_be_written_is_not_started(tmp_path: Path) -> None:
-    (tmp_path / "run.part").mkdir()
-    with pytest.raises(EstopStateError, match="Free the disk"), RunMark(tmp_path):
-        pytest.fail("the launcher starts its nodes")
+def test_a_stack_whose_state_cannot_be_written_is_not_started(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    launch, started, run_dir = tmp_path / "stack.yaml", tmp_path / "started", tmp_path / "run"
+    launch.write_text(f"launch:\n- executable: {{cmd: touch {started}, name: toucher}}\n")
+    words = ["launch", str(launch), "--run-dir", str(run_dir), "--plain"]
+    assert main(words) == 0 and started.exists()
+    started.unlink()
+    (run_dir / "run.part").mkdir()  # in the way of the file, for root too
+    assert main(words) == 1
+    assert "Free the disk, or set INSTANT_IC_RUN_DIR" in capfd.readouterr().err
+    assert not started.exists()
 
 
 def test_the_default_run_directory_keeps_its_state_where_a_power_cut_leaves_it(
