@@ -10,11 +10,18 @@ import re
 from collections.abc import Iterable
 from typing import Any, TextIO
 
-_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
-"""All control characters but tab and line feed, and those that change the direction of writing."""
+_CONTROL = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f"
+    r"\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
+    r"\u200b\u2060-\u2065\ufeff\U000e0000-\U000e007f"
+    r"\ud800-\udfff]"
+)
+"""Control characters but tab and line feed, those that change the direction of writing, those that show nothing, and
+halves of surrogate pairs, which no terminal takes."""
 _COLOUR = re.compile(r"(\x1b\[[\d;]*m)")
-_USER = re.compile(r"(://[^\s/:@]*):[^\s/]*@")
-_TOKEN = re.compile(r"([?&]token=)[^\s&]+")
+_USER = re.compile(r"(://(?!\[)[^\s/:]*):(?!\d*(?:[/?#\s\"',)\]}]|$))\S*@")
+"""User and password. A slash may be in the password, but behind digits it ends a port."""
+_TOKEN = re.compile(r"([?&;#](?:token|pass(?:word|wd)?|pwd)=)[^\s&;]+", re.IGNORECASE)
 
 
 def visible(text: str, *, colours: bool = False) -> str:

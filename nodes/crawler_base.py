@@ -56,6 +56,9 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         if config.unprotected_by:
             text = f"Protection is off ({', '.join(config.unprotected_by)}): commands of any node or age move the robot"
             self.diagnose("protection", WARN, text)
+        if not config.roboclaw.estop_pin:
+            text = "No stop button (roboclaw.estop_pin is empty): the robot is stopped by its operator's page alone"
+            self.diagnose("button", WARN, f"{text}. Wire one to the controller")
         self.diagnose_all(self.latch.diagnosis, self.gate.publishers, self.report.tracks())
         self.timer(1.0, self.watch)
         self.timer(OWN_STEP_S, self.note_step)

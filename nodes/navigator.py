@@ -36,7 +36,7 @@ class NavigatorConfig(Checked):
     controller_frequency: Annotated[float, Plausible(2, 200)] = 20.0
     replan_period_s: Annotated[float, Plausible(0.02, 10)] = 0.2
     subgoal_timeout_s: Annotated[float, Plausible(0.05, 5)] = 0.5
-    costmap_timeout_s: Annotated[float, Plausible(0.05, 10)] = 1.0
+    costmap_timeout_s: Annotated[float, Plausible(0.05, 3)] = 1.0
     state_timeout_s: Annotated[float, Plausible(0.05, 2)] = 0.3
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)

@@ -237,6 +237,8 @@ class McapSource:
             if opcode == Opcode.MESSAGE:
                 channel, _, stamp_ns, _ = MESSAGE_HEAD.unpack_from(body)
                 counts[channel] += 1
+                if not span.start_ns <= stamp_ns <= span.end_ns:
+                    raise ReaderError(f"a message at byte {span.at} has a stamp outside those that its index gives")
                 if channel in wanted and first_ns <= stamp_ns < last_ns:
                     found.append((stamp_ns, wanted[channel], body[MESSAGE_HEAD.size :]))
         if counts != span.counts:

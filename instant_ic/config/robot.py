@@ -14,6 +14,8 @@ from instant_ic.geometry.twists import clip_twist
 
 MOST_STOPPING_M = 3.0
 """Longest way on which a robot may come to a stand: farther away low obstacles are not seen."""
+MOST_STOPPING_RAD = math.pi
+"""Largest turn in which a robot that turns on the spot may come to a stand."""
 Metres = Annotated[float, Range(-100, 100)]
 Degrees = Annotated[float, Range(-360, 360)]
 
@@ -55,6 +57,13 @@ class MotionLimits(Checked):
             raise ValueError(
                 f"max_linear_accel_m_s2 must stop the robot from max_linear_m_s within {MOST_STOPPING_M:g} m "
                 f"(got {self.max_linear_accel_m_s2}: {distance:.1f} m from {self.max_linear_m_s} m/s)"
+            )
+        turn = self.max_angular_rad_s**2 / (2 * self.max_angular_accel_rad_s2)
+        if turn > MOST_STOPPING_RAD:
+            raise ValueError(
+                f"max_angular_accel_rad_s2 must stop the robot from max_angular_rad_s within half a turn "
+                f"(got {self.max_angular_accel_rad_s2}: {math.degrees(turn):.0f} degrees from "
+                f"{self.max_angular_rad_s} rad/s)"
             )
 
     def clip(self, linear: float, angular: float) -> tuple[float, float]:

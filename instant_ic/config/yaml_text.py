@@ -21,6 +21,7 @@ _MOST_VALUES = 100_000
 """Values of a document with each alias counted where it is used: 300 bytes of aliases can stand for billions."""
 _MOST_BITS = 10_000
 """Of a whole number. Python prints no number of 4300 digits, not even in the error that refuses it."""
+_TEXT = yaml.resolver.BaseResolver.DEFAULT_SCALAR_TAG
 _TOO_DEEP = "lists or mappings are nested too deeply, or an anchor contains itself"
 
 
@@ -41,7 +42,9 @@ class _SpelledLoader(_Loader):
     """Keeps the spelling of unquoted scalars; keys of mappings are text."""
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
-        if isinstance(node, yaml.ScalarNode) and not node.style and node.tag == _implicit_tag(node.value):
+        # Quotes make a text, except as `! '1:30'`, which PyYAML writes for a number with a colon.
+        plain = isinstance(node, yaml.ScalarNode) and (not node.style or node.tag != _TEXT)
+        if plain and node.tag == _implicit_tag(node.value):
             return Scalar(node.value)
         return super().construct_object(node, deep)
 

@@ -109,7 +109,8 @@ class ArbiterConfig(Checked):
             if longer.
         rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
         wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
-        unprotected: allows that the collision monitor's polygons stop and approach are off, with a permanent warning.
+        unprotected: allows that the polygons stop and approach, the blind radius, the memory or the 3D points are off,
+            with a permanent warning.
     """
 
     limits: MotionLimits = field(default_factory=MotionLimits)
@@ -135,13 +136,16 @@ class ArbiterConfig(Checked):
 
     @property
     def unprotected_by(self) -> list[str]:
-        """Names of the polygons that do not protect: switched off, or with an action that does not stop."""
-        polygons = {"stop": self.collision_monitor.stop, "approach": self.collision_monitor.approach}
-        return [
-            f"collision_monitor.{name}"
-            for name, polygon in polygons.items()
-            if not polygon.enabled or polygon.action_type != name
-        ]
+        """Names of what does not protect: polygons without their action, or things that are not seen or forgotten."""
+        monitor = self.collision_monitor
+        off = {
+            f"collision_monitor.{name}": not polygon.enabled or polygon.action_type != name
+            for name, polygon in {"stop": monitor.stop, "approach": monitor.approach}.items()
+        }
+        off["collision_monitor.blind_radius_m"] = monitor.blind_radius_m == 0.0
+        off["collision_monitor.memory_range_m"] = monitor.memory_range_m == 0.0
+        off["costmap.points.enabled"] = not self.costmap.points.enabled
+        return [name for name, is_off in off.items() if is_off]
 
     def _check_polygons(self) -> None:
         for name, polygon in self.collision_monitor.polygons().items():

@@ -54,7 +54,7 @@ class CostmapConfig:
 
     width: Annotated[float, Plausible(2, 100)] = 12.0
     resolution: Annotated[float, Plausible(0.01, 0.25)] = 0.05
-    update_frequency: Annotated[float, Plausible(0.5, 100)] = 20.0
+    update_frequency: Annotated[float, Plausible(2, 100)] = 20.0
     publish_frequency: Annotated[float, Plausible(0.1, 100)] = 5.0
     inflation_radius: Annotated[float, Plausible(0, 5)] = 0.70
     cost_scaling_factor: Annotated[float, Plausible(0.1, 100)] = 3.0

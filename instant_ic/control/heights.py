@@ -56,10 +56,10 @@ class HeightConfig:
     enabled: bool = True
     min_obstacle_height: Annotated[float, Plausible(0.01, 0.5)] = 0.05
     max_obstacle_height: Annotated[float, Plausible(0.2, 5)] = 1.30
-    ground_tilt_deg: Annotated[float, Plausible(0, 20)] = 0.8
+    ground_tilt_deg: Annotated[float, Plausible(0, 5)] = 0.8
     obstacle_min_range: Annotated[float, Plausible(0, 2)] = 0.45
     obstacle_max_range: Annotated[float, Plausible(1, 100)] = 6.0
-    mark_threshold: Annotated[int, Plausible(1, 50)] = 2
+    mark_threshold: Annotated[int, Plausible(1, 10)] = 2
 
     def __post_init__(self) -> None:
         check_ranges(self)

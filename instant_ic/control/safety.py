@@ -50,7 +50,7 @@ class PolygonConfig:
     action_type: ActionType = "approach"
     points: str = ""
     padding_m: Annotated[float, Plausible(0, 2)] = 0.04
-    min_points: Annotated[int, Plausible(1, 50)] = 2
+    min_points: Annotated[int, Plausible(1, 10)] = 2
     slowdown_ratio: Annotated[float, Plausible(0.05, 1)] = 0.6
     linear_limit: Annotated[float, Plausible(0.01, 3)] = 0.25
     angular_limit: Annotated[float, Plausible(0.02, 6)] = 0.5
@@ -105,8 +105,8 @@ class CollisionMonitorConfig(Checked):
 
     Attributes:
         source_timeout: s; older scans or points stop the robot.
-        blind_radius_m: m; the LiDAR sees nothing nearer than this; the costmap's lethal cells are used instead.
-        memory_range_m: m; marks of 3D points count up to here, whether seen at present or not.
+        blind_radius_m: m; the LiDAR sees nothing nearer than this; the costmap's lethal cells are used instead; 0: off.
+        memory_range_m: m; marks of 3D points count up to here, whether seen at present or not; 0: off.
         stop: something inside, and the command leads deeper: zero.
         slowdown: something inside: slower.
         limit: something inside: at most the limits.

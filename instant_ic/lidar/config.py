@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from instant_ic.config.ranges import Plausible, Range, Share, check_ranges
+from instant_ic.config.ranges import Plausible, Range, check_ranges
 from instant_ic.config.robot import LIDAR_MOUNT, Mount
 from instant_ic.lidar.head import TURN_CDEG, Sector
 from instant_ic.lidar.receiver import ReceiverConfig
@@ -56,12 +56,12 @@ class FlatScanConfig:
         min_coverage: smallest measured share of the circle for a scan, 0-1.
     """
 
-    min_height: Annotated[float, Plausible(-1, 1)] = 0.10
-    max_height: Annotated[float, Plausible(0.05, 5)] = 1.30
-    beams: Annotated[int, Range(4, 7200)] = 720
+    min_height: Annotated[float, Plausible(-1, 0.5)] = 0.10
+    max_height: Annotated[float, Plausible(0.2, 5)] = 1.30
+    beams: Annotated[int, Plausible(90, 7200)] = 720
     range_min: Annotated[float, Plausible(0, 5)] = 0.4
     range_max: Annotated[float, Plausible(1, 150)] = 100.0
-    min_coverage: Share = 0.75
+    min_coverage: Annotated[float, Plausible(0.05, 1)] = 0.75
 
     def __post_init__(self) -> None:
         check_ranges(self)

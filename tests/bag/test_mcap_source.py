@@ -197,6 +197,20 @@ def test_counts_that_differ_from_the_content_are_an_error(tmp_path: Path) -> Non
             list(reader.messages())
 
 
+def test_fault_an_index_with_other_stamps_gives_messages_out_of_order(tmp_path: Path) -> None:
+    path, data = tmp_path / "a.mcap", chunk(ALL)
+    at = file_of(path, definitions(), data).read_bytes().index(data) + len(data)
+    index = b"".join(record(Opcode.MESSAGE_INDEX, struct.pack("<HI", channel, 64) + bytes(64)) for channel in CHANNELS)
+    size = len(index) // len(CHANNELS)
+    offsets = b"".join(struct.pack("<HQ", channel, at + size * n) for n, channel in enumerate(CHANNELS))
+    entry = bytearray(chunk_index(path, data, offsets, len(index)))
+    struct.pack_into("<QQ", entry, 9, 0, 0)  # the writer left the chunk's stamps out
+    summary = definitions() + bytes(entry) + statistics(12, 1)
+    with BagReader(file_of(path, definitions(), data, index, summary=summary)) as reader:
+        with pytest.raises(BagError, match="stamp outside those that its index gives"):
+            list(reader.messages())
+
+
 @pytest.mark.parametrize(
     ("data", "why"),
     [

@@ -55,6 +55,13 @@ TEXTS += ["yes", "no", "On", "off", "True", "null", "~", ".nan", ".inf", "-.INF"
 
 
 @pytest.mark.parametrize("text", TEXTS)
+def test_fault_a_text_in_a_list_changes_on_its_way_to_a_node(text: str) -> None:
+    """``ic param set`` sends a list as one line, in which ``1:30`` must be quoted."""
+    sent = one_line(read_spelled(f"[{text}, 5]"))
+    assert params.build(Mixed, {"words": Value(read_spelled(sent), "ic param set")}).words == (text, "5")
+
+
+@pytest.mark.parametrize("text", TEXTS)
 def test_text_keeps_its_spelling(tmp_path: Path, text: str) -> None:
     for made in (from_word(f"text:={text}"), from_file(tmp_path, f"text:={text}")):
         assert made.text == text

@@ -11,6 +11,7 @@ from base_line import NodeBench
 from hypothesis import given
 from hypothesis import strategies as st
 
+from instant_ic.base.config import RoboclawConfig
 from instant_ic.bus import OK, WARN, ParameterError
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.node_files import node_class
@@ -29,7 +30,11 @@ ABSURD = [
     ("arbiter", "timeouts.scan:=300", r"timeouts.scan must lie in 0.05..2 \(got 300\); did you mean 0.3\?"),
     ("arbiter", "timeouts.command:=9", "timeouts.command must lie in"),
     ("arbiter", "collision_monitor.source_timeout:=1e6", "source_timeout must lie in"),
-    ("arbiter", "collision_monitor.stop.min_points:=100000", "min_points must lie in 1..50"),
+    ("arbiter", "collision_monitor.stop.min_points:=100000", "min_points must lie in 1..10"),
+    ("arbiter", "collision_monitor.approach.min_points:=20", r"did you mean 2\?"),
+    ("arbiter", "costmap.points.mark_threshold:=20", "mark_threshold must lie in 1..10"),
+    ("arbiter", "costmap.points.ground_tilt_deg:=8", r"did you mean 0.8\?"),
+    ("arbiter", "costmap.update_frequency:=0.5", "update_frequency must lie in"),
     ("arbiter", "collision_monitor.blind_radius_m:=450", r"did you mean 0.45\?"),
     ("arbiter", "pose_trust.stop:=1.0", "pose_trust.stop must lie in"),
     ("arbiter", "rate_hz:=0.1", "rate_hz must lie in 5..200"),
@@ -43,6 +48,11 @@ ABSURD = [
     ("navigator", "state_timeout_s:=1e6", "state_timeout_s must lie in"),
     ("navigator", "limits.max_angular_rad_s:=57", r"did you mean 5.7\?"),
     ("virtual_robot", "state_timeout_s:=1e6", "state_timeout_s must lie in"),
+    ("navigator", "costmap_timeout_s:=10", r"did you mean 1\?"),
+    ("vlp16_driver", "scan.min_height:=1", r"did you mean 0.1\?"),
+    ("vlp16_driver", "scan.max_height:=0.13", r"did you mean 1.3\?"),
+    ("vlp16_driver", "scan.beams:=4", "scan.beams must lie in 90..7200"),
+    ("vlp16_driver", "scan.min_coverage:=0", "scan.min_coverage must lie in"),
     ("vlp16_driver", "scan.min_height:=5", "scan.min_height must lie in"),
     ("vlp16_driver", "decoder.min_range:=40", r"did you mean 4\?"),
     ("theta_camera", "theta.latency_s:=200", "theta.latency_s must lie in"),
@@ -72,6 +82,7 @@ COMBINED = [
         ("limits.max_linear_m_s:=1.5", "limits.max_linear_accel_m_s2:=2", "timeouts.scan:=1"),
         "timeouts.scan must be at most 0.67 s",
     ),
+    (("limits.max_angular_rad_s:=6", "limits.max_angular_accel_rad_s2:=0.2"), "must stop .* within half a turn"),
     (("limits.max_linear_m_s:=2",), "time_before_collision must be at least 2.5 s, to brake"),
     (
         (
@@ -82,6 +93,9 @@ COMBINED = [
         "must stop the robot within 1 m",
     ),
     (("collision_monitor.stop.enabled:=false",), "collision_monitor.stop: protection is off"),
+    (("costmap.points.enabled:=false",), r"costmap\.points\.enabled: protection is off"),
+    (("collision_monitor.blind_radius_m:=0",), r"collision_monitor\.blind_radius_m: protection is off"),
+    (("collision_monitor.memory_range_m:=0",), r"collision_monitor\.memory_range_m: protection is off"),
     (("collision_monitor.stop.action_type:=limit",), "collision_monitor.stop: protection is off"),
     (
         ("collision_monitor.stop.enabled:=false", "collision_monitor.approach.enabled:=false"),
@@ -147,6 +161,13 @@ def test_a_base_that_obeys_anybody_warns_and_needs_a_word() -> None:
     bench = NodeBench(command_source="", unprotected=True)
     bench.run(30.0)
     assert bench.diagnosis("protection")[0] == WARN
+
+
+def test_a_base_without_a_stop_button_warns() -> None:
+    bench = NodeBench(roboclaw=RoboclawConfig(port="memory", estop_pin=""))
+    bench.run(30.0)
+    level, text = bench.diagnosis("button")
+    assert level == WARN and "No stop button" in text
 
 
 def state_of(node: Any, name: str) -> tuple[int, str]:
