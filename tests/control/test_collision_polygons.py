@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 import pytest
+from control_world import World
+from test_frozen_nodes import KEY, MODES, stack_in
 
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.commands import CommandRules
@@ -15,6 +17,7 @@ from instant_ic.control.heights import sort_points
 from instant_ic.control.moving import MovingPoints
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig, parse_polygon
 from instant_ic.control.snapshot import ArbiterInputs
+from instant_ic.control.states import Mode
 
 OFF = PolygonConfig(enabled=False)
 AHEAD = "[[1.0, 0.4], [1.0, -0.4], [0.0, -0.4], [0.0, 0.4]]"
@@ -158,3 +161,17 @@ def test_the_robot_stands_when_a_person_arrives(place_m: float, time_s: float, s
     assert found.command[0] == pytest.approx(speed)
     assert watched.limit((0.2, 0.0), person).action == "free"
     assert watched.limit((0.2, 0.0), person, moving=MovingPoints(person, -moving.velocities)).action == "free"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_appears_ahead_is_not_touched_in_any_mode(mode: Mode) -> None:
+    """A wall as wide as two robots, 0.6 m ahead; the key is held on."""
+    stack = stack_in(mode)
+    assert stack.base.v > 0.3
+    x, y, yaw = stack.base.pose
+    ahead, left = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+    middle = np.array([x, y]) + 0.6 * ahead
+    wall = np.array([[middle - 0.4 * left, middle + 0.4 * left]])
+    stack.world = World(np.concatenate([stack.world.segments, wall]))
+    stack.drive(4.0, KEY)
+    assert not stack.contact
