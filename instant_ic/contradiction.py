@@ -25,7 +25,7 @@ class Contradiction(IntEnum):
 
     @property
     def text(self) -> str:
-        """What happened and what to do, for the operator; empty without a contradiction."""
+        """Message to the operator: cause and remedy; empty without a contradiction."""
         return _TEXTS[self]
 
 

@@ -226,7 +226,7 @@ class BagReader(Closing):
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[BagMessage]:
-        """As :meth:`messages`, with messages of an older definition converted to the present one (``upgrade.py``).
+        """Yield what :meth:`messages` does, with older definitions converted to the present one (``upgrade.py``).
 
         Raises:
             BagError: a file is damaged.

@@ -143,7 +143,7 @@ def own_schema(type_name: str) -> Schema:
 
 
 def schema_or_unknown(type_name: str) -> Schema:
-    """As :func:`own_schema`, but without a definition where the type is unknown, as rosbag2 does."""
+    """Return :func:`own_schema` of a type; without a definition where it is unknown, as rosbag2 does."""
     try:
         return own_schema(type_name)
     except (MessageError, TypesysError):  # TypesysError: a type of ours, but not by this full name
@@ -225,7 +225,7 @@ def _profiles(text: str) -> tuple[Qos, ...]:
 
 @functools.lru_cache(maxsize=200)  # asked once per message
 def preset_of_text(profiles: str) -> QoS:
-    """As :func:`preset_of`, from the text in an MCAP file; ``reliable`` where the text is damaged."""
+    """Return :func:`preset_of` of the text in an MCAP file; ``reliable`` where the text is damaged."""
     try:
         return preset_of(profiles_of(profiles))
     except Exception:  # noqa: BLE001 - a parser may raise anything on damaged YAML

@@ -130,7 +130,7 @@ class PageFeed:
         self._request_view()
 
     def layers_of(self, message: VspaceLayers) -> PageLayers | str:
-        """What pages render of a version of the virtual space, or what is wrong with it. For a worker thread."""
+        """Return the layers that pages render, or an error as text. For a worker thread."""
         try:
             layers = layers_of(message)
             return PageLayers(layers.version, self._mount, self._meshes.layers(layers)[:MOST_LAYERS])

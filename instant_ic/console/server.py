@@ -228,7 +228,7 @@ class ConsoleServer:
 
     @property
     def warnings(self) -> list[str]:
-        """What the log should warn about: access that the parameters leave open."""
+        """Warnings for the log: access that the parameters leave open."""
         who = "every user of this machine" if is_loopback(self.config.host) else "anyone on the network"
         unguarded = f"{who} may drive, because server.access.sign_in is never"
         return [PLAIN_HTTP] * self.plain_http + [unguarded] * self.access.unguarded

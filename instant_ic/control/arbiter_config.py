@@ -75,7 +75,7 @@ class SwitchConfig(Checked):
 
 @dataclass(frozen=True)
 class PoseTrustConfig:
-    """What the robot may do when the SLAM doubts its pose.
+    """Restrictions while the SLAM doubts its pose.
 
     Attributes:
         slow: probability of being lost from which the r-bot drives slowly and does not switch.

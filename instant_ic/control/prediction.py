@@ -1,4 +1,4 @@
-"""Where the present command leads, and whether the footprint meets an obstacle on the way."""
+"""Prediction of the path under the present command, and of contacts of the footprint with obstacles."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _STEP_S = 0.05
 
 @dataclass(frozen=True)
 class PredictionConfig(Checked):
-    """How far to look ahead.
+    """Range of the prediction.
 
     Attributes:
         latency_s: s; delay from a command to the base's response.

@@ -1,4 +1,4 @@
-"""What the robot knows of its surroundings: the newest scan and 3D points in its own frame, and the costmap."""
+"""Surroundings of the robot: the newest scan and 3D points in its own frame, and the costmap."""
 
 from __future__ import annotations
 

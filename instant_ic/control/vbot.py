@@ -26,7 +26,7 @@ _LEAD_BACK_M_S, _LEAD_BACK_RAD_S = 0.2, math.radians(20.0)
 
 @dataclass(frozen=True)
 class VbotConfig:
-    """How far the v-bot may lead, and how gently it is eased onto the r-bot.
+    """Lead of the v-bot, and its easing onto the r-bot.
 
     Attributes:
         max_lead_m: largest lead over the r-bot, in metres.

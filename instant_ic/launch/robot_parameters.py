@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-RELATED = ("arbiter", "crawler_base", "navigator", "virtual_robot", "console")
+RELATED = ("arbiter", "crawler_base", "navigator", "virtual_robot", "console", "foxglove_bridge")
 """Nodes that have something to agree on."""
 _MISSED = 2
 """Messages that may be missing before a time-out."""
@@ -49,6 +49,9 @@ _SPANS = (
 )
 """Node and time-out; node and rate of the messages, at most the last number."""
 
+_SIMULATED = (("console", "server.access.simulated"), ("foxglove_bridge", "simulated"))
+"""Nodes through which operators come, and the parameter that opens them to all users of the machine."""
+
 
 def disagreements(robot: Mapping[str, Driving]) -> Iterator[str]:
     """Contradictions between the nodes of one robot, one text each.
@@ -66,11 +69,25 @@ def disagreements(robot: Mapping[str, Driving]) -> Iterator[str]:
                     f"{node.at}: node {name}: {timeout} must span {_MISSED} messages of {source}: "
                     f"{_MISSED / hz:.2g} s at {rate} {hz:g} (got {node.value(timeout)})"
                 )
+    yield from _open_doors(robot)
     if (arbiter := robot.get("arbiter")) and (base := robot.get("crawler_base")):
         tracks, width = base.value("geometry.track_width"), arbiter.value("footprint.width_m")
         if tracks > width:
             rule = f"geometry.track_width must be within footprint.width_m {width}"
             yield f"{base.at}: node crawler_base: {rule} (got {tracks})"
+
+
+def _open_doors(robot: Mapping[str, Driving]) -> Iterator[str]:
+    """Doors that need no token because every robot is simulated, beside a base on a serial device."""
+    port = robot["crawler_base"].value("roboclaw.port") if "crawler_base" in robot else ""
+    if not port.startswith("/dev/") or port.startswith("/dev/shm/"):  # the simulator's is in its run directory
+        return
+    for name, key in _SIMULATED:
+        if name in robot and robot[name].value(key):
+            yield (
+                f"{robot[name].at}: node {name}: {key} is true, but crawler_base drives {port}: any user of this "
+                "machine could drive the robot. Set it to false"
+            )
 
 
 def _differing(robot: Mapping[str, Driving], key: str) -> Iterator[str]:

@@ -198,3 +198,13 @@ def test_nodes_that_drive_one_robot_agree(tmp_path: Path, arbiter: str, base: st
     (tmp_path / "stack.yaml").write_text(STACK.format())
     found = check_parameters(read_launch_file(tmp_path / "stack.yaml").nodes)
     assert any(text in problem for problem in found), found
+
+
+@pytest.mark.parametrize(("node", "key"), [("console", "server.access.simulated"), ("foxglove_bridge", "simulated")])
+def test_fault_a_door_that_is_open_as_for_a_simulator_drives_a_real_base(tmp_path: Path, node: str, key: str) -> None:
+    open_door = f"- node: {{exec: {node}, param: [{{name: {key}, value: true}}]}}"
+    for port, refused in (("/dev/ttyACM0", True), ("/run/user/1000/instant_ic/dev/roboclaw", False)):
+        base = f"- node: {{exec: crawler_base, param: [{{name: roboclaw.port, value: {port}}}]}}"
+        (tmp_path / "stack.yaml").write_text(f"launch:\n{base}\n{open_door}\n")
+        found = check_parameters(read_launch_file(tmp_path / "stack.yaml").nodes)
+        assert any(f"{key} is true, but crawler_base drives {port}" in problem for problem in found) == refused, found
