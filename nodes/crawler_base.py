@@ -133,6 +133,9 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def on_state(self, state: BaseState) -> None:
         if state.link:
             self.diagnose_all(self.report.link(state.connected, state.link, self.clock.steady_ns()))
+        if state.restarted:
+            self.report.restarted()
+            self.press(True)
         if state.health is not None:
             self.publish_health(state.health)
         if state.status is not None:

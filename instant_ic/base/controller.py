@@ -44,6 +44,7 @@ class BaseState:
         connected: whether the controller answers.
         link: text of the link event in this step; empty without one.
         fault: which track does not follow its command, so that the base has stopped; empty otherwise.
+        restarted: the controller had lost its settings, so that the base has stopped.
         odometry: new estimate, if any.
         status: faults and warnings of the controller, if it was read; with a fault the base has stopped.
         health: battery, if it was read in this step.
@@ -55,6 +56,7 @@ class BaseState:
     connected: bool
     link: str = ""
     fault: str = ""
+    restarted: bool = False
     odometry: OdometryEstimate | None = None
     status: Status | None = None
     health: Health | None = None
@@ -307,22 +309,29 @@ class BaseController:
         return ""
 
     def _connect(self, now_ns: int) -> BaseState:
+        """Connect when it is time; the base stops as in an emergency when the controller has restarted meanwhile."""
         if now_ns < self._next_connect_ns:
             return BaseState(connected=False)
+        failure, version, limited = "", "", False
         try:
             version = self.roboclaw.connect()
             per_metre = self.config.geometry.pulses_per_metre
             limited = self.roboclaw.limit_speed_error(_RUNAWAY * self._fastest_m_s * per_metre)
         except LinkError as error:
             self._lost(now_ns, self._backoff.fail(now_ns * 1e-9))
-            return BaseState(connected=False, link=str(error))
-        if self.roboclaw.restarted:
+            failure = str(error)
+        restarted = self.roboclaw.restarted
+        if restarted:
             self.odometry.forget_counts()
+            self.emergency_stop(True)
+        if failure:
+            return BaseState(connected=False, link=failure, restarted=restarted)
         self._encoders = None
         self._backoff.succeed()
         self._last_step_ns = now_ns
         without = "" if limited else ", whose firmware has no speed error limit"
-        return BaseState(connected=True, link=f"connected to {version} at {self.config.roboclaw.port}{without}")
+        link = f"connected to {version} at {self.config.roboclaw.port}{without}"
+        return BaseState(connected=True, link=link, restarted=restarted)
 
     def _lost(self, now_ns: int, wait_s: float) -> None:
         self.roboclaw.close()

@@ -64,6 +64,10 @@ class BaseReport:
         text = f"{health.battery_v:.1f} V" + (f", below {empty_v} V: charge it" if low else "")
         return Diagnosis("battery", Level.WARN if low else Level.OK, text)
 
+    def restarted(self) -> None:
+        """Note that the controller has restarted; a fault that is over until the stop is released."""
+        self._fault = "the motor controller has restarted: check its supply voltage"
+
     def controller(self, status: Status) -> Diagnosis:
         """Faults and warnings of the controller; a fault until the stop is released, under its name."""
         faults, warnings = ", ".join(status.faults), ", ".join(status.warnings)

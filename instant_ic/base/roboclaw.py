@@ -188,6 +188,7 @@ class Roboclaw:
                 stop button does not latch.
         """
         self.close()
+        self.restarted = False
         self._port = self._open_port(self.config)
         self._status_size = None
         try:

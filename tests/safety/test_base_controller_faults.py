@@ -127,6 +127,30 @@ def test_a_fault_of_the_controller_stops_and_latches_with_its_name(bit: int, sta
     assert bench.diagnosis("controller") == (OK, "no faults")
 
 
+@pytest.mark.parametrize("silent_s", [0.0, 0.5, 1.0])
+def test_a_controller_that_restarted_stops_and_latches_with_its_name(silent_s: float) -> None:
+    """A brown-out is a fault that takes its own status bits with it; the key is held all the time."""
+    bench = driving()
+    line = bench.line
+    line.brown_out()
+    line.forward = line.back = lambda data: b""
+    bench.run(silent_s, v=0.38)
+    line.forward = line.back = bytes
+    # After it, the first try to connect may fail half-way, when the watchdog is set again already.
+    line.emulator.pins = [0x01, 0, 0, 0, 0]
+    bench.run(0.6, v=0.38)
+    line.emulator.pins = [0x81, 0, 0, 0, 0]
+    before_m = line.travelled_m
+    bench.run(2.5, v=0.38)
+    assert line.travelled_m == before_m and not line.emulator.closed_loop
+    assert [message.data for message in bench.bus.messages("/robot/estop")][-2:] == [True, False], "the arbiter too"
+    level, text = bench.diagnosis("controller")
+    assert level == ERROR and text.startswith("the motor controller has restarted: check its supply voltage. The robot")
+    bench.estop(False)
+    bench.run(0.4, v=0.38)
+    assert line.speed > 0.1 and bench.diagnosis("controller") == (OK, "no faults")
+
+
 def test_a_warning_of_the_controller_is_a_diagnosis_and_drives_on() -> None:
     bench = driving()
     bench.line.emulator.status = 0x00080000  # main voltage low
