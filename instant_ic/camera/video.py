@@ -110,6 +110,8 @@ class VideoCamera(Camera):
             parameters = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, timeout_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, timeout_ms]
         # OpenCV takes the time-out of devices from here, in whole seconds, once in a process; the default is 10 s.
         os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(math.ceil(self.config.read_timeout_s)))
+        if self._source != self.url:  # OpenCV logs an address that it cannot open, with its password
+            cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
         capture = cv2.VideoCapture(source, cv2.CAP_ANY, parameters)
         if not capture.isOpened():
             capture.release()

@@ -59,6 +59,15 @@ def test_only_the_stream_itself_gets_the_password(password_file, monkeypatch, ur
         assert "rd@1" not in shown and "rd%40" not in shown and "operator" not in shown
 
 
+def test_fault_opencv_logs_the_password_of_an_address_that_it_cannot_open(password_file, capfd):
+    _, camera = open_with(password_file, url="http://127.0.0.1:9/live.mjpg")  # nothing listens there
+    with pytest.raises(CameraError, match="cannot be opened as video"):
+        camera.connect()
+    camera.close()
+    shown = "".join(capfd.readouterr())
+    assert "rd@1" not in shown and "rd%40" not in shown
+
+
 def test_the_theta_gets_the_password_of_the_file(password_file):
     password_file.write_text("THETAYL00105307:00105307")
     with FakeTheta(Behaviour(password="00105307")) as theta:
