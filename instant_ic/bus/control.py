@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from instant_ic.bus import registry
 from instant_ic.bus.node import NodeError
-from instant_ic.config.parameter_info import ParameterInfo, plain
+from instant_ic.config.parameter_info import ParameterInfo
 from instant_ic.config.params import ParameterError, yaml_value
 from instant_ic.config.yaml_text import one_line
 
@@ -257,7 +257,7 @@ class NodeControl:
             ParameterError: a value is refused; the message says why.
             NodeBusyError: the node's thread is busy.
         """
-        texts = {key: one_line(plain(value)) for key, value in values.items()}
+        texts = {key: one_line(value) for key, value in values.items()}
         changed: dict[str, Any] = self.request({"op": "set", "yaml": texts})["changed"]
         return changed
 

@@ -136,6 +136,14 @@ def test_set_is_taken_on_the_nodes_thread_and_told(tuned):
     assert event.changed_parameters[1].value.double_value == 1.0
 
 
+def test_fault_a_text_is_set_with_its_password_masked(tuned):
+    """``***`` stood in the node instead of the token."""
+    node, client = tuned
+    for text in ("http://h/?token=secret", "rtsp://me:secret@h/live"):
+        client.set({"label": text})
+        assert node.config.label == text and "secret" not in client.get()["label"]
+
+
 def test_a_value_typed_by_hand_is_read_by_the_type_of_its_parameter(tuned):
     node, client = tuned
     client.set({"label": yaml_value("0123", "label"), "inner.gain": yaml_value("5e-01", "inner.gain")})
