@@ -326,7 +326,7 @@ def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_
     assert bus.records("/operator/estop")[-1].payload == b"\x00"
 
 
-def test_a_hosts_own_stop_is_released_at_once_and_another_hosts_only_a_second_later():
+def test_a_hosts_own_stop_is_released_at_once_and_another_hosts_only_a_second_later(caplog):
     bus = LockstepBus()
     importer = bus.add(Importer)
 
@@ -343,6 +343,7 @@ def test_a_hosts_own_stop_is_released_at_once_and_another_hosts_only_a_second_la
     assert hear("tablet", True, 20_000) is True
     assert hear("station", True, 20_500) is True
     assert hear("station", False, 20_999) is True  # the tablet's stop holds
+    assert "dropped /operator/estop of station" in caplog.text
     assert hear("station", False, 21_000) is False
     assert hear("tablet", True, 19_999) is False  # and comes again too late
     for number in range(100):

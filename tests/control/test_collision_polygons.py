@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from control_world import World
 from test_frozen_nodes import KEY, MODES, stack_in
 
 from instant_ic.control.arbiter_config import ArbiterConfig
@@ -18,6 +17,7 @@ from instant_ic.control.moving import MovingPoints
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig, parse_polygon
 from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.states import Mode
+from instant_ic.msg import twist_values
 
 OFF = PolygonConfig(enabled=False)
 AHEAD = "[[1.0, 0.4], [1.0, -0.4], [0.0, -0.4], [0.0, 0.4]]"
@@ -164,14 +164,14 @@ def test_the_robot_stands_when_a_person_arrives(place_m: float, time_s: float, s
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_what_appears_ahead_is_not_touched_in_any_mode(mode: Mode) -> None:
-    """A wall as wide as two robots, 0.6 m ahead; the key is held on."""
+def test_every_command_of_every_mode_passes_the_monitor(mode: Mode) -> None:
+    """The corridor's walls are in a polygon that limits the speed to a quarter of the key's."""
     stack = stack_in(mode)
-    assert stack.base.v > 0.3
-    x, y, yaw = stack.base.pose
-    ahead, left = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-    middle = np.array([x, y]) + 0.6 * ahead
-    wall = np.array([[middle - 0.4 * left, middle + 0.4 * left]])
-    stack.world = World(np.concatenate([stack.world.segments, wall]))
-    stack.drive(4.0, KEY)
-    assert not stack.contact
+    assert stack.bus.last("/ic/state").mode == mode
+    limit = "collision_monitor.limit."
+    changes = {limit + "enabled": True, limit + "padding_m": 1.0, limit + "linear_limit": 0.1}
+    stack.arbiter.set_parameters(changes)
+    before = len(stack.bus.records("/cmd_vel"))
+    stack.drive(0.5, KEY)
+    speeds = [abs(twist_values(message)[0]) for message in stack.bus.messages("/cmd_vel")[before:]]
+    assert 0.05 < max(speeds) <= 0.1 + 1e-6

@@ -28,11 +28,14 @@ def drive(made: Loop, seconds: float, command: tuple[float, float]) -> None:
 def test_a_doubt_slows_the_robot_and_a_lost_pose_stops_it() -> None:
     made = loop()
     drive(made, 2.0, FORWARD)
-    assert made.frames[-1].command == pytest.approx(FORWARD)
-    made.pose_lost = 0.2
+    made.pose_lost = 0.09
     drive(made, 0.5, FORWARD)
-    assert made.frames[-1].command[0] == pytest.approx(PoseTrustConfig().speed_m_s)
-    made.pose_lost = 0.9
+    assert made.frames[-1].command == pytest.approx(FORWARD)
+    for probability in (0.1, 0.49):
+        made.pose_lost = probability
+        drive(made, 0.5, FORWARD)
+        assert made.frames[-1].command[0] == pytest.approx(PoseTrustConfig().speed_m_s)
+    made.pose_lost = 0.5
     drive(made, 0.1, FORWARD)
     stopped = made.frames[-1]
     assert stopped.decision.mode == Mode.STOPPED and stopped.command == NOTHING

@@ -183,6 +183,10 @@ def test_the_loss_of_each_source_commands_zero_in_time_and_brakes_hard(rig: Rig,
         assert stop.frame == HARD_STOP, (phase, stop)
     if loss not in OPERATORS:
         assert_waits_for_a_release(rig)
+        return
+    for _ in range(round(1.0 / STEP_S)):
+        rig.step()
+    assert rig.speed() > 0.2 and rig.stack.state.mode == ControlState.REAL
 
 
 def assert_waits_for_a_release(rig: Rig) -> None:
