@@ -416,7 +416,7 @@ def _coerce(value: Any, hint: Any, key: str) -> Any:
         return _coerce_sequence(value, origin, get_args(hint), key)
     if hint is Any:
         return resolved(value)
-    wanted = getattr(hint, "__name__", str(hint)) if origin is None else str(hint)
+    wanted = "a list" if origin in (tuple, list) else getattr(hint, "__name__", str(hint))
     raise _RefusedError(f"{key} must be {wanted} (got {value!r})")
 
 

@@ -16,7 +16,7 @@ MOST_STOPPING_M = 3.0
 """Longest way on which a robot may come to a stand: farther away low obstacles are not seen."""
 MOST_STOPPING_RAD = math.pi
 """Largest turn in which a robot that turns on the spot may come to a stand."""
-Metres = Annotated[float, Range(-100, 100)]
+Metres = Annotated[float, Plausible(-5, 5)]
 Degrees = Annotated[float, Range(-360, 360)]
 
 

@@ -65,6 +65,8 @@ class HeightConfig:
         check_ranges(self)
         if not self.min_obstacle_height < self.max_obstacle_height:
             raise ValueError(f"min_obstacle_height must be below max_obstacle_height (got {self.min_obstacle_height})")
+        if not self.obstacle_min_range < self.obstacle_max_range:
+            raise ValueError(f"obstacle_min_range must be below obstacle_max_range (got {self.obstacle_min_range})")
 
 
 @dataclass(frozen=True)

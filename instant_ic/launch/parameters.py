@@ -176,7 +176,7 @@ def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = Non
     problems = _check_apart(unknown, compared)
     bad = {label for label, _ in problems}
     good = [key for node, key in keys.items() if json.loads(node)["label"] not in bad]
-    good += [together] if compared and _TOGETHER not in bad else []
+    good += [together] if compared and not bad else []
     _remember(cache, [*(key for key in known if key not in good), *good])
     return list(dict.fromkeys(text for _, text in problems))
 

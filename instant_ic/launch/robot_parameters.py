@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-RELATED = ("arbiter", "crawler_base", "navigator", "virtual_robot", "console", "foxglove_bridge")
+RELATED = ("arbiter", "crawler_base", "navigator", "virtual_robot", "console", "foxglove_bridge", "vlp16_driver")
 """Nodes that have something to agree on."""
 _MISSED = 2
 """Messages that may be missing before a time-out."""
@@ -70,6 +70,12 @@ def disagreements(robot: Mapping[str, Driving]) -> Iterator[str]:
                     f"{_MISSED / hz:.2g} s at {rate} {hz:g} (got {node.value(timeout)})"
                 )
     yield from _open_doors(robot)
+    if (arbiter := robot.get("arbiter")) and (lidar := robot.get("vlp16_driver")):
+        blind_m = arbiter.value("collision_monitor.blind_radius_m")
+        for key in ("decoder.min_range", "scan.range_min"):
+            if blind_m and lidar.value(key) > blind_m:
+                rule = f"{key} must be at most the arbiter's collision_monitor.blind_radius_m = {blind_m} m"
+                yield f"{lidar.at}: node vlp16_driver: {rule}: nearer things are forgotten (got {lidar.value(key)})"
     if (arbiter := robot.get("arbiter")) and (base := robot.get("crawler_base")):
         tracks, width = base.value("geometry.track_width"), arbiter.value("footprint.width_m")
         if tracks > width:

@@ -24,15 +24,13 @@ class DecoderConfig:
     """
 
     cut_angle_deg: Annotated[float, Range(0, below=360)] = 180.0
-    min_range: Annotated[float, Plausible(0, 5)] = 0.4
-    max_range: Annotated[float, Plausible(1, 131.07)] = 130.0
+    min_range: Annotated[float, Plausible(0, 2)] = 0.4
+    max_range: Annotated[float, Plausible(5, 131.07)] = 130.0
     fov_start_deg: Azimuth = 0.0
     fov_end_deg: Azimuth = 360.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if not self.min_range < self.max_range:
-            raise ValueError(f"min_range must be below max_range (got {self.min_range}, {self.max_range})")
         if self.fov_start_deg == self.fov_end_deg:
             raise ValueError(f"fov_start_deg and fov_end_deg must differ (got {self.fov_start_deg} for both)")
 
@@ -59,16 +57,14 @@ class FlatScanConfig:
     min_height: Annotated[float, Plausible(-1, 0.5)] = 0.10
     max_height: Annotated[float, Plausible(0.2, 5)] = 1.30
     beams: Annotated[int, Plausible(90, 7200)] = 720
-    range_min: Annotated[float, Plausible(0, 5)] = 0.4
-    range_max: Annotated[float, Plausible(1, 150)] = 100.0
+    range_min: Annotated[float, Plausible(0, 2)] = 0.4
+    range_max: Annotated[float, Plausible(5, 150)] = 100.0
     min_coverage: Annotated[float, Plausible(0.05, 1)] = 0.75
 
     def __post_init__(self) -> None:
         check_ranges(self)
         if not self.min_height < self.max_height:
             raise ValueError(f"min_height must be below max_height (got {self.min_height}, {self.max_height})")
-        if not self.range_min < self.range_max:
-            raise ValueError(f"range_min must be below range_max (got {self.range_min}, {self.range_max})")
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def test_all_mistakes_of_a_file_at_once(tmp_path: Path) -> None:
     file = tmp_path / "p.yaml"
     file.write_text(
         "arbiter:\n  ros__parameters:\n    rate_hz: fast\n    limits: {max_linear_m_s: -1}\n    switch: {yaw_dg: 3}\n"
-        "vlp16_driver:\n  ros__parameters:\n    decoder: {min_range: 3.0, max_range: 2.0}\n    rate: .nan\n"
+        "vlp16_driver:\n  ros__parameters:\n    scan: {min_height: 0.4, max_height: 0.3}\n    rate: .nan\n"
         "arbitr:\n  ros__parameters: {a: 1}\n"
     )
     found = [problem.removeprefix(f"{file}") for problem in check_parameter_file(file)]

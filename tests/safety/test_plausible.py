@@ -53,8 +53,11 @@ ABSURD = [
     ("vlp16_driver", "scan.max_height:=0.13", r"did you mean 1.3\?"),
     ("vlp16_driver", "scan.beams:=4", "scan.beams must lie in 90..7200"),
     ("vlp16_driver", "scan.min_coverage:=0", "scan.min_coverage must lie in"),
+    ("vlp16_driver", "lidar_mount.xyz:=[0, 0, 60]", r"xyz\[2\] must lie in -5..5 \(got 60\); did you mean 0.6\?"),
+    ("vlp16_driver", "decoder.max_range:=1", "decoder.max_range must lie in"),
+    ("vlp16_driver", "scan.range_max:=1", "scan.range_max must lie in"),
     ("vlp16_driver", "scan.min_height:=5", "scan.min_height must lie in"),
-    ("vlp16_driver", "decoder.min_range:=40", r"did you mean 4\?"),
+    ("vlp16_driver", "decoder.min_range:=40", r"did you mean 0.4\?"),
     ("theta_camera", "theta.latency_s:=200", "theta.latency_s must lie in"),
     ("console", "server.drive.watchdog_s:=250", r"did you mean 0.25\?"),
     ("console", "server.drive.max_linear_mps:=40", r"did you mean 0.4\?"),
@@ -93,6 +96,10 @@ COMBINED = [
         "must stop the robot within 1 m",
     ),
     (("collision_monitor.stop.enabled:=false",), "collision_monitor.stop: protection is off"),
+    (
+        ("costmap.points.obstacle_min_range:=2", "costmap.points.obstacle_max_range:=1"),
+        "obstacle_min_range must be below obstacle_max_range",
+    ),
     (("costmap.points.enabled:=false",), r"costmap\.points\.enabled: protection is off"),
     (("collision_monitor.blind_radius_m:=0",), r"collision_monitor\.blind_radius_m: protection is off"),
     (("collision_monitor.memory_range_m:=0",), r"collision_monitor\.memory_range_m: protection is off"),
@@ -178,6 +185,7 @@ STACK = """launch:
 - node: {{exec: arbiter, param: [{{from: arbiter.yaml}}]}}
 - node: {{exec: crawler_base, param: [{{from: base.yaml}}]}}
 - node: {{exec: console}}
+- node: {{exec: vlp16_driver}}
 """
 TOGETHER = [
     (
@@ -187,6 +195,7 @@ TOGETHER = [
     ),
     ("footprint: {width_m: 0.3}", "odom_frame: odom", "geometry.track_width must be within footprint.width_m 0.3"),
     ("rate_hz: 5", "odom_frame: odom", "crawler_base: command_timeout_s must span 2 messages of arbiter: 0.4 s"),
+    ("collision_monitor: {blind_radius_m: 0.3}", "odom_frame: odom", "vlp16_driver: decoder.min_range must be at most"),
     ("timeouts: {command: 0.05}", "odom_frame: odom", "timeouts.command must span 2 messages of console"),
 ]
 
