@@ -104,6 +104,8 @@ class ArbiterInbox:
             timeout_s: age in seconds above which a command takes no lease.
         """
         message = deserialize(received.payload, received.type_name)
+        if not all(math.isfinite(value) for value in twist_values(message)):
+            return False  # neither a motion nor a release: it refreshes no age
         sender, given_ns = f"{received.publisher}/{message.header.frame_id}", received.given_ns(stamp_ns(message))
         if sender.endswith(RELEASED):
             taken = self.lease.release(sender.removesuffix(RELEASED))
@@ -182,6 +184,7 @@ class ArbiterInbox:
             robot_velocity=velocity,
             operator_command=self._twist("command"),
             operator_gone=self.operator_gone(),
+            held_in_vain=self.lease.held_in_vain(steady_ns),
             estop=latch.pressed,
             estop_button=latch.button,
             estop_why=latch.why,

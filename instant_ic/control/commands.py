@@ -161,7 +161,7 @@ def why_stopped(s: Snapshot, stopped_by: Notice) -> Notice:
         longest_s = s.config.timeouts.slowest_image_s
         text = f"stopped: waiting for a camera image every {longest_s:g} s or more often"
         return Notice(Reason.IMAGES_TOO_RARE, text)
-    if s.command != NO_MOTION:
+    if s.command != NO_MOTION or inputs.held_in_vain:
         return Notice(Reason.RELEASE_CONTROLS, f"let go of the controls to continue (stopped: {stopped_by.text})")
     return stopped_by.prefixed("stopped: ")
 

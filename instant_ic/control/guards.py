@@ -124,7 +124,7 @@ def image_fits(s: Snapshot) -> bool:
 
 
 def may_resume(s: Snapshot) -> bool:
-    if estop_pressed(s) or s.command != NO_MOTION or s.inputs.robot_pose is None:
+    if estop_pressed(s) or s.command != NO_MOTION or s.inputs.held_in_vain or s.inputs.robot_pose is None:
         return False
     if (s.awaits_operator and not s.fresh) or images_too_rare(s.inputs, s.config):
         return False

@@ -86,6 +86,10 @@ class Lease:
         """Whether a sender has the lease and is not lost."""
         return bool(sender) and sender == self.holder and now_ns - self._heard_ns <= self.silent_s * 1e9
 
+    def held_in_vain(self, now_ns: int) -> bool:
+        """Whether nobody drives because controls are held that must be let go first."""
+        return not self.holder and any(now_ns - held_ns <= self.silent_s * 1e9 for held_ns in self._held.values())
+
     @property
     def diagnosis(self) -> Diagnosis:
         """Who drives; a warning while others try to."""

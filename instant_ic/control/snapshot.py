@@ -54,6 +54,8 @@ class ArbiterInputs:
     operator_command: Twist2 = (0.0, 0.0)
     operator_gone: bool = False
     """The client that sent the command has left since: the command is void, whatever its age."""
+    held_in_vain: bool = False
+    """Nobody drives, because a client holds its controls since before it may."""
     estop: bool = False
     estop_button: bool = False
     """The button on the robot is pressed; only releasing it ends the stop."""

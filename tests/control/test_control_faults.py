@@ -35,7 +35,8 @@ def test_fault_a_pause_of_the_link_starts_the_robot_under_a_held_key(pause_s: fl
     stack.drive(pause_s, None)
     assert stack.drive(1.0, FORWARD)[-1].mode == ControlState.STOPPED
     assert twist_values(stack.bus.last("/cmd_vel")) == NOTHING
-    stack.drive(1.5, None)  # nobody there
+    stack.lost_ns = stack.now  # the page tells that nobody is there
+    stack.drive(1.5, None)
     assert stack.drive(1.0, FORWARD)[-1].mode == ControlState.REAL
 
 

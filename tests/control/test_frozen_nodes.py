@@ -5,6 +5,7 @@ The operator holds the key all the time. A frozen node is taken off the bus, and
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -167,6 +168,14 @@ def test_a_source_that_ended_in_a_freeze_moves_nothing_even_if_the_clock_was_set
     since = len(stack.bus.records("/cmd_vel"))
     stack.drive(2.0, None)
     assert set(commands(stack, since)) == {NOTHING}
+
+
+def test_a_command_that_is_no_number_is_no_release() -> None:
+    stack = stack_in(Mode.REAL)
+    freeze(stack, ["arbiter"], 2.0)
+    stack.drive(0.5, KEY)
+    assert {state.mode for state in stack.drive(2.0, (math.nan, 0.0))} == {Mode.STOPPED}
+    assert_waits_for_a_release(stack, "stood still")
 
 
 def test_silence_after_a_held_key_is_no_release() -> None:

@@ -23,7 +23,9 @@ def test_controls_held_in_vain_must_be_let_go_and_the_refused_are_named():
     lease.grant("a", 0)
     assert lease.refusal("b", True, 0) is not None
     assert lease.diagnosis.text == "a drives; refused: b" and lease.diagnosis.level == 1
+    assert not lease.held_in_vain(0)
     assert lease.release("a") and not lease.release("a") and lease.holder == ""
+    assert lease.held_in_vain(2 * SECOND) and not lease.held_in_vain(3 * SECOND)
     refused = lease.refusal("b", True, SECOND)
     assert refused is not None and refused.reason == "held"
     assert lease.refusal("b", False, SECOND) is None
