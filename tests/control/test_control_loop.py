@@ -236,23 +236,26 @@ def test_a_lost_operator_makes_the_robot_wait_in_virtual_mode_and_then_stop() ->
     made.ages["command"] = 0.0
     drive(made, 0.5, FORWARD)
     assert made.frames[-1].decision.mode == Mode.STOPPED  # back, but with a key held
-    drive(made, 0.1, NOTHING)
+    drive(made, 0.15, NOTHING)
     assert made.frames[-1].decision.mode == Mode.REAL
 
 
-def test_a_silent_operator_is_harmless_in_real_mode_and_counts_as_hands_off() -> None:
+@pytest.mark.parametrize(("last", "resumes"), [(NOTHING, True), (FORWARD, False)])
+def test_a_silent_operator_is_harmless_in_real_mode_and_counts_as_hands_off_after_a_zero_alone(
+    last: tuple[float, float], resumes: bool
+) -> None:
     made = loop(None)
     drive(made, 1.0, FORWARD)
     made.ages["command"] = math.inf
-    drive(made, 5.0, FORWARD)
+    drive(made, 5.0, last)
     assert made.frames[-1].decision.mode == Mode.REAL
     assert made.frames[-1].command == NOTHING
     assert made.frames[-1].decision.operator_command == NOTHING
     made.ages["scan"] = 1.6
-    assert made.step(FORWARD).decision.mode == Mode.STOPPED
+    assert made.step(last).decision.mode == Mode.STOPPED
     made.ages["scan"] = 0.0
-    drive(made, 1.0, FORWARD)
-    assert made.frames[-1].decision.mode == Mode.REAL
+    drive(made, 1.0, last)
+    assert (made.frames[-1].decision.mode == Mode.REAL) is resumes
 
 
 @pytest.mark.parametrize("cause", ["camera", "estop"])
