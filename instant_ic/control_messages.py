@@ -120,6 +120,8 @@ class ArbiterInbox:
                     self.shown.forget()
         if taken:
             self.sources["command"].put(message, received)
+        else:
+            self.sources["command"].note(received)  # a restarted console is a new client, who has no lease yet
         return taken
 
     def take_shown(self, received: Received, mode: Mode) -> bool:

@@ -8,7 +8,6 @@ process that commands motion looks at the time since its own last step.
 from __future__ import annotations
 
 import math
-import time
 
 BRIEF_S = 0.3
 """Longest time between two steps without a stop, in seconds of the stack."""
@@ -16,16 +15,6 @@ SETTLE_S = 0.3
 """Time after a gap in which nothing moves: what waited meanwhile is then read, and a source that has ended is stale."""
 _SUSPENDED_NS = 50_000_000
 """A machine was suspended if its two clocks differ by so much more than before."""
-
-
-def suspended_ns() -> int:
-    """Nanoseconds for which this machine was suspended since it started; too few if the process is held up meanwhile.
-
-    A paused virtual machine does not see its pause.
-    """
-    # In this order: a process that is held up between the two must not look suspended.
-    since_start_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-    return since_start_ns - time.monotonic_ns()
 
 
 class StepGap:

@@ -10,7 +10,6 @@ import time
 from typing import Protocol
 
 from instant_ic import pace
-from instant_ic.step_gap import suspended_ns
 
 
 class Clock(Protocol):
@@ -35,14 +34,14 @@ class SystemClock:
     Attributes:
         now_ns: returns nanoseconds since the epoch.
         steady_ns: returns nanoseconds of a clock that never jumps, even when somebody sets the machine's clock.
-        suspended_ns: :func:`instant_ic.step_gap.suspended_ns`.
+        suspended_ns: :func:`instant_ic.pace.suspended_ns`.
     """
 
     def __init__(self) -> None:
         current = pace.current()
         self.now_ns = time.time_ns if current.real else current.now_ns
         self.steady_ns = time.monotonic_ns if current.real else current.steady_ns
-        self.suspended_ns = suspended_ns
+        self.suspended_ns = pace.suspended_ns
 
 
 class ManualClock:

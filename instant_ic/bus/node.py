@@ -117,8 +117,12 @@ class Latest:
     def put(self, message: Any, received: Received) -> None:
         """Store a newer message with its reception data."""
         self._message, self._received_ns = message, received.steady_ns
-        self.instances[received.publisher] = received.instance
+        self.note(received)
         self._given_ns = received.given_ns(stamp_ns(message)) if hasattr(message, "header") else received.steady_ns
+
+    def note(self, received: Received) -> None:
+        """Note the publisher of a message that is not stored."""
+        self.instances[received.publisher] = received.instance
 
     def forget(self) -> None:
         """Drop the message, as before the first."""

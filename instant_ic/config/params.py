@@ -31,6 +31,9 @@ from instant_ic.safe_text import masked, masked_values
 
 ConfigT = TypeVar("ConfigT")
 
+_MOST_SHOWN = 80
+"""Characters of a refused value that its error shows."""
+
 SHARED = "/**"
 """Section of a parameter file for all nodes: each takes the values that it has a parameter for."""
 
@@ -388,6 +391,11 @@ def field_default(field: dataclasses.Field[Any]) -> Any:
     return None if field.default is dataclasses.MISSING else field.default
 
 
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
+
+
 def _coerce(value: Any, hint: Any, key: str) -> Any:
     origin = get_origin(hint)
     if origin is Annotated:
@@ -406,18 +414,18 @@ def _coerce(value: Any, hint: Any, key: str) -> Any:
             with suppress(ValueError):
                 if READERS[type(option)](value) == option:
                     return option
-        raise _RefusedError(f"{key} must be one of {', '.join(map(str, get_args(hint)))} (got {value!r})")
+        raise _RefusedError(f"{key} must be one of {', '.join(map(str, get_args(hint)))} (got {_shown(value)})")
     if hint in READERS:
         try:
             return READERS[hint](value)
         except ValueError as error:
-            raise _RefusedError(f"{key} {error} (got {value!r})") from None
+            raise _RefusedError(f"{key} {error} (got {_shown(value)})") from None
     if origin in (tuple, list) and isinstance(value, list):
         return _coerce_sequence(value, origin, get_args(hint), key)
     if hint is Any:
         return resolved(value)
     wanted = "a list" if origin in (tuple, list) else getattr(hint, "__name__", str(hint))
-    raise _RefusedError(f"{key} must be {wanted} (got {value!r})")
+    raise _RefusedError(f"{key} must be {wanted} (got {_shown(value)})")
 
 
 def _coerce_sequence(value: list[Any], origin: Any, arguments: tuple[Any, ...], key: str) -> Any:

@@ -42,8 +42,7 @@ from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, 
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
 from instant_ic.control.robot_lease import sender_name
-from instant_ic.pace import current
-from instant_ic.step_gap import suspended_ns
+from instant_ic.pace import current, suspended_ns
 from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
 
 STATIC = Path(__file__).parent / "static"

@@ -88,7 +88,9 @@ class Lease:
 
     def held_in_vain(self, now_ns: int) -> bool:
         """Whether nobody drives because controls are held that must be let go first."""
-        return not self.holder and any(now_ns - held_ns <= self.silent_s * 1e9 for held_ns in self._held.values())
+        return not self.holds(self.holder, now_ns) and any(
+            now_ns - held_ns <= self.silent_s * 1e9 for held_ns in self._held.values()
+        )
 
     @property
     def diagnosis(self) -> Diagnosis:

@@ -98,9 +98,9 @@ def test_parameter_file_that_is_no_utf8_is_an_error_with_its_name(tmp_path: Path
         ("port", "9" * 400, "port must have at most 64 bits"),
         ("port", "-" + "9" * 400, "port must have at most 64 bits"),
         ("silence_s", "9" * 400, "silence_s must be a finite number"),
-        ("port", "0x" + "f" * 5000, "the number is too long"),
-        ("silence_s", "[0x" + "f" * 5000 + "]", "the number is too long"),
-        ("port", "1:" + "59:" * 3000 + "59", "the number is too long"),  # in base 60
+        ("port", "0x" + "f" * 5000, "port must have at most 64 bits"),
+        ("silence_s", "[0x" + "f" * 5000 + "]", "silence_s must be float"),
+        ("port", "1:" + "59:" * 3000 + "59", "port must be int"),  # in base 60
     ],
 )
 def test_parameter_with_a_huge_number_is_an_error_with_its_place(
@@ -111,8 +111,9 @@ def test_parameter_with_a_huge_number_is_an_error_with_its_place(
 
     path = tmp_path / "params.yaml"
     path.write_text(f"node:\n  ros__parameters:\n    {key}: {value}\n")
-    with pytest.raises(ParameterError, match=rf"params\.yaml:3: .*{why}"):
+    with pytest.raises(ParameterError, match=rf"params\.yaml:3: .*{why}") as refused:
         build(Vlp16DriverConfig, load_file(path, "node"))
+    assert len(str(refused.value)) < len(str(path)) + 200
 
 
 @pytest.mark.parametrize("value", ["1" * 5000, "2001-13-45", "!!timestamp x", "{[]: 1}", "[" * 3000, '!!int "_"'])

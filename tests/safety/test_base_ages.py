@@ -10,6 +10,7 @@ from base_line import SetClock
 from instant_ic.bus import ERROR, SENSOR
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.camera.files import FileCamera
+from instant_ic.cli.message_input import build
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.geometry.poses import pose_matrix
@@ -66,15 +67,16 @@ def test_a_stamp_ahead_counts_from_its_arrival() -> None:
 
 
 @JUMPS
-def test_the_virtual_robot_obeys_no_old_command_after_the_clock_was_set(jump_s: int) -> None:
+def test_the_virtual_robot_obeys_no_old_state_after_the_clock_was_set(jump_s: int) -> None:
     bus, clock = clocked()
     node = bus.add(VirtualRobotNode)
-    bus.publish("/operator/cmd_vel", twist_stamped(0.2, 0.0, clock.now_ns() - S // 5))
-    assert node.operator() == (0.2, 0.0)
+    state = build("instant_ic_msgs/msg/ControlState", {"header": {"stamp": "now"}}, clock.now_ns() - S // 5)
+    bus.publish("/ic/state", state, latched=True)
+    assert node.state.fresh is not None
     clock.set_by_ns = jump_s * S
-    assert node.operator() == (0.2, 0.0)
-    clock.set(clock.steady_ns() + S // 5)  # 0.4 s since it was given, 0.2 s since it came
-    assert node.operator() == (0.0, 0.0)
+    assert node.state.fresh is not None
+    clock.set(clock.steady_ns() + 2 * S // 5)  # 0.6 s since it was given, 0.4 s since it came
+    assert node.state.fresh is None
 
 
 @JUMPS

@@ -296,7 +296,7 @@ def test_a_driver_can_come_back(controller: tuple[RoboclawEmulator, RoboClawServ
     emulator, server = controller
     for count in (5, 7):
         emulator.encoder[:] = count
-        with closing(Roboclaw(RoboclawConfig(port=str(server.link), reply_timeout_s=TIMEOUT_S))) as driver:
+        with closing(Roboclaw(RoboclawConfig(port=str(server.link), reply_timeout_s=2.0))) as driver:
             driver.connect()
             assert driver.encoders().tolist() == [count, count]
             assert "Roboclaw" in driver.version()
