@@ -20,11 +20,9 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import importlib.util
 import itertools
 import json
 import math
-import os
 import platform
 import statistics
 import sys
@@ -146,10 +144,6 @@ class Place:
         return space.render(self.start @ pose, *self._setup.view, FOV).rgb
 
 
-def has_triton() -> bool:
-    return importlib.util.find_spec("triton") is not None
-
-
 def kernels(setup: Setup) -> dict[str, Any]:
     """Errors, gradients, parameters after some steps and views, with one keyframe and with three."""
     place = Place(setup.worlds[0], setup)
@@ -201,10 +195,10 @@ def _compared(scene: Scene, setup: Setup) -> dict[str, Any]:
 
 
 def _judged(setup: Setup) -> Device:
-    if not setup.dry or has_triton():
+    if not setup.dry:  # Triton's interpreter would take minutes; tests/vspace/test_triton.py has it
         from instant_ic.vspace.nerf.triton_device import TritonDevice
 
-        return TritonDevice(setup.field, setup.train, "cpu" if setup.dry else "cuda")
+        return TritonDevice(setup.field, setup.train, "cuda")
     from instant_ic.vspace.nerf.numba_device import NumbaDevice
 
     device = NumbaDevice(setup.field, setup.train)
@@ -215,7 +209,7 @@ def _judged(setup: Setup) -> Device:
 def _gradient_error(ours: Any, peer: TorchDevice, uniform: Any, setup: Setup) -> dict[str, float] | str:
     """Largest difference of the gradients of one batch, as a share of the largest gradient: table and network."""
     if not hasattr(ours, "_launch_gradient"):
-        return "not measured: triton is not installed"
+        return "not measured: a dry run uses no Triton"
     ours.step(uniform, 1e-9, 1e-9)  # uploads the batch, and compiles
     peer.load(ours.parameters())
     b = ours._buffers
@@ -410,7 +404,6 @@ def main() -> int:
         parser.error("torch finds no CUDA device; --dry-run checks the script without one")
     arguments.out.mkdir(parents=True, exist_ok=True)
     if arguments.dry_run:
-        os.environ["TRITON_INTERPRET"] = "1"  # before triton is imported
         torch.set_num_threads(1)  # of tiny work threads wait for each other
         setup = Setup.tiny(arguments.out)
     else:
