@@ -382,7 +382,7 @@ def control_state(mode: int, stamp: int) -> ControlState:
     fields |= dict.fromkeys(("pose_gap_m", "yaw_gap_rad", "time_to_obstacle_s", "vbot_limit_m_s"), 0.0)
     fields |= dict.fromkeys(("estop", "blocked"), False)
     fields |= dict.fromkeys(("transitions", "shown", "vbot_action", "reason_code"), 0)
-    return ControlState(header=header("map", stamp), mode=mode, reason="", **fields)
+    return ControlState(header=header("map", stamp), mode=mode, reason="", holder="", **fields)
 
 
 def test_only_a_recent_state_in_which_the_virtual_space_is_shown_brings_keyframes_closer() -> None:
