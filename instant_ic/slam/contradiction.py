@@ -22,6 +22,8 @@ SCANS = 3
 """Smallest number of scans that must contradict: one bad match, or a late odometry message, moves two steps."""
 CERTAIN_M = 0.05
 """Sum above which a contradiction is certain: several times the error of scan matching."""
+MOST_M = CERTAIN_M / 2
+"""Largest share of one scan in the sum: a pose that is found again elsewhere is no motion."""
 LEVER_M = 0.3
 """Metres per radian: half the distance of the tracks."""
 SLIP = np.array([0.5, 0.5, 0.65])
@@ -75,7 +77,7 @@ class ContradictionMonitor:
         explained = SLIP * np.abs(wheels_m) + (STILL_M_S if stand else DRIFT_M_S) * elapsed_s
         explained[:2] += TURN_SHIFT_M * max(abs(float(wheels[2])), abs(float(seen[2])))
         apart_m = np.stack([seen_m - wheels_m, wheels_m - seen_m])
-        self._sum = np.maximum(0.0, self._sum + apart_m - explained)
+        self._sum = np.maximum(0.0, self._sum + np.minimum(apart_m - explained, MOST_M))
         going, contradicts = self._sum > 0.0, apart_m > explained
         for total, step in (
             (self._apart_m, apart_m),

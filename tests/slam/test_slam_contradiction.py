@@ -57,6 +57,16 @@ def test_each_kind_is_found_within_half_a_second_or_0_15_m(
         assert monitor.state is kind and scans >= 2
 
 
+def test_fault_a_pose_that_is_found_again_elsewhere_counts_as_motion_for_minutes() -> None:
+    """The jump left a sum of metres, so that the next two scans with a millimetre of noise were a contradiction."""
+    monitor = ContradictionMonitor()
+    steps(monitor, 20, (0.03, 0.0), (0.03, 0.0))
+    steps(monitor, 1, (0.03, 0.0), (-1.4, 2.5))
+    for _ in range(50):
+        steps(monitor, 1, seen=(0.002, 0.001))
+        assert steps(monitor, 1, (0.0, 0.009), (-0.001, 0.009)) == 0
+
+
 def test_ordinary_slip_wide_tracks_and_noise_are_none() -> None:
     monitor, rng = ContradictionMonitor(), np.random.default_rng(0)
     poses = np.zeros(3)
