@@ -28,6 +28,13 @@ def rig() -> Iterator[Rig]:
     made.stack.close()
 
 
+@pytest.fixture
+def own_rig() -> Iterator[Rig]:
+    made = Rig()
+    yield made
+    made.stack.close()
+
+
 def run(rig: Rig, seconds: float) -> None:
     for _ in range(round(seconds / STEP_S)):
         rig.step()
@@ -85,7 +92,8 @@ def test_after_a_freeze_the_robot_stands_until_the_controls_are_released(
 
 
 @pytest.mark.parametrize("name", ["crawler_base", "console"])
-def test_a_restarted_base_or_console_waits_for_a_release_even_within_1_5_s(rig: Rig, name: str) -> None:
+def test_a_restarted_base_or_console_waits_for_a_release_even_within_1_5_s(own_rig: Rig, name: str) -> None:
+    rig = own_rig  # a new base counts its odometry from zero: the next test gets another SLAM
     rig.drive()
     start = rig.stack.robot[:2]
     restart(rig, name, 0.7)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import tempfile
 import time
 from collections.abc import Iterator
 from itertools import permutations
@@ -260,13 +261,14 @@ def test_a_stop_whose_state_cannot_be_written_holds_and_is_an_error(robot: Robot
 def test_a_stack_whose_state_cannot_be_written_is_not_started(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    launch, started, run_dir = tmp_path / "stack.yaml", tmp_path / "started", tmp_path / "run"
+    launch, started = tmp_path / "stack.yaml", tmp_path / "started"
     launch.write_text(f"launch:\n- executable: {{cmd: touch {started}, name: toucher}}\n")
-    words = ["launch", str(launch), "--run-dir", str(run_dir), "--plain"]
-    assert main(words) == 0 and started.exists()
-    started.unlink()
-    (run_dir / "run.part").mkdir()  # in the way of the file, for root too
-    assert main(words) == 1
+    with tempfile.TemporaryDirectory() as run_dir:  # short enough for the names of sockets
+        words = ["launch", str(launch), "--run-dir", run_dir, "--plain"]
+        assert main(words) == 0 and started.exists()
+        started.unlink()
+        (Path(run_dir) / "run.part").mkdir()  # in the way of the file, for root too
+        assert main(words) == 1
     assert "Free the disk, or set INSTANT_IC_RUN_DIR" in capfd.readouterr().err
     assert not started.exists()
 
