@@ -156,7 +156,7 @@ def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str
 
 
 def latches(mode: int, pin: str, status_bytes: int) -> bool:
-    """Whether a mode of command 75 makes a pin a latching emergency stop.
+    """Return whether a mode of command 75 makes a pin a latching emergency stop.
 
     Args:
         mode: function of the pin.

@@ -27,7 +27,7 @@ class LiveImages:
         self._repeats = RepeatWatch()
 
     def is_live(self, frame: Frame) -> bool:
-        """Whether an image may be shown; otherwise ``fault`` says why not."""
+        """Return whether an image may be shown; otherwise ``fault`` says why not."""
         if not self._repeats.is_new(frame.jpeg):
             self.fault = "the camera repeats the same image: restart the camera, or the program that feeds its device"
         elif _empty(frame):

@@ -51,7 +51,7 @@ class Camera(Closing):
         self.cancelled = threading.Event()
         """Set by another thread: a call that waits for the device then ends soon, with an error."""
         self.advice = ""
-        """What the operator should change although images arrive; empty if nothing."""
+        """Advice to the operator while images arrive; empty if there is none."""
         self._latency_ns = round(latency_s * 1e9)
         self._now_ns = now_ns
 

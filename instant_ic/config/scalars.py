@@ -38,7 +38,7 @@ class Scalar:
 
 
 def is_null(value: Any) -> bool:
-    """Whether a value is null: ``null``, ``~`` or nothing, unquoted."""
+    """Return whether a value is null: ``null``, ``~`` or nothing, unquoted."""
     return value is None or (isinstance(value, Scalar) and value.text.lower() in _NULLS)
 
 

@@ -83,11 +83,11 @@ class Lease:
         return True
 
     def holds(self, sender: str, now_ns: int) -> bool:
-        """Whether a sender has the lease and is not lost."""
+        """Return whether a sender has the lease and is not lost."""
         return bool(sender) and sender == self.holder and now_ns - self._heard_ns <= self.silent_s * 1e9
 
     def held_in_vain(self, now_ns: int) -> bool:
-        """Whether nobody drives because controls are held that must be let go first."""
+        """Return whether nobody drives because held controls must be released first."""
         return not self.holds(self.holder, now_ns) and any(
             now_ns - held_ns <= self.silent_s * 1e9 for held_ns in self._held.values()
         )

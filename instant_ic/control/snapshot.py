@@ -151,7 +151,7 @@ class Snapshot:
     let_go_s: float
     """Seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
     interrupted: Notice | None = None
-    """What has happened since the step before that the controls must be released for."""
+    """Event since the previous step after which the controls must be released; None without one."""
     settles: bool = False
     """The arbiter itself stood still, less than ``SETTLE_S`` ago."""
     pose_lost: bool = False
