@@ -7,8 +7,8 @@
 
 Server, driver and flood are three processes. The flood comes from 127.0.0.2, the driver from 127.0.0.1; ``--same``
 floods from the driver's address. A disconnected client reconnects at once. Round trip: ping to pong, 20 Hz, as the page
-measures it. Stop: from the driver's ``estop`` until it is on the topic, by the machine's monotonic clock. Output is
-JSON in milliseconds; ``ratio`` is flood over quiet.
+measures it. Stop: from the driver's ``estop`` (``--post``: ``POST /estop`` on a new connection) until it is on the
+topic, by the machine's monotonic clock. Output is JSON in milliseconds; ``ratio`` is flood over quiet.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any
 
+import aiohttp
 import numpy as np
 from reporting import parser_of, report
 
@@ -135,9 +136,18 @@ def flood(channel: Connection, port: int, kind: str, clients: int, address: str)
     channel.send(counts)
 
 
-async def drive(port: int, seconds: float) -> tuple[list[float], list[float]]:
-    """Round trips in seconds, and the times at which emergency stops were sent."""
-    trips, stops = [], []
+async def post_stop(port: int) -> bool:
+    """Stop by a new connection; False: it was refused."""
+    try:
+        async with aiohttp.ClientSession() as http, http.post(f"http://127.0.0.1:{port}/estop") as response:
+            return response.status == 204
+    except aiohttp.ClientError:
+        return False
+
+
+async def drive(port: int, seconds: float, post: bool) -> tuple[list[float], list[float], int]:
+    """Round trips in seconds, the times at which emergency stops were sent, and how many were refused."""
+    trips, stops, refused = [], [], 0
     async with ConsoleClient(f"http://127.0.0.1:{port}/") as driver:
         await driver.acquire()
         driver._tasks.pop().cancel()  # stop the client's own heartbeat; this function sends it
@@ -151,10 +161,14 @@ async def drive(port: int, seconds: float) -> tuple[list[float], list[float]]:
             trips.append(driver.round_trip_s)
             if len(trips) % 5 == 0:
                 stops.append(time.monotonic())
-                await driver.estop()
+                if not post:
+                    await driver.estop()
+                elif not await post_stop(port):
+                    stops.pop()
+                    refused += 1
                 await driver.release_estop()
             await asyncio.sleep(max(0.0, 0.05 - (time.monotonic() - sent_s)))
-    return trips, stops
+    return trips, stops, refused
 
 
 def summary(values_s: Any) -> dict[str, float]:
@@ -167,7 +181,7 @@ def summary(values_s: Any) -> dict[str, float]:
     }
 
 
-def measure(kind: str | None, clients: int, seconds: float, address: str) -> dict[str, Any]:
+def measure(kind: str | None, clients: int, seconds: float, address: str, post: bool) -> dict[str, Any]:
     """One run, with a flood of ``kind`` or without."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -181,7 +195,7 @@ def measure(kind: str | None, clients: int, seconds: float, address: str) -> dic
             attack = context.Process(target=flood, args=(flood_theirs, port, kind, clients, address), daemon=True)
             attack.start()
             time.sleep(2.0)
-        trips, sent = asyncio.run(drive(port, seconds))
+        trips, sent, result["refused_stops"] = asyncio.run(drive(port, seconds, post))
         if kind is not None:
             flood_ours.send(None)
             result["flood"] = flood_ours.recv()
@@ -189,7 +203,8 @@ def measure(kind: str | None, clients: int, seconds: float, address: str) -> dic
         ours.send(None)
         came = ours.recv()
         assert len(came) == len(sent), f"{len(sent)} stops were sent, {len(came)} came"
-        result |= {"round_trip": summary(trips), "stop": summary(np.subtract(came, sent)), "pings": len(trips)}
+        result |= {"round_trip": summary(trips), "pings": len(trips), "stops": len(sent)}
+        result["stop"] = summary(np.subtract(came, sent)) if sent else {}
     finally:
         server.join(10)
         server.kill()
@@ -202,11 +217,12 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--same", action="store_true", help="flood from the driver's own address")
+    parser.add_argument("--post", action="store_true", help="stop by a POST /estop on a new connection")
     args = parser.parse_args()
-    quiet = measure(None, args.clients, args.seconds, ELSEWHERE)
-    flooded = measure(args.flood, args.clients, args.seconds, "127.0.0.1" if args.same else ELSEWHERE)
+    quiet = measure(None, args.clients, args.seconds, ELSEWHERE, args.post)
+    flooded = measure(args.flood, args.clients, args.seconds, "127.0.0.1" if args.same else ELSEWHERE, args.post)
     ratio = {
-        what: {key: round(value / quiet[what][key], 2) for key, value in flooded[what].items()}
+        what: {key: round(value / quiet[what][key], 2) for key, value in flooded[what].items() if quiet[what]}
         for what in ("round_trip", "stop")
     }
     about = {"flood_by": args.flood, "clients": args.clients, "load": os.getloadavg()[0]}

@@ -149,6 +149,10 @@ class Access:
         roles = [role for role, known in self._digests.items() if hmac.compare_digest(known, digest)]
         return roles[0] if roles else None
 
+    def role_of(self, token: str, cookie: str, now_s: float) -> Role | None:
+        """Return the role of a request: programs send a token, pages the cookie of their sign-in."""
+        return self.role_of_token(token) if token else self.role_of_session(cookie, now_s)
+
     def count_wrong_token(self, address: str, now_s: float) -> float:
         """Count a wrong token against its address; return the seconds to wait before answering it.
 

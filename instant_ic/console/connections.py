@@ -26,9 +26,14 @@ CLOSE_S = 1.0  # time for a closing handshake
 RETRY_S = 0.2  # pause after a failed accept
 BYTES_PER_S = 48 * 1024  # received on one connection; a page that drives by touch sends about a third
 BURST_BYTES = 48 * 1024
-CONNECTIONS_PER_S = 20.0  # of one address; a page opens about six
+CONNECTIONS_PER_S = 20.0  # of one address, without a sign-in; a page opens about six
 BURST_CONNECTIONS = 64.0
+HANDSHAKES_PER_S = 400.0  # TLS, of one address; each costs about 1 ms of the thread that passes the driver's commands
+BURST_HANDSHAKES = 128.0
+MOST_NEWCOMERS = 256
+MOST_HEADERS = 32 * 1024  # bytes of a request line with its headers; browsers send cookies of all ports of a host
 _MOST_ADDRESSES = 1024
+_TOO_MANY = b"HTTP/1.1 429 Too Many Requests\r\nRetry-After: 1\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 logger = logging.getLogger("instant_ic.console")
 
 
@@ -61,10 +66,68 @@ def network_of(host: str) -> str:
     return str(address)
 
 
+class Newcomer(asyncio.Protocol):
+    """A connection whose first request has not arrived: it may send headers, and costs no more than they do.
+
+    Args:
+        network: see :func:`network_of`.
+        on_headers: called once, when the headers are complete.
+        on_gone: called when the connection ends before.
+    """
+
+    def __init__(
+        self, network: str, on_headers: Callable[[Newcomer], None], on_gone: Callable[[Newcomer], None]
+    ) -> None:
+        self.network = network
+        self.kept = False
+        self.received = b""
+        """Headers, and what follows them."""
+        self.transport: asyncio.Transport | None = None
+        self.task: asyncio.Task[None] | None = None
+        self._on_headers, self._on_gone = on_headers, on_gone
+        self._late: asyncio.TimerHandle | None = None
+
+    def abort(self) -> None:
+        """Cut the connection at once, even during its TLS handshake."""
+        if self.transport is not None:
+            self.transport.abort()
+        elif self.task is not None:
+            self.task.cancel()
+
+    def become(self, protocol: asyncio.Protocol) -> None:
+        """Hand transport and received data over to another protocol."""
+        assert self.transport is not None
+        self._end_wait()
+        self.transport.set_protocol(protocol)
+        protocol.connection_made(self.transport)
+        protocol.data_received(self.received)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        self._late = asyncio.get_running_loop().call_later(HEADERS_S, transport.abort)
+
+    def data_received(self, data: bytes) -> None:
+        self.received += data
+        if b"\r\n\r\n" in self.received:
+            self._on_headers(self)
+        elif len(self.received) > MOST_HEADERS:
+            self.abort()
+
+    def connection_lost(self, exc: BaseException | None) -> None:
+        self._end_wait()
+        self._on_gone(self)
+
+    def _end_wait(self) -> None:
+        if self._late is not None:
+            self._late.cancel()
+            self._late = None
+
+
 class Connection(web.RequestHandler):
     """One client's connection: HTTP, possibly upgraded to a WebSocket. Cut if it floods or takes no data."""
 
-    __slots__ = ("_bucket", "_headers", "_on_flood", "_on_gone", "_stall", "kept", "muted", "network", "task")
+    __slots__ = ("_bucket", "_headers", "_on_flood", "_on_gone", "_stall", "kept", "muted", "network")
 
     def __init__(
         self,
@@ -85,7 +148,6 @@ class Connection(web.RequestHandler):
         """Whether it is a WebSocket; no newer connection displaces one."""
         self.muted = False
         """Whether data from the client is discarded unread."""
-        self.task: asyncio.Task[None] | None = None
         self._headers = headers
         self._on_gone = on_gone
         self._on_flood: Callable[[], None] = self.abort
@@ -103,11 +165,9 @@ class Connection(web.RequestHandler):
             self.transport.pause_reading()
 
     def abort(self) -> None:
-        """Cut the connection at once, even during its TLS handshake."""
+        """Cut the connection at once."""
         if self.transport is not None:
             self.transport.abort()
-        elif self.task is not None:
-            self.task.cancel()
 
     def data_received(self, data: bytes) -> None:
         if self.muted:
@@ -148,24 +208,37 @@ class Connection(web.RequestHandler):
 class Listener:
     """Accepts connections within limits.
 
-    At the limit of an address, its oldest connection that is not a WebSocket makes room. At the total limit, the
-    oldest one of the address with the most such connections does. So a client with idle connections displaces itself.
+    1. Each starts as a :class:`Newcomer`. Of too many, the oldest one of the address with the most is cut.
+    2. With its headers complete it is admitted if ``known`` says so, or within the rate of its address. So nobody
+       who is signed in waits for others of his address, which may be a whole building's.
+    3. At the limit of an address, its oldest connection that is not a WebSocket makes room. At the total limit, the
+       oldest one of the address with the most such connections does. So a client with idle connections displaces
+       itself.
 
     Args:
         server: answers the requests.
-        most: largest number of simultaneous connections.
+        most: largest number of simultaneous connections, newcomers not counted.
         most_per_address: the same for one address.
         tls: context for https; None: http.
         headers: added to error responses that are created below the application.
+        known: whether a request with these headers is admitted above the rate.
     """
 
     def __init__(
-        self, server: web.Server, most: int, most_per_address: int, tls: ssl.SSLContext | None, headers: dict[str, str]
+        self,
+        server: web.Server,
+        most: int,
+        most_per_address: int,
+        tls: ssl.SSLContext | None,
+        headers: dict[str, str],
+        known: Callable[[bytes], bool],
     ) -> None:
-        self._server, self._tls, self._headers = server, tls, headers
+        self._server, self._tls, self._headers, self._known = server, tls, headers, known
         self._most, self._most_per_address = most, most_per_address
+        self._newcomers: dict[Newcomer, None] = {}  # oldest first
         self._connections: dict[Connection, None] = {}  # oldest first
         self._rates = AddressBuckets(CONNECTIONS_PER_S, BURST_CONNECTIONS)
+        self._handshakes = AddressBuckets(HANDSHAKES_PER_S, BURST_HANDSHAKES)
         self._sockets: list[socket.socket] = []
         self._tasks: list[asyncio.Task[None]] = []
         self.refused = 0
@@ -212,16 +285,29 @@ class Listener:
                 continue
             except OSError as error:  # out of file descriptors or memory
                 logger.error("cannot accept a connection: %s; an idle one is closed to make room", error.strerror)
-                self._displace(self._connections)
+                _ = self._displace(self._newcomers) or self._displace(self._connections)
                 await asyncio.sleep(RETRY_S)
                 continue
-            self._admit(accepted, network_of(peer[0]))
+            self._receive(accepted, network_of(peer[0]))
             await asyncio.sleep(0)  # existing connections come first
 
-    def _admit(self, accepted: socket.socket, network: str) -> None:
+    def _receive(self, accepted: socket.socket, network: str) -> None:
+        if self._tls is not None and not self._handshakes.of(network).take(time.monotonic()):
+            accepted.close()
+            self._refuse(network, f"more than {HANDSHAKES_PER_S:g} new ones a second")
+            return
+        if len(self._newcomers) >= MOST_NEWCOMERS:
+            self._displace(self._newcomers)
+        newcomer = Newcomer(network, self._admit, self._forget)
+        self._newcomers[newcomer] = None
+        newcomer.task = asyncio.create_task(self._serve(accepted, newcomer))
+
+    def _admit(self, newcomer: Newcomer) -> None:
+        self._forget(newcomer)
+        network = newcomer.network
         own = [connection for connection in self._connections if connection.network == network]
-        if not self._rates.of(network).take(time.monotonic()):
-            reason = f"more than {CONNECTIONS_PER_S:g} new ones a second"
+        if not (self._known(newcomer.received) or self._rates.of(network).take(time.monotonic())):
+            reason = f"more than {CONNECTIONS_PER_S:g} new ones a second without a sign-in"
         elif len(own) >= self._most_per_address and not self._displace(own):
             reason = f"it has {len(own)} WebSockets"
         elif len(self._connections) >= self._most and not self._displace(self._connections):
@@ -229,13 +315,18 @@ class Listener:
         else:
             connection = Connection(self._server, network, self._headers, self._forget)
             self._connections[connection] = None
-            connection.task = asyncio.create_task(self._serve(accepted, connection))
+            newcomer.become(connection)
             return
-        accepted.close()
+        assert newcomer.transport is not None
+        newcomer.transport.write(_TOO_MANY)
+        newcomer.abort()  # a slow goodbye would cost a place
+        self._refuse(network, reason)
+
+    def _refuse(self, network: str, reason: str) -> None:
         self.refused += 1
         logger.warning("refused a connection from %s: %s", network, reason)
 
-    def _displace(self, connections: Iterable[Connection]) -> bool:
+    def _displace(self, connections: Iterable[Newcomer | Connection]) -> bool:
         """Cut the oldest non-WebSocket of the address that has the most of them; return False if there is none."""
         idle = [connection for connection in connections if not connection.kept]
         if not idle:
@@ -246,20 +337,21 @@ class Listener:
         oldest.abort()
         return True
 
-    def _forget(self, connection: Connection) -> None:
-        self._connections.pop(connection, None)
+    def _forget(self, connection: Newcomer | Connection) -> None:
+        places: dict[Any, None] = self._newcomers if isinstance(connection, Newcomer) else self._connections
+        places.pop(connection, None)
 
-    async def _serve(self, accepted: socket.socket, connection: Connection) -> None:
+    async def _serve(self, accepted: socket.socket, newcomer: Newcomer) -> None:
         try:
             await asyncio.get_running_loop().connect_accepted_socket(
-                lambda: connection, accepted, ssl=self._tls, ssl_handshake_timeout=HEADERS_S if self._tls else None
+                lambda: newcomer, accepted, ssl=self._tls, ssl_handshake_timeout=HEADERS_S if self._tls else None
             )
         except OSError as error:  # includes failed TLS handshakes
-            logger.debug("no connection with %s: %s", connection.network, error)
+            logger.debug("no connection with %s: %s", newcomer.network, error)
         finally:
-            if connection.transport is None:  # cut or failed before it was set up
+            if newcomer.transport is None:  # cut or failed before it was set up
                 accepted.close()
-                self._forget(connection)
+                self._forget(newcomer)
 
 
 def _report_end(task: asyncio.Task[None]) -> None:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Protocol
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote, unquote, urlsplit
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
@@ -333,7 +333,7 @@ class ConsoleServer:
         await runner.setup()
         assert runner.server is not None
         limits = self.config.max_connections, self.config.max_connections_per_address
-        self._listener = listener = Listener(runner.server, *limits, self._tls, SECURITY_HEADERS)
+        self._listener = listener = Listener(runner.server, *limits, self._tls, SECURITY_HEADERS, self._known)
         try:
             self.port = await listener.open(self.config.host, self.config.port)
             drive_task = asyncio.create_task(self._drive_forever())
@@ -384,15 +384,26 @@ class ConsoleServer:
         """Return the role of a request: programs send a token in the header, pages the cookie of their sign-in."""
         if not self.access.required:
             return Role.DRIVE
-        credential = request[_COOKIE]
-        if token := _bearer(request):
-            request[_COOKIE], credential = "", token
-            role = self.access.role_of_token(token)
-        else:
-            role = self.access.role_of_session(credential, time.monotonic())
+        token = _bearer(request.headers.get("Authorization", ""))
+        role = self.access.role_of(token, request[_COOKIE], time.monotonic())
         if role is not None:
-            request[_PAYER] = credential
+            request[_PAYER] = token or request[_COOKIE]
+        if token:
+            request[_COOKIE] = ""
         return role
+
+    def _known(self, received: bytes) -> bool:
+        """Whether the headers of a first request carry a right token or cookie; without sign-in, whether it is a stop.
+
+        This only admits a connection: :meth:`_guard` decides on the request.
+        """
+        if not self.access.required:
+            return received.startswith(b"POST /estop ")
+        start, *lines = received.partition(b"\r\n\r\n")[0].decode("latin-1").split("\r\n")
+        fields = {name.lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+        cookies = dict(pair.strip().partition("=")[::2] for pair in fields.get("cookie", "").split(";"))
+        token = _bearer(fields.get("authorization", "")) or unquote(start.partition("?token=")[2].partition(" ")[0])
+        return self.access.role_of(token, cookies.get(COOKIE, ""), time.monotonic()) is not None
 
     async def _slow_down(self, request: web.Request) -> None:
         """Delay the answer to a wrong token."""
@@ -406,7 +417,7 @@ class ConsoleServer:
             if token := request.query.get("token", ""):
                 return await self._enter(request, token)
             return self._sign_in_page("Sign in to see the robot.")
-        if _bearer(request):
+        if _bearer(request.headers.get("Authorization", "")):
             await self._slow_down(request)
         return web.Response(
             status=401, text="sign in first, or send 'Authorization: Bearer TOKEN'\n",
@@ -911,9 +922,9 @@ def zip_of(files: dict[str, bytes]) -> bytes:
     return packed.getvalue()
 
 
-def _bearer(request: web.Request) -> str:
-    """Return the token in the header; empty if there is none."""
-    scheme, _, token = request.headers.get("Authorization", "").partition(" ")
+def _bearer(authorization: str) -> str:
+    """Return the token in an Authorization header; empty if there is none."""
+    scheme, _, token = authorization.partition(" ")
     return token.strip() if scheme.lower() == "bearer" else ""
 
 

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import logging
+import ssl
 import subprocess
 import sys
 import textwrap
@@ -520,7 +521,7 @@ def test_more_connections_a_second_than_a_page_needs_are_refused_without_a_log_f
     async def scenario():
         for _ in range(50):
             _, writer = await asyncio.open_connection("127.0.0.1", server.port, local_addr=ELSEWHERE)
-            writer.close()
+            writer.write(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         await until(lambda: server._listener.refused == 45)
         async with ConsoleClient(server.url) as driver:  # from another address
             await driver.acquire()
@@ -529,6 +530,100 @@ def test_more_connections_a_second_than_a_page_needs_are_refused_without_a_log_f
         run(scenario)
     # How many seconds it took, the machine decides: once a second, and 45 at once are one line.
     assert 1 <= sum("refused a connection from 127.0.0.2" in line for line in caplog.messages) < 45
+
+
+STOP = b"POST /estop HTTP/1.1\r\nHost: 127.0.0.1\r\n"
+STRANGERS = {
+    "wrong token": STOP + b"Authorization: Bearer wrong\r\n\r\n",
+    "none": STOP + b"\r\n",
+    "half": STOP,
+    "": b"",
+}
+
+
+@pytest.mark.parametrize("tls", [False, True], ids=["http", "https"])
+@pytest.mark.parametrize("sent", STRANGERS.values(), ids=STRANGERS)
+def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
+    serve, monkeypatch, tmp_path, certificate, sent, tls
+):
+    """Whoever else is behind the same router, or a user of the same machine, opens 15 connections to each stop."""
+    monkeypatch.setattr(connections_module, "BURST_CONNECTIONS", 5.0)
+    monkeypatch.setattr(connections_module, "CONNECTIONS_PER_S", 1e-5)
+    monkeypatch.setattr(connections_module, "BURST_HANDSHAKES", 1e5)
+    drive = token_file(tmp_path, "drive", DRIVE)
+    server = serve(access=AccessConfig(token_file=drive, **(certificate if tls else {})))
+    trusting = ssl.create_default_context(cafile=certificate["tls_certificate"]) if tls else None
+
+    async def stranger():
+        with contextlib.suppress(OSError):  # refused
+            _, writer = await asyncio.open_connection("127.0.0.1", server.port, ssl=trusting)
+            writer.write(sent)
+            return writer
+
+    async def answer(request):
+        async with aiohttp.ClientSession() as http:  # a new connection
+            method, path, headers = request
+            sent = {"headers": headers, "ssl": trusting or True, "allow_redirects": False}
+            async with http.request(method, server.url + path, **sent) as response:
+                return response.status, response.headers.get("Set-Cookie", "").partition(";")[0]
+
+    async def scenario():
+        held = []
+        entered, cookie = await answer(("GET", f"?token={DRIVE}", {}))
+        assert entered == 303
+        ways = {"Authorization": f"bearer  {DRIVE}"}, {"Cookie": f"other=1; {cookie}; more"}
+        for number in range(20):
+            held += await asyncio.gather(*(stranger() for _ in range(15)))
+            assert (await answer(("POST", "estop", ways[number % 2])))[0] == 204
+        assert (await answer(("GET", f"?token={DRIVE}", {})))[0] == 303
+        if sent.endswith(b"\r\n\r\n"):
+            assert (await answer(("POST", "estop", {"Authorization": "Bearer wrong"})))[0] == 429
+            assert (await answer(("GET", "", {})))[0] == 429
+        for writer in filter(None, held):
+            writer.close()
+
+    run(scenario)
+    assert server.backend.estops == [True] * 20
+
+
+def test_without_a_sign_in_only_stops_are_admitted_above_the_rate_of_an_address(serve, monkeypatch):
+    monkeypatch.setattr(connections_module, "BURST_CONNECTIONS", 5.0)
+    monkeypatch.setattr(connections_module, "CONNECTIONS_PER_S", 1e-5)
+    server = serve()
+
+    async def answer(request):
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(request)
+        status = (await reader.readuntil(b"\r\n"))[9:12]
+        writer.close()
+        return status
+
+    async def scenario():
+        page = STOP.replace(b"POST /estop", b"GET /") + b"\r\n"
+        assert [await answer(page) for _ in range(7)] == [b"200"] * 5 + [b"429"] * 2
+        assert [await answer(STOP + b"\r\n") for _ in range(20)] == [b"204"] * 20
+
+    run(scenario)
+
+
+def test_connections_without_complete_headers_are_few_and_small(serve, monkeypatch):
+    monkeypatch.setattr(connections_module, "MOST_NEWCOMERS", 10)
+    server = serve()
+
+    async def scenario():
+        opened = [await asyncio.open_connection("127.0.0.1", server.port, local_addr=ELSEWHERE) for _ in range(50)]
+        ends = [asyncio.create_task(reader.read()) for reader, _ in opened]
+        await until(lambda: sum(end.done() for end in ends) >= 40)
+        other, long = await asyncio.open_connection("127.0.0.1", server.port)
+        long.write(b"GET / HTTP/1.1\r\nX: " + bytes(connections_module.MOST_HEADERS))
+        with contextlib.suppress(ConnectionError):  # what it has not read resets the connection
+            assert await other.read() == b""
+        assert ends[-1].done() is False  # the oldest of the address with the most make room
+        for _, writer in [*opened, (other, long)]:
+            writer.close()
+        await asyncio.gather(*ends, return_exceptions=True)
+
+    run(scenario)
 
 
 SERVER_WITHOUT_FILES = """
