@@ -5,8 +5,8 @@ from __future__ import annotations
 import zlib
 from collections import deque
 
-REMEMBERED = 8
-"""Number of different measurements that are remembered: a ring of old buffers repeats several."""
+REMEMBERED = 128
+"""Number of different measurements that are remembered: rings of old buffers and short recordings repeat many."""
 
 
 class RepeatWatch:
@@ -31,3 +31,8 @@ class RepeatWatch:
         self._known.append(digest)
         self.copies = 0
         return True
+
+    def forget(self) -> None:
+        """Take no measurement so far for an earlier one."""
+        self._known.clear()
+        self.copies = 0

@@ -92,6 +92,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.diagnose_all(found)
         self.log.info("%s: %s", self.config.pcap, found.text)
         if self.config.loop:
+            self.report.capture_restarts()
             self.open_capture()
 
     def on_datagram(self, received: Received) -> None:

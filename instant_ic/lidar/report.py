@@ -65,6 +65,10 @@ class LidarReport:
         self.withheld += not trusted
         return trusted
 
+    def capture_restarts(self) -> None:
+        """Take a capture for new data when it is played again."""
+        self._repeats.forget()
+
     def covers(self, revolution: Revolution, min_coverage: float) -> bool:
         """Whether a revolution gives a scan: not an incomplete one, which counts as partial, nor a blind one."""
         # Half blind: it would mislead map matching, and the scan itself does not show the fault to other nodes.

@@ -112,6 +112,12 @@ def test_packets_of_a_bag_give_the_same_again_bit_for_bit(capture: Path) -> None
         assert [record.payload for record in again.records(topic)] == expected
 
 
+def test_fault_a_short_capture_that_loops_is_taken_for_a_sensor_that_repeats_itself(capture: Path) -> None:
+    bus, node = played(capture, loop=True)
+    bus.advance(2.0)
+    assert len(bus.messages("/scan")) >= 14 and node.report.withheld == 0
+
+
 @pytest.mark.parametrize(("min_coverage", "scans"), [(0.5, 4), (0.05, 5), (0.75, 3)])
 def test_revolutions_that_are_cut_short_give_no_scan(tmp_path: Path, min_coverage: float, scans: int) -> None:
     # 287 packets of 1.327 ms are 3.81 turns at 600 rpm: a tenth up to the first cut, three whole ones, 0.71.
