@@ -1,9 +1,15 @@
 """Decides whether wheel odometry and scan matching contradict each other.
 
-Each scan gives a step of the wheels and a step seen by the LiDAR: along, across and in rotation. For each of the three
-and each sign, a cumulative sum (Page, 1954) adds how much farther the robot was seen to move than its tracks. It
-subtracts what ordinary slip explains, and does not fall below zero. A contradiction begins where its sum was last zero.
-It is certain once the sum exceeds what matching errs, over several scans; it counts after `LONGEST_S` or `LONGEST_M`.
+Each scan gives a step of the wheels and a step seen by the LiDAR: along, across and in rotation.
+
+1. Steps are added up until they are a motion of `STEP_M`, or for `STEP_S`: noise is no motion, however slow the robot.
+   Scans in a burst are one step, because their stamps are not the times at which they were measured.
+2. For each of the three and each sign, a cumulative sum (Page, 1954) adds how much farther the robot was seen to move
+   than its tracks. It subtracts what ordinary slip explains, and does not fall below zero. A contradiction begins where
+   its sum was last zero.
+3. A contradiction is certain once its sum exceeds the error of the comparison, over several comparisons: that of scan
+   matching, and the motion in half a period, by which the stamps of scans and odometry may differ. It counts after
+   `LONGEST_S` or `LONGEST_M`.
 
 A direction is judged only where the scan itself fixes the pose: along a bare corridor, odometry decides the match.
 """
@@ -11,26 +17,35 @@ A direction is judged only where the scan itself fixes the pose: along a bare co
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from instant_ic.contradiction import Contradiction
 from instant_ic.slam.scan import FloatArray
 
 LONGEST_S, LONGEST_M = 0.5, 0.15
 """Time and distance between wheels and LiDAR over which a contradiction counts."""
-SCANS = 3
-"""Smallest number of scans that must contradict: one bad match, or a late odometry message, moves two steps."""
-CERTAIN_M = 0.05
-"""Sum above which a contradiction is certain: several times the error of scan matching."""
-MOST_M = CERTAIN_M / 2
-"""Largest share of one scan in the sum: a pose that is found again elsewhere is no motion."""
+STEP_M, STEP_S = 0.01, 0.5
+"""Motion, and time without it, after which the steps so far are compared."""
+BURST = 0.5
+"""Share of the usual period below which a scan comes in a burst."""
+COMPARISONS = 3
+"""Smallest number that must contradict: one bad match, or a late odometry message, moves two steps."""
+CERTAIN_M, CERTAIN_SIGMAS, CERTAIN_STEPS = 0.02, 4.0, 0.5
+"""Error of a comparison: sum of a constant, standard deviations of the match and usual steps of the robot."""
+USUAL_SCANS = 20
+"""Number of scans over which the usual period and step are averaged."""
+MOST = 0.5
+"""Largest part of the error that one comparison adds: a pose that is found again elsewhere is no motion."""
 LEVER_M = 0.3
 """Metres per radian: half the distance of the tracks."""
 SLIP = np.array([0.5, 0.5, 0.65])
 """Shares of the tracks' motion that ordinary slip explains; skid steering turns by as little as a third."""
+UNEVEN = 0.1
+"""Share of the way along that tracks differ: it turns the robot, times LEVER_M."""
 TURN_SHIFT_M = 0.15
 """Metres per radian: a robot that turns on the spot also moves, because it does not turn about base_link."""
-DRIFT_M_S, STILL_M_S = 0.003, 0.05
+STAND_M_S = 0.003
+"""Speed of the tracks below which they stand."""
+DRIFT_M_S, STILL_M_S = 0.0005, 0.05
 """Speeds that are no motion, while the tracks turn and while they stand: sums of errors fade away."""
 FIXED = np.array([0.01, 0.01, 0.005])
 """A direction is judged up to this standard deviation of the scan alone; a bare corridor has 0.02 m along its axis."""
@@ -38,6 +53,7 @@ AGREED_M = 0.3
 """Motion of the tracks in agreement with the LiDAR that ends a contradiction."""
 _STANDS = 0.1
 """Share of the one motion below which the other is none."""
+_TO_M = np.array([1.0, 1.0, LEVER_M])
 
 
 class ContradictionMonitor:
@@ -52,13 +68,19 @@ class ContradictionMonitor:
         self.state = Contradiction.NONE
         self.count = 0
         self._agreed_m = 0.0
+        self._scans, self._period_s, self._usual_m = 0, 0.0, np.zeros(3)
+        self._begin_step()
         self._restart()
+
+    def _begin_step(self) -> None:
+        # Of wheels and LiDAR, (2, 3); rotation times LEVER_M.
+        self._step_m, self._step_s, self._step_judged = np.zeros((2, 3)), 0.0, np.ones(3, np.bool_)
 
     def _restart(self) -> None:
         # Rows: more and less than the tracks; columns: along, across, rotation times LEVER_M.
         self._sum, self._apart_m, self._seconds = np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 3))
         self._wheels_m, self._seen_m = np.zeros((2, 3)), np.zeros((2, 3))
-        self._scans: NDArray[np.int64] = np.zeros((2, 3), np.int64)
+        self._comparisons = np.zeros((2, 3))
 
     def update(self, wheels: FloatArray, seen: FloatArray, elapsed_s: float, scan_sigma: FloatArray | None) -> None:
         """Add a step.
@@ -69,26 +91,43 @@ class ContradictionMonitor:
             elapsed_s: duration of the step.
             scan_sigma: standard deviations (3,) of the match by the scan alone; None if the scan was not matched.
         """
-        to_m = np.array([1.0, 1.0, LEVER_M])
-        judged = np.zeros(3, np.bool_) if scan_sigma is None else scan_sigma < FIXED
-        wheels_m = wheels * to_m
-        seen_m = np.where(judged, seen * to_m, wheels_m)
-        stand = float(np.abs(wheels_m).sum()) < DRIFT_M_S * elapsed_s
+        sigma = np.full(3, np.inf) if scan_sigma is None else scan_sigma
+        judged = sigma < FIXED
+        step_m = np.stack([wheels, np.where(judged, seen, wheels)]) * _TO_M
+        # One pause, or one pose that jumps, hardly changes what is usual.
+        pause_s = 4.0 * self._period_s if self._scans else elapsed_s
+        self._scans = min(self._scans + 1, USUAL_SCANS)
+        self._period_s += (min(elapsed_s, pause_s) - self._period_s) / self._scans
+        self._usual_m += (np.abs(step_m).min(axis=0) - self._usual_m) / self._scans
+        self._step_m += step_m
+        self._step_s += elapsed_s
+        self._step_judged &= judged
+        moved = float(np.abs(self._step_m).max()) >= STEP_M and self._step_s >= BURST * self._period_s
+        if moved or self._step_s >= STEP_S - 1e-6:
+            sigma_m = np.where(judged, sigma, FIXED) * _TO_M
+            self._compare(CERTAIN_M + CERTAIN_SIGMAS * sigma_m + CERTAIN_STEPS * self._usual_m)
+            self._begin_step()
+
+    def _compare(self, error_m: FloatArray) -> None:
+        """Compare wheels and LiDAR over a step; ``error_m`` (3,) is that of the comparison."""
+        (wheels_m, seen_m), elapsed_s = self._step_m, self._step_s
+        stand = float(np.abs(wheels_m).sum()) < STAND_M_S * elapsed_s
         explained = SLIP * np.abs(wheels_m) + (STILL_M_S if stand else DRIFT_M_S) * elapsed_s
-        explained[:2] += TURN_SHIFT_M * max(abs(float(wheels[2])), abs(float(seen[2])))
+        explained[:2] += TURN_SHIFT_M / LEVER_M * float(np.abs(self._step_m[:, 2]).max())
+        explained[2] += UNEVEN * abs(float(wheels_m[0]))
         apart_m = np.stack([seen_m - wheels_m, wheels_m - seen_m])
-        self._sum = np.maximum(0.0, self._sum + np.minimum(apart_m - explained, MOST_M))
+        self._sum = np.maximum(0.0, self._sum + np.minimum(apart_m - explained, MOST * error_m))
         going, contradicts = self._sum > 0.0, apart_m > explained
         for total, step in (
             (self._apart_m, apart_m),
             (self._seconds, elapsed_s * contradicts),
             (self._wheels_m, wheels_m),
             (self._seen_m, seen_m),
-            (self._scans, contradicts),
+            (self._comparisons, contradicts),
         ):
             total += step
             total[~going] = 0
-        certain = (self._sum > CERTAIN_M) & (self._scans >= SCANS)
+        certain = (self._sum > error_m) & (self._comparisons >= COMPARISONS)
         found = certain & ((self._apart_m > LONGEST_M) | (self._seconds > LONGEST_S))
         if found.any():
             worst = np.unravel_index(np.argmax(np.where(found, self._sum, 0.0)), found.shape)
@@ -97,7 +136,7 @@ class ContradictionMonitor:
             self._agreed_m = 0.0
             self._restart()
         elif self.state:
-            agrees = judged[[0, 2]].all() and not (self._sum > 0.5 * CERTAIN_M).any()
+            agrees = self._step_judged[[0, 2]].all() and not (self._sum > 0.5 * error_m).any()
             self._agreed_m = self._agreed_m + float(np.abs(wheels_m).sum()) if agrees else 0.0
             if self._agreed_m > AGREED_M:
                 self.state = Contradiction.NONE

@@ -113,6 +113,16 @@ def test_tracks_that_slip_on_the_spot_stop_and_the_operator_drives_free_slowly(s
     assert abs(robot.tracks).min() > 0.3 and not stack.stopped
 
 
+@pytest.mark.parametrize("speed_m_s", [0.02, 0.01])
+def test_fault_slow_tracks_that_slip_on_the_spot_run_on(stack: Stack, speed_m_s: float) -> None:
+    """At 0.02 m/s they ran 0.25 m, at 0.01 m/s for ever."""
+    stack.drive(FORWARD, 2.0)
+    stack.drive(NOTHING, 1.0)
+    stack.simulation.robot.touches = lambda pose: True
+    assert stack.drive((speed_m_s, 0.0), 0.16 / speed_m_s, until=lambda: stack.stopped) * speed_m_s < 0.15
+    assert stack.stopped and stack.state.reason_code == Reason.RELEASE_CONTROLS
+
+
 def covered(packet: bytes, first_deg: float, end_deg: float) -> bytes:
     """A data packet without the returns between two azimuths, clockwise from ahead."""
     data = np.frombuffer(packet, np.uint8).copy()

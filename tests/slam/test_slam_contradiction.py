@@ -80,6 +80,42 @@ def test_ordinary_slip_wide_tracks_and_noise_are_none() -> None:
     assert monitor.count == 0 and monitor.state is Contradiction.NONE
 
 
+@pytest.mark.parametrize("speed_m_s", [0.05, 0.02, 0.01, 0.005])
+def test_fault_slow_tracks_that_slip_are_found_late_or_never(speed_m_s: float) -> None:
+    """At 0.02 m/s it was found after 0.2 m, at 0.01 m/s never: the noise of each scan counted as motion."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        monitor, way_m, noise = ContradictionMonitor(), 0.0, np.zeros(3)
+        while not monitor.count and way_m < 1.0:
+            before, noise = noise, rng.normal(0.0, [0.001, 0.001, 0.0005])
+            monitor.update(np.array([speed_m_s * SCAN_S, 0.0, 0.0]), noise - before, SCAN_S, CLEAR)
+            way_m += speed_m_s * SCAN_S
+        assert monitor.state is Contradiction.SLIPPING and way_m <= LONGEST_M
+
+
+def test_fault_scans_that_come_in_a_burst_are_a_contradiction() -> None:
+    """Scans that were kept back arrive together, with the odometry of that moment, beyond what they have seen."""
+    monitor, wheels_m = ContradictionMonitor(), 0.35 * 0.6
+    for _ in range(20):
+        for elapsed_s in (*[0.6] * 6, 2.4, 0.002, 0.002, 0.002):
+            wheels = wheels_m * round(elapsed_s / 0.6)
+            monitor.update(np.array([wheels, 0, 0]), np.array([wheels_m, 0, 0]), elapsed_s, CLEAR)
+    assert monitor.count == 0
+
+
+def test_scans_measured_half_a_period_before_the_odometry_are_none() -> None:
+    monitor, before = ContradictionMonitor(), np.zeros(3)
+    for k in range(600):
+        wheels = np.array([0.07, 0.0, 0.15]) * np.clip(1.5 * np.sin(k / 7), -1, 1)
+        monitor.update(wheels, (wheels + before) / 2, SCAN_S, CLEAR)
+        before = wheels
+    assert monitor.count == 0
+
+
+def test_fault_tracks_that_differ_by_a_tenth_turn_the_robot_and_are_a_contradiction() -> None:
+    assert steps(ContradictionMonitor(), 300, (0.04, 0.0), (0.04, 0.012)) == 0
+
+
 def test_what_the_scan_does_not_fix_is_no_contradiction() -> None:
     monitor = ContradictionMonitor()
     assert steps(monitor, 100, (0.04, 0.0), (0.0, 0.0), ALONG_UNKNOWN) == 0

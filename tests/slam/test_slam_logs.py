@@ -273,7 +273,15 @@ def test_mines_is_tracked_through_with_and_without_wheels(use_wheel_odom: bool) 
     assert len(result.trajectory) == 400
     assert result.statuses.get("lost", 0) == 0
     assert result.scores.mean() > 0.75
+    assert result.slam.contradiction.count == 0
     grid = result.slam.grid()
     # Crisp walls: few cells that hits and rays disagree about.
     sure = ((grid.values >= 0) & ((grid.values < 45) | (grid.values > 65))).sum()
     assert sure > 0.9 * (grid.values >= 0).sum()
+
+
+@pytest.mark.parametrize("mark", [pytest.param(None, marks=real_data)])
+def test_fault_scans_of_a_sound_robot_that_come_in_bursts_contradict_its_wheels(mark: None) -> None:
+    """Intel's scans were sometimes kept back and stamped together: five contradictions in these."""
+    result = run_log(islice(read_log(DATA / "intel.log.gz"), 2960, 3160))
+    assert result.slam.contradiction.count == 0
