@@ -161,7 +161,7 @@ class BaseController:
             self._forget_motion()
             dt_s = 0.0
         command = self._fresh_command()
-        stops, health = self.roboclaw.counters.stops, None
+        stops = self.roboclaw.counters.stops
         try:
             v, w = self._drive(command, dt_s)
             asked_ns = self._steady_ns()
@@ -171,10 +171,7 @@ class BaseController:
             self._check_counts(encoders)
             power, current_a = self.roboclaw.pwm(), self.roboclaw.currents_a()
             status = self.roboclaw.status()
-            if now_ns >= self._next_health_ns:
-                self.roboclaw.check_watchdog()
-                health = Health(self._now_ns(), self.roboclaw.battery_v())
-                self._next_health_ns = now_ns + int(self.config.health_period_s * 1e9)
+            health = self._read_health(now_ns)
             rejected, estimate, fault = self.odometry.rejected, None, ""
             if self._sure(asked_ns, encoders_ns):
                 estimate = self.odometry.update(encoders, encoders_ns)
@@ -204,6 +201,15 @@ class BaseController:
             v=v,
             w=w,
         )
+
+    def _read_health(self, now_ns: int) -> Health | None:
+        """Check the watchdog and read the battery every ``health_period_s``; None between."""
+        if now_ns < self._next_health_ns:
+            return None
+        self.roboclaw.check_watchdog()
+        health = Health(self._now_ns(), self.roboclaw.battery_v())
+        self._next_health_ns = now_ns + int(self.config.health_period_s * 1e9)
+        return health
 
     def _sure(self, asked_ns: int, read_ns: int) -> bool:
         """Whether the time of a reading is known well enough; a reading left out costs no motion, the next has it."""
