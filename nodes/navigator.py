@@ -44,6 +44,10 @@ class NavigatorConfig(Checked):
     follower: FollowerConfig = field(default_factory=FollowerConfig)
 
 
+PRESENT_S = 0.2
+"""Period of the zeros at rest: by them the arbiter notices a restart in every mode."""
+
+
 class NavigatorNode(Node[NavigatorConfig]):
     """Connects ``Navigator`` to topics."""
 
@@ -66,6 +70,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.costmap = self.latest("/costmap", msg.OccupancyGrid, c.costmap_timeout_s)
         self.vbot = self.latest("/vbot/odom", msg.Odometry, 0.3)
         self.state = self.latest("/ic/state", msg.ControlState, c.state_timeout_s, qos=LATCHED, callback=self.on_state)
+        self.timer(PRESENT_S, self.show_presence)
 
     def made(self, c: NavigatorConfig) -> Navigator:
         follower = PathFollower(c.follower, c.limits, c.footprint)
@@ -76,12 +81,16 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.navigator = self.made(config)  # plans again at once
 
     def on_state(self, state: msg.ControlState) -> None:
-        """Follow at the controller's rate while the operator drives the v-bot; otherwise nothing runs."""
+        """Follow at the controller's rate while the operator drives the v-bot; otherwise rest."""
         if state.mode != Mode.VIRTUAL:
             self.rest()
         elif self.follow_timer is None:
             self.follow_timer = self.timer(1.0 / self.config.controller_frequency, self.tick)
             self.tick()
+
+    def show_presence(self) -> None:
+        if self.follow_timer is None and self.state.fresh is not None:
+            self.cmd_vel.publish(msg.twist_stamped(0.0, 0.0, self.clock.now_ns()))
 
     def rest(self) -> None:
         if self.follow_timer is not None:
