@@ -18,8 +18,6 @@ RATE_COMMANDS = 200  # newest commands kept to measure the rate
 CONFIRM_S = 1.0  # time in which the robot confirms a press of the emergency stop; until then the press counts
 LOOK_S = 0.1
 """Longest time between two steps of the server while there is a driver."""
-LONG_GAP_S = 1.5
-"""After a longer gap between two steps, the driver must let go of the controls; as ``stop_after_s`` of the arbiter."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +36,8 @@ class DriveConfig:
         beat_timeout_s: silence of the driver's page (pings at 20 Hz) after which the driver is reported lost to the
             arbiter.
         lease_timeout_s: silence of the driver's page after which it loses the lease.
+        stop_after_s: time for which the console stood still after which the driver must let go of the controls; at most
+            the arbiter's timeouts.stop_after_s.
     """
 
     max_linear_mps: Annotated[float, Plausible(0.02, 3)] = 0.4
@@ -49,6 +49,7 @@ class DriveConfig:
     keep_alive_hz: Annotated[float, Plausible(1, 100)] = 10.0
     beat_timeout_s: Annotated[float, Plausible(0.02, 2)] = 0.25
     lease_timeout_s: Annotated[float, Plausible(0.05, 120)] = 2.0
+    stop_after_s: Annotated[float, Plausible(0.1, 10)] = 1.5
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -109,7 +110,7 @@ class DriveGate:
         elif gap_s:
             self.stop(now)
             self._driver_beat, self._let_go_since = -math.inf, now
-            self._held |= gap_s > LONG_GAP_S
+            self._held |= gap_s > self.config.stop_after_s
 
     @property
     def command(self) -> tuple[float, float]:

@@ -69,6 +69,11 @@ def disagreements(robot: Mapping[str, Driving]) -> Iterator[str]:
                     f"{node.at}: node {name}: {timeout} must span {_MISSED} messages of {source}: "
                     f"{_MISSED / hz:.2g} s at {rate} {hz:g} (got {node.value(timeout)})"
                 )
+    if (arbiter := robot.get("arbiter")) and (console := robot.get("console")):
+        key, longest_s = "server.drive.stop_after_s", arbiter.value("timeouts.stop_after_s")
+        if console.value(key) > longest_s:
+            rule = f"{key} must be at most the arbiter's timeouts.stop_after_s = {longest_s} s"
+            yield f"{console.at}: node console: {rule} (got {console.value(key)})"
     yield from _open_doors(robot)
     if (arbiter := robot.get("arbiter")) and (lidar := robot.get("vlp16_driver")):
         blind_m = arbiter.value("collision_monitor.blind_radius_m")

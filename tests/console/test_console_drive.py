@@ -276,6 +276,12 @@ def test_a_console_that_stood_still_waits_for_a_release(seconds, suspended_s):
     assert gate.moving
 
 
+def test_a_console_counts_as_long_still_after_stop_after_s():
+    gate = DriveGate(DriveConfig(stop_after_s=0.5))
+    assert gate.request(1, 0.0)
+    assert look_and_drive(gate, frozen(gate, 0.6), 100) is Verdict.HELD
+
+
 def test_after_a_short_freeze_of_the_console_the_held_key_drives_on():
     gate = driving_gate()
     now = frozen(gate, 0.8)

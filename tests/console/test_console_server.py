@@ -255,6 +255,12 @@ def test_zeros_end_when_the_drivers_page_beats_no_more_and_come_back_with_it(ser
     asyncio.run(scenario())
 
 
+def test_a_console_that_starts_again_names_its_clients_anew():
+    """Behind a bridge the arbiter notices the restart by these names alone."""
+    first, second = (ConsoleServer(Recorder(), ServerConfig(port=0)).client for _ in range(2))
+    assert first != second
+
+
 @pytest.mark.parametrize("how", ["silent", "hidden", "given back", "cut"])
 def test_the_loss_of_the_driver_is_told_at_once(serve, how):
     """Not by the silence alone: that has to last before it counts. The page's beats are made by the test."""

@@ -196,6 +196,11 @@ TOGETHER = [
     ("footprint: {width_m: 0.3}", "odom_frame: odom", "geometry.track_width must be within footprint.width_m 0.3"),
     ("rate_hz: 5", "odom_frame: odom", "crawler_base: command_timeout_s must span 2 messages of arbiter: 0.4 s"),
     ("collision_monitor: {blind_radius_m: 0.3}", "odom_frame: odom", "vlp16_driver: decoder.min_range must be at most"),
+    (
+        "timeouts: {stop_after_s: 1.0}",
+        "odom_frame: odom",
+        "node console: server.drive.stop_after_s must be at most the arbiter's timeouts.stop_after_s = 1.0 s",
+    ),
     ("timeouts: {command: 0.05}", "odom_frame: odom", "timeouts.command must span 2 messages of console"),
 ]
 
