@@ -185,6 +185,7 @@ class ArbiterInbox:
             contradictions=0 if trust is None else int(trust.contradictions),
             robot_velocity=velocity,
             operator_command=self._twist("command"),
+            holder=self.lease.holder,
             operator_gone=self.operator_gone(),
             held_in_vain=self.lease.held_in_vain(steady_ns),
             estop=latch.pressed,
@@ -250,8 +251,8 @@ def command_message(decision: Decision, now_ns: int) -> TwistStamped:
     return twist_stamped(*decision.command, now_ns, HARD_STOP if decision.hard else "base_link")
 
 
-def control_state(decision: Decision, inputs: ArbiterInputs, holder: str, now_ns: int) -> ControlState:
-    """ControlState of one step of the arbiter; ``holder``: who has the robot's lease."""
+def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> ControlState:
+    """ControlState of one step of the arbiter."""
     return ControlState(
         header=header("map", now_ns),
         mode=int(decision.mode),
@@ -273,7 +274,7 @@ def control_state(decision: Decision, inputs: ArbiterInputs, holder: str, now_ns
         robot_twist=twist_message(*inputs.robot_velocity),
         vbot_limit_m_s=decision.vbot_limit_m_s,
         reason_code=int(decision.reason_code),
-        holder=holder,
+        holder=inputs.holder,
     )
 
 

@@ -153,7 +153,7 @@ class ArbiterNode(Node[ArbiterConfig]):
             self.cancel_extra = self.timer(stale_in_s + STEP_AFTER_S, self.tick).cancel
 
     def publish_decision(self, decision: Decision, inputs: ArbiterInputs, now_ns: int) -> None:
-        self.state.publish(control_state(decision, inputs, self.inbox.lease.holder, now_ns))
+        self.state.publish(control_state(decision, inputs, now_ns))
         if decision.changed:
             self.log.info("%s: %s", decision.mode.label, decision.reason)
         self.diagnose_all(decision.diagnosis, self.inbox.lease.diagnosis, *self.surroundings.findings.values())

@@ -17,6 +17,7 @@ from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.commands import CommandRules
 from instant_ic.control.guards import GUARD_FUNCTIONS, against_switch, estop_pressed, hold, images_agree, stop_notice
 from instant_ic.control.interruptions import Interruptions
+from instant_ic.control.operator_commands import OperatorCommands
 from instant_ic.control.passage import find_passage
 from instant_ic.control.planner import HybridPlanner
 from instant_ic.control.prediction import Prediction, Predictor
@@ -86,7 +87,6 @@ class Arbiter:
         self._fresh_since_ns: int | None = None
         self._agree_since_ns: int | None = None
         self._slow_since_ns: int | None = None  # the v-bot drives slower than commanded since then
-        self._driven: tuple[Twist2, int] | None = None  # last command that was not zero, and when
         self._ready: tuple[Vspace, int] | None = None  # the v-space when it was last ready, and when
         self._leading_back = False
         self._no_view_fits = False  # the last entry was abandoned
@@ -97,7 +97,7 @@ class Arbiter:
         self._contradictions = 0  # those that the robot has been stopped for
         self._stopped_by = Notice(Reason.STARTING, "waiting for the sensors")
         self._awaits_operator = False  # STOPPED until an operator's command shows that no key is held
-        self._let_go_since_ns: int | None = None
+        self._operator = OperatorCommands()
         self._interruptions = Interruptions()
         self._interrupted: Notice | None = None  # since the previous step
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
@@ -124,11 +124,7 @@ class Arbiter:
         """Take at most one transition, then return the command of the resulting state."""
         if self._since_ns is None:
             self._since_ns = now_ns
-        longest_s = self.config.timeouts.stop_after_s
-        self._interrupted = self._interruptions.step(now_ns, inputs.suspended_ns, inputs.instances, longest_s)
-        if self._interrupted is not None or self._interruptions.gap_s:
-            # Nobody has looked meanwhile.
-            self._fresh_since_ns = self._agree_since_ns = self._slow_since_ns = self._let_go_since_ns = None
+        self._interrupted = self._interruption(inputs, now_ns)
         self._awaits_operator |= self._interrupted is not None
         snapshot = self._assess(inputs, now_ns)
         rows = (row for row in TRANSITIONS if row.source == self.mode)
@@ -174,6 +170,18 @@ class Arbiter:
         """
         return self._sources.stale_in_s(inputs, self.mode, *self._durations_s(now_ns))
 
+    def _interruption(self, inputs: ArbiterInputs, now_ns: int) -> Notice | None:
+        """Note this step and its command; return why the controls must be released first."""
+        longest_s, operator = self.config.timeouts.stop_after_s, self._operator
+        found = self._interruptions.step(now_ns, inputs.suspended_ns, inputs.instances, longest_s)
+        if found is not None or self._interruptions.gap_s:
+            # Nobody has looked meanwhile.
+            self._fresh_since_ns = self._agree_since_ns = self._slow_since_ns = None
+            operator.forget_zeros()
+        fresh = self._sources.command_is_fresh(inputs)
+        held = operator.step(inputs, fresh, self.config.limits, longest_s, now_ns)
+        return found or held
+
     # -- transitions
 
     def _take(self, row: Transition, snapshot: Snapshot, now_ns: int) -> None:
@@ -196,7 +204,7 @@ class Arbiter:
         self._vbot_start = snapshot.vbot_pose.copy()
 
     def _hand_back(self, snapshot: Snapshot, now_ns: int) -> None:
-        self._driven = (snapshot.command, now_ns)
+        self._operator.hand_back(now_ns)
         if snapshot.mode != Mode.STOPPED:
             self._returned_ns = now_ns
 
@@ -209,12 +217,7 @@ class Arbiter:
     def _assess(self, inputs: ArbiterInputs, now_ns: int) -> Snapshot:
         """Snapshot of this step; keeps the instants from which its durations count."""
         in_mode_s = self._since_s(self._since_ns, now_ns, 0.0)
-        fresh = self._sources.command_is_fresh(inputs)
-        command = self.config.limits.clip(*inputs.operator_command) if fresh else NO_MOTION
-        if command != NO_MOTION:
-            self._driven = (command, now_ns)
-        last_command, driven_ns = self._driven or (NO_MOTION, self._since_ns)
-        self._let_go_since_ns = _kept(self._let_go_since_ns, now_ns) if fresh and command == NO_MOTION else None
+        operator = self._operator
         if inputs.vspace.ready:
             self._ready = (inputs.vspace, now_ns)
         stale = self._sources.stale(inputs, self.mode, *self._durations_s(now_ns))
@@ -226,22 +229,17 @@ class Arbiter:
         gap_m, yaw_gap_rad = float(np.linalg.norm(vbot[:2] - target[:2])), wrap_angle(float(vbot[2] - target[2]))
         agree = self.mode == Mode.VIRTUAL and inputs.robot_pose is not None and self._poses_agree(gap_m, yaw_gap_rad)
         self._agree_since_ns = _kept(self._agree_since_ns, now_ns) if agree else None
-        wanted_m_s = min(abs(command[0]), self._sources.vbot_limit_m_s(inputs, self.mode))
-        slow = self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * wanted_m_s
-        self._slow_since_ns = _kept(self._slow_since_ns, now_ns) if slow else None
-        trust, lost = self.config.pose_trust, inputs.pose_lost_probability
-        self._stopped_for_pose = self._stopped_for_pose and lost >= trust.slow
-        self._contradictions = min(self._contradictions, inputs.contradictions)  # a new SLAM counts from 0
+        self._slow_since_ns = _kept(self._slow_since_ns, now_ns) if self._vbot_is_slow(inputs) else None
         snapshot = Snapshot(
             config=self.config,
             predictor=self.predictor,
             inputs=inputs,
             mode=self.mode,
             in_mode_s=in_mode_s,
-            command=command,
-            fresh=fresh,
-            last_command=last_command,
-            idle_s=self._since_s(driven_ns, now_ns, 0.0),
+            command=operator.command,
+            fresh=operator.fresh,
+            last_command=operator.last,
+            idle_s=operator.idle_s(now_ns),
             stale=stale,
             lost=tuple(one for one in stale if self._sources.is_lost(one, inputs)),
             stale_in_real=stale_in_real,
@@ -254,16 +252,16 @@ class Arbiter:
             yaw_gap_rad=yaw_gap_rad,
             yaw_gap_before_rad=self._yaw_gap_before,
             agree_s=self._since_s(self._agree_since_ns, now_ns, -1.0),
-            prediction=self._prediction(inputs, command, vbot),
+            prediction=self._prediction(inputs, operator.command, vbot),
             since_return_s=self._since_s(self._returned_ns, now_ns, math.inf),
             awaits_operator=self._awaits_operator,
             slow_s=self._since_s(self._slow_since_ns, now_ns, 0.0),
-            let_go_s=self._since_s(self._let_go_since_ns, now_ns, -1.0),
+            let_go_s=operator.let_go_s(now_ns),
             interrupted=self._interrupted,
             settles=self._interruptions.gap.settles(now_ns),
-            pose_lost=lost >= trust.stop and not self._stopped_for_pose,
+            pose_lost=self._pose_lost(inputs),
             pose_jumped=self._jumps("r-bot", inputs.robot_pose, now_ns),
-            contradicted=inputs.contradictions > self._contradictions,
+            contradicted=self._contradicted(inputs),
             vbot_jumped=self._vbot_jumps(vbot, now_ns),
         )
         self._no_view_fits = self._no_view_fits and not _may_enter_again(snapshot)
@@ -275,6 +273,22 @@ class Arbiter:
             subgoal=self._subgoal(snapshot),
         )
         return replace(snapshot, against_switch=self._against_switch(snapshot, now_ns))
+
+    def _vbot_is_slow(self, inputs: ArbiterInputs) -> bool:
+        """Whether the operator drives the v-bot, and it is slower than commanded."""
+        wanted_m_s = min(abs(self._operator.command[0]), self._sources.vbot_limit_m_s(inputs, self.mode))
+        return self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * wanted_m_s
+
+    def _pose_lost(self, inputs: ArbiterInputs) -> bool:
+        """Whether the SLAM is lost, and the robot has not been stopped for it yet."""
+        trust, lost = self.config.pose_trust, inputs.pose_lost_probability
+        self._stopped_for_pose = self._stopped_for_pose and lost >= trust.slow
+        return lost >= trust.stop and not self._stopped_for_pose
+
+    def _contradicted(self, inputs: ArbiterInputs) -> bool:
+        """Whether wheels and LiDAR contradict each other, and the robot has not been stopped for it yet."""
+        self._contradictions = min(self._contradictions, inputs.contradictions)  # a new SLAM counts from 0
+        return inputs.contradictions > self._contradictions
 
     def _vbot_jumps(self, pose: NDArray[np.float64], now_ns: int) -> bool:
         """As ``_jumps``, while the r-bot follows the v-bot."""

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from instant_ic.control.freshness import IMAGES
+from instant_ic.control.operator_commands import LET_GO_S
 from instant_ic.control.reasons import Notice, stale_notice
 from instant_ic.control.snapshot import NO_MOTION, Snapshot
 from instant_ic.control.sources import images_too_rare
@@ -17,9 +18,9 @@ MIN_SWITCH_SPEED_M_S = 0.03
 """Forward speed below which the robot counts as turning."""
 RETURN_SIDE_M = 0.12
 """Width beside the footprint, on each side, that must be free for a return."""
-_LET_GO_S, _SILENT_S = 0.1, 1.0
-"""Hands are off after such a time of zeros, or of silence: a link that pauses says nothing about a held key, and the
-console's last zero is followed at once by its report of the loss. Silence after a held key shows nothing."""
+_SILENT_S = 1.0
+"""Hands are off after such a time of silence: a link that pauses says nothing about a held key. Silence after a held
+key shows nothing."""
 
 
 def estop_pressed(s: Snapshot) -> bool:
@@ -129,7 +130,7 @@ def may_resume(s: Snapshot) -> bool:
     if (s.awaits_operator and not s.fresh) or images_too_rare(s.inputs, s.config):
         return False
     silent = s.idle_s >= _SILENT_S and (s.inputs.operator_command == NO_MOTION or s.inputs.operator_gone)
-    if interrupted(s) or s.settles or not (s.let_go_s >= _LET_GO_S if s.fresh else silent):
+    if interrupted(s) or s.settles or not (s.let_go_s >= LET_GO_S if s.fresh else silent):
         return False
     return s.fresh_s >= s.config.timeouts.recover_s
 

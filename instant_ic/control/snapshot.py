@@ -52,6 +52,8 @@ class ArbiterInputs:
     """Number of contradictions that the SLAM has reported."""
     robot_velocity: Twist2 = (0.0, 0.0)
     operator_command: Twist2 = (0.0, 0.0)
+    holder: str = ""
+    """Sender who has the robot's lease; empty: nobody."""
     operator_gone: bool = False
     """The client that sent the command has left since: the command is void, whatever its age."""
     held_in_vain: bool = False

@@ -171,15 +171,15 @@ TRANSITIONS: tuple[Transition, ...] = (
 
 GUARDS: dict[str, str] = {
     "estop_pressed": "the emergency stop is latched",
-    "source_lost": "a source that this state needs has been silent for stop_after_s (camera, views: for twice their "
-    "time-out, if that is longer)",
-    "interrupted": "the arbiter has not stepped for stop_after_s, its machine was suspended, or crawler_base, "
-    "navigator, virtual_robot or the console restarted",
+    "source_lost": "a source that this state needs has been silent for stop_after_s (camera, views: twice their "
+    "time-out if longer)",
+    "interrupted": "the arbiter has not stepped, or the commands of a held key have ceased, for stop_after_s, or their "
+    "sender has changed; its machine was suspended; crawler_base, navigator, virtual_robot or the console restarted",
     "pose_lost": "the SLAM is lost with a probability of pose_trust.stop or more, or the pose (or the shown v-bot's) "
-    "has jumped by pose_trust.jump_m or jump_deg; once the operator has let go, the r-bot may drive, slowly until its "
-    "place is recognized",
-    "contradicted": "wheels and LiDAR contradict each other for 0.5 s or 0.15 m; once the operator has let go, the "
-    "r-bot may drive, slowly until they have agreed for 0.3 m; a contradiction that lasts stops it again",
+    "has jumped by pose_trust.jump_m or jump_deg; after a release the r-bot may drive, slowly until its place is "
+    "recognized",
+    "contradicted": "wheels and LiDAR contradict each other for 0.5 s or 0.15 m; after a release the r-bot may drive, "
+    "slowly until they have agreed for 0.3 m; a contradiction that lasts stops it again",
     "vspace_lost": "the virtual space has failed, or its node is silent",
     "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, the r-bot has a way "
     "round; after an abandoned entry, also: a view fits, or the operator let go",
@@ -196,7 +196,7 @@ GUARDS: dict[str, str] = {
     "after twice that nothing is required)",
     "may_resume": "the emergency stop is released, every source has been fresh for recover_s, images arrive at least "
     "every slowest_image_s, the command has been zero for 0.1 s (or silent for 1 s, no key held before), and the "
-    "operator's link is back if `interrupted` or its loss caused the stop",
+    "operator's link is back after `interrupted` or its loss",
 }
 
 ACTIONS: dict[str, str] = {

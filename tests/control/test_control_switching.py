@@ -130,6 +130,7 @@ def test_what_switches_in_and_what_switches_out_never_hold_together(
     inputs = ArbiterInputs(
         robot_pose=pose, robot_velocity=velocity, operator_command=command, costmap=map_, ages={"command": 0.0}
     )
+    arbiter.step(inputs, 0)
     snapshot = arbiter._assess(inputs, 0)
     assert snapshot.command == command
     assert not (snapshot.obstacle_ahead and way_free(snapshot))

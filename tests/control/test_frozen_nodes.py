@@ -28,7 +28,7 @@ MODES = (Mode.REAL, Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
 def stack_in(mode: Mode) -> Stack:
     """A stack that is driven through the obstacle until it is in this mode."""
     stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
-    stack.drive(1.5, None)
+    stack.drive(1.5, NOTHING)
     stack.drive(0.5, KEY)
     for _ in range(600):
         if stack.step(KEY).mode == mode and (mode != Mode.VIRTUAL or stack.base.v > 0.1):
@@ -117,12 +117,13 @@ def test_a_machine_that_is_suspended_while_the_arbiter_is_frozen_waits_for_a_rel
     assert_waits_for_a_release(stack, "this computer was suspended")
 
 
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", ["navigator", "virtual_robot"])
-def test_a_restarted_node_waits_for_a_release(name: str) -> None:
+def test_a_restarted_node_waits_for_a_release(name: str, mode: Mode) -> None:
     """Back within 1.5 s, so that no source counts as lost."""
-    stack = stack_in(Mode.VIRTUAL)
+    stack = stack_in(mode)
     restart(stack, name)
-    stack.drive(0.1, KEY)
+    stack.drive(0.3, KEY)
     assert_waits_for_a_release(stack, f"({name}) was restarted")
 
 
@@ -196,6 +197,49 @@ def test_a_single_zero_of_a_page_that_comes_back_is_no_release() -> None:
     stack.drive(1.2, None)
     stack.drive(0.05, NOTHING)
     assert ControlState.REAL not in {state.mode for state in stack.drive(1.0, KEY)}
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_key_held_through_a_long_silence_of_the_commands_waits_for_a_release(mode: Mode) -> None:
+    stack = stack_in(mode)
+    stack.drive(2.0, None)
+    assert_waits_for_a_release(stack, "the operator's link")
+
+
+def test_a_key_held_through_a_short_silence_of_the_commands_drives_on() -> None:
+    stack = stack_in(Mode.REAL)
+    stack.drive(1.2, None)
+    states = stack.drive(1.0, KEY)
+    assert {state.mode for state in states} == {Mode.REAL} and stack.base.v > 0.2
+
+
+def test_a_page_that_is_lost_and_comes_back_with_its_key_held_waits_for_a_release() -> None:
+    """The console sends a zero at the loss, and another one before it hears of the key."""
+    stack = stack_in(Mode.REAL)
+    stack.drive(0.05, NOTHING)
+    stack.lost_ns = stack.now
+    stack.drive(2.0, None)
+    stack.drive(0.05, NOTHING)
+    assert_waits_for_a_release(stack, "the operator's link was lost")
+
+
+@pytest.mark.parametrize("before", [(NOTHING, 0.3), (NOTHING, 2.0), (None, 2.0)], ids=["let go", "idle", "no page"])
+def test_who_held_nothing_before_a_silence_need_not_release_it(before: tuple[tuple[float, float], float]) -> None:
+    stack = stack_in(Mode.REAL)
+    stack.drive(0.3, NOTHING)
+    stack.drive(before[1], before[0])
+    stack.drive(3.0, None)
+    assert {state.mode for state in stack.drive(1.0, KEY)} == {Mode.REAL}
+    assert stack.base.v > 0.2
+
+
+def test_a_client_that_sends_nothing_at_rest_is_not_asked_to_release_what_it_does_not_hold() -> None:
+    """Its silence is its release, as that of Foxglove's Teleop panel."""
+    stack = Stack(rectangle(9.0, -0.25, 9.5, 0.25))
+    stack.drive(1.5, None)
+    for _ in range(3):
+        assert {state.mode for state in stack.drive(1.0, KEY)[1:]} == {Mode.REAL}
+        stack.drive(2.0, None)
 
 
 @pytest.mark.parametrize("order", ["command first", "timer first"])

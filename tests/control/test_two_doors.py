@@ -143,6 +143,37 @@ def test_a_lease_that_is_given_back_is_free_at_once(free: Stack) -> None:
     assert sent(free)[-1] == pytest.approx(0.3)
 
 
+@pytest.mark.parametrize("ends", ["killed", "cleanly"])
+@pytest.mark.parametrize("after_s", [0.3, 1.9, 3.0])
+def test_a_console_restarted_behind_a_bridge_does_not_drive_under_the_held_key(
+    free: Stack, after_s: float, ends: str
+) -> None:
+    """The arbiter sees the bridge's identity alone; the names of the pages are new with each start of a console."""
+    before, after = (f"host_bridge/station/console/page 1 {start}" for start in ("1f", "2e"))
+    command(free, 0.0, FIRST + RELEASED)
+    free.drive(0.3, None)
+
+    def hold(page: str, seconds: float, speed: float = 0.3) -> list[ControlState]:
+        states = []
+        for _ in range(round(seconds * 20)):
+            command(free, speed, page)
+            states.append(free.step(None))
+        return states
+
+    hold(before, 0.5, 0.0)
+    assert hold(before, 1.0)[-1].holder == before and free.base.v > 0.2
+    if ends == "cleanly":
+        command(free, 0.0, before)
+        command(free, 0.0, before + RELEASED)
+    free.drive(after_s, None)
+    hold(after, 0.05, 0.0)  # the console's first zero, before it hears of the key
+    already = len(sent(free))
+    hold(after, 4.0)
+    assert not any(sent(free, already))
+    hold(after, 2.5, 0.0)
+    assert hold(after, 1.0)[-1].mode == ControlState.REAL and free.base.v > 0.2
+
+
 def test_a_driver_who_gives_the_lease_back_while_driving_stops_the_robot(free: Stack) -> None:
     drive(free, 1.0, 0.4, None)
     command(free, 0.0, FIRST + RELEASED)

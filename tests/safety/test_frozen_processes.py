@@ -16,6 +16,8 @@ from instant_ic.control.states import Reason
 from instant_ic.experiments.teleop_stack import STEP_S
 from instant_ic.msg import HARD_STOP, ControlState
 
+ALL = ("arbiter", "crawler_base", "console", "navigator", "virtual_robot")
+"""The processes that command motion."""
 AFTER_S = 3.0
 BRAKING_M = 0.16
 """Longest way to a stand after a loss."""
@@ -78,7 +80,7 @@ def assert_stands(rig: Rig, start: tuple[float, float], text: str = "") -> None:
 
 
 @pytest.mark.parametrize("seconds", [1.6, 3.0])
-@pytest.mark.parametrize("names", [("arbiter",), ("crawler_base",), ("arbiter", "crawler_base")], ids="+".join)
+@pytest.mark.parametrize("names", [("arbiter",), ("crawler_base",), ("console",), ALL], ids="+".join)
 def test_after_a_freeze_the_robot_stands_until_the_controls_are_released(
     rig: Rig, names: tuple[str, ...], seconds: float
 ) -> None:

@@ -23,8 +23,6 @@ SPEED_M_S = 0.38
 STANDS_M_S = 0.01
 ZERO_S, STAND_S = 0.3, 0.55
 ESTOP_S, ESTOP_M = 0.25, 0.06
-OPERATORS = ("console frozen", "operator's commands cease", "the driver's page is lost")
-"""Losses after which the held key drives on as soon as it is heard again; the console itself may ask for a release."""
 PHASES = (0, 3)
 """Steps of a sixtieth of a second by which the losses are put off: over a period of the 10 Hz sources."""
 
@@ -63,6 +61,7 @@ class Rig:
         config = StackConfig(method="stop", command_latency_s=(0.0, 0.0))
         self.stack = Watched(corridor_world(obstacle=False), config)
         self.operates = True
+        self.steps = 0
         self.command = (0.0, 0.0)
         self.dead: list = []
         self.packets = self.stack.simulation.scan_packets
@@ -75,6 +74,7 @@ class Rig:
         return self.stack.bus
 
     def step(self) -> None:
+        self.steps += 1
         self.stack.step((lambda: self.command) if self.operates else None)
 
     def speed(self) -> float:
@@ -83,9 +83,11 @@ class Rig:
     def drive(self) -> None:
         """Hands off until the robot may be driven, then at full speed for a second."""
         self.command = (0.0, 0.0)
-        for _ in range(round(10.0 / STEP_S)):
+        for k in range(1, round(10.0 / STEP_S)):
             self.step()
-            if self.stack.state.reason_code == ControlState.REASON_DRIVE_ROBOT:
+            # The stack takes every third command; each drive begins, and ends, with one in its next step.
+            due = k * STEP_S > 0.2 and self.steps % 3 == 0
+            if due and self.stack.state.reason_code == ControlState.REASON_DRIVE_ROBOT:
                 break
         else:
             raise AssertionError(f"cannot be driven: {self.stack.state.reason}")
@@ -181,12 +183,7 @@ def test_the_loss_of_each_source_commands_zero_in_time_and_brakes_hard(rig: Rig,
         assert stop.zero_s <= ZERO_S, (phase, stop)
         assert stop.stand_s <= STAND_S, (phase, stop)
         assert stop.frame == HARD_STOP, (phase, stop)
-    if loss not in OPERATORS:
-        assert_waits_for_a_release(rig)
-        return
-    for _ in range(round(1.0 / STEP_S)):
-        rig.step()
-    assert rig.speed() > 0.2 and rig.stack.state.mode == ControlState.REAL
+    assert_waits_for_a_release(rig)
 
 
 def assert_waits_for_a_release(rig: Rig) -> None:
@@ -232,4 +229,4 @@ def test_letting_go_of_a_key_keeps_the_soft_ramp(rig: Rig) -> None:
 
     stop = rig.lose(let_go, 0)
     assert stop.frame == "base_link"
-    assert 0.45 < stop.stand_s <= 0.6 and stop.distance_m < 0.125, stop
+    assert 0.45 < stop.stand_s <= 0.6 and stop.distance_m < 0.135, stop

@@ -1,0 +1,86 @@
+"""The operator's commands over time: when he last drove and let go, and whether he holds a control from before."""
+
+from __future__ import annotations
+
+from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.reasons import Notice
+from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs
+from instant_ic.control.states import Reason
+
+LET_GO_S = 0.1
+"""Seconds of zeros that show that no control is held: the console's last zero is followed at once by its report of the
+loss, and a page that comes back sends a zero before the command of the held key."""
+
+
+class OperatorCommands:
+    """Follows the commands from step to step.
+
+    A control that was held when its commands ended must be released first, also by the next operator. They end if none
+    arrives for too long, or if their sender has given up the lease or was started again. This needs a sender that sends
+    zeros while its operator commands nothing, as the console does. The silence of any other sender may be its release.
+
+    Attributes:
+        command: m/s, rad/s, within the limits; zero when stale.
+        fresh: the command is not stale, and its client is still there.
+        last: the last command that was not zero.
+    """
+
+    def __init__(self) -> None:
+        self.command = self.last = NO_MOTION
+        self.fresh = False
+        self._driven_ns: int | None = None  # time of the last motion
+        self._let_go_ns: int | None = None  # start of the present zeros
+        self._zeros_of = ""  # sender that has sent a zero
+        self._held_by = ""  # sender of the last motion, until it has let go
+        self._ended = False  # its commands ended since
+
+    def step(
+        self, inputs: ArbiterInputs, fresh: bool, limits: MotionLimits, longest_s: float, now_ns: int
+    ) -> Notice | None:
+        """Note the command of a step.
+
+        Args:
+            inputs: inputs of the step.
+            fresh: whether the command counts.
+            limits: limits of the command.
+            longest_s: seconds of silence after which a held control must be released.
+            now_ns: steady time.
+
+        Returns:
+            Why the controls must be released first; None if they need not.
+        """
+        self.fresh, self.command = fresh, limits.clip(*inputs.operator_command) if fresh else NO_MOTION
+        if self._driven_ns is None:
+            self._driven_ns = now_ns
+        if self._held_by:
+            self._ended |= inputs.holder != self._held_by or (not fresh and inputs.age("command") > longest_s)
+        if self.command != NO_MOTION:
+            self.last, self._driven_ns, self._let_go_ns = self.command, now_ns, None
+            self._held_by = inputs.holder if inputs.holder == self._zeros_of else ""
+            ended, self._ended = self._ended, False
+            return Notice(Reason.OPERATOR_LOST, "the operator's link was lost") if ended else None
+        if not fresh:
+            self._let_go_ns = None
+        elif self._let_go_ns is None:
+            self._let_go_ns = now_ns
+        if fresh and inputs.holder:
+            self._zeros_of = inputs.holder
+            if self.let_go_s(now_ns) >= LET_GO_S:
+                self._held_by, self._ended = "", False
+        return None
+
+    def idle_s(self, now_ns: int) -> float:
+        """Seconds since the last motion was commanded."""
+        return 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / 1e9
+
+    def let_go_s(self, now_ns: int) -> float:
+        """Seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
+        return -1.0 if self._let_go_ns is None else (now_ns - self._let_go_ns) / 1e9
+
+    def forget_zeros(self) -> None:
+        """Count the zeros from the next step on: nobody has looked meanwhile."""
+        self._let_go_ns = None
+
+    def hand_back(self, now_ns: int) -> None:
+        """Let the present command be the last one: the operator drives the r-bot from now on."""
+        self.last, self._driven_ns = self.command, now_ns
