@@ -106,7 +106,7 @@ class _Queue:
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
-        self.bytes = 0
+        self.bytes = self.messages = 0  # including those in the thread's hands
         self._items: deque[BagMessage | Callable[[], None]] = deque()
         self._condition = threading.Condition()
 
@@ -118,6 +118,7 @@ class _Queue:
                 return False
             self._items.append(item)
             self.bytes += size
+            self.messages += isinstance(item, BagMessage)
             self._condition.notify()
         return True
 
@@ -132,6 +133,7 @@ class _Queue:
         """Release the bytes of a message that has been written."""
         with self._condition:
             self.bytes -= len(item.payload)
+            self.messages -= 1
 
 
 @dataclass
@@ -407,8 +409,8 @@ class Recorder:
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             raise BagError(
-                f"bag {self.path}: the disk did not take the last {self._queue.bytes / 1e6:.1f} MB within "
-                f"{timeout_s:g} s; ic bag recover {self.path}"
+                f"bag {self.path}: the disk did not take the last {self._queue.messages} messages "
+                f"({self._queue.bytes / 1e6:.1f} MB) within {timeout_s:g} s; ic bag recover {self.path}"
             )
         if self._state == FAILED:
             raise BagError(self.error)
