@@ -26,7 +26,17 @@ def open_with(path, **given):
     return config, open_camera(config, lambda: 0)
 
 
-@pytest.mark.parametrize("url", ["rtsp://me:secret@10.0.0.7/live", "http://me:sec:ret@10.0.0.7", "rtsp://:secret@host"])
+ADDRESSES = [
+    "rtsp://me:secret@10.0.0.7/live",
+    "http://me:sec:ret@10.0.0.7",
+    "rtsp://:secret@host",
+    "rtsp://10.0.0.7/live?user=me&pwd=secret",
+    "http://10.0.0.7/video?password=secret&size=1",
+    "http://10.0.0.7/video?Token=secret",
+]
+
+
+@pytest.mark.parametrize("url", ADDRESSES)
 def test_fault_a_password_in_the_address_is_shown_by_ps_log_bag_and_parameters(url):
     values = params.gather("theta_camera", [], [f"url:={url}", "source:=video"])
     with pytest.raises(params.ParameterError, match="set password_file") as refused:
