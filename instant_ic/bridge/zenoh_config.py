@@ -26,7 +26,8 @@ class ZenohGatewayConfig:
         commands: operators' commands to accept: /operator/cmd_vel, /operator/estop. Only over TLS with certificates on
             both sides (session_file); without it only pressing the emergency stop.
         insecure_loopback_commands: accept commands without TLS where every link stays within this machine, as in a
-            simulation; anybody who can run a program on it can then drive.
+            simulation; anybody who can run a program on it can then drive. Refused beside a real base.
+        unprotected: allows it beside a real base, with a permanent warning.
         limits: limits on the commands.
         discovery_period_s: seconds between searches for new and removed topics.
     """
@@ -40,6 +41,7 @@ class ZenohGatewayConfig:
     subscribe: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
     insecure_loopback_commands: bool = False
+    unprotected: bool = False
     limits: CommandLimits = field(default_factory=CommandLimits)
     discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.2
 

@@ -322,7 +322,7 @@ def _disagreements(nodes: Sequence[_Node]) -> list[str]:
     from instant_ic.bus.process import argument_parser
     from instant_ic.config.params import ParameterError, configure, gather
 
-    robots: dict[str, dict[str, Driving]] = {}
+    robots: dict[str, dict[str, list[Driving]]] = {}
     for node in nodes:
         with suppress(ParameterError, NodeFileError, SystemExit):  # the check of the node reports it
             found = node_class(node.exec)
@@ -330,7 +330,8 @@ def _disagreements(nodes: Sequence[_Node]) -> list[str]:
             values = gather(args.name, args.params_file, args.param, node.places)
             config = configure(found.config_class(), values)[0]
             meant = {key for key, value in values.items() if value.file is None}
-            robots.setdefault(node.group, {})[node.exec] = Driving(node.at, config, meant | node.shared.keys())
+            alike = robots.setdefault(node.group, {}).setdefault(node.exec, [])
+            alike.append(Driving(node.at, config, meant | node.shared.keys()))
     return [text for robot in robots.values() for text in disagreements(robot)]
 
 

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-RELATED = ("arbiter", "crawler_base", "navigator", "virtual_robot", "console", "foxglove_bridge", "vlp16_driver")
+RELATED = (
+    "arbiter",
+    "crawler_base",
+    "navigator",
+    "virtual_robot",
+    "console",
+    "foxglove_bridge",
+    "zenoh_gateway",
+    "vlp16_driver",
+)
 """Nodes that have something to agree on."""
 _MISSED = 2
 """Messages that may be missing before a time-out."""
@@ -49,16 +59,25 @@ _SPANS = (
 )
 """Node and time-out; node and rate of the messages, at most the last number."""
 
-_SIMULATED = (("console", "server.access.simulated"), ("foxglove_bridge", "simulated"))
+_SIMULATED = (
+    ("console", "server.access.simulated"),
+    ("foxglove_bridge", "simulated"),
+    ("zenoh_gateway", "insecure_loopback_commands"),
+)
 """Nodes through which operators come, and the parameter that opens them to all users of the machine."""
 
 
-def disagreements(robot: Mapping[str, Driving]) -> Iterator[str]:
+def disagreements(robot: Mapping[str, Sequence[Driving]]) -> Iterator[str]:
     """Contradictions between the nodes of one robot, one text each.
 
     Args:
-        robot: node → its configuration; a node that is elsewhere is missing.
+        robot: node → configuration of each such node; a node that is elsewhere is missing.
     """
+    found = (_between(dict(zip(robot, nodes, strict=True))) for nodes in itertools.product(*robot.values()))
+    yield from dict.fromkeys(itertools.chain.from_iterable(found))
+
+
+def _between(robot: Mapping[str, Driving]) -> Iterator[str]:
     for key in _SAME:
         yield from _differing(robot, key)
     for name, timeout, source, rate, most_hz in _SPANS:
@@ -94,10 +113,10 @@ def _open_doors(robot: Mapping[str, Driving]) -> Iterator[str]:
     if not port.startswith("/dev/") or port.startswith("/dev/shm/"):  # the simulator's is in its run directory
         return
     for name, key in _SIMULATED:
-        if name in robot and robot[name].value(key):
+        if name in robot and robot[name].value(key) and not (meant := robot[name].value("unprotected")):
             yield (
                 f"{robot[name].at}: node {name}: {key} is true, but crawler_base drives {port}: any user of this "
-                "machine could drive the robot. Set it to false"
+                f"machine could drive the robot. Set it to false{'' if meant is None else ', or unprotected to true'}"
             )
 
 

@@ -214,7 +214,14 @@ def test_nodes_that_drive_one_robot_agree(tmp_path: Path, arbiter: str, base: st
     assert any(text in problem for problem in found), found
 
 
-@pytest.mark.parametrize(("node", "key"), [("console", "server.access.simulated"), ("foxglove_bridge", "simulated")])
+DOORS = (
+    ("console", "server.access.simulated"),
+    ("foxglove_bridge", "simulated"),
+    ("zenoh_gateway", "insecure_loopback_commands"),
+)
+
+
+@pytest.mark.parametrize(("node", "key"), DOORS)
 def test_fault_a_door_that_is_open_as_for_a_simulator_drives_a_real_base(tmp_path: Path, node: str, key: str) -> None:
     open_door = f"- node: {{exec: {node}, param: [{{name: {key}, value: true}}]}}"
     for port, refused in (("/dev/ttyACM0", True), ("/run/user/1000/instant_ic/dev/roboclaw", False)):
@@ -222,3 +229,21 @@ def test_fault_a_door_that_is_open_as_for_a_simulator_drives_a_real_base(tmp_pat
         (tmp_path / "stack.yaml").write_text(f"launch:\n{base}\n{open_door}\n")
         found = check_parameters(read_launch_file(tmp_path / "stack.yaml").nodes)
         assert any(f"{key} is true, but crawler_base drives {port}" in problem for problem in found) == refused, found
+
+
+def test_a_gateway_without_tls_beside_a_real_base_needs_a_word(tmp_path: Path) -> None:
+    words = "{name: insecure_loopback_commands, value: true}, {name: unprotected, value: true}"
+    text = f"launch:\n- node: {{exec: crawler_base}}\n- node: {{exec: zenoh_gateway, param: [{words}]}}\n"
+    (tmp_path / "stack.yaml").write_text(text)
+    assert not check_parameters(read_launch_file(tmp_path / "stack.yaml").nodes)
+
+
+@pytest.mark.parametrize("order", [("true", "false"), ("false", "true")])
+def test_fault_only_the_last_of_two_nodes_of_one_kind_is_compared(tmp_path: Path, order: tuple[str, str]) -> None:
+    consoles = "".join(
+        f"- node: {{exec: console, name: console{index}, param: [{{name: server.access.simulated, value: {value}}}]}}\n"
+        for index, value in enumerate(order)
+    )
+    (tmp_path / "stack.yaml").write_text(f"launch:\n- node: {{exec: crawler_base}}\n{consoles}")
+    found = check_parameters(read_launch_file(tmp_path / "stack.yaml").nodes)
+    assert len(found) == 1 and f"stack.yaml:{3 + order.index('true')}: node console: server.access" in found[0], found
