@@ -64,6 +64,7 @@ class Verdict(Enum):
     NOT_DRIVER = "another client drives"
     OUT_OF_ORDER = "sequence number not newer"
     OLD = "command too old"
+    NOT_FINITE = "command is not a number"
     STOPPED = "emergency stop is set"
     HELD = "the console stood still for too long: let go of the controls, then drive on"
 
@@ -170,7 +171,8 @@ class DriveGate:
         if client == self.driver and moves:
             self._held &= now - self._let_go_since < self.config.watchdog_s
             self._let_go_since = now
-        verdict = self._judge(client, sequence, age_s, moves)
+        finite = math.isfinite(age_s) and math.isfinite(linear) and math.isfinite(angular)
+        verdict = self._judge(client, sequence, age_s, moves) if finite else Verdict.NOT_FINITE
         self.counts[verdict] += 1
         if verdict is not Verdict.ACCEPTED:
             return verdict

@@ -107,11 +107,11 @@ class PathFollower:
         Args:
             pose: x, y, yaw in the frame of the plan.
             speed_m_s: the robot's speed.
-            plan: newest plan; an empty one stops the robot.
+            plan: newest plan; an empty one stops the robot, and so does a value that is not finite.
             goal_velocity: velocity of the goal (m/s, rad/s) when it is a driving v-bot.
             costmap: checks arcs to the carrot for collisions; None: no check.
         """
-        if len(plan.poses) == 0:
+        if len(plan.poses) == 0 or not np.isfinite([*pose, speed_m_s, *goal_velocity]).all():
             return FollowerCommand((0.0, 0.0), "end")
         goal = plan.poses[-1]
         ahead, left, turn = (float(value) for value in relative2(pose, goal))

@@ -19,6 +19,7 @@ def accelerate(
     velocity: tuple[float, float], command: tuple[float, float], limits: MotionLimits, dt_s: float
 ) -> tuple[float, float]:
     """Velocity (m/s, rad/s) after accelerating towards ``command`` for ``dt_s`` within the limits."""
+    command = limits.clip(*command)
     return (
         _towards(velocity[0], command[0], limits.max_linear_accel_m_s2 * dt_s),
         _towards(velocity[1], command[1], limits.max_angular_accel_rad_s2 * dt_s),
@@ -35,5 +36,6 @@ def move(pose: NDArray[np.float64], linear: float, angular: float, dt_s: float) 
 
 
 def extrapolate(pose: NDArray[np.float64], velocity: tuple[float, float], age_s: float) -> NDArray[np.float64]:
-    """Present pose (3,) from one of a message that is up to a period old: at most 0.1 s on at its velocity."""
-    return move(pose, *velocity, min(max(age_s, 0.0), 0.1))
+    """Present pose (3,) from one of a message that is up to a period old: 0.1 s on at most, at a finite velocity."""
+    known = math.isfinite(velocity[0]) and math.isfinite(velocity[1])
+    return move(pose, *velocity, min(max(0.0, age_s), 0.1)) if known else pose.copy()

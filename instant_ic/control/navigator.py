@@ -84,7 +84,10 @@ class Navigator:
         now_ns: int,
         subgoal_velocity: tuple[float, float] = (0.0, 0.0),
     ) -> NavigatorStep:
-        """Twist towards ``subgoal`` (x, y, yaw) from ``pose``, both in the costmap's frame."""
+        """Twist towards ``subgoal`` (x, y, yaw) from ``pose``, both in the costmap's frame; zero if not finite."""
+        if not np.isfinite([*pose, speed_m_s, *subgoal, *subgoal_velocity]).all():
+            unknown = replace(self._plan, reached=False, reason="pose, subgoal or a speed is not a number")
+            return NavigatorStep((0.0, 0.0), "end", unknown, False)
         due = self._planned_ns is None or now_ns - self._planned_ns >= self.replan_period_s * 1e9
         if due:
             self._plan = self._planned(costmap, pose, subgoal, now_ns)
@@ -151,7 +154,8 @@ def meeting_pose(
     the image was taken that arrives with the next view. When the two meet, nothing is left to ease.
     """
     ahead = float(relative2(shown_pose, robot_pose)[0])
-    return move(vbot_pose, min(max(ahead, -_MOST_AHEAD_M), _MOST_AHEAD_M), 0.0, 1.0)
+    lead = min(max(ahead, -_MOST_AHEAD_M), _MOST_AHEAD_M) if math.isfinite(ahead) else 0.0
+    return move(vbot_pose, lead, 0.0, 1.0)
 
 
 _AT_VBOT_M = 0.15

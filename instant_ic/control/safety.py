@@ -188,7 +188,7 @@ class CollisionMonitor:
             moving: points of people and other moving things, in ``base_link`` at present.
         """
         linear, angular = command
-        if not (math.isfinite(linear) and math.isfinite(angular)):
+        if not all(map(math.isfinite, (linear, angular, *(velocity or ())))):
             return MonitoredCommand((0.0, 0.0), "stop", 0.0)
         if linear == 0.0 and angular == 0.0:
             return MonitoredCommand(command, "free", math.inf)

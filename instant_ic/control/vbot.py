@@ -82,7 +82,7 @@ class VirtualRobot:
     ) -> None:
         """Move by ``dt_s`` under the operator's command."""
         linear, angular = self.limits.clip(*command)
-        slower = min(1.0, speed_limit_m_s / max(abs(linear), 1e-9))
+        slower = min(1.0, max(0.0, speed_limit_m_s) / max(abs(linear), 1e-9))  # in this order NaN is 0
         linear, angular = linear * slower, angular * slower
         factor = self.lead_factor(linear, robot_pose)
         self.slowed_by = "lead" if factor < 1.0 - self.config.trail_slow else ""
@@ -105,10 +105,10 @@ class VirtualRobot:
     def ease(self, target: NDArray[np.float64], velocity: tuple[float, float], dt_s: float) -> None:
         """Move for ``dt_s`` at the r-bot's ``velocity`` (m/s, rad/s), easing the remaining error to ``target`` (3,)."""
         config = self.config
-        moved = move(self.pose, *velocity, dt_s)
+        self.velocity = self.limits.clip(*velocity)
+        moved = move(self.pose, *self.velocity, dt_s)
         share = min(1.0, dt_s / _EASE_TIME_S)
         self.pose = _towards(moved, target, share, config.ease_m_s * dt_s, math.radians(config.ease_deg_s) * dt_s)
-        self.velocity = self.limits.clip(*velocity)
         self.slowed_by = ""
 
     def lead_back(self, robot_pose: NDArray[np.float64], dt_s: float, walls: WallMap | None = None) -> None:
