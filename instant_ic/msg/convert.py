@@ -284,7 +284,7 @@ def matrix_from_pose(pose: Any) -> Matrix:
     """4×4 matrix from a Pose, PoseStamped, PoseWithCovariance(Stamped) or Odometry.
 
     Raises:
-        MessageError: the quaternion is zero, or a value is not finite.
+        MessageError: the quaternion is zero or not finite.
     """
     while hasattr(pose, "pose"):
         pose = pose.pose
@@ -293,8 +293,6 @@ def matrix_from_pose(pose: Any) -> Matrix:
 
 def _matrix(rotation: Any, translation: Any, what: str) -> Matrix:
     q, t = rotation, translation
-    if not (math.isfinite(t.x) and math.isfinite(t.y) and math.isfinite(t.z)):
-        raise MessageError(f"{what}: position ({t.x}, {t.y}, {t.z}) is not finite")
     try:
         return matrix_from_quaternion((q.x, q.y, q.z, q.w), (t.x, t.y, t.z))
     except ValueError as error:
@@ -321,7 +319,7 @@ def transform_matrix(message: Any) -> Matrix:
     """4×4 ``parent_from_child`` from a Transform or TransformStamped.
 
     Raises:
-        MessageError: the quaternion is zero, or a value is not finite.
+        MessageError: the quaternion is zero or not finite.
     """
     transform = getattr(message, "transform", message)
     return _matrix(transform.rotation, transform.translation, "transform")

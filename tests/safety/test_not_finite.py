@@ -20,7 +20,6 @@ from instant_ic.control.navigator import Navigator, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
-from instant_ic.msg import MessageError, odometry_message, pose2_from_message
 
 LIMITS = MotionLimits()
 STANDS = (0.0, 0.0)
@@ -72,11 +71,6 @@ def test_a_pose_is_not_moved_on_by_what_is_no_number(odd: float) -> None:
         assert not extrapolate(np.zeros(3), (linear, angular), 0.1).any()
     if math.isnan(odd):  # else as old as it can be
         assert not extrapolate(np.zeros(3), (0.5, 0.5), odd).any()
-    for index in range(2):
-        matrix = np.eye(4)
-        matrix[index, 3] = odd
-        with pytest.raises(MessageError, match="position"):
-            pose2_from_message(odometry_message(matrix, 0.0, 0.0, "map", "base_link", 0))
 
 
 @ODD
