@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from instant_ic.console.drive import DriveConfig
 from instant_ic.launch.topics import TopicRate, TopicTableError, nominal_rate, read_topic_rates, topic_rates
+from nodes.navigator import PRESENT_S
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -50,6 +52,11 @@ def test_mistakes_are_told_with_their_lines(tmp_path: Path) -> None:
     lines = str(caught.value).splitlines()
     assert [int(line.split(":")[1]) for line in lines] == [1, 2, 2, 3, 4]
     assert "rate_hz must be a number > 0 (got 0)" in lines[0] and "unknown key 'rate'" in lines[1]
+
+
+def test_commands_of_an_operator_who_commands_nothing_are_not_too_slow() -> None:
+    assert topic_rates()["/operator/cmd_vel"].freq_ok(DriveConfig().keep_alive_hz)
+    assert topic_rates()["/nav/cmd_vel"].freq_ok(1.0 / PRESENT_S)
 
 
 def test_every_topic_of_the_table_is_one_that_a_node_gives() -> None:
