@@ -79,6 +79,8 @@ _REVOLUTION = 76
 PROCESSES = ("arbiter", "crawler_base", "console", "grid_slam", "vlp16_driver", "theta_camera")
 CONTROL = ("arbiter", "crawler_base", "console", "navigator", "virtual_robot")
 """The last two are not needed in REAL."""
+LET_GO_S = 0.4
+"""Seconds without a key before each drive: after a freeze, the console and the arbiter wait for its release."""
 FROZEN_S, AFTER_THAW_S = 2.0, 3.0
 """Seconds of a freeze under the held key, and seconds watched after its end."""
 LAUNCH = """launch:
@@ -510,6 +512,7 @@ async def at_speed(rig: Rig, until: Any, page: ConsoleClient, fault: Fault, wait
     reached, kept = (0.97, 0.9) if wanted == SPEED_M_S else (0.85, 0.7)  # slip shows more when slow or turning
     for _ in range(_TRIES):
         await until(rig.ready, 90, "robot that can be driven")
+        await asyncio.sleep(rig.pace.wait_s(LET_GO_S))
         sign = 1.0 if rig.truth[-1].x < 5.0 else -1.0
 
         def fast(sign: float = sign) -> bool:
