@@ -21,7 +21,8 @@ halves of surrogate pairs, which no terminal takes."""
 _COLOUR = re.compile(r"(\x1b\[[\d;]*m)")
 _USER = re.compile(r"(://(?!\[)[^\s/:]*):(?!\d*(?:[/?#\s\"',)\]}]|$))\S*@")
 """User and password. A slash may be in the password, but behind digits it ends a port."""
-_TOKEN = re.compile(r"([?&;#](?:token|pass(?:word|wd)?|pwd)=)[^\s&;]+", re.IGNORECASE)
+_TOKEN = re.compile(r"([?&;#](?:token|pass(?:word|wd)?|pwd)=)(?!\{password\}(?:[\s&;#]|$))[^\s&;]+", re.IGNORECASE)
+"""Password or token in a query; ``{password}`` is only the place for one."""
 
 
 def visible(text: str, *, colours: bool = False) -> str:

@@ -90,7 +90,8 @@ class ThetaCameraConfig:
         source: ``theta`` (Web API), ``video`` (device, RTSP address or video file), ``files``.
         url: address of the Theta; device, address or path for the other sources. It must not hold a password.
         password_file: file with USER:PASSWORD of the Theta or the stream, mode 0600; empty: none, for the Theta as in
-            INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD.
+            INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD. They replace ``{user}`` and ``{password}`` in the
+            stream's address, or stand before its host.
         frame_id: the camera's frame.
         camera_mount: the camera's pose on base_link.
         silence_s: seconds without an image that cause a warning; four times as long is an error.
@@ -120,3 +121,5 @@ class ThetaCameraConfig:
                 "url must not hold a password, which ps, logs, parameters and bags would show: write USER:PASSWORD "
                 "into a file, run chmod 600 on it, and set password_file"
             )
+        if "{password}" in self.url and not self.password_file:
+            raise ValueError("url has a place for a password: set password_file")

@@ -40,7 +40,9 @@ class VideoCamera(Camera):
     ) -> None:
         self.url = url
         scheme, separator, rest = url.partition("://")
-        signed_in = f"{scheme}://{quote(user, safe='')}:{quote(password, safe='')}@{rest}"
+        user, password = quote(user, safe=""), quote(password, safe="")
+        placed = url.replace("{user}", user).replace("{password}", password)
+        signed_in = f"{scheme}://{user}:{password}@{rest}" if placed == url else placed
         self._source = signed_in if user and separator else url  # shown nowhere
         self.config = config or VideoConfig()
         super().__init__(self.config.latency_s, now_ns)

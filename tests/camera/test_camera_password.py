@@ -33,6 +33,7 @@ ADDRESSES = [
     "rtsp://10.0.0.7/live?user=me&pwd=secret",
     "http://10.0.0.7/video?password=secret&size=1",
     "http://10.0.0.7/video?Token=secret",
+    "http://10.0.0.7/video?pwd={password}secret",
 ]
 
 
@@ -42,6 +43,11 @@ def test_fault_a_password_in_the_address_is_shown_by_ps_log_bag_and_parameters(u
     with pytest.raises(params.ParameterError, match="set password_file") as refused:
         params.configure(ThetaCameraConfig, values)
     assert "secret" not in str(refused.value) and "sec:ret" not in str(refused.value)
+
+
+def test_a_place_for_a_password_needs_its_file():
+    with pytest.raises(ValueError, match="set password_file"):
+        ThetaCameraConfig(source="video", url="http://10.0.0.7/live?pwd={password}")
 
 
 class Closed:
@@ -56,7 +62,11 @@ class Closed:
 
 @pytest.mark.parametrize(
     ("url", "source"),
-    [("rtsp://10.0.0.7:554/live", "rtsp://operator:pass%2Fw%3Ard%401@10.0.0.7:554/live"), ("3", 3)],
+    [
+        ("rtsp://10.0.0.7:554/live", "rtsp://operator:pass%2Fw%3Ard%401@10.0.0.7:554/live"),
+        ("http://10.0.0.7/live?usr={user}&pwd={password}", "http://10.0.0.7/live?usr=operator&pwd=pass%2Fw%3Ard%401"),
+        ("3", 3),
+    ],
 )
 def test_only_the_stream_itself_gets_the_password(password_file, monkeypatch, url, source):
     asked = []
