@@ -15,7 +15,7 @@ from instant_ic.cli.progress import progress
 from instant_ic.safe_text import direct
 
 if TYPE_CHECKING:
-    from instant_ic.experiments.slam import LogResult
+    from instant_ic.experiments.slam import LogResult, Relations
     from instant_ic.experiments.slam_logs import LogEntry
 
 
@@ -62,20 +62,11 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_slam(args: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from instant_ic.bag.replay import make_node
     from instant_ic.experiments.particle_slam import ParticleConfig
-    from instant_ic.experiments.slam import (
-        evaluate_log,
-        perturb_odometry,
-        read_relations,
-        read_stamps,
-        write_trajectory,
-    )
+    from instant_ic.experiments.slam import evaluate_log, perturb_odometry, write_trajectory
     from instant_ic.experiments.slam_bag import is_bag, read_bag
-    from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
-    from instant_ic.experiments.slam_logs import BadLines, LogError, read_log
+    from instant_ic.experiments.slam_logs import BadLines, read_log
 
     if args.stamps and not args.relations:
         raise UserError("--stamps selects relations: give --relations too", 2)
@@ -89,25 +80,13 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     check_files(args.json, args.plot)
     bad = None if args.strict else BadLines()
     with errors_for_the_user():
-        relations = read_relations(args.relations) if args.relations else None
-        if relations is not None and args.stamps:
-            relations = relations.at_stamps(read_stamps(args.stamps), args.tolerance)
-            if len(relations) == 0:
-                raise LogError(f"no relation in {args.relations} has both ends at a time in {args.stamps}")
+        relations = _relations(args)
         entries: list[LogEntry] = list(
             read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log, bad)
         )
         folder.mkdir(parents=True, exist_ok=True)
         if args.faults:
-            faults = FAULTS if args.faults == "all" else tuple(args.faults.split(","))
-            with Console(file=direct(sys.stderr)).status("") as status:
-                report = evaluate_faults(
-                    entries, config, places=args.places, seed=args.seed, noise_seeds=args.noise_seeds,
-                    relations=relations, faults=faults, on_step=status.update,
-                )  # fmt: skip
-            report = {"log": args.log.name, "seed": args.seed, **report, "output": str(folder)}
-            print_figures(report, folder / "faults.json", args.json)
-            return 0
+            return _evaluate_faults(args, entries, relations, config, folder)
         source = entries if args.perturb_odometry is None else perturb_odometry(entries, args.perturb_odometry)
         with progress(args.log.name) as advance:
             report, run = evaluate_log(
@@ -126,6 +105,38 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         if file is not None:
             _plot(file, run)
     print_figures(report, folder / "figures.json", args.json)
+    return 0
+
+
+def _relations(args: argparse.Namespace) -> Relations | None:
+    """Read the relations, limited to those at the stamps; None if none were given."""
+    from instant_ic.experiments.slam import read_relations, read_stamps
+    from instant_ic.experiments.slam_logs import LogError
+
+    relations = read_relations(args.relations) if args.relations else None
+    if relations is not None and args.stamps:
+        relations = relations.at_stamps(read_stamps(args.stamps), args.tolerance)
+        if len(relations) == 0:
+            raise LogError(f"no relation in {args.relations} has both ends at a time in {args.stamps}")
+    return relations
+
+
+def _evaluate_faults(
+    args: argparse.Namespace, entries: list[LogEntry], relations: Relations | None, config: Any, folder: Path
+) -> int:
+    """Run ``--faults`` and print its figures."""
+    from rich.console import Console
+
+    from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
+
+    faults = FAULTS if args.faults == "all" else tuple(args.faults.split(","))
+    with Console(file=direct(sys.stderr)).status("") as status:
+        report = evaluate_faults(
+            entries, config, places=args.places, seed=args.seed, noise_seeds=args.noise_seeds,
+            relations=relations, faults=faults, on_step=status.update,
+        )  # fmt: skip
+    report = {"log": args.log.name, "seed": args.seed, **report, "output": str(folder)}
+    print_figures(report, folder / "faults.json", args.json)
     return 0
 
 
