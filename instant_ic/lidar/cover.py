@@ -71,7 +71,8 @@ class CoverWatch:
         first = int(starts[0]) if len(starts) else 0
         text = (
             f"nothing returns any more from {int(self.covered.sum()) * width}° of the circle, from {first * width}° on "
-            "(clockwise from ahead): uncover the sensor. The robot does not drive that way"
+            "(clockwise from ahead): uncover the sensor, or keep away from what is nearer than it sees. The robot does "
+            "not drive that way"
         )
         return Diagnosis("cover", Level.ERROR, text)
 
