@@ -27,9 +27,12 @@ test: check install-tests chromium
 
 NEWEST := .venv-newest
 newest:
-	@options=$$($(PYTHON) scripts/newest.py $(NEWEST) $(if $(filter file,$(origin PYTHON)),,--python $(PYTHON))) && \
-	$(NEWEST)/bin/ic compile && \
-	$(NEWEST)/bin/python -m pytest -n 2 --dist loadgroup -m "not system" $$options $(ARGS)
+	@options=$$($(PYTHON) scripts/newest.py $(NEWEST) $(if $(filter file,$(origin PYTHON)),,--python $(PYTHON))) || exit; \
+	$(NEWEST)/bin/ic compile || { echo "make newest: ic compile FAILED"; exit 1; }; \
+	units=passed; \
+	$(NEWEST)/bin/python -m pytest -n 2 --dist loadgroup -m "not system" $$options $(ARGS) || units=FAILED; \
+	echo "make newest: $$($(NEWEST)/bin/python -V), unit tests $$units"; \
+	test $$units = passed
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .

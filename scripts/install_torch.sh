@@ -16,8 +16,12 @@ want = sys.argv[1]
 sys.exit(0 if have == want or have.split("+")[0] == want else 1)
 PY
 then exit 0; fi
-pip=("$python" -m pip install -q --disable-pip-version-check --progress-bar off)
-# A dry run shows which build the index offers; only a CPU build is installed from it.
-report=$("$python" -m pip install -q --disable-pip-version-check --dry-run --no-deps --report - "$spec" 2>/dev/null || true)
-if printf '%s' "$report" | grep -q '%2Bcpu\|+cpu'; then exec "${pip[@]}" --no-deps "$spec"; fi
-exec "${pip[@]}" --no-deps --retries 1 --index-url https://download.pytorch.org/whl/cpu "$spec"
+pip=("$python" -m pip install -q --disable-pip-version-check --progress-bar off --no-deps --only-binary :all:)
+# A dry run shows which build would come; only a CPU build is installed. Torch's own index is asked too, but pip also looks
+# at the extra indexes of its configuration, which may offer a CUDA build.
+for index in "" "--retries 1 --index-url https://download.pytorch.org/whl/cpu"; do
+  report=$("${pip[@]}" $index --dry-run --report - "$spec" 2>/dev/null || true)
+  if grep -qE '"version": "[^"]+\+cpu' <<<"$report"; then exec "${pip[@]}" $index "$spec"; fi
+done
+echo "no index offers a CPU build of $spec for this Python" >&2
+exit 1

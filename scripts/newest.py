@@ -40,7 +40,10 @@ def _of_pyenv(version: str) -> list[str]:
     if shutil.which("pyenv") is None:
         return []
     root = subprocess.run(["pyenv", "root"], capture_output=True, text=True, check=True).stdout.strip()
-    return sorted(str(python) for python in Path(root, "versions").glob(f"{version}.*/bin/python"))
+    pythons = Path(root, "versions").glob(f"{version}.*/bin/python")
+    return sorted(
+        map(str, pythons), key=lambda python: [int(part) for part in re.findall(r"\d+", python)], reverse=True
+    )
 
 
 def requirements() -> list[str]:
@@ -56,25 +59,35 @@ def requirements() -> list[str]:
     return [one for one in asked if not re.match(r"torch\b", one)] + torch["requires-dist"]
 
 
+def run(what: str, command: list[str | Path]) -> None:
+    """Run a command.
+
+    Raises:
+        SystemExit: it failed; says what.
+    """
+    if subprocess.run(command, stdout=sys.stderr).returncode:
+        sys.exit(f"make newest: {what} FAILED")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the environment, made again each time")
     parser.add_argument("--python", default="", help="interpreter; default the newest of 3.11 to 3.14 here")
     args = parser.parse_args()
     python = args.python or newest_python()
-    subprocess.run([python, "-m", "venv", "--clear", args.folder], check=True)
+    run("making the environment", [python, "-m", "venv", "--clear", args.folder])
     inside = str(args.folder / "bin" / "python")
     pip = [inside, "-m", "pip", "install", "-q", "--disable-pip-version-check", "--progress-bar", "off"]
     no_torch = args.folder / "no-torch.txt"
     no_torch.write_text("torch<0\n", encoding="utf-8")  # a package that asks for torch fails instead of fetching CUDA's
-    subprocess.run([*pip, "--only-binary", ":all:", "-c", no_torch, "--upgrade", "pip", *requirements()], check=True)
+    run("installing packages", [*pip, "--only-binary", ":all:", "-c", no_torch, "--upgrade", "pip", *requirements()])
     install = [str(ROOT / "scripts" / "install_torch.sh"), inside]
     torch = any(subprocess.run([*install, *spec], stdout=sys.stderr).returncode == 0 for spec in (["torch"], []))
     if torch:
-        subprocess.run([*pip, "--only-binary", ":all:", "triton"], check=True)
+        run("installing triton", [*pip, "--only-binary", ":all:", "triton"])
     else:
-        print("torch has no CPU build for this Python here: what needs it is skipped", file=sys.stderr)
-    subprocess.run([*pip, "--no-deps", "--no-build-isolation", "-e", "."], cwd=ROOT, check=True)
+        print("What needs torch is skipped.", file=sys.stderr)
+    run("installing the project", [*pip, "--no-deps", "--no-build-isolation", "-e", str(ROOT)])
     # The pins are for the other environment.
     print("--ignore=tests/test_lock.py" + ("" if torch else " --without-torch"))
 

@@ -24,6 +24,37 @@ def test_newest_interpreter_that_works_is_taken(tmp_path: Path, monkeypatch: pyt
         newest.newest_python()
 
 
+def test_newest_patch_release_of_pyenv_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path, text in (
+        ("pyenv", f"echo {tmp_path}"),
+        ("versions/3.13.9/bin/python", "exit 0"),
+        ("versions/3.13.10/bin/python", "exit 0"),
+    ):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / path).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert newest.newest_python() == str(tmp_path / "versions/3.13.10/bin/python")
+
+
+@pytest.mark.parametrize(("version", "status"), [("2.13.0", 1), ("2.13.0+cpu", 0)])
+def test_a_cuda_build_of_torch_is_never_installed_whichever_index_offers_it(
+    version: str, status: int, tmp_path: Path
+) -> None:
+    python, installed = tmp_path / "python", tmp_path / "installed"
+    report = f'{{"metadata": {{"version": "{version}", "description": "pip install torch+cpu"}}}}'
+    python.write_text(
+        f'#!/bin/sh\ncase "$*" in -\\ *) exit 1;; *--dry-run*) echo \'{report}\';; *) echo "$*" > {installed};; esac\n'
+    )
+    python.chmod(0o755)
+    done = subprocess.run(
+        [ROOT / "scripts/install_torch.sh", python, "torch"], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == status, done.stderr
+    assert installed.exists() == (status == 0)
+    assert "no index offers a CPU build of torch" in done.stderr or status == 0
+
+
 def test_nothing_is_pinned_and_torch_is_apart() -> None:
     asked = newest.requirements()
     assert {"numpy>=2.0", "pytest>=8.3", "sympy"} <= set(asked)
@@ -53,18 +84,48 @@ def test_what_imports_torch_is_skipped_by_name_where_it_is_missing_and_fails_oth
     assert "error" in outcome() and "skipped" not in outcome()
 
 
+ENVIRONMENT = {name: text for name, text in os.environ.items() if not name.startswith(("MAKE", "MFLAGS", "PYTHON"))}
+
+
 def test_make_newest_takes_the_given_interpreter_and_cleans_up() -> None:
     def recipe(*words: str) -> str:
-        environment = {
-            key: value for key, value in os.environ.items() if not key.startswith(("MAKE", "MFLAGS", "PYTHON"))
-        }
         made = subprocess.run(
-            ["make", "-n", *words], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True, env=environment
+            ["make", "-n", *words], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True, env=ENVIRONMENT
         )
         return made.stdout
 
-    assert "newest.py .venv-newest )" in recipe("newest") and 'pytest -n 2 --dist loadgroup -m "not system"' in recipe(
-        "newest"
-    )
+    plain = recipe("newest")
+    assert "newest.py .venv-newest )" in plain and 'pytest -n 2 --dist loadgroup -m "not system"' in plain
     assert "newest.py .venv-newest --python python3.12)" in recipe("newest", "PYTHON=python3.12")
     assert ".venv-newest" in recipe("clean")
+
+
+@pytest.mark.parametrize(
+    ("failing", "message"),
+    [
+        ("venv", "making the environment FAILED"),
+        ("pip", "installing packages FAILED"),
+        ("compile", "ic compile FAILED"),
+        ("not system", "Python 3.15.0, unit tests FAILED"),
+        ("nothing", "Python 3.15.0, unit tests passed"),
+    ],
+)
+def test_make_newest_says_what_failed(failing: str, message: str, tmp_path: Path) -> None:
+    tool = (
+        "#!/bin/sh\n"
+        f'case "$*" in scripts/newest.py*) exec {sys.executable} "$@";; -V) echo Python 3.15.0;; esac\n'
+        f'case "$*" in *"-m venv"*) mkdir -p {tmp_path}/bin; cp {tmp_path}/tool {tmp_path}/bin/python\n'
+        f'cp {tmp_path}/tool {tmp_path}/bin/ic;; esac\ncase "$*" in *"{failing}"*) exit 1;; esac\n'
+    )
+    (tmp_path / "tool").write_text(tool)
+    (tmp_path / "tool").chmod(0o755)
+    made = subprocess.run(
+        ["make", "newest", f"PYTHON={tmp_path}/tool", f"NEWEST={tmp_path}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=ENVIRONMENT,
+    )
+    assert f"make newest: {message}" in made.stdout + made.stderr, made.stderr
+    assert (made.returncode == 0) == (failing == "nothing")
