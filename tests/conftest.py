@@ -1,7 +1,9 @@
 """For all tests: no time limit for one example of a property, and ``--without-torch`` for a Python that has none."""
 
 import sys
+import traceback
 from importlib.abc import MetaPathFinder
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -15,7 +17,9 @@ class _NoTorch(MetaPathFinder):
 
     def find_spec(self, name: str, *_: object) -> None:
         if name == "torch":
-            pytest.skip("torch is missing: it has no CPU build for this Python", allow_module_level=True)
+            files = (Path(frame.filename).name for frame in reversed(traceback.extract_stack()))
+            test = next((file for file in files if file.startswith("test_")), "this test")
+            pytest.skip(f"{test} needs torch, which has no CPU build for this Python", allow_module_level=True)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
