@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from instant_ic.base.following import SLOW_CYCLE_S
 from instant_ic.base.protocol import BAUD_RATES, CYCLE_BYTES, PINS
 from instant_ic.config.ranges import Checked, Plausible, Range, check_ranges, require, require_protection
 from instant_ic.config.robot import MotionLimits
@@ -148,11 +149,11 @@ class CrawlerBaseConfig(ControllerConfig):
                 f"(got {self.battery_empty_v}, {self.battery_full_v})"
             )
         line_s = CYCLE_BYTES * _BITS / self.roboclaw.baud
+        cycle = f"a cycle takes {line_s:.3f} s on the line at roboclaw.baud {self.roboclaw.baud}: raise it"
+        if line_s > SLOW_CYCLE_S:
+            raise ValueError(f"{cycle}; above {SLOW_CYCLE_S} s the tracks cannot be watched")
         if line_s > 1.0 / self.rate_hz:
-            raise ValueError(
-                f"a cycle takes {line_s:.3f} s on the line at roboclaw.baud {self.roboclaw.baud}: raise it, or lower "
-                f"rate_hz to {int(1.0 / line_s)} (got {self.rate_hz})"
-            )
+            raise ValueError(f"{cycle}, or lower rate_hz to {int(1.0 / line_s)} (got {self.rate_hz})")
         if self.roboclaw.watchdog_s < _LEAST_PERIODS / self.rate_hz:
             raise ValueError(
                 f"roboclaw.watchdog_s must span {_LEAST_PERIODS} periods of rate_hz "

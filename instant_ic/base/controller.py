@@ -112,7 +112,8 @@ class BaseController:
         self._encoders: NDArray[np.int64] | None = None
         limits = config.limits
         self._fastest_m_s = limits.max_linear_m_s + 0.5 * config.geometry.effective_width * limits.max_angular_rad_s
-        self._watch = TrackWatch(self._fastest_m_s, simulated=not current().real)
+        pulse_m = 1.0 / config.geometry.pulses_per_metre
+        self._watch = TrackWatch(self._fastest_m_s, pulse_m, simulated=not current().real)
         self._watched: tuple[NDArray[np.int64], int] | None = None  # the last counts that it judged, and their time
         self._sent: tuple[NDArray[np.float64], int] | None = None  # speeds of the tracks, and until when it has them
         self._last_step_ns: int | None = None
@@ -171,11 +172,12 @@ class BaseController:
             self._check_counts(encoders)
             power, current_a = self.roboclaw.pwm(), self.roboclaw.currents_a()
             status = self.roboclaw.status()
+            self._watch.exchanged((self._steady_ns() - now_ns) * 1e-9)
             health = self._read_health(now_ns)
-            rejected, estimate, fault = self.odometry.rejected, None, ""
+            rejected, estimate = self.odometry.rejected, None
             if self._sure(asked_ns, encoders_ns):
                 estimate = self.odometry.update(encoders, encoders_ns)
-                fault = self._check_tracks(encoders, power, current_a, encoders_ns)
+            fault = self._check_tracks(encoders, power, current_a, asked_ns, encoders_ns)
             if (fault or status.faults) and not self._stopped:
                 self.emergency_stop(True)
                 self.roboclaw.stop()
@@ -272,7 +274,12 @@ class BaseController:
         self._sent = speeds, now_ns
 
     def _check_tracks(
-        self, encoders: NDArray[np.int64], power: NDArray[np.float64], current_a: NDArray[np.float64], read_ns: int
+        self,
+        encoders: NDArray[np.int64],
+        power: NDArray[np.float64],
+        current_a: NDArray[np.float64],
+        asked_ns: int,
+        read_ns: int,
     ) -> str:
         """Return why a track does not follow what drives it; empty if both do."""
         last, self._watched = self._watched, (encoders, read_ns)
@@ -283,7 +290,8 @@ class BaseController:
         per_metre = self.config.geometry.pulses_per_metre
         powers = kinematics.tracks_from_motors(power * per_metre)
         currents = kinematics.tracks_from_motors(current_a * per_metre)
-        return self._watch.judge(moved, powers, currents, (read_ns - last[1]) * 1e-9)
+        # The counts are from between request and reply: at least this time has passed since the last.
+        return self._watch.judge(moved, powers, currents, max(0, asked_ns - last[1]) * 1e-9)
 
     def _check_counts(self, encoders: NDArray[np.int64]) -> None:
         """Check the watchdog when both counts jump to zero: the controller may have restarted."""

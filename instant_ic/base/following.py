@@ -8,29 +8,36 @@ command. The watch therefore judges the power, not the command. For each track a
 2. The rest of the power drives the track. At full power, it is at least as fast as the fastest command.
 3. Motion that the counts lack of that speed adds up; counts in the power's direction take it back. Above a distance,
    the track is at fault.
+
+Power that winds up slowly is found sooner by :mod:`instant_ic.base.wind_up`.
 """
 
 import math
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
 
-_LEAST_SHARE = 0.25
-"""Share of the speed by its power that a healthy track has."""
+from instant_ic.base.wind_up import LEAST_A, LEAST_POWER, LEAST_SHARE, WindUpWatch
+
+SLOW_CYCLE_S = 0.06
+"""Longest exchange with the controller in a cycle at which a runaway track is noticed in time."""
 _MISSING_M, _MISSING_SIMULATED_M = 0.02, 0.04
 """Motion that the counts of a track at fault lack; a simulation may be late on a busy machine."""
+_MOST_SIMULATED_S = 0.05
+"""Time that a reading of a simulation stands for at most: it may have paused for the rest."""
 _CHANGING_S = 0.25
 """More may lack, by this time at a change of the command: the power brakes a track before it turns it round."""
 _LAG_S, _RECENT_S = 0.1, 0.3
 """Time from a command to its motion, and time for which a change of the command counts."""
 _BLANKED_POWER = 0.2
 """Up to this power the controller may blank its currents, and report none."""
-_LEAST_A, _LEAST_POWER = 0.2, 0.03
-"""Smaller currents and powers show nothing."""
 _MARGIN, _MARGIN_POWER = 1.3, 0.05
 """Factor on the load by its current, for resistance and battery, and power added to it."""
 _MOST_LOAD = 0.5
 """A track that stands at more power is blocked, if its encoder is not dead."""
+_SLOW_CYCLES = 5
+"""Cycles whose median tells a slow line: a few late replies do not."""
 
 
 class TrackWatch:
@@ -38,14 +45,17 @@ class TrackWatch:
 
     Args:
         fastest_m_s: speed of a track at the fastest command.
+        pulse_m: motion of a track for one pulse of its encoder, metres.
         simulated: whether the tracks are those of a simulation, which pauses on a busy machine.
     """
 
-    def __init__(self, fastest_m_s: float, simulated: bool = False) -> None:
+    def __init__(self, fastest_m_s: float, pulse_m: float, simulated: bool = False) -> None:
         self._fastest_m_s = fastest_m_s
+        self._pulse_m = pulse_m
         self._simulated = simulated
         self._missing_limit_m = _MISSING_SIMULATED_M if simulated else _MISSING_M
         self._stall_a = np.zeros(2)  # for full power; largest seen
+        self._cycles_s: deque[float] = deque([0.0] * _SLOW_CYCLES, _SLOW_CYCLES)
         self.reset()
 
     def reset(self) -> None:
@@ -53,17 +63,24 @@ class TrackWatch:
         self._command = np.zeros(2)
         self._lagged = np.zeros(2)  # command after the lag
         self._change = np.zeros(2)  # of the command, recently
+        self._braking = np.zeros(2)  # the part of it that slows or reverses the track
         self._missing_m = np.zeros(2)
         self._power = np.zeros(2)  # at the last reading
         self._current_a = np.zeros(2)
+        self._wind_up = WindUpWatch(self._pulse_m)
         self._moved_once = np.zeros(2, bool)  # since the reset
+
+    def exchanged(self, cycle_s: float) -> None:
+        """Note that the commands and replies of a cycle took ``cycle_s`` seconds."""
+        self._cycles_s.append(cycle_s)
 
     def commanded(self, speeds: NDArray[np.float64], dt_s: float) -> None:
         """Note that the tracks, left and right, were commanded ``speeds`` (2,), m/s, for the last ``dt_s`` seconds."""
         self._command = speeds
-        recent = np.maximum(np.abs(speeds - self._lagged), self._change * math.exp(-dt_s / _RECENT_S))
-        self._lagged = speeds + (self._lagged - speeds) * math.exp(-dt_s / _LAG_S)
-        self._change = recent
+        lags, kept = self._lagged - speeds, math.exp(-dt_s / _RECENT_S)
+        self._change = np.maximum(np.abs(lags), self._change * kept)
+        self._braking = np.maximum(lags * np.sign(self._lagged), self._braking * kept)
+        self._lagged = speeds + lags * math.exp(-dt_s / _LAG_S)
 
     def judge(
         self, moved: NDArray[np.float64], power: NDArray[np.float64], current_a: NDArray[np.float64], dt_s: float
@@ -79,20 +96,30 @@ class TrackWatch:
         Returns:
             What is wrong, for the operator; empty if both tracks follow.
         """
+        cycle_s = sorted(self._cycles_s)[_SLOW_CYCLES // 2]
+        if cycle_s > SLOW_CYCLE_S and not self._simulated:
+            return (
+                f"the motor controller answers too slowly to watch the tracks (a cycle takes {cycle_s:.2f} s; "
+                f"at most {SLOW_CYCLE_S} s): check roboclaw.baud, the USB cable and hub, the adapter's latency timer"
+            )
         current_a = np.abs(current_a)
         still = not moved.any() and bool((power == self._power).all() and (current_a == self._current_a).all())
-        if self._simulated and still:
-            return ""  # the simulation pauses: in any other case at least the noise of the currents changes
+        if self._simulated:
+            if still:
+                return ""  # the simulation pauses: in any other case at least the noise of the currents changes
+            dt_s = min(dt_s, _MOST_SIMULATED_S)
         self._learn(moved, power, current_a)
         # Between two readings the power is known to be the smaller one only.
         least = np.where(power * self._power > 0.0, np.minimum(np.abs(power), np.abs(self._power)), 0.0)
         load = self._load(np.maximum(current_a, self._current_a))
         due_m = np.maximum(0.0, least - load) * self._fastest_m_s * dt_s
         done_m = np.maximum(0.0, moved * np.sign(power))
-        self._missing_m = np.maximum(0.0, self._missing_m + due_m - done_m / _LEAST_SHARE)
+        self._missing_m = np.maximum(0.0, self._missing_m + due_m - done_m / LEAST_SHARE)
+        lacks = self._missing_m > self._missing_limit_m + _CHANGING_S * self._change
+        lacks |= self._wind_up.judge(self._command, self._braking, moved, power, current_a, dt_s)
         self._power, self._current_a = power, current_a
         self._moved_once |= moved != 0.0
-        for track in np.flatnonzero(self._missing_m > self._missing_limit_m + _CHANGING_S * self._change):
+        for track in np.flatnonzero(lacks):
             return (
                 f"the {('left', 'right')[track]} track does not follow its command of {self._command[track]:.2f} m/s "
                 f"(power {abs(power[track]):.0%}): check its encoder, the encoder's cable and direction, and whether "
@@ -102,8 +129,8 @@ class TrackWatch:
 
     def _load(self, current_a: NDArray[np.float64]) -> NDArray[np.float64]:
         """Power that the loads of the tracks need at most, (2,), by the currents, amperes, (2,)."""
-        known = (current_a >= _LEAST_A) & (self._stall_a > 0.0)
-        share = current_a / np.maximum(self._stall_a, _LEAST_A)
+        known = (current_a >= LEAST_A) & (self._stall_a > 0.0)
+        share = current_a / np.maximum(self._stall_a, LEAST_A)
         return np.where(known, np.minimum(_MARGIN * share + _MARGIN_POWER, _MOST_LOAD), _BLANKED_POWER)
 
     def _learn(self, moved: NDArray[np.float64], power: NDArray[np.float64], current_a: NDArray[np.float64]) -> None:
@@ -111,5 +138,5 @@ class TrackWatch:
         size = np.abs(power)
         faster = (self._command * power > 0.0) & (np.abs(self._command) >= np.abs(self._lagged) - 1e-3)
         follows = (moved * power > 0.0) | ~self._moved_once
-        shown = faster & follows & (size >= _LEAST_POWER) & (current_a >= _LEAST_A)
-        self._stall_a = np.maximum(self._stall_a, np.where(shown, current_a / np.maximum(size, _LEAST_POWER), 0.0))
+        shown = faster & follows & (size >= LEAST_POWER) & (current_a >= LEAST_A)
+        self._stall_a = np.maximum(self._stall_a, np.where(shown, current_a / np.maximum(size, LEAST_POWER), 0.0))

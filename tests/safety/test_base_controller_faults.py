@@ -46,8 +46,10 @@ def test_the_status_is_read_in_every_control_cycle_and_fits_the_line_at_38400_ba
     assert len(read_s) >= RATE_HZ - 1
     assert max(after - before for before, after in pairwise(read_s)) < 1.0 / RATE_HZ + 3 * TICK_S
     CrawlerBaseConfig(roboclaw=RoboclawConfig(baud=38400))
-    with pytest.raises(ValueError, match=r"roboclaw\.baud 9600: raise it, or lower rate_hz to 15"):
-        CrawlerBaseConfig(roboclaw=RoboclawConfig(baud=9600))
+    with pytest.raises(ValueError, match=r"roboclaw\.baud 38400: raise it, or lower rate_hz to 60"):
+        CrawlerBaseConfig(rate_hz=100.0, roboclaw=RoboclawConfig(baud=38400))
+    with pytest.raises(ValueError, match=r"roboclaw\.baud 9600: raise it; above 0\.06 s the tracks cannot be watched"):
+        CrawlerBaseConfig(rate_hz=10.0, roboclaw=RoboclawConfig(baud=9600))
 
 
 def connection(pins: list[int], status_bytes: int = 4, pin: str = "S3") -> Base:
