@@ -92,6 +92,27 @@ def test_a_robot_that_moves_otherwise_than_its_tracks_stops(
     assert math.hypot(moved[0], moved[1]) < within and abs(wrap_angle(float(moved[2]))) < within
 
 
+@pytest.mark.parametrize("tracks", [[0], [0, 1]], ids=["one", "both"])
+@pytest.mark.parametrize(
+    ("command", "within_s", "within_m"),
+    [((0.03, 0.0), 2.0, 0.2), ((0.1, 0.0), 0.9, 0.3), (FORWARD, 0.6, 0.7), ((0.0, 0.4), 1.4, 0.55)],
+    ids=["0.03 m/s", "0.1 m/s", "0.38 m/s", "turning"],
+)
+def test_an_encoder_that_counts_30_percent_stops_the_robot(
+    stack: Stack, command: tuple[float, float], within_s: float, within_m: float, tracks: list[int]
+) -> None:
+    """The base sees a track that follows, which in truth is three times too fast: only the scans contradict it."""
+    stack.drive(command, 1.5)
+    motors = stack.simulation.robot.motors
+    motors.encoders[tracks] = 0.3
+    before = motors.travelled
+    assert stack.drive(command, 6.0, until=lambda: stack.stopped) <= within_s
+    stack.drive(command, 1.0)
+    assert stack.stopped and stack.tracks_stand
+    assert np.abs(motors.travelled - before).max() <= within_m
+    assert "check" in stack.page.state["reason"].lower()
+
+
 def test_tracks_that_slip_on_the_spot_stop_and_the_operator_drives_free_slowly(stack: Stack) -> None:
     stack.drive(FORWARD, 2.0)
     robot = stack.simulation.robot
