@@ -37,7 +37,7 @@ _MARGIN, _MARGIN_POWER = 1.3, 0.05
 _MOST_LOAD = 0.5
 """A track that stands at more power is blocked, if its encoder is not dead."""
 _SLOW_CYCLES = 5
-"""Cycles whose median tells a slow line: a few late replies do not."""
+"""Cycles whose median shows a slow line: a few late replies do not."""
 
 
 class TrackWatch:
