@@ -69,6 +69,7 @@ class ArbiterInbox:
     """Last report of the robot's own emergency stop, steady clock."""
     _was_gone: bool = False  # at the page's last report
     _shown_by: str = ""  # node of that report
+    _zeros_of: str = ""  # sender of the last zero
 
     def scan(self) -> Scan | None:
         """The newest scan."""
@@ -107,15 +108,17 @@ class ArbiterInbox:
         if not all(math.isfinite(value) for value in twist_values(message)):
             return False  # neither a motion nor a release: it refreshes no age
         sender, given_ns = f"{received.publisher}/{message.header.frame_id}", received.given_ns(stamp_ns(message))
+        moves = twist_values(message) != NO_MOTION
         if sender.endswith(RELEASED):
-            taken = self.lease.release(sender.removesuffix(RELEASED))
+            taken = not moves and self.lease.release(sender.removesuffix(RELEASED))
         else:
-            now_ns, moves = self.clock.steady_ns(), twist_values(message) != NO_MOTION
+            now_ns = self.clock.steady_ns()
             refusal = self.lease.refusal(sender, moves, now_ns, self._stands())
             new = sender == self.lease.holder or now_ns - given_ns <= timeout_s * 1e9
             taken = refusal is None and new
             if taken:
                 self.lease.grant(sender, given_ns)
+                self._zeros_of = self._zeros_of if moves else sender
                 if not self._counts(self._shown_by):
                     self.shown.forget()
         if taken:
@@ -186,6 +189,7 @@ class ArbiterInbox:
             robot_velocity=velocity,
             operator_command=self._twist("command"),
             holder=self.lease.holder,
+            holder_sends_zeros=self.lease.holder == self._zeros_of != "",
             operator_gone=self.operator_gone(),
             held_in_vain=self.lease.held_in_vain(steady_ns),
             estop=latch.pressed,

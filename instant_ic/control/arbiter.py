@@ -257,6 +257,7 @@ class Arbiter:
             awaits_operator=self._awaits_operator,
             slow_s=self._since_s(self._slow_since_ns, now_ns, 0.0),
             let_go_s=operator.let_go_s(now_ns),
+            held=operator.held_by != "",
             interrupted=self._interrupted,
             settles=self._interruptions.gap.settles(now_ns),
             pose_lost=self._pose_lost(inputs),

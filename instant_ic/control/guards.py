@@ -129,7 +129,8 @@ def may_resume(s: Snapshot) -> bool:
         return False
     if (s.awaits_operator and not s.fresh) or images_too_rare(s.inputs, s.config):
         return False
-    silent = s.idle_s >= _SILENT_S and (s.inputs.operator_command == NO_MOTION or s.inputs.operator_gone)
+    let_go = not s.held and (s.inputs.operator_command == NO_MOTION or s.inputs.operator_gone)
+    silent = s.idle_s >= _SILENT_S and let_go
     if interrupted(s) or s.settles or not (s.let_go_s >= LET_GO_S if s.fresh else silent):
         return False
     return s.fresh_s >= s.config.timeouts.recover_s

@@ -10,29 +10,35 @@ from instant_ic.control.states import Reason
 LET_GO_S = 0.1
 """Seconds of zeros that show that no control is held: the console's last zero is followed at once by its report of the
 loss, and a page that comes back sends a zero before the command of the held key."""
+_MOST_SENDERS = 64
+"""Pages have a new name after each start."""
 
 
 class OperatorCommands:
     """Follows the commands from step to step.
 
-    A control that was held when its commands ended must be released first, also by the next operator. They end if none
-    arrives for too long, or if their sender has given up the lease or was started again. This needs a sender that sends
-    zeros while its operator commands nothing, as the console does. The silence of any other sender may be its release.
+    A control that was held when its commands ended must be released first, by its sender whenever it comes back, and by
+    the next operator. They end if none is fresh for too long, or if their sender has given up the lease or was started
+    again. This needs a sender that sends zeros while its operator commands nothing, as the console does. The silence of
+    any other sender may be its release.
 
     Attributes:
         command: m/s, rad/s, within the limits; zero when stale.
         fresh: the command is not stale, and its client is still there.
         last: the last command that was not zero.
+        held_by: sender of the last motion, until it has let go; empty if it sends no zeros.
     """
 
     def __init__(self) -> None:
         self.command = self.last = NO_MOTION
         self.fresh = False
+        self.held_by = ""
+        self._fresh_ns: int | None = None  # time of the last fresh command
         self._driven_ns: int | None = None  # time of the last motion
-        self._let_go_ns: int | None = None  # start of the present zeros
-        self._zeros_of = ""  # sender that has sent a zero
-        self._held_by = ""  # sender of the last motion, until it has let go
-        self._ended = False  # its commands ended since
+        self._let_go_ns: int | None = None  # start of the present sender's zeros
+        self._holder = ""  # in the previous step
+        self._must_release: dict[str, None] = {}  # senders whose control was held when their commands ended
+        self._ended = False  # held commands ended, and nobody has let go since
 
     def step(
         self, inputs: ArbiterInputs, fresh: bool, limits: MotionLimits, longest_s: float, now_ns: int
@@ -52,22 +58,33 @@ class OperatorCommands:
         self.fresh, self.command = fresh, limits.clip(*inputs.operator_command) if fresh else NO_MOTION
         if self._driven_ns is None:
             self._driven_ns = now_ns
-        if self._held_by:
-            self._ended |= inputs.holder != self._held_by or (not fresh and inputs.age("command") > longest_s)
+        if fresh or self._fresh_ns is None:
+            self._fresh_ns = now_ns
+        holder, before = inputs.holder, self._holder
+        self._holder = holder
+        # Commands that always arrive late keep a small age, but none is fresh.
+        silent_s = 0.0 if fresh else max(inputs.age("command"), (now_ns - self._fresh_ns) / 1e9)
+        if self.held_by and (holder != self.held_by or silent_s > longest_s):
+            self._note_end()
         if self.command != NO_MOTION:
             self.last, self._driven_ns, self._let_go_ns = self.command, now_ns, None
-            self._held_by = inputs.holder if inputs.holder == self._zeros_of else ""
-            ended, self._ended = self._ended, False
+            self.held_by = holder if inputs.holder_sends_zeros or holder in self._must_release else ""
+            ended = self.held_by and (self._ended or holder in self._must_release)
             return Notice(Reason.OPERATOR_LOST, "the operator's link was lost") if ended else None
         if not fresh:
             self._let_go_ns = None
-        elif self._let_go_ns is None:
+        elif self._let_go_ns is None or holder != before:
             self._let_go_ns = now_ns
-        if fresh and inputs.holder:
-            self._zeros_of = inputs.holder
-            if self.let_go_s(now_ns) >= LET_GO_S:
-                self._held_by, self._ended = "", False
+        if fresh and holder and self.let_go_s(now_ns) >= LET_GO_S:
+            self.held_by, self._ended = "", False
+            self._must_release.pop(holder, None)
         return None
+
+    def _note_end(self) -> None:
+        self._ended = True
+        self._must_release[self.held_by] = None
+        if len(self._must_release) > _MOST_SENDERS:
+            del self._must_release[next(iter(self._must_release))]
 
     def idle_s(self, now_ns: int) -> float:
         """Seconds since the last motion was commanded."""

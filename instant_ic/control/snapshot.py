@@ -54,6 +54,8 @@ class ArbiterInputs:
     operator_command: Twist2 = (0.0, 0.0)
     holder: str = ""
     """Sender who has the robot's lease; empty: nobody."""
+    holder_sends_zeros: bool = False
+    """It has sent zeros: its silence is no release."""
     operator_gone: bool = False
     """The client that sent the command has left since: the command is void, whatever its age."""
     held_in_vain: bool = False
@@ -152,6 +154,8 @@ class Snapshot:
     """Seconds for which the v-bot has driven slower than commanded."""
     let_go_s: float
     """Seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
+    held: bool = False
+    """Whether the last motion's sender has not let go: his silence is no release."""
     interrupted: Notice | None = None
     """Event since the previous step after which the controls must be released; None without one."""
     settles: bool = False

@@ -206,6 +206,28 @@ def test_a_key_held_through_a_long_silence_of_the_commands_waits_for_a_release(m
     assert_waits_for_a_release(stack, "the operator's link")
 
 
+@pytest.mark.parametrize("mode", [Mode.REAL, Mode.VIRTUAL])
+def test_a_key_held_while_its_commands_are_late_for_long_waits_for_a_release(mode: Mode) -> None:
+    """Each of them is old, but none is older than stop_after_s."""
+    stack = stack_in(mode)
+    for _ in range(60):
+        stack.operate(KEY, ahead_s=-0.5)
+        stack.step(None)
+    assert_waits_for_a_release(stack, "the operator's link")
+
+
+def test_a_page_that_is_lost_for_a_moment_is_no_release_after_another_loss() -> None:
+    stack = stack_in(Mode.REAL)
+    stack.silent.add("/camera/image/compressed")
+    stack.drive(2.0, KEY)
+    stack.silent.clear()
+    stack.drive(0.05, NOTHING)  # the console's zero at the loss
+    stack.lost_ns = stack.now
+    stack.drive(1.2, None)
+    assert stack.drive(0.05, NOTHING)[-1].mode == Mode.STOPPED
+    assert_waits_for_a_release(stack, "no camera image")
+
+
 def test_a_key_held_through_a_short_silence_of_the_commands_drives_on() -> None:
     stack = stack_in(Mode.REAL)
     stack.drive(1.2, None)

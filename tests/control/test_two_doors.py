@@ -10,7 +10,11 @@ import pytest
 from control_world import rectangle
 from test_control_nodes import Stack
 
+from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.operator_commands import OperatorCommands
+from instant_ic.control.reasons import Notice
 from instant_ic.control.robot_lease import LEASE_S, RELEASED
+from instant_ic.control.snapshot import ArbiterInputs
 from instant_ic.control.states import Reason
 from instant_ic.msg import (
     HARD_STOP,
@@ -172,6 +176,50 @@ def test_a_console_restarted_behind_a_bridge_does_not_drive_under_the_held_key(
     assert not any(sent(free, already))
     hold(after, 2.5, 0.0)
     assert hold(after, 1.0)[-1].mode == ControlState.REAL and free.base.v > 0.2
+
+
+@pytest.mark.parametrize("ends", ["released", "silent"])
+def test_a_key_held_while_another_had_the_lease_waits_for_a_release(free: Stack, ends: str) -> None:
+    """The other operator has let go; that is no release of the first one's key."""
+    drive(free, 1.0, 0.4, None)
+    drive(free, LEASE_S + 0.5, None, None)
+    assert drive(free, 1.0, None, 0.0)[-1].holder == SECOND
+    if ends == "released":
+        command(free, 0.0, SECOND + RELEASED)
+    drive(free, LEASE_S + 0.5, None, None)
+    drive(free, 0.05, 0.0, None)  # the console's first zero, before it hears of the key
+    already = len(sent(free))
+    assert drive(free, 2.0, 0.4, None)[-1].holder == FIRST
+    assert not any(sent(free, already))
+    drive(free, 1.0, 0.0, None)
+    assert drive(free, 1.0, 0.4, None)[-1].mode == ControlState.REAL and free.base.v > 0.2
+
+
+def test_zeros_of_the_sender_before_are_no_release() -> None:
+    """The robot stands before an obstacle while the key is held, so that the lease can pass on at once."""
+    operator, steps = OperatorCommands(), (("a", 0.3), ("a", 0.0), ("", 0.0), ("b", 0.0), ("b", 0.3))
+    notices = []
+    for k, (holder, speed) in enumerate(steps):
+        inputs = ArbiterInputs(
+            operator_command=(speed, 0.0), holder=holder, holder_sends_zeros=holder != "", ages={"command": 0.0}
+        )
+        notices.append(operator.step(inputs, True, MotionLimits(), 1.5, k * 60_000_000))
+    assert notices == [None] * 4 + [Notice(Reason.OPERATOR_LOST, "the operator's link was lost")]
+
+
+def test_who_sends_no_zeros_need_not_release_what_another_held(free: Stack) -> None:
+    drive(free, 1.0, 0.4, None)
+    command(free, 0.0, FIRST + RELEASED)
+    drive(free, LEASE_S + 0.5, None, None)
+    states = drive(free, 1.0, None, 0.4)
+    assert {state.mode for state in states} == {ControlState.REAL} and free.base.v > 0.2
+
+
+def test_a_release_that_moves_is_neither(free: Stack) -> None:
+    drive(free, 0.5, 0.0, None)
+    command(free, 0.3, FIRST + RELEASED)
+    assert drive(free, 0.2, None, None)[-1].holder == FIRST
+    assert not any(sent(free))
 
 
 def test_a_driver_who_gives_the_lease_back_while_driving_stops_the_robot(free: Stack) -> None:
