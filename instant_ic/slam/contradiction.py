@@ -83,7 +83,7 @@ class ContradictionMonitor:
         self._comparisons = np.zeros((2, 3))
 
     def update(self, wheels: FloatArray, seen: FloatArray, elapsed_s: float, scan_sigma: FloatArray | None) -> None:
-        """Add a step.
+        """Add a step; one that is not finite is left out, for it would end the watch.
 
         Args:
             wheels: odometry step (3,) in the base's frame.
@@ -94,6 +94,8 @@ class ContradictionMonitor:
         sigma = np.full(3, np.inf) if scan_sigma is None else scan_sigma
         judged = sigma < FIXED
         step_m = np.stack([wheels, np.where(judged, seen, wheels)]) * _TO_M
+        if not (np.isfinite(step_m).all() and 0.0 <= elapsed_s < np.inf):
+            return
         # One pause, or one pose that jumps, hardly changes what is usual.
         pause_s = 4.0 * self._period_s if self._scans else elapsed_s
         self._scans = min(self._scans + 1, USUAL_SCANS)

@@ -12,6 +12,7 @@ from instant_ic.base.config import LimitsConfig
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.config.robot import MotionLimits
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.contradiction import Contradiction
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
@@ -20,6 +21,7 @@ from instant_ic.control.navigator import Navigator, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
+from instant_ic.slam.contradiction import ContradictionMonitor
 
 LIMITS = MotionLimits()
 STANDS = (0.0, 0.0)
@@ -98,3 +100,13 @@ def test_fault_a_monitor_lets_a_robot_pass_whose_speed_is_no_number(odd: float) 
     for v, w, now_v, now_w, age_s in spoilt((0.1, 0.1, 0.1, 0.1, 0.0), odd):
         if age_s != -math.inf:
             assert monitor.limit((v, w), nothing, float(age_s), (now_v, now_w)).command == STANDS
+
+
+@ODD
+def test_fault_one_step_that_is_no_number_ends_the_watch_over_wheels_and_scans(odd: float) -> None:
+    for wrong in spoilt((0.03, 0.0, 0.0, 0.03, 0.0, 0.0, 0.1), odd):
+        monitor, sigma = ContradictionMonitor(), np.full(3, 0.001)
+        monitor.update(wrong[:3], wrong[3:6], float(wrong[6]), sigma)
+        for _ in range(10):
+            monitor.update(np.array([0.03, 0.0, 0.0]), np.array([-0.03, 0.0, 0.0]), 0.1, sigma)
+        assert monitor.state is Contradiction.OTHER_WAY, wrong
