@@ -11,7 +11,7 @@ motion:
 
     detect_s    to the first sign of the stop: /cmd_vel, the speed commanded to the motor controller, or the true speed
                 falls by a tenth
-    stand_s     to a true speed that stays below 0.01 m/s
+    stand_s     to a true speed that stays below 0.01 m/s, and below a third of the speed before the loss
     distance_m  from the position at the loss to the stopping position
     after_m     motion in the second after it has stopped: zero, unless what was lost is back before the arbiter has
                 gone to STOPPED (``timeouts.stop_after_s``), as a camera driver that starts fast: the key is still held
@@ -551,7 +551,7 @@ async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[st
                 await asyncio.sleep(rig.pace.wait_s(AFTER_THAW_S))
 
             def over() -> bool:
-                stand_ns = stands_ns(rig.truth, lost_ns)
+                stand_ns = stands_ns(rig.truth, lost_ns, cruise)
                 stood = stand_ns is not None and rig.truth[-1].at_ns - stand_ns > AFTER_S * 1e9
                 return stood or rig.pace.now_ns() - lost_ns > LONGEST_S * 1e9
 
@@ -565,13 +565,14 @@ async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[st
     return figures
 
 
-def stands_ns(truth: Sequence[Truth], lost_ns: int) -> int | None:
-    """Time at which the robot began to stand for ``STANDS_S``; None if it has not."""
+def stands_ns(truth: Sequence[Truth], lost_ns: int, cruise: float) -> int | None:
+    """Time at which the robot, which drove at ``cruise`` m/s, began to stand for ``STANDS_S``; None if it has not."""
     began: int | None = None
+    limit = min(STANDS_M_S, cruise / 3)
     for row in truth:
         if row.at_ns < lost_ns:
             continue
-        if row.speed >= STANDS_M_S:
+        if row.speed >= limit:
             began = None
         elif began is None:
             began = row.at_ns
@@ -586,11 +587,12 @@ def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
     start = max((row for row in rig.truth if row.at_ns <= lost_ns), key=lambda row: row.at_ns)
     gap_s = (lost_ns - start.at_ns) / 1e9  # driving time between this sample and the loss
     signs = [at for at, speed in rig.commands if at >= lost_ns and speed < 0.9 * cruise]
-    signs += [row.at_ns for row in rows if row.speed < 0.9 * cruise]
+    if cruise > 5 * STANDS_M_S:  # below, the true speed falls by a tenth by itself
+        signs += [row.at_ns for row in rows if row.speed < 0.9 * cruise]
     requests = [(rig.pace.stamp_ns(at), speed) for at, speed in rig.serial.speeds]
     driven = max((request for request in requests if request[0] <= lost_ns), default=(0, 0.0))[1]
     signs += [at for at, speed in requests if at > lost_ns and speed < 0.9 * driven]
-    stand_ns = stands_ns(rows, lost_ns)
+    stand_ns = stands_ns(rows, lost_ns, cruise)
     found: dict[str, Any] = {
         "cruise_m_s": round(cruise, 3),
         "detect_s": round((min(signs) - lost_ns) / 1e9, 3) if signs else None,
@@ -636,7 +638,7 @@ def summary(drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
         known = [value for value in values if value is not None]
         result[key] = {
             "median": round(statistics.median(known), 3) if known else None,
-            "worst": max(known) if len(known) == len(values) else None,
+            "worst": max(known) if known and len(known) == len(values) else None,
         }
     return result
 

@@ -29,6 +29,8 @@ ACCEPTABLE_DELAY_S = 0.06
 JPEG_QUALITY = 92
 #: Standard deviation of the sensor's noise, of 255: no two images are equal. It makes a JPEG 2 % larger.
 NOISE = 1.0
+_NOISE_STEP = 389
+"""Columns by which the noise moves from image to image: a prime, so that it returns after the whole width only."""
 #: Time after setting options during which the preview is not ready, seconds.
 SETTLE_S = 0.8
 
@@ -115,6 +117,7 @@ class ThetaServer:
         self.config = config
         self._rng = np.random.default_rng([67, seed])
         self._noise: npt.NDArray[np.int8] = np.empty((0, 0, 3), np.int8)
+        self._noise_first = 0
         self.source = source
         self.rate_hz = 0.0
         self.frames = 0
@@ -176,7 +179,10 @@ class ThetaServer:
         height, width = rgb.shape[:2]
         if self._noise.shape[:2] != (height, 2 * width):
             self._noise = np.rint(self._rng.normal(0.0, NOISE, (height, 2 * width, 3))).astype(np.int8)
-        first = int(self._rng.integers(width))
+        # Each place once in turn: at random, one of the last hundred would come again soon, and the image of a standing
+        # robot would be equal to an earlier one.
+        self._noise_first = (self._noise_first + _NOISE_STEP) % width
+        first = self._noise_first
         noisy = cv2.add(rgb, self._noise[:, first : first + width], dtype=cv2.CV_8U)
         bgr = cv2.cvtColor(noisy, cv2.COLOR_RGB2BGR)
         ok, encoded = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
