@@ -190,6 +190,7 @@ class ArbiterInbox:
             operator_command=self._twist("command"),
             holder=self.lease.holder,
             holder_sends_zeros=self.lease.holder == self._zeros_of != "",
+            refused=self.lease.refused,
             operator_gone=self.operator_gone(),
             held_in_vain=self.lease.held_in_vain(steady_ns),
             estop=latch.pressed,

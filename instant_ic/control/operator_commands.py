@@ -17,10 +17,10 @@ _MOST_SENDERS = 64
 class OperatorCommands:
     """Follows the commands from step to step.
 
-    A control that was held when its commands ended must be released first, by its sender whenever it comes back, and by
-    the next operator. They end if none is fresh for too long, or if their sender has given up the lease or was started
-    again. This needs a sender that sends zeros while its operator commands nothing, as the console does. The silence of
-    any other sender may be its release.
+    A control that was held in vain, or when its commands ended, must be released first, by its sender whenever it comes
+    back; in the second case also by the next operator. Commands end if none is fresh for too long, or if their sender
+    has given up the lease or was started again. This needs a sender that sends zeros while its operator commands
+    nothing, as the console does. The silence of any other sender may be its release.
 
     Attributes:
         command: m/s, rad/s, within the limits; zero when stale.
@@ -37,7 +37,8 @@ class OperatorCommands:
         self._driven_ns: int | None = None  # time of the last motion
         self._let_go_ns: int | None = None  # start of the present sender's zeros
         self._holder = ""  # in the previous step
-        self._must_release: dict[str, None] = {}  # senders whose control was held when their commands ended
+        # Senders who held a control in vain, or when their commands ended; whether they are known to send zeros.
+        self._must_release: dict[str, bool] = {}
         self._ended = False  # held commands ended, and nobody has let go since
 
     def step(
@@ -65,10 +66,13 @@ class OperatorCommands:
         # Commands that always arrive late keep a small age, but none is fresh.
         silent_s = 0.0 if fresh else max(inputs.age("command"), (now_ns - self._fresh_ns) / 1e9)
         if self.held_by and (holder != self.held_by or silent_s > longest_s):
-            self._note_end()
+            self._ended = True
+            self._note(self.held_by, sends_zeros=True)
+        for sender in inputs.refused:
+            self._note(sender, sends_zeros=self._must_release.get(sender, False))
         if self.command != NO_MOTION:
             self.last, self._driven_ns, self._let_go_ns = self.command, now_ns, None
-            self.held_by = holder if inputs.holder_sends_zeros or holder in self._must_release else ""
+            self.held_by = holder if inputs.holder_sends_zeros or self._must_release.get(holder) else ""
             ended = self.held_by and (self._ended or holder in self._must_release)
             return Notice(Reason.OPERATOR_LOST, "the operator's link was lost") if ended else None
         if not fresh:
@@ -80,9 +84,8 @@ class OperatorCommands:
             self._must_release.pop(holder, None)
         return None
 
-    def _note_end(self) -> None:
-        self._ended = True
-        self._must_release[self.held_by] = None
+    def _note(self, sender: str, *, sends_zeros: bool) -> None:
+        self._must_release[sender] = sends_zeros
         if len(self._must_release) > _MOST_SENDERS:
             del self._must_release[next(iter(self._must_release))]
 

@@ -93,6 +93,11 @@ class Lease:
         )
 
     @property
+    def refused(self) -> tuple[str, ...]:
+        """Senders whose motion was refused lately."""
+        return tuple(self._held)
+
+    @property
     def diagnosis(self) -> Diagnosis:
         """Who drives; a warning while others try to."""
         text = f"{self.holder or 'nobody'} drives"

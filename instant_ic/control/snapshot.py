@@ -56,6 +56,8 @@ class ArbiterInputs:
     """Sender who has the robot's lease; empty: nobody."""
     holder_sends_zeros: bool = False
     """It has sent zeros: its silence is no release."""
+    refused: tuple[str, ...] = ()
+    """Senders without the lease who hold a control."""
     operator_gone: bool = False
     """The client that sent the command has left since: the command is void, whatever its age."""
     held_in_vain: bool = False

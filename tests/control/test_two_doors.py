@@ -195,6 +195,22 @@ def test_a_key_held_while_another_had_the_lease_waits_for_a_release(free: Stack,
     assert drive(free, 1.0, 0.4, None)[-1].mode == ControlState.REAL and free.base.v > 0.2
 
 
+def test_a_key_held_in_vain_through_a_lost_page_waits_for_a_release(free: Stack) -> None:
+    """The console sends one zero at the loss, and one before it hears of the key again."""
+    drive(free, 0.5, 0.0, 0.0)
+    assert drive(free, 1.0, 0.0, 0.4)[-1].holder == FIRST
+    command(free, 0.0)
+    drive(free, 0.5, 0.0, None)
+    command(free, 0.0, FIRST + RELEASED)
+    drive(free, 0.5, None, None)
+    already = len(sent(free))
+    command(free, 0.0)
+    assert drive(free, 2.0, None, 0.4)[-1].holder == SECOND
+    assert not any(sent(free, already))
+    drive(free, 1.0, None, 0.0)
+    assert drive(free, 1.0, None, 0.4)[-1].mode == ControlState.REAL and free.base.v > 0.2
+
+
 def test_zeros_of_the_sender_before_are_no_release() -> None:
     """The robot stands before an obstacle while the key is held, so that the lease can pass on at once."""
     operator, steps = OperatorCommands(), (("a", 0.3), ("a", 0.0), ("", 0.0), ("b", 0.0), ("b", 0.3))
