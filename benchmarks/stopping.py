@@ -73,6 +73,8 @@ STANDS_S = 0.3
 """Seconds below the limit that count as standing."""
 LONGEST_S = 4.0
 AFTER_S = 1.0
+RUNAWAY = 0.95
+"""Share of the top speed; at all of it, the jump from a slow speed alone is a speed error to the controller."""
 _TRIES = 5
 _REVOLUTION = 76
 """Packets of a revolution of the LiDAR."""
@@ -257,7 +259,7 @@ class SerialRelay(Closing):
         if len(data) != 16 or data[1] != Command.SPEED_ACCELERATION_BOTH:
             return data
         _, left, right = struct.unpack(">Iii", data[2:-2])
-        full = round(math.copysign(MAX_SPEED_PPS, left)) if left else 0
+        full = round(math.copysign(RUNAWAY * MAX_SPEED_PPS, left)) if left else 0
         return write_frame(data[0], data[1], struct.pack(">Iii", 0, full, right))
 
     def _listen(self, data: bytes) -> None:
