@@ -95,7 +95,7 @@ def test_a_robot_that_moves_otherwise_than_its_tracks_stops(
 @pytest.mark.parametrize("tracks", [[0], [0, 1]], ids=["one", "both"])
 @pytest.mark.parametrize(
     ("command", "within_s", "within_m"),
-    [((0.03, 0.0), 2.0, 0.2), ((0.1, 0.0), 0.9, 0.3), (FORWARD, 0.8, 0.75), ((0.0, 0.4), 1.4, 0.55)],
+    [((0.03, 0.0), 2.0, 0.2), ((0.1, 0.0), 0.9, 0.3), (FORWARD, 0.8, 0.85), ((0.0, 0.4), 1.4, 0.55)],
     ids=["0.03 m/s", "0.1 m/s", "0.38 m/s", "turning"],
 )
 def test_an_encoder_that_counts_30_percent_stops_the_robot(
