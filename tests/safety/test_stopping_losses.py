@@ -83,12 +83,12 @@ class Rig:
     def drive(self) -> None:
         """Hands off until the robot may be driven, then at full speed for a second."""
         self.command = (0.0, 0.0)
-        free_s = 0.0  # an operator who was lost has let go only when his zeros have been heard for a while
-        for _ in range(round(10.0 / STEP_S)):
+        for k in range(1, round(10.0 / STEP_S)):
             self.step()
-            free_s = free_s + STEP_S if self.stack.state.reason_code == ControlState.REASON_DRIVE_ROBOT else 0.0
             # The stack takes every third command; each drive begins, and ends, with one in its next step.
-            if free_s > 0.2 and self.steps % 3 == 0:
+            # A lost operator has let go when the arbiter, which steps rarely at rest, has heard his zeros for a while.
+            due = k * STEP_S > 0.5 and self.steps % 3 == 0
+            if due and self.stack.state.reason_code == ControlState.REASON_DRIVE_ROBOT:
                 break
         else:
             raise AssertionError(f"cannot be driven: {self.stack.state.reason}")
