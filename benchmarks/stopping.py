@@ -64,6 +64,7 @@ from instant_ic.experiments.stack import Stack, StackError, free_port
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState, message_type, pose2_from_message, stamp_ns, twist_values
 from instant_ic.paths import share_dir
+from instant_ic.sim.capture_replay import with_noise
 from instant_ic.sim.roboclaw_emulator import MAX_SPEED_PPS, RoboclawEmulator
 
 SPEED_M_S = 0.38
@@ -159,12 +160,11 @@ class PacketRelay(Closing):
         if not self.repeats:
             self._recent.append(data)
             return data
-        old = np.frombuffer(self._recent[0], np.uint8).copy()
+        old = self._recent[0]
         self._recent.rotate(-1)
         if self.repeats == "noise":
-            returns = old[:1200].reshape(12, 100)[:, 4:].reshape(12, 32, 3)
-            returns[..., 0] ^= self._rng.integers(0, 2, (12, 32), np.uint8) & (returns[..., :2].max(axis=2) > 1)
-        return old[:1200].tobytes() + data[1200:1204] + old[1204:].tobytes()
+            old = with_noise(old, self._rng)
+        return old[:1200] + data[1200:1204] + old[1204:]
 
     def close(self) -> None:
         self._ends.set()

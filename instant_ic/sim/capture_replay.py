@@ -4,14 +4,25 @@ import contextlib
 import socket
 from pathlib import Path
 
+import numpy as np
+
 from instant_ic.lidar.capture import CaptureReader
 from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES
 
 
-class CaptureReplay:
-    """Sends the data and position packets of a VLP-16 capture with unchanged payloads and recorded timing.
+def with_noise(packet: bytes, rng: np.random.Generator) -> bytes:
+    """Return a data packet of which a random half of the returns is 2 mm nearer or farther."""
+    data = np.frombuffer(packet, np.uint8).copy()
+    returns = data[:1200].reshape(12, 100)[:, 4:].reshape(12, 32, 3)
+    returns[..., 0] ^= rng.integers(0, 2, (12, 32), np.uint8) & (returns[..., :2].max(axis=2) > 1)
+    return data.tobytes()
 
-    It starts again after the end, with a pause of one packet.
+
+class CaptureReplay:
+    """Sends the data and position packets of a VLP-16 capture with recorded timing, at first with unchanged payloads.
+
+    It starts again after the end, with a pause of one packet. The ranges then have noise: without it, a short capture
+    would be a sensor that repeats itself, which the driver withholds.
 
     Args:
         path: pcap or pcapng.
@@ -43,6 +54,7 @@ class CaptureReplay:
         self._period_s = self.duration_s * (count + 1) / count if count > 1 else 0.1
         self._next = 0
         self._began_s = 0.0
+        self._rng: np.random.Generator | None = None  # from the second time on
         self.sent = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -51,6 +63,8 @@ class CaptureReplay:
         """Send the packets that are due at ``time_s`` (seconds since the start)."""
         while self._items[self._next][0] + self._began_s <= time_s:
             _, address, payload = self._items[self._next]
+            if self._rng is not None and len(payload) == DATA_PACKET_BYTES:
+                payload = with_noise(payload, self._rng)
             # The kernel reports the refusal of an earlier datagram here; a real sensor ignores it.
             with contextlib.suppress(ConnectionRefusedError):
                 self._socket.sendto(payload, address)
@@ -58,6 +72,7 @@ class CaptureReplay:
             self._next += 1
             if self._next == len(self._items):
                 self._next = 0
+                self._rng = self._rng or np.random.default_rng(0)
                 self._began_s = max(self._began_s + self._period_s, time_s - self._period_s)
 
     def close(self) -> None:
