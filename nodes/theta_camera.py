@@ -66,7 +66,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
 
     def on_frame(self, frame: Frame) -> None:
         """Publish a device's image unless it is a copy or empty; runs on the camera's thread. Files may repeat."""
-        if isinstance(self.camera, FileCamera) or self.images.is_live(frame):
+        if self.camera.recorded or self.images.is_live(frame):
             self.publish(frame)
 
     def publish(self, frame: Frame) -> None:

@@ -27,6 +27,7 @@ class FileCamera(Camera):
         self.path = Path(path)
         self.config = config or FilesConfig()
         super().__init__(0.0, now_ns)
+        self.recorded = True
         self._sleep = sleep
         self._paths: list[Path] = []
         self._loaded: dict[Path, tuple[bytes, int, int]] = {}

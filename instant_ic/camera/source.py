@@ -52,6 +52,8 @@ class Camera(Closing):
         """Set by another thread: a call that waits for the device then ends soon, with an error."""
         self.advice = ""
         """Advice to the operator while images arrive; empty if there is none."""
+        self.recorded = False
+        """Whether the images come from files, which may be played again."""
         self._latency_ns = round(latency_s * 1e9)
         self._now_ns = now_ns
 

@@ -6,6 +6,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -46,6 +47,7 @@ class VideoCamera(Camera):
         self._source = signed_in if user and separator else url  # shown nowhere
         self.config = config or VideoConfig()
         super().__init__(self.config.latency_s, now_ns)
+        self.recorded = not separator and Path(url).is_file()
         self._reader: _Reader | None = None
         self._hung: list[_Reader] = []
 

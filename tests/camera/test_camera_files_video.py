@@ -84,6 +84,7 @@ def test_video_frames_come_encoded_and_stamped(tmp_path: Path) -> None:
         with pytest.raises(CameraError, match="no more frames"):
             camera.read()
     assert [(frame.width, frame.height, frame.stamp_ns) for frame in frames] == [(64, 32, 750_000_000)] * 3
+    assert camera.recorded and not VideoCamera("/dev/null").recorded and not VideoCamera("rtsp://host/live").recorded
     means = [cv2.imdecode(np.frombuffer(frame.jpeg, np.uint8), 1).mean() for frame in frames]
     np.testing.assert_allclose(means, [50, 100, 150], atol=4)
 
