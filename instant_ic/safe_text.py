@@ -44,7 +44,7 @@ def masked(text: str) -> str:
 
 
 def holds_password(address: str) -> bool:
-    """Whether an address has a password or token in it, before the host or in its query."""
+    """Return whether an address has a password or token in it, before the host or in its query."""
     return _USER.search(address) is not None or _TOKEN.search(address) is not None
 
 

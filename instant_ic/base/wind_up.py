@@ -56,7 +56,7 @@ class WindUpWatch:
         current_a: NDArray[np.float64],
         dt_s: float,
     ) -> NDArray[np.bool_]:
-        """Whether each track turns without counts, (2,).
+        """Return for each track whether it turns without counts, (2,).
 
         Args:
             command: commanded speeds, m/s, (2,).

@@ -53,7 +53,7 @@ class Camera(Closing):
         self.advice = ""
         """Advice to the operator while images arrive; empty if there is none."""
         self.recorded = False
-        """Whether the images come from files, which may be played again."""
+        """True for images from files, which may be played again."""
         self._latency_ns = round(latency_s * 1e9)
         self._now_ns = now_ns
 

@@ -393,7 +393,7 @@ class ConsoleServer:
         return role
 
     def _known(self, received: bytes) -> bool:
-        """Whether the headers of a first request carry a right token or cookie; without sign-in, whether it is a stop.
+        """Return whether a request has a right token or cookie in its headers; without sign-in, whether it is a stop.
 
         This only admits a connection: :meth:`_guard` decides on the request.
         """

@@ -276,18 +276,18 @@ class Arbiter:
         return replace(snapshot, against_switch=self._against_switch(snapshot, now_ns))
 
     def _vbot_is_slow(self, inputs: ArbiterInputs) -> bool:
-        """Whether the operator drives the v-bot, and it is slower than commanded."""
+        """Return whether the operator drives the v-bot, and it is slower than commanded."""
         wanted_m_s = min(abs(self._operator.command[0]), self._sources.vbot_limit_m_s(inputs, self.mode))
         return self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * wanted_m_s
 
     def _pose_lost(self, inputs: ArbiterInputs) -> bool:
-        """Whether the SLAM is lost, and the robot has not been stopped for it yet."""
+        """Return whether the SLAM is lost, and the robot has not been stopped for it yet."""
         trust, lost = self.config.pose_trust, inputs.pose_lost_probability
         self._stopped_for_pose = self._stopped_for_pose and lost >= trust.slow
         return lost >= trust.stop and not self._stopped_for_pose
 
     def _contradicted(self, inputs: ArbiterInputs) -> bool:
-        """Whether wheels and LiDAR contradict each other, and the robot has not been stopped for it yet."""
+        """Return whether wheels and LiDAR contradict each other, and the robot has not been stopped for it yet."""
         self._contradictions = min(self._contradictions, inputs.contradictions)  # a new SLAM counts from 0
         return inputs.contradictions > self._contradictions
 

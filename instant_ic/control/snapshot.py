@@ -157,7 +157,7 @@ class Snapshot:
     let_go_s: float
     """Seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
     held: bool = False
-    """Whether the last motion's sender has not let go: his silence is no release."""
+    """True while the sender of the last motion has not let go: his silence is no release."""
     interrupted: Notice | None = None
     """Event since the previous step after which the controls must be released; None without one."""
     settles: bool = False

@@ -30,7 +30,7 @@ def encoded(image: np.ndarray) -> bytes:
 
 @pytest.mark.parametrize("count", [8, 120])
 def test_fault_a_camera_that_repeats_its_last_image_or_a_ring_of_images_is_live(count: int) -> None:
-    """Of a ring of more than eight images, each one was live."""
+    """A ring of more than eight images was taken for a live camera."""
     images = LiveImages()
     ring = [frame(jpeg(value)) for value in range(count)]
     assert all(images.is_live(one) for one in ring)

@@ -103,7 +103,7 @@ async def frames_of(reader):
 
 
 async def all_of(reader):
-    """What the server sends until it closes; data that it has not read resets the connection."""
+    """Return what the server sends until it closes; data that it has not read resets the connection."""
     text = b""
     with contextlib.suppress(ConnectionError):
         while part := await reader.read(4096):

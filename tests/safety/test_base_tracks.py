@@ -68,7 +68,7 @@ def test_a_slow_wind_up_at_a_creeping_command_stands_within_0_6_s(v: float) -> N
 
 @pytest.mark.parametrize("seed", range(20))
 def test_creeping_tracks_stand_within_0_6_s_of_running_away(seed: int) -> None:
-    """From when a track is 0.02 m/s too fast; one that sticks when its encoder dies runs away later."""
+    """Count from when a track is 0.02 m/s too fast; one that sticks when its encoder dies runs away later."""
     _, distance_m, away_s, _ = runaway(seed, fastest_m_s=0.03)
     assert away_s <= 0.6
     assert distance_m <= 0.2
