@@ -45,7 +45,7 @@ from instant_ic.msg import (
     stamp_ns,
     twist_stamped,
 )
-from instant_ic.paths import node_file, shipped_file
+from instant_ic.util.paths import node_file, shipped_file
 
 COMMAND, PICTURE, STATE = "/operator/cmd_vel", "/camera/image/compressed", "/vbot/odom"
 PICTURE_BYTES = 200_000

@@ -24,7 +24,7 @@ from instant_ic.experiments.depth import DepthSettings, Evaluator, LidarSettings
 from instant_ic.experiments.depth_lidar import Errors, measure_world
 from instant_ic.experiments.depth_pictures import Sheets
 from instant_ic.experiments.depth_worlds import KINDS, LIDAR_HEIGHT_M, Scene, scenes
-from instant_ic.paths import shipped_file
+from instant_ic.util.paths import shipped_file
 
 SOURCES = ("as estimated", "network", "lidar", "fused", "completed")
 TARGET_MRE, TARGET_DELTA1, TARGET_SCALE_MEDIAN, TARGET_SCALE_P95 = 0.08, 0.93, 0.03, 0.10

@@ -22,10 +22,10 @@ from instant_ic.depth.sources import DepthSource
 from instant_ic.experiments.depth_lidar import Errors, measure_world
 from instant_ic.experiments.depth_worlds import LIDAR_HEIGHT_M
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.paths import shipped_file
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.world import World
 from instant_ic.sim.worlds import corridor_world, load_world, random_world
+from instant_ic.util.paths import shipped_file
 
 FIRST_SEED = 990_000
 UP = np.array([0.0, 0.0, 1.0])

@@ -56,7 +56,7 @@ from instant_ic.launch.nodes import NODE_MAIN
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.launch.process import dies_with_us
 from instant_ic.msg import ControlState, stamp_ns
-from instant_ic.paths import node_file
+from instant_ic.util.paths import node_file
 
 MOVES_M_S = 0.02
 ESTOP_STANDS_S = 0.25

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from reporting import parser_of, report
 
-from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.depth.sources import DepthSource, SourceConfig
@@ -29,12 +28,13 @@ from instant_ic.experiments.depth_worlds import CAMERA_HEIGHT_M, LIDAR_HEIGHT_M
 from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.transforms import TransformBuffer
+from instant_ic.lidar.deskew import Revolution
 from instant_ic.mapping.local_model import warm_up
 from instant_ic.mapping.mapper import LocalMapper, LocalView
-from instant_ic.paths import shipped_file
 from instant_ic.sim.render import EquirectRenderer, Frame
 from instant_ic.sim.world import Material, World, WorldBuilder
 from instant_ic.sim.worlds import corridor_world, load_world, long_world, random_world
+from instant_ic.util.paths import shipped_file
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 
 BEHIND_M = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)

@@ -25,7 +25,6 @@ import numpy as np
 from playwright.sync_api import sync_playwright
 from reporting import parser_of, report
 
-from instant_ic import paths
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayers
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
@@ -37,6 +36,7 @@ from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import make_world
+from instant_ic.util import paths
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.jobs import decode_panorama
 from instant_ic.vspace.layers import LayerEncoder

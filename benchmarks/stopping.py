@@ -51,11 +51,9 @@ import aiohttp
 import numpy as np
 from reporting import parser_of, report
 
-from instant_ic import pace
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.protocol import ESTOP_BITS, Command, encode_reply, read_request, write_frame
 from instant_ic.bus import LATCHED, registry
-from instant_ic.closing import Closing
 from instant_ic.console.client import ConsoleClient
 from instant_ic.control.states import Reason
 from instant_ic.experiments.drive import pump
@@ -63,9 +61,11 @@ from instant_ic.experiments.impaired_link import ImpairedLink
 from instant_ic.experiments.stack import Stack, StackError, free_port
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState, message_type, pose2_from_message, stamp_ns, twist_values
-from instant_ic.paths import share_dir
 from instant_ic.sim.capture_replay import with_noise
 from instant_ic.sim.roboclaw_emulator import MAX_SPEED_PPS, RoboclawEmulator
+from instant_ic.util import pace
+from instant_ic.util.closing import Closing
+from instant_ic.util.paths import share_dir
 
 SPEED_M_S = 0.38
 HALF_WIDTH_M = 0.5 * SkidSteerConfig().effective_width

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from instant_ic import msg
+from instant_ic.adapters.control import ArbiterInbox, command_message, control_state
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import Arbiter, Decision
@@ -15,7 +16,6 @@ from instant_ic.control.step_times import REST_COSTMAP_S, REST_STEP_S, StepTimes
 from instant_ic.control.surroundings import Surroundings
 from instant_ic.control.walls import WALL_PERIOD_S, WallSearch
 from instant_ic.control.warmup import warm_up
-from instant_ic.control_messages import ArbiterInbox, command_message, control_state
 from instant_ic.geometry.poses import matrix_from_pose2
 
 

@@ -14,8 +14,8 @@ from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.control.robot_lease import RELEASED
-from instant_ic.paths import sign_in_file
-from instant_ic.web_access import AccessError, offer_sign_in
+from instant_ic.util.paths import sign_in_file
+from instant_ic.util.web_access import AccessError, offer_sign_in
 
 RECORDER_TIMEOUT_S = 3.0
 

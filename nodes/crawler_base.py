@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from instant_ic.adapters.base import estimate_message, read_command
 from instant_ic.base.command_gate import CommandGate
 from instant_ic.base.config import CrawlerBaseConfig, RoboclawConfig
 from instant_ic.base.controller import BaseController, BaseState, ControllerThread, Health, SteppedController
 from instant_ic.base.pace import refuse_pace
 from instant_ic.base.report import BaseReport
 from instant_ic.base.roboclaw import SerialPort, Status, open_serial
-from instant_ic.base_messages import estimate_message, read_command
 from instant_ic.bus import ERROR, LATCHED, SENSOR, WARN, Node, NodeError, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.estop import EstopLatch
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import BatteryState, Bool, ControlState, Odometry, battery_message, deserialize
-from instant_ic.pace import PaceError, current
-from instant_ic.step_gap import BRIEF_S
+from instant_ic.util.pace import PaceError, current
+from instant_ic.util.step_gap import BRIEF_S
 
 OWN_STEP_S = 0.1
 """Period at which the node's thread shows the serial thread that it runs."""

@@ -6,6 +6,7 @@ import functools
 from dataclasses import fields
 from typing import Any
 
+from instant_ic.adapters.depth import held_image, keyframe_message, revolution_of
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.control.states import Mode
 from instant_ic.depth.chain import DepthChain
@@ -14,7 +15,6 @@ from instant_ic.depth.inputs import HeldImage
 from instant_ic.depth.manifest import ManifestError
 from instant_ic.depth.metric_depth import DepthScalerConfig
 from instant_ic.depth.sources import DepthResult, complete
-from instant_ic.depth_messages import held_image, keyframe_message, revolution_of
 from instant_ic.mapping.local_model import warm_up
 from instant_ic.msg import (
     CompressedImage,

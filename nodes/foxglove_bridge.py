@@ -13,9 +13,9 @@ from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, Ser
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.bus.registry import TopicWatch
 from instant_ic.config.ranges import Range
-from instant_ic.diagnosis import RecentCount
-from instant_ic.paths import sign_in_file
-from instant_ic.web_access import AccessError, is_loopback, offer_sign_in
+from instant_ic.util.diagnosis import RecentCount
+from instant_ic.util.paths import sign_in_file
+from instant_ic.util.web_access import AccessError, is_loopback, offer_sign_in
 
 _TIME_S = 0.05
 REFUSED_S = 10.0  # a refusal is a warning for this long

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from instant_ic import msg, slam_messages
+from instant_ic import msg
+from instant_ic.adapters import slam as slam_messages
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, WARN, Node, NodeError, QoS, main
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.slam.config import GridSlamConfig

@@ -18,7 +18,7 @@ from instant_ic.control.navigator import Navigator, moving_subgoal
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
-from instant_ic.step_gap import StepGap
+from instant_ic.util.step_gap import StepGap
 
 
 @dataclass(frozen=True)

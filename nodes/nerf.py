@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from instant_ic.adapters.nerf import decode_keyframe, status_message, view_message
+from instant_ic.adapters.vspace import layers_message
 from instant_ic.bus import LATCHED, SENSOR, WARN, Node, NodeError, main
 from instant_ic.msg import (
     CompressedImage,
@@ -17,13 +19,11 @@ from instant_ic.msg import (
     VspaceStatus,
     matrix_from_pose,
 )
-from instant_ic.nerf_messages import decode_keyframe, status_message, view_message
 from instant_ic.vspace import State
 from instant_ic.vspace.config import NerfConfig
 from instant_ic.vspace.jobs import Incoming, Outcome, SpaceWorker, ViewOrder, load_robot_mask
 from instant_ic.vspace.layers import Layers
 from instant_ic.vspace.schedule import JobSchedule, Turns
-from instant_ic.vspace_messages import layers_message
 
 _STATUS_S = 0.5
 _LOCKSTEP_S, _LOCKSTEP_ITERATIONS = 0.1, 5  # in tests and replay training runs by iterations, not by time

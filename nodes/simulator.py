@@ -6,16 +6,16 @@ import functools
 from contextlib import ExitStack
 
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
-from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.capture import CaptureError
 from instant_ic.msg import Bool, Float32, Odometry, PoseStamped, odometry_message, pose2_from_message
-from instant_ic.pace import current
-from instant_ic.paths import run_dir
 from instant_ic.sim.capture_replay import CaptureReplay
 from instant_ic.sim.real_time import ACCEPTABLE_LAG_S, RealTimeLoop, SimulatedDevices, SimulatorConfig
 from instant_ic.sim.simulation import Simulation
 from instant_ic.sim.theta import ACCEPTABLE_DELAY_S
 from instant_ic.sim.vlp16 import Vlp16Server
+from instant_ic.util.jit import leave_out_blas
+from instant_ic.util.pace import current
+from instant_ic.util.paths import run_dir
 
 _TRUTH_S = 1.0 / 30.0
 _LATE_S = 0.2

@@ -15,7 +15,7 @@ from instant_ic.control.step_times import StepTimes
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WALL_PERIOD_S, WallSearch
 from instant_ic.geometry.poses import matrix_from_pose2
-from instant_ic.step_gap import StepGap
+from instant_ic.util.step_gap import StepGap
 
 
 @dataclass(frozen=True)

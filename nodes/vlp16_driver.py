@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from instant_ic.adapters.lidar import flat_scan_message, packets_message
 from instant_ic.bus import SENSOR, Node, NodeError, main
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar.capture import CaptureError
@@ -17,7 +18,6 @@ from instant_ic.lidar.player import CapturePlayer
 from instant_ic.lidar.receiver import PacketReceiver, Received, ReceiverError, ReceiverThread
 from instant_ic.lidar.report import LidarReport
 from instant_ic.lidar.stream import Revolution
-from instant_ic.lidar_messages import flat_scan_message, packets_message
 from instant_ic.msg import LaserScan, PointCloud2, VelodyneScan, cloud_message, stamp_ns
 
 _MAX_WAITING = 5

@@ -38,7 +38,7 @@ def parameters() -> dict[str, int]:
     """Parameters of each node."""
     from instant_ic.bus.node_files import node_class
     from instant_ic.config.parameter_info import parameter_infos
-    from instant_ic.paths import node_names
+    from instant_ic.util.paths import node_names
 
     return {name: len(parameter_infos(node_class(name).config_class())) for name in node_names()}
 

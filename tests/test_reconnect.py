@@ -1,6 +1,6 @@
 """Waits between attempts to connect."""
 
-from instant_ic.reconnect import Backoff
+from instant_ic.util.reconnect import Backoff
 
 
 def test_the_wait_stays_short_while_the_device_may_still_start_then_doubles() -> None:

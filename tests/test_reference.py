@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from instant_ic.bus.node_files import node_class
-from instant_ic.paths import node_names
+from instant_ic.util.paths import node_names
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from instant_ic.safe_text import VisibleStream, direct, holds_password, masked, masked_values, visible
+from instant_ic.util.safe_text import VisibleStream, direct, holds_password, masked, masked_values, visible
 
 
 @pytest.mark.parametrize(

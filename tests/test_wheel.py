@@ -83,7 +83,7 @@ def run(installed, folder, *arguments):
 def test_installed_wheel_finds_its_files(installed, tmp_path):
     found = Path(
         run(
-            installed, tmp_path, "-c", "import instant_ic.paths as p; print(p.shipped_file('launch', 'sim.yaml'))"
+            installed, tmp_path, "-c", "import instant_ic.util.paths as p; print(p.shipped_file('launch', 'sim.yaml'))"
         ).strip()
     )
     assert found.is_relative_to(installed.parents[1]) and found.parts[-4:-1] == ("instant_ic", "share", "launch")

@@ -23,8 +23,8 @@ from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
 from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.qos import QoS
-from instant_ic.closing import Closing
 from instant_ic.msg import deserialize
+from instant_ic.util.closing import Closing
 
 guard_rosbags()
 DirectoryReader.STORAGE_PLUGINS["mcap"] = McapSource  # type: ignore[index]

@@ -21,7 +21,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from instant_ic.private import open_file
+from instant_ic.util.private import open_file
 
 CHUNK_BYTES = 1 << 20
 """A chunk is closed once it is larger than this."""

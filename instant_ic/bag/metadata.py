@@ -30,7 +30,7 @@ from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.config.yaml_text import dump_yaml, read_yaml
 from instant_ic.msg import MessageError, message_type, type_hash, typestore
-from instant_ic.private import open_file, sync_folder
+from instant_ic.util.private import open_file, sync_folder
 
 METADATA_FILE = "metadata.yaml"
 REPEATED = "instant_ic.repeated"

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 
 from instant_ic.bag.message import BagMessage
-from instant_ic.closing import Closing
+from instant_ic.util.closing import Closing
 
 _MOST_BYTES = 64_000_000
 

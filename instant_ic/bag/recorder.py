@@ -29,7 +29,7 @@ from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Stats
 from instant_ic.config.ranges import Checked, NotNegative, NotNegativeInt, Positive, PositiveInt, Range
-from instant_ic.diagnosis import Diagnosis, Level, RecentCount
+from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 FOREIGN_CLOCK_NS = 10_000_000_000
 """A stamp farther than this from the simulated clock comes from another clock."""

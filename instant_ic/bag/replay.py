@@ -14,7 +14,6 @@ from typing import Any
 
 import yaml
 
-from instant_ic import paths
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagReader
 from instant_ic.bag.message import BagMessage
@@ -28,6 +27,7 @@ from instant_ic.bus.node_files import node_class
 from instant_ic.config.params import SHARED, configure, gather
 from instant_ic.config.yaml_text import read_yaml
 from instant_ic.msg import deserialize
+from instant_ic.util import paths
 
 BROADCASTS: Mapping[str, tuple[str, ...]] = {
     "grid_slam": ("odom",),

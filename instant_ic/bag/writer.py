@@ -14,8 +14,8 @@ from instant_ic.bag.mcap_writer import Buffer, McapWriter, Schema
 from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import PartInfo, Topic, channel_metadata, schema_or_unknown, write_metadata
 from instant_ic.bus.qos import SENSOR, QoS
-from instant_ic.closing import Closing
-from instant_ic.private import make_folder, sync_folder
+from instant_ic.util.closing import Closing
+from instant_ic.util.private import make_folder, sync_folder
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 

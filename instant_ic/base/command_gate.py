@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 
 from instant_ic.base.config import CrawlerBaseConfig
-from instant_ic.diagnosis import Diagnosis, Level, RecentCount
+from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 
 class CommandGate:

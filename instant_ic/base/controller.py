@@ -12,9 +12,9 @@ from instant_ic.base.following import TrackWatch
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_counts
 from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
-from instant_ic.pace import current, suspended_ns
-from instant_ic.reconnect import Backoff
-from instant_ic.step_gap import StepGap
+from instant_ic.util.pace import current, suspended_ns
+from instant_ic.util.reconnect import Backoff
+from instant_ic.util.step_gap import StepGap
 
 _COUNTED_SINCE_M = 0.2
 """Largest count, in metres of track, that a restarted controller can reach before the next reading."""

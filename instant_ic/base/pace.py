@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from instant_ic.pace import Pace, PaceError
+from instant_ic.util.pace import Pace, PaceError
 
 
 def refuse_pace(pace: Pace, port: str, run_dir: Path | None) -> None:

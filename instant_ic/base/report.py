@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from instant_ic.base.config import CrawlerBaseConfig
 from instant_ic.base.controller import BaseController, Health
 from instant_ic.base.roboclaw import Status
-from instant_ic.diagnosis import Diagnosis, Level, RecentCount
+from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 _CONNECT_GRACE_S = 5.0  # after the start, for which a missing controller is not an error yet
 

@@ -26,7 +26,7 @@ from instant_ic.base.protocol import (
     read_request,
     write_frame,
 )
-from instant_ic.pace import current
+from instant_ic.util.pace import current
 
 
 class LinkError(ConnectionError):

@@ -32,7 +32,7 @@ from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Received
 from instant_ic.config.ranges import Range, check_ranges
-from instant_ic.web_access import SIGN_IN, TokenBucket, refusal, sign_in_needed
+from instant_ic.util.web_access import SIGN_IN, TokenBucket, refusal, sign_in_needed
 
 _START_S = 10.0
 _END_S = 2.0

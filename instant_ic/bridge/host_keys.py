@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from instant_ic.private import make_folder, open_file
+from instant_ic.util.private import make_folder, open_file
 
 ROLES = ("driver", "viewer")
 """Roles of allowed hosts: a driver's topics are accepted; a viewer only watches."""

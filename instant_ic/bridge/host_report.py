@@ -11,7 +11,7 @@ from instant_ic.bridge.host_link import HostLink, PeerStatus
 from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_topics import TopicCounts
 from instant_ic.bus import ERROR, OK, WARN
-from instant_ic.diagnosis import RecentCount
+from instant_ic.util.diagnosis import RecentCount
 
 RECENT_S = 10.0
 UNLISTED = "of no list"

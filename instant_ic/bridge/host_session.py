@@ -33,7 +33,7 @@ from instant_ic.bridge.host_protocol import (
 )
 from instant_ic.bridge.host_topics import TopicCounts, TopicRule, moves, releases
 from instant_ic.config.ranges import Range, check_ranges
-from instant_ic.web_access import TokenBucket
+from instant_ic.util.web_access import TokenBucket
 
 MAX_MESSAGE = 64 << 20
 """Largest message that is reassembled, in bytes."""

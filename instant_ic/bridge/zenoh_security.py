@@ -7,7 +7,7 @@ import re
 from typing import Any
 
 from instant_ic.bus import ERROR, OK, WARN
-from instant_ic.web_access import is_loopback
+from instant_ic.util.web_access import is_loopback
 
 _ENDPOINT = re.compile(r"(?P<link>\w+)/(\[(?P<ipv6>[^\]]+)\]|(?P<host>[^:\[\]/]+)):\d+(\?[^#]*)?\Z")
 _TLS_LINKS = ("tls", "quic")

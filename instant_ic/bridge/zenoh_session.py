@@ -27,8 +27,8 @@ from instant_ic.bridge.zenoh_format import (
     TopicQoS,
     data_key,
 )
-from instant_ic.closing import Closing
-from instant_ic.paths import shipped_file
+from instant_ic.util.closing import Closing
+from instant_ic.util.paths import shipped_file
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
 MAX_PUBLISHERS = 256

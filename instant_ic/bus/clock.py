@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
-from instant_ic import pace
+from instant_ic.util import pace
 
 
 class Clock(Protocol):
@@ -29,12 +29,12 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The machine's clock, at this process's pace (:mod:`instant_ic.pace`), which :func:`pace.use` sets before.
+    """The machine's clock, at this process's pace (:mod:`instant_ic.util.pace`), which :func:`pace.use` sets before.
 
     Attributes:
         now_ns: returns nanoseconds since the epoch.
         steady_ns: returns nanoseconds of a clock that never jumps, even when somebody sets the machine's clock.
-        suspended_ns: :func:`instant_ic.pace.suspended_ns`.
+        suspended_ns: :func:`instant_ic.util.pace.suspended_ns`.
     """
 
     def __init__(self) -> None:

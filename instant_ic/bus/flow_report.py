@@ -10,7 +10,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from instant_ic.bus.transport import PublisherStats, Stats
-from instant_ic.diagnosis import Diagnosis, Level, RecentCount
+from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 RECENT_S = 10.0
 START_UP_S = 15.0

@@ -19,8 +19,8 @@ from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.node import Node
 from instant_ic.bus.qos import LATCHED, QoS
 from instant_ic.bus.transport import Payload, PublisherStats, Received, Stats, joined
-from instant_ic.closing import Closing
 from instant_ic.msg import deserialize, serialize, type_name
+from instant_ic.util.closing import Closing
 
 NodeT = TypeVar("NodeT", bound=Node[Any])
 

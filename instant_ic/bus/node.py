@@ -25,7 +25,6 @@ from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.bus.transport import Payload, RawPublisher, RawSubscription, Received, Transport
 from instant_ic.config import params
 from instant_ic.config.parameter_info import ParameterInfo, is_live, parameter_infos, plain
-from instant_ic.diagnosis import Diagnosis
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import (
@@ -40,8 +39,9 @@ from instant_ic.msg import (
     transform_message,
     type_name,
 )
-from instant_ic.pace import current
-from instant_ic.safe_text import masked
+from instant_ic.util.diagnosis import Diagnosis
+from instant_ic.util.pace import current
+from instant_ic.util.safe_text import masked
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of a diagnosis, as in diagnostic_msgs/DiagnosticStatus."""

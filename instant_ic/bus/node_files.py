@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from instant_ic import paths
 from instant_ic.bus.node import Node
+from instant_ic.util import paths
 
 
 class NodeFileError(ValueError):

@@ -14,7 +14,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from instant_ic import pace, paths
 from instant_ic.bus import registry
 from instant_ic.bus.clock import Clock, ManualClock, SystemClock
 from instant_ic.bus.control import ControlServer
@@ -22,7 +21,8 @@ from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import Node, NodeError
 from instant_ic.config import params
 from instant_ic.msg import MessageError
-from instant_ic.safe_text import masked, visible
+from instant_ic.util import pace, paths
+from instant_ic.util.safe_text import masked, visible
 
 _SETUP_ENDS_S = 1.0
 """How long a signal waits for a node's ``setup``; the launcher sends the next one after 2.5 s."""

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from instant_ic.bag import BagError, BagReader
 from instant_ic.calibration.mount import CalibrationError, Frame
-from instant_ic.depth.deskew import points_at
 from instant_ic.geometry.poses import Matrix, inverse, wrap_angle, yaw_of
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.limits import decode_image
+from instant_ic.lidar.deskew import points_at
 from instant_ic.msg import MessageError, cloud_array, deserialize, stamp_ns, transform_matrix
+from instant_ic.util.limits import decode_image
 
 PICTURE, CLOUD, PACKETS = (
     "sensor_msgs/msg/CompressedImage",

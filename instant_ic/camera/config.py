@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from instant_ic.config.ranges import Checked, NotNegativeInt, Percent, Plausible, PositiveInt, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
-from instant_ic.safe_text import holds_password
+from instant_ic.util.safe_text import holds_password
 
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
 """(width, height, frames/s) that the Theta Z1 offers, with firmware `FORMATS_FIRMWARE`."""

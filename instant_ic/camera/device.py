@@ -11,8 +11,8 @@ from instant_ic.camera.files import FileCamera
 from instant_ic.camera.source import Camera, CameraError
 from instant_ic.camera.theta import ThetaCamera, ThetaClient
 from instant_ic.camera.video import VideoCamera
-from instant_ic.diagnosis import Diagnosis, Level
-from instant_ic.private import read_secret
+from instant_ic.util.diagnosis import Diagnosis, Level
+from instant_ic.util.private import read_secret
 
 USER_VARIABLE = "INSTANT_IC_THETA_USER"
 PASSWORD_VARIABLE = "INSTANT_IC_THETA_PASSWORD"

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from instant_ic.camera.config import FilesConfig
 from instant_ic.camera.source import Camera, CameraError, Frame
-from instant_ic.jpeg import JpegError, check_whole, jpeg_size
-from instant_ic.limits import load_image
+from instant_ic.util.jpeg import JpegError, check_whole, jpeg_size
+from instant_ic.util.limits import load_image
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")
 SUFFIXES = (*JPEG_SUFFIXES, ".png", ".bmp", ".tif", ".tiff", ".webp")

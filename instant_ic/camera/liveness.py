@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from instant_ic.camera.source import Frame
-from instant_ic.repeats import RepeatWatch
+from instant_ic.util.repeats import RepeatWatch
 
 _EMPTY_BYTES = 0.05
 """Bytes per pixel below which an image may be empty; images of a place have several times as much."""

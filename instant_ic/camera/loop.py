@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 
 from instant_ic.camera.source import Camera, CameraError, Frame
-from instant_ic.reconnect import Backoff
+from instant_ic.util.reconnect import Backoff
 
 
 class CameraLoop(threading.Thread):

@@ -7,7 +7,7 @@ boundary only after a truncated part.
 
 import re
 
-from instant_ic.jpeg import JpegError, check_whole
+from instant_ic.util.jpeg import JpegError, check_whole
 
 _HEADER_END = b"\r\n\r\n"
 _LENGTH = re.compile(rb"content-length[ \t]*:[ \t]*(\d{1,12})", re.IGNORECASE)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
-from instant_ic.closing import Closing
+from instant_ic.util.closing import Closing
 
 
 class CameraError(ConnectionError):

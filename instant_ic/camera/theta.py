@@ -16,9 +16,9 @@ from instant_ic.camera.config import FORMATS_FIRMWARE, OLD_PREVIEW_FORMATS, Thet
 from instant_ic.camera.http import Session, is_multipart
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.camera.source import Camera, CameraError, Frame
-from instant_ic.jpeg import JpegError, jpeg_size
-from instant_ic.limits import MOST_PIXELS
-from instant_ic.pace import current
+from instant_ic.util.jpeg import JpegError, jpeg_size
+from instant_ic.util.limits import MOST_PIXELS
+from instant_ic.util.pace import current
 
 NEVER = 65535
 """Value of sleepDelay and offDelay that keeps the camera from sleeping or switching itself off."""

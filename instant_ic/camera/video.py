@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 from instant_ic.camera.config import VideoConfig
 from instant_ic.camera.source import Camera, CameraError, Frame
-from instant_ic.pace import current
+from instant_ic.util.pace import current
 
 _OPEN_S = 10.0
 """Time-out of opening: a USB camera takes seconds until its format is settled."""

@@ -18,7 +18,7 @@ from instant_ic.bus.registry import NodeInfo, list_nodes
 from instant_ic.cli.commands.bag import argument_of, topic_names
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.terminal import Terminal
-from instant_ic.paths import run_dir
+from instant_ic.util.paths import run_dir
 
 _STARTING_S = 10.0  # grace period for a node that is just starting
 _STEERED = ("bag_recorder", "bag_player")

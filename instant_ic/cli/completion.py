@@ -29,17 +29,17 @@ def topics(args: Any) -> Iterable[str]:
 
 @_quiet
 def nodes(args: Any) -> Iterable[str]:
-    from instant_ic import paths
     from instant_ic.bus import registry
+    from instant_ic.util import paths
 
     return [node.name for node in registry.list_nodes(paths.run_dir())]
 
 
 @_quiet
 def parameters(args: Any) -> Iterable[str]:
-    from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.config import params
+    from instant_ic.util import paths
 
     for node in registry.list_nodes(paths.run_dir()):
         if args is not None and node.name == str(args.node).strip("/"):
@@ -63,14 +63,14 @@ def packages(args: Any) -> Iterable[str]:
 
 @_quiet
 def programs(args: Any) -> Iterable[str]:
-    from instant_ic import paths
+    from instant_ic.util import paths
 
     return paths.node_names()
 
 
 @_quiet
 def launch_files(args: Any) -> Iterable[str]:
-    from instant_ic import paths
+    from instant_ic.util import paths
 
     shipped = [path.stem for path in paths.share_dir("launch").glob("*.yaml")]
     return sorted(shipped) + sorted(str(path) for path in Path().glob("*.yaml"))

@@ -42,12 +42,12 @@ def adapt(args: argparse.Namespace) -> int:
     from instant_ic.cli.depth_train import ends_early
     from instant_ic.cli.progress import progress
     from instant_ic.depth.model import DEFAULT_COMPLETION, DEFAULT_MODEL, DepthModel
-    from instant_ic.paths import shipped_file
     from instant_ic.training.adaptation import errors, gain, samples, split
     from instant_ic.training.drive import read_drive
     from instant_ic.training.export import export_model, load_exported
     from instant_ic.training.feeds import FileFeed
     from instant_ic.training.trainer import Team, Trainer, TrainingConfig
+    from instant_ic.util.paths import shipped_file
 
     torch.set_num_threads(args.threads)
     start, manifest = load_exported(args.start or shipped_file("models", DEFAULT_COMPLETION))

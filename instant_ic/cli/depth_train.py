@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli.arguments import not_negative, positive, positive_int
 from instant_ic.cli.errors import UserError
-from instant_ic.closing import on_end_signal
+from instant_ic.util.closing import on_end_signal
 
 if TYPE_CHECKING:
     from instant_ic.training.completion import CompletionConfig, CompletionNet

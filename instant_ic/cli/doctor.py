@@ -128,9 +128,9 @@ def check_packages() -> Iterator[Finding]:
 
 def check_configuration() -> Iterator[Finding]:
     """Check every shipped launch file and the parameters of its nodes."""
-    from instant_ic import paths
     from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
     from instant_ic.launch.parameters import check_parameters
+    from instant_ic.util import paths
 
     try:
         files = sorted(paths.share_dir("launch").glob("*.yaml"))
@@ -153,7 +153,7 @@ def check_configuration() -> Iterator[Finding]:
 
 def check_models() -> Iterator[Finding]:
     """Check that every model file loads."""
-    from instant_ic import paths
+    from instant_ic.util import paths
 
     try:
         models = sorted(paths.share_dir("models").glob("*.onnx"))

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from instant_ic import pace
 from instant_ic.bus import ERROR, OK, registry
 from instant_ic.cli.finding import FAIL, Finding
 from instant_ic.cli.finding import OK as FINE
 from instant_ic.cli.finding import WARN as DOUBTFUL
 from instant_ic.control.states import Reason
 from instant_ic.msg import DiagnosticArray, DiagnosticStatus, deserialize
+from instant_ic.util import pace
 
 _LONGEST_S = 20.0
 

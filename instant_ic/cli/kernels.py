@@ -17,8 +17,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from instant_ic import paths
 from instant_ic.launch.process import dies_with_us
+from instant_ic.util import paths
 
 PARTS = {
     "control": ("warmup",),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from instant_ic.safe_text import masked, visible
+from instant_ic.util.safe_text import masked, visible
 
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 _ALIASES = {"warn": "WARNING", "fatal": "CRITICAL"}

@@ -21,8 +21,8 @@ from typing import IO, cast
 from instant_ic.cli import commands
 from instant_ic.cli.arguments import Parser
 from instant_ic.cli.errors import UserError
-from instant_ic.closing import on_end_signal
-from instant_ic.safe_text import VisibleStream
+from instant_ic.util.closing import on_end_signal
+from instant_ic.util.safe_text import VisibleStream
 
 _DESCRIPTION = "Instant IC: teleoperation that switches between a real robot and an instantly built virtual one."
 _EPILOG = """examples:

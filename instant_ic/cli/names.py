@@ -5,9 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-from instant_ic import paths
 from instant_ic.bus import registry
 from instant_ic.cli.errors import UserError
+from instant_ic.util import paths
 
 
 def absolute(topic: str) -> str:

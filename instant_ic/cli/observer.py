@@ -9,15 +9,15 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from instant_ic import pace, paths
 from instant_ic.bus import RELIABLE, registry
 from instant_ic.bus.clock import Clock, ManualClock, SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.transport import RawSubscription, Received
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.names import absolute, unknown_topic
-from instant_ic.closing import Closing
 from instant_ic.msg import deserialize, stamp_ns
+from instant_ic.util import pace, paths
+from instant_ic.util.closing import Closing
 
 _CLOCK = "/clock"
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from instant_ic.safe_text import direct
+from instant_ic.util.safe_text import direct
 
 _QUIET_S = 5.0  # a command that ends within this time prints no lines
 _DAY_S = 86400.0

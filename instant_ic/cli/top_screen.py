@@ -15,7 +15,7 @@ from rich.text import Text
 
 from instant_ic.cli.terminal import single_keys
 from instant_ic.cli.top import HEADINGS, SORT_KEYS, NodeRow, TopicRow, cells, rate_words
-from instant_ic.safe_text import direct, visible
+from instant_ic.util.safe_text import direct, visible
 
 _STATE_COLOURS = {"running": "green", "starting": "yellow", "degraded": "dark_orange", "stopping": "dim"}
 _KEYS = {"c": "cpu", "m": "memory", "n": "name", "l": "lost"}

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 import math
 
-from instant_ic import paths
 from instant_ic.bus import registry
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.names import absolute, near, topic_types
+from instant_ic.util import paths
 
 
 def info(args: argparse.Namespace) -> int:

@@ -6,7 +6,6 @@ import argparse
 import sys
 import time
 
-from instant_ic import paths
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, registry
 from instant_ic.bus.node import Publisher
 from instant_ic.cli.errors import UserError
@@ -15,6 +14,7 @@ from instant_ic.cli.messages import Style, describe
 from instant_ic.cli.names import absolute
 from instant_ic.cli.observer import Observer
 from instant_ic.msg import message_type, type_name
+from instant_ic.util import paths
 
 _QOS = {"sensor": SENSOR, "reliable": RELIABLE, "latched": LATCHED}
 _KEEP_S = 0.2  # time for the last message to arrive before the publisher closes

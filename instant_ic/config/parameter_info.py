@@ -13,7 +13,7 @@ from typing import Any, get_args, get_type_hints
 
 from instant_ic.config.params import field_default
 from instant_ic.config.ranges import ranges
-from instant_ic.safe_text import masked
+from instant_ic.util.safe_text import masked
 
 
 @dataclass(frozen=True)

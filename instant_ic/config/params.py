@@ -27,7 +27,7 @@ import yaml
 from instant_ic.config.ranges import Checked, Range, range_of
 from instant_ic.config.scalars import READERS, is_null
 from instant_ic.config.yaml_text import compose_yaml, read_spelled, resolved, spelled
-from instant_ic.safe_text import masked, masked_values
+from instant_ic.util.safe_text import masked, masked_values
 
 ConfigT = TypeVar("ConfigT")
 

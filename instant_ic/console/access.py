@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Annotated
 
 from instant_ic.config.ranges import Positive, Range, check_ranges
-from instant_ic.private import read_secret
-from instant_ic.web_access import SIGN_IN, AccessError, is_loopback, sign_in_needed
+from instant_ic.util.private import read_secret
+from instant_ic.util.web_access import SIGN_IN, AccessError, is_loopback, sign_in_needed
 
 COOKIE = "instant_ic_session"
 MIN_TOKEN = 16

@@ -17,7 +17,7 @@ from typing import Any
 
 from aiohttp import web
 
-from instant_ic.web_access import TokenBucket
+from instant_ic.util.web_access import TokenBucket
 
 HEADERS_S = 5.0  # time for a TLS handshake, for a request's headers, and for its body
 STALL_S = 30.0  # a client that takes no data for this time is disconnected

@@ -10,7 +10,7 @@ from instant_ic.console.protocol import FrameKind
 from instant_ic.console.scene import Scene
 from instant_ic.control.states import Mode
 from instant_ic.msg import ControlState, Pose, ShownPictures, header, pose_message, to_time
-from instant_ic.pace import current
+from instant_ic.util.pace import current
 
 MODES = {int(mode): mode.label for mode in Mode}
 

@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Annotated
 
 from instant_ic.config.ranges import Plausible, check_ranges
-from instant_ic.step_gap import StepGap
+from instant_ic.util.step_gap import StepGap
 
 RATE_COMMANDS = 200  # newest commands kept to measure the rate
 CONFIRM_S = 1.0  # time in which the robot confirms a press of the emergency stop; until then the press counts

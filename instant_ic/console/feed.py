@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from instant_ic.adapters.vspace import layers_of
 from instant_ic.console import page_messages as page
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.display import Display
@@ -32,8 +33,7 @@ from instant_ic.msg import (
     VspaceStatus,
     stamp_ns,
 )
-from instant_ic.pace import current
-from instant_ic.vspace_messages import layers_of
+from instant_ic.util.pace import current
 
 IMAGE_TIMEOUT_S = 2.0
 STATE_PERIOD_S, PLAN_PERIOD_S = 0.05, 0.2

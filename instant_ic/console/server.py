@@ -42,8 +42,8 @@ from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, 
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
 from instant_ic.control.robot_lease import sender_name
-from instant_ic.pace import current, suspended_ns
-from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
+from instant_ic.util.pace import current, suspended_ns
+from instant_ic.util.web_access import TokenBucket, host_allowed, is_loopback
 
 STATIC = Path(__file__).parent / "static"
 MAX_CLIENT_MESSAGE = 4096

@@ -14,7 +14,7 @@ from aiohttp import web
 from instant_ic.console.connections import Connection
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
-from instant_ic.web_access import TokenBucket
+from instant_ic.util.web_access import TokenBucket
 
 MAX_REPLIES = 256  # pending, about one second of a page's traffic; a client with more does not read
 # Smallest first: an image must not delay the state, nor a map an image.

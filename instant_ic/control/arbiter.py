@@ -26,8 +26,8 @@ from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Snapshot, Twis
 from instant_ic.control.sources import SourceMonitor
 from instant_ic.control.states import TRANSITIONS, Mode, Reason, Transition, VbotAction
 from instant_ic.control.subgoal import Subgoal, choose_subgoal
-from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import wrap_angle
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 _PASSAGE_PERIOD_S = 0.2
 STANDS_M_S, STANDS_RAD_S = 0.03, 0.1

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from instant_ic import estop_state
 from instant_ic.control.robot_lease import may_release_estop
-from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.util import estop_state
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 FUTURE_NS = 500_000_000
 """A release stamped farther ahead than this was published before the clock was set back."""

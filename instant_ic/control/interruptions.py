@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from instant_ic.control.reasons import Notice
 from instant_ic.control.states import Reason
-from instant_ic.step_gap import StepGap
+from instant_ic.util.step_gap import StepGap
 
 WATCHED = {"odometry": "base driver", "nav": "navigator", "vbot": "virtual robot", "command": "operator's console"}
 """Sources whose restart stops the robot, with the names of their nodes for the operator."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 RELEASED = " released"
 """Ending of the name of a sender that gives the lease back; its command is zero."""

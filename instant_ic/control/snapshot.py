@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.moving import NOTHING_MOVES, MovingPoints
@@ -17,6 +16,7 @@ from instant_ic.control.reasons import Notice, Stale
 from instant_ic.control.states import Mode
 from instant_ic.control.subgoal import Subgoal
 from instant_ic.control.walls import WallMap
+from instant_ic.util.contradiction import Contradiction
 
 Twist2 = tuple[float, float]
 """Linear m/s, angular rad/s."""

@@ -13,7 +13,7 @@ from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
-from instant_ic.jit import leave_out_blas
+from instant_ic.util.jit import leave_out_blas
 
 
 def warm_up() -> None:

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.inputs import KEEP_NS, DepthRequests, HeldImage, RecentInputs, RevolutionTrigger
 from instant_ic.depth.keyframes import KeyframeSelector
 from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
 from instant_ic.depth.sources import DepthResult
-from instant_ic.diagnosis import Level
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.lidar.deskew import Revolution
+from instant_ic.util.diagnosis import Level
 
 _SILENT_S = 10.0  # without an answer to any request
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.limits import MOST_FILE_PIXELS, check_arrays, load_image
+from instant_ic.util.limits import MOST_FILE_PIXELS, check_arrays, load_image
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from instant_ic.depth.manifest import InferenceError
 from instant_ic.depth.model import DepthModel
-from instant_ic.jpeg import JpegError
-from instant_ic.limits import decode_rgb
+from instant_ic.util.jpeg import JpegError
+from instant_ic.util.limits import decode_rgb
 
 Result = TypeVar("Result")
 Floats = NDArray[np.float32]

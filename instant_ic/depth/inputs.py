@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from instant_ic.depth.deskew import Revolution
+from instant_ic.lidar.deskew import Revolution
 
 KEEP_NS = 4_000_000_000
 """Images and revolutions that differ more from the newest depth are discarded."""

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.config.ranges import Positive, PositiveInt, Range
-from instant_ic.depth.deskew import points_at
 from instant_ic.depth.inputs import MAX_CLOUD_AGE_S, RecentInputs
 from instant_ic.depth.keyframes import KeyframeSelectionConfig
 from instant_ic.depth.model import DEFAULT_COMPLETION
 from instant_ic.depth.sources import DepthResult, DepthSource, SourceConfig, without_body
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.lidar.deskew import points_at
 from instant_ic.mapping.mapper import LocalMapper, LocalView, MapperConfig, correction
 
 

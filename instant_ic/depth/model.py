@@ -14,7 +14,7 @@ from instant_ic.depth.completion import PRIOR_CHANNELS
 from instant_ic.depth.manifest import InferenceError, ManifestError, ModelManifest, load_manifest, manifest_path
 from instant_ic.depth.providers import OpenSession, open_session
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.paths import shipped_file
+from instant_ic.util.paths import shipped_file
 
 DEFAULT_MODEL = "slicenet_small.onnx"
 DEFAULT_COMPLETION = "completion.onnx"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from instant_ic.paths import cache_dir
+from instant_ic.util.paths import cache_dir
 
 PROVIDERS = {
     "tensorrt": "TensorrtExecutionProvider",

@@ -23,7 +23,7 @@ from typing import Any
 from instant_ic.experiments.places import KINDS
 from instant_ic.experiments.processes import LostError, run_all
 from instant_ic.experiments.results import finite, save_json
-from instant_ic.paths import share_dir
+from instant_ic.util.paths import share_dir
 
 EXPERIMENTS = ("reconstruction", "training-time", "ablation", "teleoperation", "operators", "environments")
 """Each is a module of this package."""

@@ -31,8 +31,8 @@ def read_keyframes(bag: Path) -> list[Shot]:
     Raises:
         ValueError: no bag, fewer than two such keyframes, or one that cannot be decoded.
     """
+    from instant_ic.adapters.nerf import decode_keyframe
     from instant_ic.depth.sources import DepthResult
-    from instant_ic.nerf_messages import decode_keyframe
 
     found = []
     for message in _messages(bag):

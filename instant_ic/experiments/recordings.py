@@ -30,7 +30,7 @@ from instant_ic.experiments.stack import Stack, StackError, free_ports
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import inverse, pose_matrix, yaw_of
 from instant_ic.msg import grid_array, image_array, matrix_from_pose, message_type, pose_message, stamp_ns, to_time
-from instant_ic.pace import read as read_pace
+from instant_ic.util.pace import read as read_pace
 
 _YAWS_DEG = (0, 90, 180, -90)
 _AHEAD_M = 0.4
@@ -56,7 +56,7 @@ def evaluate_recordings(
         timeout_s: total time limit, in seconds of the stack.
         tell: called with a description of each wait.
         same_place: photo and capture are from the same place and time: the LiDAR scales the depth, as on the robot.
-        pace: of the stack's time, see :mod:`instant_ic.pace`.
+        pace: of the stack's time, see :mod:`instant_ic.util.pace`.
 
     Raises:
         FileNotFoundError: a recording is missing.

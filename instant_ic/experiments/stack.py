@@ -19,7 +19,7 @@ from instant_ic.bus import SENSOR, Node, QoS
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.launch.process import dies_with_us
-from instant_ic.pace import read as read_pace
+from instant_ic.util.pace import read as read_pace
 
 T = TypeVar("T")
 
@@ -87,7 +87,7 @@ class Stack:
         run_dir: its path must be short (sockets).
         log_path: file for the launcher's output (default: ``RUN_DIR/launch.log``).
         prefix: command that starts the launcher, such as ``ip netns exec NAME``.
-        pace: of the stack's time, see :mod:`instant_ic.pace`; None: what the machine can do.
+        pace: of the stack's time, see :mod:`instant_ic.util.pace`; None: what the machine can do.
 
     Example::
 

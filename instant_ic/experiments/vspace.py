@@ -130,11 +130,11 @@ def make_place(world: str, settings: VspaceSettings, config: VirtualSpaceConfig 
     Raises:
         ValueError: no such world, or its start is not free.
     """
-    from instant_ic import paths
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
     from instant_ic.experiments.places import make_place_world
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import make_world
+    from instant_ic.util import paths
     from instant_ic.vspace import VirtualSpaceConfig
     from instant_ic.vspace.warm_up import warm_up
 

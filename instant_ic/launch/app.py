@@ -11,7 +11,6 @@ from pathlib import Path
 
 from instant_ic.bus import registry
 from instant_ic.bus.heartbeat import EVERY_NODES
-from instant_ic.estop_state import RunMark
 from instant_ic.launch.description import LaunchDescription
 from instant_ic.launch.health import HealthMonitor, TopicFault
 from instant_ic.launch.outlet import Outlet
@@ -21,7 +20,8 @@ from instant_ic.launch.rundir import stack_lock
 from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.launch.supervisor import Supervisor
 from instant_ic.launch.topics import nominal_rate
-from instant_ic.pace import PaceFiles, describe, remove_files
+from instant_ic.util.estop_state import RunMark
+from instant_ic.util.pace import PaceFiles, describe, remove_files
 
 _VIEW_PERIOD_S = 0.5
 _WAITING_LINES = 2000  # how many lines a terminal may lag behind

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from instant_ic import paths
+from instant_ic.util import paths
 
 HANG_TIMEOUT_S = 10.0
 """Default hang time-out: a node without a heartbeat for longer than this counts as hung."""

@@ -19,7 +19,7 @@ from instant_ic.bus.qos import QoS
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.topics import nominal_rate
 from instant_ic.msg import MessageError, deserialize, header, message_type, serialize
-from instant_ic.paths import sign_in_file
+from instant_ic.util.paths import sign_in_file
 
 FAULT_HOLDS_S = 3.0
 """A wrong rate is reported once it has lasted this long."""

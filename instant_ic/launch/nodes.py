@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from instant_ic import paths
 from instant_ic.config.yaml_text import one_line
 from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
 from instant_ic.launch.source import Value, load
@@ -28,6 +27,7 @@ from instant_ic.launch.values import (
     text_of,
     words_of,
 )
+from instant_ic.util import paths
 
 NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 """Node names that the bus accepts."""

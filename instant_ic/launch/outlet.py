@@ -17,7 +17,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from instant_ic.private import make_folder, open_file
+from instant_ic.util.private import make_folder, open_file
 
 
 class Outlet:

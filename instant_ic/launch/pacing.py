@@ -1,4 +1,4 @@
-"""Chooses the pace of a simulated stack (:mod:`instant_ic.pace`) by what the machine can do."""
+"""Chooses the pace of a simulated stack (:mod:`instant_ic.util.pace`) by what the machine can do."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from instant_ic.launch.health import HealthMonitor
-from instant_ic.pace import SLOWEST_CHOSEN as SLOWEST
-from instant_ic.pace import PaceFiles, describe
+from instant_ic.util.pace import SLOWEST_CHOSEN as SLOWEST
+from instant_ic.util.pace import PaceFiles, describe
 
 _ENOUGH_PER_S = 50e6
 """Iterations of an empty loop per second on the kind of core that ``_NEEDED_CORES`` counts."""

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic import paths
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.robot_parameters import RELATED, Driving, disagreements
+from instant_ic.util import paths
 
 if TYPE_CHECKING:
     from instant_ic.config.params import Values

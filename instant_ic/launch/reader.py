@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from instant_ic import paths
 from instant_ic.config.yaml_text import one_line
 from instant_ic.launch import nodes
 from instant_ic.launch.description import (
@@ -33,6 +32,7 @@ from instant_ic.launch.values import (
     seconds_of,
     text_of,
 )
+from instant_ic.util import paths
 
 _MAX_INCLUDE_DEPTH = 8
 _NOT_HERE = {

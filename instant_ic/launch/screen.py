@@ -14,7 +14,7 @@ from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
 
-from instant_ic.safe_text import direct, masked, visible
+from instant_ic.util.safe_text import direct, masked, visible
 
 _COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_green", "bright_magenta")
 _STATE_STYLES = {

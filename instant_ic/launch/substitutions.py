@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from instant_ic import paths
+from instant_ic.util import paths
 
 TRUE_WORDS = ("true", "1")
 FALSE_WORDS = ("false", "0", "")

@@ -14,12 +14,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol
 
-from instant_ic.closing import on_end_signal
 from instant_ic.launch.description import Announcement, NodeSpec, Shutdown
 from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, Schedule, State, describe_exit
 from instant_ic.launch.reaper import kill_marked
+from instant_ic.util.closing import on_end_signal
 
 STOP_SCHEDULE: Schedule = (
     (signal.SIGINT, 2.5),

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from instant_ic import paths
+from instant_ic.util import paths
 
 ALIVE_PERIODS = 10.0
 """A topic whose newest message is older than this many periods has stopped."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.flatscan import flat_scan
 from instant_ic.lidar.motion import MotionError, PlanarMotion
 from instant_ic.lidar.stream import Revolution
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 _SAMPLES = 13
 _LEAST_NS = 50_000_000

@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.lidar.packets import LASERS
 from instant_ic.lidar.stream import Revolution
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 SECTORS = 72
 HELD, GONE, BACK = 0.25, 0.02, 0.1

@@ -4,12 +4,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.jit import leave_out_blas
 from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.head import TURN_CDEG, Sector
 from instant_ic.lidar.motion import PlanarMotion
 from instant_ic.lidar.packets import BLOCKS, FIRINGS, LASERS, encode_data_packet
 from instant_ic.lidar.stream import PacketStream, Revolution
+from instant_ic.util.jit import leave_out_blas
 
 _MOTION_SAMPLES = 65
 """Samples of the motion over a revolution; within 1.6 ms it is straight enough (1 um at 1 rad/s)."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.lidar.capture import CaptureError, CaptureReader, Datagram
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 
 class CapturePlayer:

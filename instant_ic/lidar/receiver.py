@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
-from instant_ic.closing import Closing
 from instant_ic.config.ranges import Range, check_ranges
 from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES, check_data_packet
 from instant_ic.lidar.sources import SourceGuard
-from instant_ic.pace import current
+from instant_ic.util.closing import Closing
+from instant_ic.util.pace import current
 
 _SO_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
 """Constant of Linux, which Python 3.11 does not define."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.lidar.feed import PacketFeed
 from instant_ic.lidar.flatscan import coverage
 from instant_ic.lidar.packets import LASERS, PacketError, decode_position_packet
 from instant_ic.lidar.stream import Revolution
-from instant_ic.repeats import RepeatWatch
+from instant_ic.util.diagnosis import Diagnosis, Level
+from instant_ic.util.repeats import RepeatWatch
 
 _SILENT = {
     "topic": "no /lidar/packets for {silent_s:.1f} s",

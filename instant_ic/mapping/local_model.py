@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import Checked, NotNegative, Positive, Range
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.projections import rays_of
-from instant_ic.jit import leave_out_blas
 from instant_ic.mapping import kernels
+from instant_ic.util.jit import leave_out_blas
 
 Floats = NDArray[np.floating]
 _WINDOW, _CELL_M = 512, 0.05

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.config.ranges import Checked, Positive
-from instant_ic.depth.deskew import Revolution, points_at
 from instant_ic.geometry.poses import Matrix, inverse
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.lidar.deskew import Revolution, points_at
 from instant_ic.mapping.local_model import STRIDE, LocalDepth, LocalModel, LocalModelConfig
 
 _JUMP_M, _JUMP_RAD = 0.2, math.radians(2.0)

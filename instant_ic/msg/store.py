@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic import paths
+from instant_ic.util import paths
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic import paths
+from instant_ic.util import paths
 
 Arrays = dict[str, npt.NDArray[np.generic]]
 

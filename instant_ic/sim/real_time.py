@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic.pace import current
 from instant_ic.sim.capture_replay import CaptureReplay
 from instant_ic.sim.roboclaw import RoboClawServer
 from instant_ic.sim.simulation import Simulation, SimulationConfig
 from instant_ic.sim.theta import ThetaServer, panorama_file
 from instant_ic.sim.vlp16 import Vlp16Server
+from instant_ic.util.pace import current
 
 SERIAL_LINK = "roboclaw"
 """Name of the link to the motor controller's pseudo-terminal."""

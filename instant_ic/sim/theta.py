@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from instant_ic.camera.config import FORMATS_FIRMWARE, PREVIEW_FORMATS
 from instant_ic.config.ranges import PositiveInt, Range, check_ranges
-from instant_ic.limits import load_image
-from instant_ic.pace import current
 from instant_ic.sim.theta_options import NEVER, OptionError, ThetaOptions
+from instant_ic.util.limits import load_image
+from instant_ic.util.pace import current
 
 log = logging.getLogger(__name__)
 

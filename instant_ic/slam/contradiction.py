@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from instant_ic.contradiction import Contradiction
 from instant_ic.slam.scan import FloatArray
+from instant_ic.util.contradiction import Contradiction
 
 LONGEST_S, LONGEST_M = 0.5, 0.15
 """Time and distance between wheels and LiDAR over which a contradiction counts."""

@@ -11,9 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import Matrix, compose2, inverse2, matrix_from_pose2, relative2
-from instant_ic.jit import leave_out_blas
 from instant_ic.slam.config import GridSlamConfig, SlamConfig
 from instant_ic.slam.contradiction import ContradictionMonitor
 from instant_ic.slam.front_end import MIN_POINTS, FrontEnd, Guess, SlamStatus, Track
@@ -27,6 +25,8 @@ from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.pose_graph import Edge, optimise
 from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
+from instant_ic.util.diagnosis import Diagnosis, Level
+from instant_ic.util.jit import leave_out_blas
 
 MOST_JOIN_CONTRADICTION = 0.1
 """Contradiction of a session with the saved map above which they are not joined; a right place has 0.03."""

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from instant_ic.config.scalars import to_float
 from instant_ic.config.yaml_text import read_spelled, resolved
-from instant_ic.limits import check_arrays, load_image
 from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.occupancy import OccupancyGrid
 from instant_ic.slam.pose_graph import Edge
 from instant_ic.slam.scan import FloatArray, ScanPoints
+from instant_ic.util.limits import check_arrays, load_image
 
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.25
 WRITTEN_FREE_THRESH = 0.196

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.slam.front_end import SlamStatus
 from instant_ic.slam.grid_slam import GridSlam, SlamResult
 from instant_ic.slam.motion import MotionState
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 _STATUSES = {
     SlamStatus.FIRST: (Level.OK, "map started"),

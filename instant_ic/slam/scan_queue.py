@@ -6,11 +6,11 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from instant_ic.diagnosis import Diagnosis, Level
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix
 from instant_ic.slam.config import QueueConfig
 from instant_ic.slam.odometry import OdometryBuffer
 from instant_ic.slam.scan import FloatArray, Scan
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 STARTUP_WAIT_S, EXTRAPOLATE_S = 1.0, 0.2
 """Longest time that the first scans wait for any odometry; longest extrapolation of the last motion."""

@@ -15,7 +15,6 @@ from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from instant_ic.bag.files import BagReader
 from instant_ic.calibration.bag import read_clouds, read_images
-from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.inputs import RecentInputs
 from instant_ic.depth.manifest import InferenceError
 from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
@@ -23,11 +22,12 @@ from instant_ic.depth.model import DepthModel
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformError
-from instant_ic.jpeg import JpegError
-from instant_ic.limits import decode_rgb
+from instant_ic.lidar.deskew import Revolution
 from instant_ic.mapping.kernels import MEASURED
 from instant_ic.mapping.local_model import LocalDepth
 from instant_ic.msg import cloud_points, stamp_ns
+from instant_ic.util.jpeg import JpegError
+from instant_ic.util.limits import decode_rgb
 
 Floats = NDArray[np.floating]
 EVERY_M = 0.25

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.limits import decode_image, load_image
+from instant_ic.util.limits import decode_image, load_image
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_device_fault
 from instant_ic.vspace.layers import LayerEncoder

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.limits import decode_image
+from instant_ic.util.limits import decode_image
 from instant_ic.vspace.background import Background
 from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import (

@@ -14,7 +14,7 @@ from typing import Any, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.limits import check_arrays
+from instant_ic.util.limits import check_arrays
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import FieldParameters, Floats, Lattice
 from instant_ic.vspace.prior import MOVED, ROBOT, ROOM, SKY, PanoramaPrior

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.util.diagnosis import Diagnosis, Level
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.jobs import Incoming, Job, JobKind, Outcome, ViewOrder
 from instant_ic.vspace.space import State, Status

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from instant_ic.jit import leave_out_blas
+from instant_ic.util.jit import leave_out_blas
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.space import VirtualSpace
 

@@ -21,8 +21,8 @@ from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
-from instant_ic.diagnosis import Level
 from instant_ic.msg import Bool, serialize
+from instant_ic.util.diagnosis import Level
 
 BOOL = "std_msgs/msg/Bool"
 S = 1_000_000_000

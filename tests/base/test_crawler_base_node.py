@@ -13,9 +13,9 @@ from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.controller import RECONNECT_MAX_S, BaseController, ControllerConfig, ControllerThread
 from instant_ic.bus import ERROR, OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.diagnosis import RecentCount
 from instant_ic.msg import Twist, Vector3, matrix_from_pose, stamp_ns, twist_stamped, twist_values
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
+from instant_ic.util.diagnosis import RecentCount
 from nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 
 MILLISECOND = 1_000_000

@@ -16,7 +16,7 @@ from instant_ic.experiments.stack import Stack, free_port, free_ports, observer
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState, Odometry, TwistStamped, matrix_from_pose, twist_stamped
-from instant_ic.pace import read as read_pace
+from instant_ic.util.pace import read as read_pace
 
 pytest.importorskip("zenoh")
 pytestmark = [pytest.mark.system, pytest.mark.xdist_group("stack"), pytest.mark.timeout(900)]

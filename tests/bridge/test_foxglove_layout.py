@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic import paths
 from instant_ic.msg import message_type, typestore
+from instant_ic.util import paths
 
 ROOT = Path(__file__).resolve().parents[2]
 # Foxglove's panel types that the layout may use (docs.foxglove.dev, panels).

@@ -22,8 +22,8 @@ from instant_ic.bus.control import NodeControl
 from instant_ic.bus.node import Node
 from instant_ic.bus.node_files import node_class
 from instant_ic.msg import String, deserialize
-from instant_ic.paths import node_names, sign_in_file
-from instant_ic.web_access import is_loopback, refusal
+from instant_ic.util.paths import node_names, sign_in_file
+from instant_ic.util.web_access import is_loopback, refusal
 from nodes import foxglove_bridge
 
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"

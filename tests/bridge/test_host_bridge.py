@@ -612,8 +612,8 @@ def test_shipped_lists_are_whole():
     """Every topic that a node of one side reads and a node of the other writes is on the list."""
     import re
 
-    from instant_ic import paths
     from instant_ic.bridge.host_topics import parse_rules
+    from instant_ic.util import paths
 
     values = params.load_file(paths.shipped_file("config", "bridge.yaml"), "host_bridge")
     config = params.build(HostBridgeConfig, {**values, "listen": params.Value("tcp://0.0.0.0:7450", "test")})

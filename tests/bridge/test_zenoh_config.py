@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from live_nodes import LiveNode, Neighbour, wait_for
 
-from instant_ic import paths
 from instant_ic.bridge.zenoh_format import TopicQoS
 from instant_ic.bridge.zenoh_security import beyond_loopback, insecurity
 from instant_ic.bridge.zenoh_session import (
@@ -27,6 +26,7 @@ from instant_ic.bus.registry import list_topics
 from instant_ic.config.params import load_file
 from instant_ic.experiments.stack import free_port
 from instant_ic.msg import String, deserialize, serialize, twist_stamped, type_hash
+from instant_ic.util import paths
 from nodes.zenoh_gateway import ZenohGatewayConfig, ZenohGatewayNode
 from nodes.zenoh_router import ZenohRouterConfig, ZenohRouterNode
 

@@ -8,7 +8,7 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.node_files import node_class
 from instant_ic.config.parameter_info import is_live, parameter_infos
 from instant_ic.msg import image_message, transform_matrix
-from instant_ic.paths import node_names
+from instant_ic.util.paths import node_names
 
 NODES = node_names()
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from instant_ic import pace
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.pace import refuse_pace
 from instant_ic.base.roboclaw import open_serial
 from instant_ic.bus.clock import SystemClock
-from instant_ic.pace import Pace, PaceError, PaceFiles
+from instant_ic.util import pace
+from instant_ic.util.pace import Pace, PaceError, PaceFiles
 
 
 @pytest.fixture(autouse=True)
@@ -137,7 +137,7 @@ def test_all_folders_of_a_stack_have_one_time(machine, tmp_path):
 _READER = """
 import sys, time
 from pathlib import Path
-from instant_ic import pace
+from instant_ic.util import pace
 made = pace.read(Path(sys.argv[1]))
 last, end = 0, time.monotonic() + 1.5
 while time.monotonic() < end:

@@ -15,7 +15,7 @@ from instant_ic.camera.files import FileCamera
 from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import CameraError
 from instant_ic.camera.video import VideoCamera
-from instant_ic.reconnect import Backoff
+from instant_ic.util.reconnect import Backoff
 
 
 def test_folder_in_the_order_of_names_with_jpegs_byte_for_byte(tmp_path: Path) -> None:

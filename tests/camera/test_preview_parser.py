@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from instant_ic.camera.preview import PreviewParser
-from instant_ic.jpeg import JpegError, check_whole, jpeg_size
+from instant_ic.util.jpeg import JpegError, check_whole, jpeg_size
 
 FRAMES = [jpeg(value) for value in (40, 80, 120, 160, 200)]
 RICOH, RFC = "---osclivepreview---", "-----osclivepreview---"

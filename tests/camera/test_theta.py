@@ -9,7 +9,7 @@ from instant_ic.camera.config import ThetaConfig
 from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.camera.theta import NEVER, ThetaCamera, ThetaClient, ThetaError
-from instant_ic.reconnect import Backoff
+from instant_ic.util.reconnect import Backoff
 
 FRAMES = [jpeg(value) for value in (40, 80, 120, 160)]
 CONFIG = ThetaConfig(settle_s=0.0, busy_wait_s=0.01, connect_timeout_s=20.0, read_timeout_s=20.0)

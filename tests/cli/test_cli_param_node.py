@@ -72,7 +72,7 @@ def test_set_is_seen_in_what_the_node_does_and_tells(ic):
 
 
 def registry_dir():
-    from instant_ic import paths
+    from instant_ic.util import paths
 
     return paths.run_dir()
 

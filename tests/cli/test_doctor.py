@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 from cli_helpers import talking
 
-from instant_ic import paths
 from instant_ic.cli import doctor
 from instant_ic.cli.finding import FAIL, OK, WARN, Finding
 from instant_ic.cli.main import main
+from instant_ic.util import paths
 
 
 class Theta(http.server.BaseHTTPRequestHandler):
@@ -134,7 +134,7 @@ def test_models_and_launch_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     for folder in ("launch", "models"):
         (tmp_path / folder).mkdir()
     (tmp_path / "nodes").symlink_to(paths.share_dir("nodes"))
-    monkeypatch.setattr("instant_ic.paths.share_dir", lambda name: tmp_path / name)
+    monkeypatch.setattr("instant_ic.util.paths.share_dir", lambda name: tmp_path / name)
     assert one(doctor.check_models()).level == FAIL
     (tmp_path / "models" / "torn.onnx").write_bytes(b"not a model")
     assert one(doctor.check_models()).level == FAIL

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic import paths
 from instant_ic.bus.node_files import node_class
 from instant_ic.cli.main import main
 from instant_ic.config import params
 from instant_ic.config.parameter_info import parameter_infos, plain
 from instant_ic.launch import read_launch_file
 from instant_ic.launch.parameters import check_parameter_file, check_parameters
+from instant_ic.util import paths
 
 SHARED = "/**:\n  ros__parameters:\n    limits: {max_linear_m_s: 0.3}\n"
 STACK = """launch:

@@ -10,7 +10,7 @@ import pytest
 
 from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, ServerConfig
 from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, read_token
-from instant_ic.web_access import is_loopback
+from instant_ic.util.web_access import is_loopback
 
 DRIVE, WATCH = "drive-token-0123456789", "watch-token-0123456789"
 

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic import pace
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.console import FrameKind, Look, ViewConfig
 from instant_ic.console.config import ConsoleConfig
@@ -34,6 +33,7 @@ from instant_ic.msg import (
     twist_message,
     twist_values,
 )
+from instant_ic.util import pace
 from nodes.console import ConsoleNode
 
 START = 1_000_000_000

@@ -7,12 +7,12 @@ import time
 import aiohttp
 import pytest
 
-from instant_ic import pace
 from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, FrameKind, ServerConfig
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import origin_allowed
-from instant_ic.web_access import host_allowed
+from instant_ic.util import pace
+from instant_ic.util.web_access import host_allowed
 
 WAIT_S = 20.0
 

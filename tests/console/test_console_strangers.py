@@ -26,7 +26,7 @@ from instant_ic.console.faults import MOST_NAMES, FaultList
 from instant_ic.console.log_rate import LogRate
 from instant_ic.console.server import WATCHER_SHARE
 from instant_ic.console.session import MAX_REPLIES
-from instant_ic.web_access import TokenBucket
+from instant_ic.util.web_access import TokenBucket
 
 __all__ = ["certificate"]  # a fixture
 WAIT_S = 60.0

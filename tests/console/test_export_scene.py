@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from console_pages import BROWSER_TEST, WAIT_MS, likeness_of
 
+from instant_ic.adapters.vspace import layers_message
 from instant_ic.bag import BagWriter
 from instant_ic.cli.main import main
 from instant_ic.console.export_scene import scene_html
@@ -17,7 +18,6 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import serialize
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.layers import LayerEncoder
-from instant_ic.vspace_messages import layers_message
 
 POSE = pose_matrix(0.0, -0.3, 0.1, yaw=0.4)
 
@@ -58,10 +58,10 @@ def test_the_file_needs_nothing_else(scene, bag, capsys):
 
 
 def test_a_title_cannot_leave_its_place(scene, bag):
+    from instant_ic.adapters.vspace import layers_of
     from instant_ic.cli.commands.console import newest_of_bag
     from instant_ic.console.layer_meshes import LayerMeshes
     from instant_ic.msg import deserialize
-    from instant_ic.vspace_messages import layers_of
 
     received = newest_of_bag(bag)
     layers = LayerMeshes().layers(layers_of(deserialize(received.payload, received.type_name)))

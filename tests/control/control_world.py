@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter import Arbiter, Decision
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import CostmapConfig, RollingCostmap, scan_points, scan_rays
@@ -25,6 +24,7 @@ from instant_ic.control.states import Mode, VbotAction
 from instant_ic.control.static_map import StaticMap
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
+from instant_ic.util.contradiction import Contradiction
 
 LENGTH_M, WIDTH_M = 0.60, 0.50
 BEAMS = 720

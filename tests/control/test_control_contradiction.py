@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from control_world import Loop, World, corridor, draw_map
 
-from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter_config import PoseTrustConfig
 from instant_ic.control.states import Mode, Reason
+from instant_ic.util.contradiction import Contradiction
 
 FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 import pytest
 from rate_world import FORWARD, NOTHING, Rates, RateWorld
 
-from instant_ic import pace
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.msg import ControlState, twist_values
+from instant_ic.util import pace
 
 BOX = (2.2, -0.25, 2.7, 0.25)
 THROUGH = ["STOPPED", "REAL", "ENTERING", "VIRTUAL", "RETURNING", "REAL"]

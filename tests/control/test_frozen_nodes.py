@@ -17,8 +17,8 @@ from instant_ic.bus import Node
 from instant_ic.control.interruptions import Interruptions
 from instant_ic.control.states import Mode, Reason
 from instant_ic.msg import HARD_STOP, ControlState, twist_values
-from instant_ic.pace import suspended_ns
-from instant_ic.step_gap import StepGap
+from instant_ic.util.pace import suspended_ns
+from instant_ic.util.step_gap import StepGap
 
 KEY, NOTHING = (0.4, 0.0), (0.0, 0.0)
 ALL = ("arbiter", "navigator", "virtual_robot")

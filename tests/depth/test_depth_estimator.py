@@ -12,9 +12,9 @@ import tiny_onnx
 
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.depth.manifest import InferenceError, ModelManifest, save_manifest
-from instant_ic.jpeg import JpegError
-from instant_ic.limits import decode_rgb
 from instant_ic.msg import compressed_image_message, image_array
+from instant_ic.util.jpeg import JpegError
+from instant_ic.util.limits import decode_rgb
 from nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
 
 S = 1_000_000_000

@@ -14,7 +14,7 @@ from tiny_onnx import CHANNELS, channel
 
 from instant_ic.depth.manifest import InferenceError, ManifestError, load_manifest
 from instant_ic.depth.model import DepthModel
-from instant_ic.paths import share_dir
+from instant_ic.util.paths import share_dir
 
 EXAMPLES = sorted((share_dir("models") / "examples").glob("*.yaml"))
 

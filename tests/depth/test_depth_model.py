@@ -24,7 +24,7 @@ from instant_ic.depth.manifest import (
 )
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.paths import shipped_file
+from instant_ic.util.paths import shipped_file
 
 
 @pytest.fixture(scope="module")

@@ -690,7 +690,7 @@ def test_keyframes_are_closer_together_while_the_operator_sees_the_virtual_space
 
 def test_shipped_configuration_is_the_default() -> None:
     from instant_ic.config.params import build, load_file
-    from instant_ic.paths import shipped_file
+    from instant_ic.util.paths import shipped_file
 
     path = shipped_file("config", "depth.yaml")
     assert build(DepthEstimatorConfig, load_file(path, "depth_estimator")) == DepthEstimatorConfig()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from instant_ic.depth.deskew import points_at
 from instant_ic.depth.scale_rules import (
     ScaleError,
     consensus_scale,
@@ -21,6 +20,7 @@ from instant_ic.depth.visibility import hidden, nearest_points, on_depth_edge, p
 from instant_ic.geometry.poses import pose_matrix, transform_points
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.geometry.transforms import TransformBuffer
+from instant_ic.lidar.deskew import points_at
 
 
 def box_range(directions: np.ndarray, low: tuple[float, ...], high: tuple[float, ...]) -> np.ndarray:

@@ -248,7 +248,7 @@ def _previews() -> list[bytes]:
 
 def _parse_preview() -> Callable[[bytes], object]:
     from instant_ic.camera.preview import PreviewParser
-    from instant_ic.jpeg import JpegError, jpeg_size
+    from instant_ic.util.jpeg import JpegError, jpeg_size
 
     def parse(data: bytes) -> None:
         parser = PreviewParser(max_frame_bytes=2000)
@@ -421,7 +421,7 @@ def _console_errors() -> tuple[type[BaseException], ...]:
 def _parse_http_headers() -> Callable[[bytes], object]:
     """What the console reads of a request itself: Host, Origin, session cookie, token."""
     from instant_ic.console.server import origin_allowed
-    from instant_ic.web_access import host_allowed
+    from instant_ic.util.web_access import host_allowed
 
     def parse(data: bytes) -> None:
         first, _, second = data.decode("latin-1").partition("\n")
@@ -916,13 +916,13 @@ def _images() -> list[bytes]:
 
 
 def _parse_image() -> Callable[[bytes], object]:
-    from instant_ic.limits import decode_rgb
+    from instant_ic.util.limits import decode_rgb
 
     return lambda data: decode_rgb(data, 8, 8)
 
 
 def _image_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.jpeg import JpegError
+    from instant_ic.util.jpeg import JpegError
 
     return (JpegError,)
 

@@ -20,9 +20,9 @@ from instant_ic.config.params import ParameterError, load_file
 from instant_ic.console.protocol import PREFIX, VERSION, ProtocolError, decode_frame
 from instant_ic.depth.manifest import ManifestError, load_manifest
 from instant_ic.experiments.slam_logs import LogError, read_log
-from instant_ic.limits import decode_image, load_image
 from instant_ic.msg import message_type, serialize
 from instant_ic.slam.map_files import MapError, load_grid
+from instant_ic.util.limits import decode_image, load_image
 from tests.fuzz.targets import fix_chunk
 
 NESTED = b"[" * 100_000

@@ -6,7 +6,6 @@ import time
 import numpy as np
 import pytest
 
-from instant_ic import pace
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import prepare
@@ -15,6 +14,7 @@ from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.pacing import SLOWEST, CoreLoad, PaceChooser, Pacing, Sample, pace_of
 from instant_ic.msg import ControlState, Float32, header, pose_message, serialize, twist_message
+from instant_ic.util import pace
 
 
 class Machine:

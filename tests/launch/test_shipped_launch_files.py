@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from instant_ic import paths
 from instant_ic.experiments.study.trial import ARBITERS
 from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
 from instant_ic.launch.parameters import check_parameters
 from instant_ic.launch.source import LaunchFileError
 from instant_ic.sim.real_time import SERIAL_LINK
+from instant_ic.util import paths
 
 NAMES = sorted(file.stem for file in paths.share_dir("launch").glob("*.yaml"))
 NEEDED = {"replay": {"bag": "drive"}, "fleet_robot": {"robot_name": "robot4"}}

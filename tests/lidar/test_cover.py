@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.diagnosis import Level
 from instant_ic.lidar.cover import SECTORS, CoverWatch
 from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.lidar.packets import LASERS
 from instant_ic.lidar.stream import Revolution
+from instant_ic.util.diagnosis import Level
 
 FIRINGS = 900
 HERE = np.zeros(3)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.inputs import RecentInputs
 from instant_ic.depth.lidar_depth import LidarDepthConfig
 from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
@@ -12,6 +11,7 @@ from instant_ic.geometry.ply import write_ply
 from instant_ic.geometry.poses import Matrix, pose_matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.lidar.deskew import Revolution
 from instant_ic.mapping import kernels
 from instant_ic.mapping.local_model import LocalModel, LocalModelConfig
 from instant_ic.mapping.mapper import CloudError, LocalMapper, LocalView, MapperConfig

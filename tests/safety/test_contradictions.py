@@ -15,13 +15,13 @@ import pytest
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
 from instant_ic.bus import ERROR
-from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter_config import PoseTrustConfig
 from instant_ic.control.states import Reason
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
 from instant_ic.geometry.poses import wrap_angle
 from instant_ic.msg import ControlState
 from instant_ic.sim.worlds import make_world
+from instant_ic.util.contradiction import Contradiction
 
 FORWARD, TURN, NOTHING = (0.38, 0.0), (0.0, 0.8), (0.0, 0.0)
 TRACKS = SkidSteerConfig()

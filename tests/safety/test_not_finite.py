@@ -12,7 +12,6 @@ from instant_ic.base.config import LimitsConfig
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.config.robot import MotionLimits
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
-from instant_ic.contradiction import Contradiction
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
@@ -22,6 +21,7 @@ from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.slam.contradiction import ContradictionMonitor
+from instant_ic.util.contradiction import Contradiction
 
 LIMITS = MotionLimits()
 STANDS = (0.0, 0.0)

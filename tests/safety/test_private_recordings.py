@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic import private
 from instant_ic.bag.choice import EVERYTHING
 from instant_ic.bag.convert import convert
 from instant_ic.bag.on_demand import OnDemand
@@ -18,6 +17,7 @@ from instant_ic.bag.writer import BagWriter
 from instant_ic.bridge.host_keys import KeyStore
 from instant_ic.launch.outlet import LogFile
 from instant_ic.msg import Bool, serialize
+from instant_ic.util import private
 
 PAYLOAD = serialize(Bool(data=True))
 

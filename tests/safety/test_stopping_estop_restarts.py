@@ -13,12 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from instant_ic import estop_state
 from instant_ic.bus import ERROR, LATCHED
 from instant_ic.bus.lockstep import LockstepBus, _Transport
 from instant_ic.cli.main import main
 from instant_ic.console import ConsoleServer
-from instant_ic.estop_state import EstopStateError, KeptStop, RunMark
 from instant_ic.msg import (
     Bool,
     ControlState,
@@ -29,6 +27,8 @@ from instant_ic.msg import (
     twist_values,
     type_name,
 )
+from instant_ic.util import estop_state
+from instant_ic.util.estop_state import EstopStateError, KeptStop, RunMark
 from nodes.arbiter import ArbiterNode
 from nodes.console import ConsoleNode
 

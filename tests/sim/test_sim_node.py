@@ -14,7 +14,7 @@ import pytest
 from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.config.params import build, load_file
-from instant_ic.paths import node_file
+from instant_ic.util.paths import node_file
 from nodes.simulator import SimulatorConfig, SimulatorNode
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "sim.yaml"

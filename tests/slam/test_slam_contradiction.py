@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from slam_planar_world import PlanarWorld, box_room, corridor, l_corridor
 
-from instant_ic.contradiction import Contradiction
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam import GridSlam
 from instant_ic.slam.contradiction import AGREED_M, LONGEST_M, ContradictionMonitor
+from instant_ic.util.contradiction import Contradiction
 
 CLEAR = np.array([0.003, 0.003, 0.001])
 ALONG_UNKNOWN = np.array([0.02, 0.003, 0.001])

@@ -13,7 +13,6 @@ from slam_planar_world import PlanarWorld, box_room
 from instant_ic.bus import ERROR, OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.config import params as bus_params
-from instant_ic.contradiction import Contradiction
 from instant_ic.geometry.poses import compose2, matrix_from_pose2, pose2_from_matrix, pose_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.msg import (
@@ -31,6 +30,7 @@ from instant_ic.msg import (
     transform_matrix,
     transform_message,
 )
+from instant_ic.util.contradiction import Contradiction
 from nodes.grid_slam import GridSlamConfig, GridSlamNode
 
 START_NS = 1_700_000_000_000_000_000

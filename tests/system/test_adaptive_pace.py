@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic import pace
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.experiments.stack import Stack, free_ports
 from instant_ic.msg import ControlState, Odometry, TwistStamped, stamp_ns, twist_stamped
+from instant_ic.util import pace
 
 pytestmark = [pytest.mark.system, pytest.mark.xdist_group("stack"), pytest.mark.timeout(900)]
 ARGUMENTS = {"headless": True, "vspace": False, "world": "corridor-free"}

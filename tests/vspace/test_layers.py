@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from instant_ic.adapters.vspace import layers_message, layers_of
 from instant_ic.bus import LATCHED, Node
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.experiments import box_room
@@ -15,7 +16,6 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import VspaceLayers, deserialize, serialize
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.layers import Content, Kind, LayerEncoder, LayersError, decode, decode_layer
-from instant_ic.vspace_messages import layers_message, layers_of
 from nodes.nerf import NerfConfig, NerfNode
 from tests.vspace.test_nerf_node import keyframe_message
 

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from instant_ic.adapters.nerf import decode_keyframe
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
@@ -19,7 +20,6 @@ from instant_ic.msg import (
     image_message,
     pose_message,
 )
-from instant_ic.nerf_messages import decode_keyframe
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
 from instant_ic.vspace.jobs import Incoming, Job, JobKind, load_robot_mask
 from nodes.nerf import NerfConfig, NerfNode

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from instant_ic.adapters.vspace import layers_message
 from instant_ic.bag import BagWriter
 from instant_ic.cli.main import main
 from instant_ic.experiments import box_room
@@ -16,7 +17,6 @@ from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.export import flight, surface
 from instant_ic.vspace.layers import LayerEncoder
 from instant_ic.vspace.space import NotReadyError
-from instant_ic.vspace_messages import layers_message
 
 
 def write_rgb(path, rgb):

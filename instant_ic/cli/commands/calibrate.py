@@ -125,10 +125,10 @@ def _summary(bag: Path, recording: CalibrationRecording, given: Matrix, result: 
 
 def _lidar_mount() -> Matrix:
     """base_from_lidar of config/robot.yaml, for a bag without it."""
-    from instant_ic import paths
     from instant_ic.bus.node_files import node_class
     from instant_ic.config import params
     from instant_ic.geometry.poses import pose_matrix
+    from instant_ic.util import paths
 
     values = params.load_file(paths.shipped_file("config", "robot.yaml"), "vlp16_driver")
     return pose_matrix(*params.configure(node_class("vlp16_driver").config_class(), values)[0].lidar_mount.pose)

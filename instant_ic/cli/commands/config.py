@@ -42,9 +42,9 @@ def add_parser(subparsers: Any) -> None:
 
 
 def check_files(args: argparse.Namespace) -> int:
-    from instant_ic import paths
     from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
     from instant_ic.launch.parameters import check_parameter_file, check_parameters_quickly
+    from instant_ic.util import paths
 
     files = [_found(text) for text in args.files]
     if not files:
@@ -111,9 +111,9 @@ def show_node(args: argparse.Namespace) -> int:
 
 
 def _node(name: str, launch_files: list[str], arguments: dict[str, str]) -> NodeSpec:
-    from instant_ic import paths
     from instant_ic.cli.names import near
     from instant_ic.launch import find_launch_file, read_launch_file
+    from instant_ic.util import paths
 
     known: list[str] = []
     for file in launch_files or ["full", "sim", "replay"]:

@@ -31,10 +31,10 @@ def add_parser(subparsers: Any) -> None:
 
 
 def export_scene(args: argparse.Namespace) -> int:
+    from instant_ic.adapters.vspace import layers_of
     from instant_ic.console.export_scene import scene_html
     from instant_ic.console.layer_meshes import LayerMeshes
     from instant_ic.msg import MessageError, deserialize
-    from instant_ic.vspace_messages import layers_of
 
     check_files(args.output)
     received = newest_of_bag(args.bag) if args.bag else newest_of_stack(args.timeout)

@@ -119,7 +119,7 @@ def convert(args: argparse.Namespace) -> int:
 
 def _load(args: argparse.Namespace) -> DepthModel:
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-    from instant_ic.paths import shipped_file
+    from instant_ic.util.paths import shipped_file
 
     model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), args.threads, args.provider)
     if args.provider not in ("auto", model.provider):
@@ -174,7 +174,7 @@ def estimate(args: argparse.Namespace) -> int:
 
     from instant_ic.cli.commands.vspace import write_picture
     from instant_ic.depth.colour import depth_picture
-    from instant_ic.limits import load_image
+    from instant_ic.util.limits import load_image
 
     picture = load_image(args.image, cv2.IMREAD_COLOR)
     if picture is None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.cli.arguments import verb
-from instant_ic.safe_text import direct, masked, visible
+from instant_ic.util.safe_text import direct, masked, visible
 
 
 def add_parser(subparsers: Any) -> None:
@@ -26,9 +26,9 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from instant_ic import paths
     from instant_ic.cli.doctor import run_checks
     from instant_ic.cli.finding import FAIL, OK, WARN
+    from instant_ic.util import paths
 
     colours = {OK: "32", WARN: "33", FAIL: "31"} if sys.stdout.isatty() else {}
     counts = {OK: 0, WARN: 0, FAIL: 0}
@@ -51,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _shipped(node: str, key: str, default: Any) -> Any:
     """Value of a parameter in the shipped config/robot.yaml."""
-    from instant_ic import paths
     from instant_ic.config.params import ParameterError, load_file
+    from instant_ic.util import paths
 
     try:
         found = load_file(paths.shipped_file("config", "robot.yaml"), node).get(key)

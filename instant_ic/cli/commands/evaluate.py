@@ -15,7 +15,7 @@ from typing import Any
 from instant_ic.cli import commands
 from instant_ic.cli.arguments import group, verb
 from instant_ic.cli.evaluations import print_figures
-from instant_ic.safe_text import direct
+from instant_ic.util.safe_text import direct
 
 
 def add_parser(subparsers: Any) -> None:

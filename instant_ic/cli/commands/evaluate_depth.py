@@ -56,7 +56,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     from instant_ic.experiments.depth import DepthEvaluationError, DepthSettings, Evaluator, LidarSettings, report
     from instant_ic.experiments.depth_files import PairError, find_pictures, pair, unit_warning
     from instant_ic.experiments.depth_pictures import Sheets
-    from instant_ic.paths import shipped_file
+    from instant_ic.util.paths import shipped_file
 
     check_files(args.json)
     check_files(args.plot, args.side, suffix=".png")

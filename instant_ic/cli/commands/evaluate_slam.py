@@ -12,7 +12,7 @@ from instant_ic.cli.arguments import check_files, positive, positive_int, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user, print_figures
 from instant_ic.cli.progress import progress
-from instant_ic.safe_text import direct
+from instant_ic.util.safe_text import direct
 
 if TYPE_CHECKING:
     from instant_ic.experiments.slam import LogResult, Relations

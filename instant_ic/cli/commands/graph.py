@@ -26,11 +26,11 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.graph import make_graph, tree, write
     from instant_ic.cli.heartbeats import hear
     from instant_ic.cli.names import find_node, nobody_runs
+    from instant_ic.util import paths
 
     only = [find_node(name).name for name in args.nodes]
     infos = registry.list_nodes(paths.run_dir())

@@ -46,8 +46,8 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from instant_ic import paths
     from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
+    from instant_ic.util import paths
 
     file = find_launch_file(args.file)
     if args.show_args:
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _pace(word: str) -> float | None:
     """Read the value of ``--pace``; None is auto."""
-    from instant_ic.pace import PaceError, check_factor
+    from instant_ic.util.pace import PaceError, check_factor
 
     if word == "auto":
         return None

@@ -9,7 +9,7 @@ from typing import Any
 from instant_ic.cli import completion
 from instant_ic.cli.arguments import not_negative, seconds, verb
 from instant_ic.cli.errors import UserError
-from instant_ic.safe_text import direct
+from instant_ic.util.safe_text import direct
 
 _POLL_S = 0.2
 
@@ -34,10 +34,10 @@ def add_parser(subparsers: Any) -> None:
 def show(args: argparse.Namespace) -> int:
     import time
 
-    from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.logs import LogFolder, chosen, level_number
     from instant_ic.cli.logs import show as line_words
+    from instant_ic.util import paths
 
     if args.nodes[:1] == ["level"]:
         return _level(args.nodes[1:])
@@ -77,12 +77,12 @@ def _check_names(names: list[str], run_dir: Any, running: dict[str, float]) -> N
 
 
 def _follow(folder: Any, nodes: set[str], level: int, colour: bool) -> int:
-    from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.logs import chosen, from_rosout
     from instant_ic.cli.logs import show as line_words
     from instant_ic.cli.observer import Observer
     from instant_ic.msg import deserialize
+    from instant_ic.util import paths
 
     run_dir = paths.run_dir()
     topics = {info.topic for info in registry.list_topics(run_dir) if info.type_name == "rcl_interfaces/msg/Log"}
@@ -101,9 +101,9 @@ def _follow(folder: Any, nodes: set[str], level: int, colour: bool) -> int:
 
 
 def _level(words: list[str]) -> int:
-    from instant_ic import paths
     from instant_ic.bus.control import NodeControl
     from instant_ic.cli.names import find_node
+    from instant_ic.util import paths
 
     if len(words) not in (1, 2):
         raise UserError("usage: ic log level NODE [debug|info|warning|error]", 2)

@@ -85,8 +85,8 @@ def save_local(args: argparse.Namespace) -> int:
 def _local_of_bag(path: Path, topic: str) -> NDArray[np.float32]:
     from instant_ic.bag.files import BagReader
     from instant_ic.calibration.bag import read_clouds
-    from instant_ic.depth.deskew import Revolution
     from instant_ic.geometry.transforms import TransformError
+    from instant_ic.lidar.deskew import Revolution
     from instant_ic.mapping.mapper import LocalMapper
     from instant_ic.msg import cloud_points
 

@@ -25,9 +25,9 @@ def list_nodes(args: argparse.Namespace) -> int:
     import sys
     import time
 
-    from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import nobody_runs
+    from instant_ic.util import paths
 
     nodes = registry.list_nodes(paths.run_dir())
     if args.count_nodes:
@@ -49,11 +49,11 @@ def list_nodes(args: argparse.Namespace) -> int:
 def show(args: argparse.Namespace) -> int:
     import math
 
-    from instant_ic import paths
     from instant_ic.bus.control import ControlError, NodeControl
     from instant_ic.bus.heartbeat import Flow
     from instant_ic.cli.heartbeats import hear
     from instant_ic.cli.names import find_node
+    from instant_ic.util import paths
 
     node = find_node(args.node)
     print(f"{node.name}: {node.executable}, pid {node.pid}")

@@ -45,19 +45,19 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _control(node: str) -> NodeControl:
-    from instant_ic import paths
     from instant_ic.bus.control import NodeControl
     from instant_ic.cli.names import find_node
+    from instant_ic.util import paths
 
     return NodeControl(paths.run_dir(), find_node(node).name)
 
 
 def list_parameters(args: argparse.Namespace) -> int:
     """Print parameters from the registry: this also works for a hanging node."""
-    from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import find_node, nobody_runs
     from instant_ic.config import params
+    from instant_ic.util import paths
 
     nodes = [find_node(args.node)] if args.node else registry.list_nodes(paths.run_dir())
     if not nodes:

@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from instant_ic.paths import node_names
+    from instant_ic.util.paths import node_names
 
     names = [name for name in args.nodes.split(",") if name]
     for name in names:

@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from instant_ic.bus.node_files import NodeFileError, load, node_class
     from instant_ic.bus.process import run as run_node
     from instant_ic.cli.names import near
-    from instant_ic.paths import node_names
+    from instant_ic.util.paths import node_names
 
     try:
         if args.node.endswith(".py"):

@@ -43,12 +43,12 @@ def show(args: argparse.Namespace) -> int:
     import sys
     import time
 
-    from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.errors import UserError
     from instant_ic.cli.heartbeats import Heartbeats
     from instant_ic.cli.names import nobody_runs
     from instant_ic.cli.top import SORT_KEYS, Processes, as_json, expected_rate, make_rows, plain_table
+    from instant_ic.util import paths
 
     run_dir = paths.run_dir()
     processes = Processes()

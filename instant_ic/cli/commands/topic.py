@@ -83,9 +83,9 @@ def add_parser(subparsers: Any) -> None:
 
 
 def list_topics(args: argparse.Namespace) -> int:
-    from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import topic_types
+    from instant_ic.util import paths
 
     types = topic_types()
     if args.count_topics:

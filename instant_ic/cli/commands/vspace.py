@@ -179,7 +179,7 @@ def train(args: argparse.Namespace) -> int:
 def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Estimate the depth of a panorama in the model's own metres; print a note about that."""
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-    from instant_ic.paths import shipped_file
+    from instant_ic.util.paths import shipped_file
 
     loaded = DepthModel.load(model or shipped_file("models", DEFAULT_MODEL))
     kind = loaded.manifest.output_kind
@@ -256,11 +256,11 @@ def open_space(args: argparse.Namespace) -> VirtualSpace:
 
 
 def _space_of_bag(path: Path) -> VirtualSpace:
+    from instant_ic.adapters.vspace import layers_of
     from instant_ic.cli.commands.console import newest_of_bag
     from instant_ic.msg import MessageError, deserialize
     from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
     from instant_ic.vspace.layers import LayersError, decode
-    from instant_ic.vspace_messages import layers_of
 
     newest = newest_of_bag(path)
     space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))

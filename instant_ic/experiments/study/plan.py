@@ -18,7 +18,7 @@ from instant_ic.config.params import ParameterError, Value, build
 from instant_ic.config.ranges import Range
 from instant_ic.config.scalars import to_bool
 from instant_ic.config.yaml_text import read_spelled
-from instant_ic.private import make_folder, open_file
+from instant_ic.util.private import make_folder, open_file
 
 CONDITIONS = ("ic", "stop", "shared", "mesh")
 """Illusory control as shipped; the robot stops at obstacles; it drives around them; illusory control with a scan."""

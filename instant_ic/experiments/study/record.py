@@ -13,7 +13,7 @@ from typing import Any
 
 from instant_ic.experiments.results import finite
 from instant_ic.experiments.study.plan import Study, StudyError, save
-from instant_ic.private import make_folder, open_file
+from instant_ic.util.private import make_folder, open_file
 
 OPEN, DONE, WITHDRAWN = "open", "done", "withdrawn"
 

@@ -17,7 +17,7 @@ from instant_ic.experiments.report import Figure, Part, Section, Table, Text
 from instant_ic.experiments.study import stats
 from instant_ic.experiments.study.plan import CONDITIONS, Questionnaire, Study
 from instant_ic.experiments.study.record import DONE, WITHDRAWN, Record
-from instant_ic.private import make_folder
+from instant_ic.util.private import make_folder
 
 MEASURES = {
     "time_s": "time, s",

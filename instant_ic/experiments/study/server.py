@@ -24,7 +24,7 @@ from instant_ic.experiments.study import forms
 from instant_ic.experiments.study.plan import StudyError
 from instant_ic.experiments.study.record import OPEN, WITHDRAWN, Record
 from instant_ic.experiments.study.trial import Drive, Trial, add_answers
-from instant_ic.web_access import host_allowed
+from instant_ic.util.web_access import host_allowed
 
 STATIC = Path(__file__).with_name("static")
 MOST_BODY = 64 * 1024

@@ -27,7 +27,7 @@ from instant_ic.experiments.recorded_drive import as_log
 from instant_ic.experiments.stack import Stack, free_ports
 from instant_ic.experiments.study.plan import Study, StudyError, save
 from instant_ic.msg import ControlState, String, VspaceStatus, pose2_from_message, serialize, stamp_ns, twist_values
-from instant_ic.private import make_folder
+from instant_ic.util.private import make_folder
 
 READY_S = 240.0
 """Longest start of a stack, seconds of its own time."""

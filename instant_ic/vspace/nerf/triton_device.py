@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from instant_ic import paths
+from instant_ic.util import paths
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf.field import (
     BAND_COLOUR_WEIGHT,

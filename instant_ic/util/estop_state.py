@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from instant_ic import pace, paths
+from instant_ic.util import pace, paths
 
 RELEASE = "Release the emergency stop to continue."
 

@@ -20,7 +20,7 @@ from collections.abc import Iterable
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from instant_ic.private import open_file
+from instant_ic.util.private import open_file
 
 FILE = "pace"
 SLOWEST, FASTEST = 0.02, 10.0

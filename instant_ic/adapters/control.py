@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from instant_ic.bus import Latest
 from instant_ic.bus.clock import Clock
 from instant_ic.bus.transport import Received
-from instant_ic.contradiction import Contradiction
 from instant_ic.control.arbiter import STANDS_M_S, STANDS_RAD_S, Decision
 from instant_ic.control.estop import KeptEstop
 from instant_ic.control.freshness import TimeoutConfig
@@ -46,6 +45,7 @@ from instant_ic.msg import (
     twist_stamped,
     twist_values,
 )
+from instant_ic.util.contradiction import Contradiction
 
 
 @dataclass

@@ -12,6 +12,6 @@ def leave_out_blas() -> None:
     from numba.np import linalg
 
     def refuse() -> None:
-        raise ImportError("instant_ic.jit leaves out scipy's linear algebra: write the sums out")
+        raise ImportError("instant_ic.util.jit leaves out scipy's linear algebra: write the sums out")
 
     linalg.ensure_blas = refuse

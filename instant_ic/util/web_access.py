@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from instant_ic.safe_text import direct
+from instant_ic.util.safe_text import direct
 
 SIGN_IN = ("auto", "always", "never")
 logger = logging.getLogger(__name__)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from instant_ic.depth.deskew import Revolution
 from instant_ic.depth.inputs import HeldImage
 from instant_ic.depth.keyframes import encode_sigma
 from instant_ic.depth.sources import DepthResult
 from instant_ic.geometry.poses import Matrix
+from instant_ic.lidar.deskew import Revolution
 from instant_ic.msg import Keyframe, cloud_array, cloud_points, header, image_message, pose_message, stamp_ns
 
 

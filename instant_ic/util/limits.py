@@ -7,7 +7,7 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.jpeg import JpegError, jpeg_size
+from instant_ic.util.jpeg import JpegError, jpeg_size
 
 if TYPE_CHECKING:
     import numpy as np

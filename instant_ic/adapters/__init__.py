@@ -1,0 +1,1 @@
+"""Conversion of messages to the plain values of the algorithms and back, one module a part."""
