@@ -4,7 +4,7 @@ python benchmarks/slam.py [--data FOLDER] [--only NAME ...]
 python benchmarks/slam.py --only faults --log NAME [--first N] [--faults NAME ...] [--places N] [--noise-seeds N]
 
 Parts: ``box`` (720 beams in a room), ``long`` (the same for a long time, to see whether the cost per scan grows),
-``intel``, ``intel_seeds`` (five seeds of degraded odometry), ``intel_rbpf`` (the particle filter), ``worlds``, ``sim``,
+``intel``, ``intel_seeds`` (five seeds of degraded odometry), ``worlds``, ``sim``,
 ``faults`` (faults put into one log, which may be a generated one; only if named).
 All use the default parameters. ``--data`` is the folder with intel.log.gz; default ../shared/data/slam2d.
 """
@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 from reporting import note, parser_of, report
 
-from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
 from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
 from instant_ic.experiments.slam_logs import LogEntry, read_log
@@ -76,12 +75,10 @@ def room_drive(scans: int) -> list[dict[str, object]]:
     return parts
 
 
-def intel(
-    entries: list[LogEntry], relations: Relations, seed: int | None = None, particles: ParticleConfig | None = None
-) -> dict[str, object]:
+def intel(entries: list[LogEntry], relations: Relations, seed: int | None = None) -> dict[str, object]:
     """The Intel log; ``seed`` degrades its odometry."""
     source = entries if seed is None else perturb_odometry(entries, seed)
-    report, _ = evaluate_log(source, relations, particles=particles)
+    report, _ = evaluate_log(source, relations)
     return {key: report[key] for key in KEPT if key in report}
 
 
@@ -148,7 +145,7 @@ def named_log(name: str, data: Path) -> tuple[list[LogEntry], FloatArray | None,
 
 
 def main() -> None:
-    parts = ("box", "long", "intel", "intel_seeds", "intel_rbpf", "worlds", "sim")
+    parts = ("box", "long", "intel", "intel_seeds", "worlds", "sim")
     parser = parser_of(__doc__)
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"
     parser.add_argument("--data", type=Path, default=default)
@@ -183,8 +180,6 @@ def main() -> None:
                 result["intel"] = intel(entries, relations)
             if "intel_seeds" in args.only:
                 result["intel_seeds"] = [intel(entries, relations, seed) for seed in range(1, 6)]
-            if "intel_rbpf" in args.only:
-                result["intel_rbpf"] = intel(entries, relations, particles=ParticleConfig())
         else:
             result["intel"] = f"left out: {args.data / 'intel.log.gz'} is missing"
     if "worlds" in args.only:

@@ -42,8 +42,8 @@ def section(results: Sequence[Result], options: Options) -> Section:
         Table("Sources", ("source", "what it is"), [[name, SOURCES[name]] for name in (*_OURS, *_PAPER[:2])]),
         Text(
             "no-depth is the paper's Ours (-depth), paper-no-scale its Ours (-scale), paper its Ours. All sources but "
-            "slam-pose are seen from true poses. The poses of slam-pose come from the stack's SLAM, with --method "
-            "paper from GMapping's particle filter, on slipping tracks."
+            "slam-pose are seen from true poses. The poses of slam-pose come from the stack's SLAM on slipping "
+            "tracks, with --method paper too; the paper used GMapping."
         ),
     ]
     verdict: dict[str, bool | None] = {}

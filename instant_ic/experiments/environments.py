@@ -108,8 +108,8 @@ def section(results: Sequence[Result], options: Options) -> Section:
             f"Mean PSNR from 0.5 to 2 m, straight and on a curve. A place fails below {FIT_DB:g} dB, the value from "
             "which the stack regards a virtual space as fit to show. unseen: what the truth would gain where no "
             "keyframe has seen the place. depth: what true depth would gain beyond that. pose: what the poses of SLAM "
-            "lose against true ones (the stack's SLAM, with --method paper GMapping's particle filter; slipping "
-            "tracks). motion: what a world would gain in which nobody walks on after the panorama; the robot drives "
+            "lose against true ones (the stack's SLAM with either method; the paper used GMapping; slipping tracks). "
+            "motion: what a world would gain in which nobody walks on after the panorama; the robot drives "
             f"at 0.4 m/s. The reason is the largest loss; resolution where none reaches {_LEAST_DB:g} dB: what remains "
             "is sharpness and looks that depend on the direction of view."
         ),

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 
-from instant_ic.experiments.particle_slam import ParticleConfig, ParticleSlam
 from instant_ic.experiments.slam_logs import LogEntry, LogError, open_log
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, Scan, SlamConfig, SlamResult
@@ -154,7 +153,7 @@ class LogResult:
         background_ms: CPU milliseconds of loop closure and optimisation after each scan (n,).
         scores: match score of each scan (n,).
         statuses: count of each status.
-        slam: the final state, with its map: of the graph method, or of the paper's particle filter.
+        slam: the final state, with its map.
     """
 
     trajectory: FloatArray
@@ -163,7 +162,7 @@ class LogResult:
     background_ms: FloatArray
     scores: FloatArray
     statuses: dict[str, int]
-    slam: GridSlam | ParticleSlam
+    slam: GridSlam
 
     def report(self) -> dict[str, object]:
         """Figures for JSON; the mean counts all CPU time, the 99th percentile that of the scan thread."""
@@ -185,7 +184,6 @@ def run_log(
     entries: Iterable[LogEntry],
     config: SlamConfig | None = None,
     *,
-    particles: ParticleConfig | None = None,
     use_wheel_odom: bool = True,
     on_scan: Callable[[int], None] | None = None,
 ) -> LogResult:
@@ -196,14 +194,13 @@ def run_log(
 
     Args:
         entries: of `instant_ic.experiments.slam_logs.read_log`, or compatible.
-        particles: run the particle filter instead of the grid SLAM.
         use_wheel_odom: False ignores the log's odometry.
         on_scan: called with the number of processed scans, for a progress bar.
 
     Raises:
         LogError: the log has no scan.
     """
-    slam = GridSlam(config) if particles is None else ParticleSlam(particles, config)
+    slam = GridSlam(config)
     warm_up(config)
     stamps: list[float] = []
     online: list[FloatArray] = []
@@ -300,7 +297,6 @@ def evaluate_log(
     relations: Relations | None = None,
     config: SlamConfig | None = None,
     *,
-    particles: ParticleConfig | None = None,
     use_wheel_odom: bool = True,
     tolerance_s: float = 0.006,
     on_scan: Callable[[int], None] | None = None,
@@ -311,7 +307,7 @@ def evaluate_log(
     refer to the poses published online.
     """
     entries = list(entries)
-    result = run_log(entries, config, particles=particles, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
+    result = run_log(entries, config, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
     report: dict[str, object] = {}
     if relations is not None:
         final, online = (

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import LogResult, run_log
 from instant_ic.experiments.slam_logs import LogEntry
 from instant_ic.experiments.slam_worlds import trajectory_errors
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 from instant_ic.sim.world import World
-from instant_ic.slam import GridSlam, Scan
+from instant_ic.slam import Scan
 from instant_ic.slam.scan import FloatArray
 
 BEAMS = 720
@@ -105,16 +104,13 @@ def _entry(
     return LogEntry(scan, odometry, np.zeros(3))
 
 
-def evaluate_round_trip(
-    trip: RoundTrip, particles: ParticleConfig | None = None, use_wheel_odom: bool = True
-) -> tuple[dict[str, object], LogResult]:
+def evaluate_round_trip(trip: RoundTrip, use_wheel_odom: bool = True) -> tuple[dict[str, object], LogResult]:
     """Run SLAM on the trip and compare with ground truth: figures for JSON, and the run itself."""
-    result = run_log(trip.entries, particles=particles, use_wheel_odom=use_wheel_odom)
+    result = run_log(trip.entries, use_wheel_odom=use_wheel_odom)
     final_m, final_deg = trajectory_errors(result.trajectory[:, 1:], trip.truth)
     online_m, online_deg = trajectory_errors(result.online[:, 1:], trip.truth)
     wheels = np.array([entry.odom_pose for entry in trip.entries])
     wheels_m, wheels_deg = trajectory_errors(wheels, trip.truth)
-    slam = result.slam
     return {
         "driven_m": trip.driven_m,
         "end_error_m": float(online_m[-1]),
@@ -125,6 +121,6 @@ def evaluate_round_trip(
         "final_mean_error_deg": float(final_deg.mean()),
         "wheels_end_error_m": float(wheels_m[-1]),
         "wheels_end_error_deg": float(wheels_deg[-1]),
-        **({"turn_factor": slam.motion.turn_factor} if isinstance(slam, GridSlam) else {}),
+        "turn_factor": result.slam.motion.turn_factor,
         **result.report(),
     }, result

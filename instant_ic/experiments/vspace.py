@@ -227,10 +227,9 @@ def renderer_after(place: Place, seconds: float) -> EquirectRenderer:
 def slam_errors(world: World, poses: Sequence[Any], settings: VspaceSettings) -> NDArray[np.float64] | None:
     """Error (x, y, yaw) of the SLAM's pose at each camera pose (4, 4) of a path, (N, 3), in the robot's true frame.
 
-    The robot drives along the path on slipping tracks: the stack's SLAM, or GMapping's filter with the paper's method.
-    None where the robot cannot drive there.
+    The robot drives along the path on slipping tracks and is localised by the stack's SLAM. None where the robot
+    cannot drive there.
     """
-    from instant_ic.experiments.particle_slam import ParticleConfig
     from instant_ic.experiments.slam import run_log
     from instant_ic.experiments.slam_sim import round_trip
 
@@ -241,8 +240,7 @@ def slam_errors(world: World, poses: Sequence[Any], settings: VspaceSettings) ->
         trip = round_trip(world, seed=settings.seed, rounds=1, route=places)
     except ValueError:  # it touches something
         return None
-    particles = ParticleConfig(seed=settings.seed) if settings.method == "paper" else None
-    estimates = run_log(trip.entries, particles=particles).online[:, 1:]
+    estimates = run_log(trip.entries).online[:, 1:]
     begin = np.array([*places[0], math.atan2(places[1][1] - places[0][1], places[1][0] - places[0][0])])
     found = []
     for place in places:

@@ -351,25 +351,22 @@ def test_places_have_what_they_are_named_for() -> None:
         make_place_world("hall:big")
 
 
-def test_the_paper_method_estimates_poses_with_particles(monkeypatch) -> None:
-    world, used = box_world(1.5), []
+def test_a_path_is_driven_with_the_poses_of_slam(monkeypatch) -> None:
+    world = box_world(1.5)
 
     class Found:
         online = np.zeros((50, 4))
 
-    def run_log(entries, particles=None):
-        used.append(type(particles).__name__)
+    def run_log(entries):
         found = Found()
         found.online = np.column_stack([np.zeros(len(entries)), np.zeros((len(entries), 3))])
         return found
 
     monkeypatch.setattr("instant_ic.experiments.slam.run_log", run_log)
     poses = [pose_matrix(x, 1.0, 1.2) for x in (-1.0, -0.5, 0.0)]
-    for method in ("ours", "paper"):
-        errors = vspace.slam_errors(world, poses, VspaceSettings(method=method))
-        # An estimate that never moves is wrong by the way, backwards.
-        assert errors is not None and errors[:, 0] == pytest.approx([0.0, -0.5, -0.9], abs=0.12)
-    assert used == ["NoneType", "ParticleConfig"]
+    errors = vspace.slam_errors(world, poses, VspaceSettings())
+    # An estimate that never moves is wrong by the way, backwards.
+    assert errors is not None and errors[:, 0] == pytest.approx([0.0, -0.5, -0.9], abs=0.12)
     assert vspace.slam_errors(world, poses[:1], VspaceSettings()) is None
 
 

@@ -93,16 +93,6 @@ def test_figures_trajectory_and_plot(
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_particle_filter_by_name(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    start = tmp_path / "start.log"  # a filter costs many times what the graph does
-    start.write_bytes(b"".join(gzip.decompress(log.read_bytes()).splitlines(keepends=True)[:60]))
-    words = ["evaluate", "slam", str(start), "--backend", "rbpf", "-o", str(tmp_path / "out")]
-    assert main([*words, "--particles", "5"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["backend"] == "rbpf" and report["updates"] > 3
-    assert len(np.loadtxt(tmp_path / "out" / "trajectory.txt")) == report["scans"]
-
-
 @pytest.mark.parametrize(
     ("text", "what"),
     [

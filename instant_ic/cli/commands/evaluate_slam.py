@@ -39,9 +39,6 @@ def add_kind(kinds: Any) -> None:
         metavar="S",
         help="tolerance of that match (default: %(default)g s)",
     )
-    text = "graph: grid SLAM; rbpf: particle filter"
-    add("--backend", choices=("graph", "rbpf"), default="graph", help=text)
-    add("--particles", **count, default=30, help="of rbpf (default: %(default)d)")
     add("-o", "--output", type=Path, metavar="DIR", help="default: runs/slam_LOG_DATE_TIME")
     add("--json", type=Path, metavar="OUT", help="also write the figures here")
     add("--plot", type=Path, metavar="OUT.png", help="also write the map here")
@@ -63,18 +60,14 @@ def add_kind(kinds: Any) -> None:
 
 def evaluate_slam(args: argparse.Namespace) -> int:
     from instant_ic.bag.replay import make_node
-    from instant_ic.experiments.particle_slam import ParticleConfig
     from instant_ic.experiments.slam import evaluate_log, perturb_odometry, write_trajectory
     from instant_ic.experiments.slam_bag import is_bag, read_bag
     from instant_ic.experiments.slam_logs import BadLines, read_log
 
     if args.stamps and not args.relations:
         raise UserError("--stamps selects relations: give --relations too", 2)
-    if args.faults and args.backend != "graph":
-        raise UserError("--faults needs --backend graph", 2)
     overrides = [f"grid_slam.{override}" for override in args.param]
     config = make_node("grid_slam", args.params_file or [], overrides).config
-    particles = ParticleConfig(particles=args.particles) if args.backend == "rbpf" else None
     stem = args.log.resolve().name.removesuffix(".gz").rsplit(".", 1)[0]
     folder = args.output or Path(f"runs/slam_{stem}_{time.strftime('%Y%m%d_%H%M%S')}")
     check_files(args.json, args.plot)
@@ -90,10 +83,10 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         source = entries if args.perturb_odometry is None else perturb_odometry(entries, args.perturb_odometry)
         with progress(args.log.name) as advance:
             report, run = evaluate_log(
-                source, relations, config, particles=particles, use_wheel_odom=not args.no_odometry,
+                source, relations, config, use_wheel_odom=not args.no_odometry,
                 tolerance_s=args.tolerance, on_scan=lambda done: advance(done / len(entries)),
             )  # fmt: skip
-    report = {"log": args.log.name, "backend": args.backend, **report, "output": str(folder)}
+    report = {"log": args.log.name, **report, "output": str(folder)}
     if bad is not None:
         report["bad_lines"] = bad.count
         for line in bad.errors:

@@ -23,7 +23,6 @@ def add_kind(kinds: Any) -> None:
     add("--seeds", type=positive_int, default=5, metavar="N", help="number of drives (default: %(default)d)")
     text = "round trips per drive, about 39 m each (default: %(default)d)"
     add("--rounds", type=positive_int, default=2, help=text)
-    add("--backend", choices=("graph", "rbpf"), default="graph", help="SLAM method")
     add("--no-odometry", action="store_true", help="ignore the encoders")
     add("--json", type=Path, metavar="OUT", help="also write the figures here")
     text = "write an image of the last drive's map and paths here"
@@ -31,7 +30,6 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_slam_sim(args: argparse.Namespace) -> int:
-    from instant_ic.experiments.particle_slam import ParticleConfig
     from instant_ic.experiments.pictures import save_map
     from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip
     from instant_ic.sim.worlds import make_world
@@ -41,8 +39,7 @@ def evaluate_slam_sim(args: argparse.Namespace) -> int:
         world = make_world(args.world)
         for seed in range(args.seeds):
             trip = round_trip(world, args.slip, seed, args.rounds)
-            particles = ParticleConfig() if args.backend == "rbpf" else None
-            report, run = evaluate_round_trip(trip, particles=particles, use_wheel_odom=not args.no_odometry)
+            report, run = evaluate_round_trip(trip, use_wheel_odom=not args.no_odometry)
             reports.append({"seed": seed, **report})
             advance((seed + 1) / args.seeds)
     worst = {key: max(float(report[key]) for report in reports) for key in _WORST}  # type: ignore[arg-type]
