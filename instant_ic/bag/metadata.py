@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,7 +29,7 @@ from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.config.yaml_text import dump_yaml, read_yaml
 from instant_ic.msg import MessageError, message_type, type_hash, typestore
-from instant_ic.util.private import open_file, sync_folder
+from instant_ic.util.files import replacing
 
 METADATA_FILE = "metadata.yaml"
 REPEATED = "instant_ic.repeated"
@@ -107,17 +106,8 @@ def write_metadata(
         "ros_distro": "jazzy",
     }
     text = dump_yaml({"rosbag2_bagfile_information": information}, width=1000)
-    scratch = folder / f"{METADATA_FILE}.tmp"
-    try:
-        with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        scratch.replace(folder / METADATA_FILE)
-        sync_folder(folder)
-    except OSError:
-        scratch.unlink(missing_ok=True)
-        raise
+    with replacing(folder / METADATA_FILE, private=True, sync=True) as file:
+        file.write(text.encode())
 
 
 def _span(parts: Sequence[PartInfo]) -> dict[str, Any]:

@@ -26,7 +26,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from instant_ic.util.private import make_folder, open_file
+from instant_ic.util.files import replacing
+from instant_ic.util.private import make_folder
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
@@ -220,16 +221,11 @@ class Claim:
         Raises:
             RegistryError: the disk is full, or the run directory is gone.
         """
-        scratch = self.json_path.with_suffix(".tmp")
         with self._writing:
             try:
-                with os.fdopen(
-                    open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8"
-                ) as file:
-                    file.write(json.dumps(content, default=str))
-                scratch.replace(self.json_path)
+                with replacing(self.json_path, private=True) as file:
+                    file.write(json.dumps(content, default=str).encode())
             except OSError as error:
-                scratch.unlink(missing_ok=True)
                 raise RegistryError(f"{self._what} cannot be registered: {error}") from error
 
     def release(self) -> None:
@@ -474,7 +470,8 @@ def sweep(run_dir: Path) -> int:
             if not _is_at(fd, lock_path):  # its process has just ended, and another may have the name
                 continue
             stem = lock_path.with_suffix("")
-            leftovers = [p for s in (".json", ".sock", ".tmp") if (p := stem.with_name(stem.name + s)).exists()]
+            leftovers = [p for s in (".json", ".sock") if (p := stem.with_name(stem.name + s)).exists()]
+            leftovers += stem.parent.glob(f".{stem.name}.json.*.part")
             for path in (*leftovers, lock_path):
                 path.unlink(missing_ok=True)
             swept += bool(leftovers)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
+
+from instant_ic.util.files import replacing
 
 
 def finite(value: Any, digits: int | None = None) -> Any:
@@ -29,9 +30,5 @@ def save_json(path: Path, value: Any) -> None:
 
 def save_text(path: Path, text: str) -> None:
     """Write a file atomically: an interrupted program leaves the old file or the new one."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(text, encoding="utf-8")
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with replacing(path) as file:
+        file.write(text.encode())

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.util import paths
+from instant_ic.util.files import replacing
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -155,11 +155,10 @@ def read_entries(definitions: Path, make: Callable[[], Typestore]) -> dict[str, 
             types: dict[str, Entry] = found["types"]
             return types
     types = entries_of(make())
-    scratch = file.with_suffix(f".{os.getpid()}")
     with suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
-        scratch.write_text(json.dumps({"key": key, "types": types}))
-        scratch.replace(file)
+        with replacing(file) as out:
+            out.write(json.dumps({"key": key, "types": types}).encode())
     return types
 
 

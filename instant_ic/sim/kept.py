@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instant_ic.util import paths
+from instant_ic.util.files import replacing
 
 Arrays = dict[str, npt.NDArray[np.generic]]
 
@@ -49,10 +50,8 @@ def kept(kind: str, parts: Iterable[str | npt.NDArray[np.generic]], make: Callab
     arrays = make()
     with suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
-        scratch = file.with_suffix(f".{os.getpid()}")
-        with scratch.open("wb") as out:
+        with replacing(file) as out:
             np.savez(out, allow_pickle=False, **arrays)
-        scratch.replace(file)
         _make_room(file.parent)
     return arrays
 

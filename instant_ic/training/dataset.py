@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.util.files import replacing
+
 Floats = NDArray[np.floating]
 _HELD_OUT_WORLDS = 12
 
@@ -38,10 +40,8 @@ class Sample:
 
 def save_sample(path: Path, rgb: NDArray[np.uint8], depth_m: Floats, priors: Sequence[Floats]) -> None:
     """Write a panorama with its priors (``Sample``) to ``NAME.npz``; the file is there only when it is complete."""
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
+    with replacing(path) as file:
         np.savez_compressed(file, rgb=rgb, depth_m=depth_m.astype(np.float16), priors=np.array(priors, np.float16))
-    part.replace(path)
 
 
 class RenderedDataset:

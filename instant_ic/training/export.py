@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-import shutil
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from instant_ic.depth.model import DepthModel
 from instant_ic.training.completion import NORM_EPS, CompletionConfig, CompletionNet, Encoder
 from instant_ic.training.folding import fold_upsampling
 from instant_ic.training.slicenet import CheckpointError, SliceNet, check_state
+from instant_ic.util.files import replacing
 
 OPSET = 17
 HALF_PRECISION_MIN_ELEMENTS = 256
@@ -101,12 +101,8 @@ def export_onnx(
             if not result["half_difference"] < MAX_HALF_DIFFERENCE:
                 raise ExportError(f"float16 weights change the depth by {result['half_difference']:.1e}")
             report(f"float16 weights change the depth by {result['half_difference']:.1e}")
-        beside = path.with_name(f".{path.name}.new")
-        try:
-            shutil.copyfile(plain, beside)
-            beside.replace(path)
-        finally:
-            beside.unlink(missing_ok=True)
+        with replacing(path) as file:
+            file.write(plain.read_bytes())
     return result
 
 

@@ -31,6 +31,7 @@ from instant_ic.training.feeds import Ahead, Batch, Feed, Samples, stack
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.losses import depth_loss, edge_loss, sigma_loss
 from instant_ic.training.slicenet import CheckpointError, read_checkpoint
+from instant_ic.util.files import replacing
 
 POLE_WEIGHT = 0.1
 """Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
@@ -385,9 +386,8 @@ class Trainer:
                 "elapsed_s": self.elapsed_s,
             },
         }
-        temporary = self.output.with_name(self.output.name + ".part")
-        torch.save(state, temporary)
-        temporary.replace(self.output)
+        with replacing(self.output) as file:
+            torch.save(state, file)
         log.row({**entry, "loss": None}, f"held-out panoramas: {entry}")
 
     def record(self) -> dict[str, Any]:

@@ -19,6 +19,8 @@ from types import TracebackType
 from typing import Self
 
 from instant_ic.util import pace, paths
+from instant_ic.util.files import replacing
+from instant_ic.util.private import sync_folder
 
 RELEASE = "Release the emergency stop to continue."
 
@@ -109,24 +111,14 @@ class RunMark:
 
 def _put(file: Path, content: dict[str, object] | None) -> None:
     """Replace a file atomically, or remove it; the change is on disk when this returns."""
-    part = file.with_suffix(".part")
     try:
         if content is None:
             file.unlink(missing_ok=True)
+            sync_folder(file.parent)
         else:
             file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            part.unlink(missing_ok=True)
-            descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-            with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
-                json.dump(content, stream)
-                stream.flush()
-                os.fsync(stream.fileno())
-            part.replace(file)
-        folder = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+            with replacing(file, private=True, sync=True) as stream:
+                stream.write(json.dumps(content).encode())
     except OSError as error:
         if content is None and isinstance(error, FileNotFoundError):
             return  # without the folder there is no file either

@@ -20,7 +20,7 @@ from collections.abc import Iterable
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
-from instant_ic.util.private import open_file
+from instant_ic.util.files import replacing
 
 FILE = "pace"
 SLOWEST, FASTEST = 0.02, 10.0
@@ -283,14 +283,10 @@ def remove_files(folders: Iterable[Path]) -> None:
 
 def _create(file: Path, content: bytes) -> mmap.mmap:
     """Replace a file and map the new one; processes that mapped the old one keep it."""
-    part = file.with_suffix(".part")
-    descriptor = open_file(part, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
-    try:
-        os.write(descriptor, content)
-        part.replace(file)
-        return mmap.mmap(descriptor, len(content))
-    finally:
-        os.close(descriptor)
+    with replacing(file, private=True) as stream:
+        stream.write(content)
+        stream.flush()
+        return mmap.mmap(stream.fileno(), len(content))
 
 
 def read(run_dir: Path) -> Pace:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.util.files import replacing
 from instant_ic.util.limits import check_arrays
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import FieldParameters, Floats, Lattice
@@ -80,15 +80,8 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
         for field in dataclasses.fields(part):
             arrays[f"{group}.{field.name}"] = np.asarray(getattr(part, field.name))
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f".{file.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, sha256=np.frombuffer(_checksum(arrays), np.uint8), **arrays)
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(file)
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(file, sync=True) as stream:
+        np.savez(stream, allow_pickle=False, sha256=np.frombuffer(_checksum(arrays), np.uint8), **arrays)
     return file
 
 

@@ -146,7 +146,7 @@ def test_a_symbolic_link_where_an_entry_is_written_is_not_followed(tmp_path):
     run_dir, target = registry.prepare(tmp_path / "run"), tmp_path / "precious"
     target.write_text("precious")
     claim = registry.Claim(run_dir / "nodes" / "talker", "node talker")
-    (run_dir / "nodes" / "talker.tmp").symlink_to(target)
+    (run_dir / "nodes" / f".talker.json.{os.getpid()}.part").symlink_to(target)
     with pytest.raises(RegistryError):
         claim.write({"name": "talker"})
     claim.release()

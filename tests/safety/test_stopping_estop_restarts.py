@@ -245,7 +245,7 @@ def test_a_state_that_cannot_be_kept_is_an_error_that_says_what_to_do(tmp_path: 
 
 
 def test_a_stop_whose_state_cannot_be_written_holds_and_is_an_error(robot: Robot, run_dir: Path) -> None:
-    (run_dir / "estop.part").mkdir()  # in the way of the file, for root too
+    (run_dir / f".estop.json.{os.getpid()}.part").mkdir()  # in the way of the file, for root too
     robot.console.on_estop(True)
     robot.bus.advance(1.0)
     assert robot.stopped()
@@ -267,7 +267,7 @@ def test_a_stack_whose_state_cannot_be_written_is_not_started(
         words = ["launch", str(launch), "--run-dir", run_dir, "--plain"]
         assert main(words) == 0 and started.exists()
         started.unlink()
-        (Path(run_dir) / "run.part").mkdir()  # in the way of the file, for root too
+        (Path(run_dir) / f".run.json.{os.getpid()}.part").mkdir()  # in the way of the file, for root too
         assert main(words) == 1
     assert "Free the disk, or set INSTANT_IC_RUN_DIR" in capfd.readouterr().err
     assert not started.exists()

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -183,7 +184,7 @@ def test_a_file_that_is_none_is_named_with_its_fault(space, tmp_path, name):
 def test_a_failing_write_leaves_the_old_file(space, tmp_path, monkeypatch):
     file = space.save(tmp_path)
     before = file.read_bytes()
-    monkeypatch.setattr(saved.os, "fsync", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     with pytest.raises(OSError, match="No space left"):
         space.save(tmp_path)
     assert file.read_bytes() == before

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli.arguments import group, numbers, positive, positive_int, size, verb
 from instant_ic.cli.errors import UserError
+from instant_ic.util.files import replacing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -411,9 +412,8 @@ def write_picture(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -
         done = False
     if not done:
         raise UserError(f"{path}: the name of an image must end in .png or .jpg", 2)
-    part = path.with_name(f".{path.name}.part")
-    part.write_bytes(content.tobytes())
-    part.replace(path)
+    with replacing(path) as file:
+        file.write(content.tobytes())
 
 
 def write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
