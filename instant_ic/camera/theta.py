@@ -255,19 +255,14 @@ class ThetaCamera(Camera):
         response, session = self._response, self._session
         if response is None or session is None:
             raise CameraError(f"{self.client.url}: not connected; call connect() first")
-        timeout_s = current().timeout_s(self.config.read_timeout_s)
-        deadline = time.monotonic() + timeout_s
-        # One read may need several receives: the head of a chunk can arrive byte by byte.
-        session.deadline.start(2.0 * timeout_s)
+        session.deadline_s = time.monotonic() + current().timeout_s(self.config.read_timeout_s)
         while True:
-            if time.monotonic() > deadline:
-                fault = f" ({self._parser.last_fault})" if self._parser.last_fault else ""
-                raise self._ended(f"data arrived, but no complete image for {self.config.read_timeout_s} s{fault}")
             try:
                 # read1 returns the available data instead of waiting until the buffer is full.
                 data = response.raw.read1(_CHUNK)
             except (urllib3.exceptions.HTTPError, OSError) as error:
-                raise self._ended(_cause(error)) from error
+                fault = f" ({self._parser.last_fault})" if self._parser.last_fault else ""
+                raise self._ended(f"{_cause(error)}{fault}") from error
             if not data:
                 raise self._ended("the camera ended it (button, shooting or change of mode)")
             bad_before = self._parser.bad_frames

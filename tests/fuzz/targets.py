@@ -266,23 +266,6 @@ def _parse_preview() -> Callable[[bytes], object]:
 _DIGEST = b'Digest realm="RICOH THETA", nonce="00f1c8c4", qop="auth", algorithm=MD5, opaque="x", stale=false'
 
 
-def _parse_digest() -> Callable[[bytes], object]:
-    import re
-
-    from requests.utils import parse_dict_header
-
-    from instant_ic.camera.http import _Digest
-
-    def parse(data: bytes) -> None:
-        digest = _Digest("user", "password")
-        digest.init_per_thread_state()
-        text = re.sub("digest ", "", data.decode("latin-1"), count=1, flags=re.IGNORECASE)
-        digest._thread_local.chal = parse_dict_header(text)
-        digest.build_digest_header("GET", "http://theta/osc/info")
-
-    return parse
-
-
 def _camera_errors() -> tuple[type[BaseException], ...]:
     from instant_ic.camera.source import CameraError
 
@@ -310,10 +293,10 @@ def _http_replies() -> list[bytes]:
 
 
 def _parse_http() -> Callable[[bytes], object]:
+    from requests.auth import HTTPDigestAuth
     from urllib3.util import connection
 
     from instant_ic.camera.config import ThetaConfig
-    from instant_ic.camera.http import _Digest
     from instant_ic.camera.theta import ThetaClient
 
     content = b""
@@ -334,7 +317,7 @@ def _parse_http() -> Callable[[bytes], object]:
     def parse(data: bytes) -> None:
         nonlocal content
         content = data
-        client._session.auth = _Digest("user", "password")  # what one camera asks for is nothing to the next
+        client._session.auth = HTTPDigestAuth("user", "password")  # what one camera asks for is nothing to the next
         client._session.cookies.clear()
         real, connection.create_connection = connection.create_connection, connected
         try:
@@ -1040,14 +1023,6 @@ TARGETS = {
             _parse_preview,
             dictionary=(b"osclivepreview", b"Content-Length: ", b"\r\n\r\n", b"\xff\xd8", b"\xff\xd9"),
             share=1000,
-        ),
-        Target(
-            "theta-digest",
-            lambda: [_DIGEST],
-            _parse_digest,
-            _camera_errors(),
-            (b"realm=", b"nonce=", b'"', b",", b"qop=auth-int", b"algorithm=SHA-256", b"\r\n", b"="),
-            share=2000,
         ),
         Target(
             "theta-http",
