@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.bus.heartbeat import EVERY_NODES, Flow, Heartbeat
-from instant_ic.config.cpu_budget import cpu_budget
 
 if TYPE_CHECKING:
     from instant_ic.launch.topics import TopicRate
@@ -40,7 +39,6 @@ class NodeRow:
         state: from its heartbeat; ``silent`` or ``busy`` where there is none.
         message: its worst diagnosis, else the faults of its rates.
         cpu_percent: percent of one core since the last measurement.
-        budget_percent: CPU budget, percent of one core; None where there is none.
     """
 
     node: str
@@ -48,17 +46,12 @@ class NodeRow:
     state: str
     message: str = ""
     cpu_percent: float = math.nan
-    budget_percent: float | None = None
     rss_mb: float = math.nan
     threads: int = 0
     outputs: list[TopicRow] = field(default_factory=list)
     inputs: list[TopicRow] = field(default_factory=list)
     lost: int = 0
     up_s: float = 0.0
-
-    @property
-    def over_budget(self) -> bool:
-        return self.budget_percent is not None and self.cpu_percent > self.budget_percent
 
 
 SORT_KEYS: dict[str, Callable[[NodeRow], Any]] = {
@@ -118,7 +111,7 @@ def make_rows(
     rows = []
     for info in infos:
         cpu, rss, threads = look(info.pid)
-        row = NodeRow(info.name, info.pid, "silent", "", cpu, cpu_budget(info.name), rss, threads)
+        row = NodeRow(info.name, info.pid, "silent", "", cpu, rss, threads)
         row.up_s = max(0.0, (now_ns - info.started_ns) / 1e9)
         beat = beats.get(info.name)
         if beat is None or beat.pid != info.pid:
@@ -165,7 +158,7 @@ def expected_rate(topic: str) -> TopicRate | None:
     return nominal_rate(topic) or nominal_rate(topic, topic.split("/")[1])
 
 
-HEADINGS = ("NODE", "PID", "STATE", "CPU%", "BUDGET", "MEM MB", "THR", "LOST", "OUT Hz", "IN Hz", "MESSAGE")
+HEADINGS = ("NODE", "PID", "STATE", "CPU%", "MEM MB", "THR", "LOST", "OUT Hz", "IN Hz", "MESSAGE")
 
 
 def cells(row: NodeRow) -> list[str]:
@@ -182,7 +175,6 @@ def cells(row: NodeRow) -> list[str]:
         str(row.pid),
         row.state,
         number(row.cpu_percent),
-        "-" if row.budget_percent is None else f"{'over ' if row.over_budget else ''}{row.budget_percent:.0f}",
         number(row.rss_mb),
         str(row.threads or "-"),
         str(row.lost),
@@ -194,15 +186,15 @@ def cells(row: NodeRow) -> list[str]:
 
 def plain_table(rows: Sequence[NodeRow]) -> str:
     """Table for a pipe or a log: columns aligned with spaces, rates in lines below each node."""
-    table = [[*HEADINGS[:8], "MESSAGE"], *([*cells(row)[:8], row.message] for row in rows)]
-    widths = [max(len(line[column]) for line in table) for column in range(8)]
+    table = [[*HEADINGS[:7], "MESSAGE"], *([*cells(row)[:7], row.message] for row in rows)]
+    widths = [max(len(line[column]) for line in table) for column in range(7)]
     lines = []
     for index, line in enumerate(table):
         first = [
             f"{cell:<{w}}" if i in (0, 2) else f"{cell:>{w}}"
             for i, (cell, w) in enumerate(zip(line, widths, strict=False))
         ]
-        lines.append("  ".join([*first, line[8]]).rstrip())
+        lines.append("  ".join([*first, line[7]]).rstrip())
         if index:
             lines += [
                 f"    → {topic.topic} {rate_words(topic)} Hz{f'  ({topic.fault})' if topic.fault else ''}"

@@ -31,17 +31,17 @@ def table(rows: Sequence[NodeRow], sort: str, inputs: bool = False) -> Group:
     for heading in HEADINGS:
         if heading == "IN Hz" and not inputs:
             continue
-        right = heading in ("PID", "CPU%", "BUDGET", "MEM MB", "THR", "LOST")
+        right = heading in ("PID", "CPU%", "MEM MB", "THR", "LOST")
         wide = heading in ("OUT Hz", "IN Hz", "MESSAGE")
         shown.add_column(heading, justify="right" if right else "left", no_wrap=not wide, ratio=2 if wide else None)
     for row in sorted(rows, key=SORT_KEYS[sort]):
         words: list[str | Text] = list(cells(row))
         words[2] = Text(row.state, style=_STATE_COLOURS.get(row.state, "bold red"))
-        words[3] = Text(str(words[3]), style="bold red" if row.over_budget else "bold" if row.cpu_percent > 80 else "")
-        words[7] = Text(str(words[7]), style="" if row.lost else "dim")  # a total: the start-up's losses count too
-        words[8] = _flows(row.outputs)
-        words[9] = _flows(row.inputs)
-        words[10] = Text(visible(row.message), style="yellow" if row.message else "")
+        words[3] = Text(str(words[3]), style="bold" if row.cpu_percent > 80 else "")
+        words[6] = Text(str(words[6]), style="" if row.lost else "dim")  # a total: the start-up's losses count too
+        words[7] = _flows(row.outputs)
+        words[8] = _flows(row.inputs)
+        words[9] = Text(visible(row.message), style="yellow" if row.message else "")
         shown.add_row(*(word for heading, word in zip(HEADINGS, words, strict=True) if heading != "IN Hz" or inputs))
     cpu = sum(row.cpu_percent for row in rows if row.cpu_percent == row.cpu_percent)
     memory = sum(row.rss_mb for row in rows if row.rss_mb == row.rss_mb)

@@ -1,10 +1,9 @@
-"""What the nodes report to the operator: diagnoses, missing heartbeats, and CPU against its budget."""
+"""What the nodes report to the operator: diagnoses, missing heartbeats, and CPU."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from instant_ic.config.cpu_budget import cpu_budget
 from instant_ic.msg import DiagnosticArray, NodeStatus
 
 TIMEOUT_S = 3.0
@@ -22,9 +21,9 @@ class FaultList:
         self._cpu_percent: dict[str, float] = {}
 
     def nodes(self, now_s: float) -> list[dict[str, Any]]:
-        """Return the running nodes: ``name``, ``cpu_percent`` and ``budget_percent`` of one core (None: no budget)."""
+        """Return the running nodes: ``name``, and ``cpu_percent`` of one core."""
         return [
-            {"name": name, "cpu_percent": round(self._cpu_percent[name], 1), "budget_percent": cpu_budget(name)}
+            {"name": name, "cpu_percent": round(self._cpu_percent[name], 1)}
             for name, (seen_s, stopping) in sorted(self._heartbeats.items())
             if not stopping and now_s - seen_s <= TIMEOUT_S
         ]

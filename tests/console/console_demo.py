@@ -92,7 +92,7 @@ class Demo:
         self.forced_mode: str | None = None
         self.faults: list[dict[str, str]] = []
         self.pace = ""
-        self.nodes = [{"name": "nerf", "cpu_percent": 12.0, "budget_percent": 17.0}]
+        self.nodes = [{"name": "nerf", "cpu_percent": 12.0}]
         self.images = True
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
         self._layers_at: Pose | None = None  # keyframe of the layers that were sent

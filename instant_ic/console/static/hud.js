@@ -55,9 +55,8 @@ export function showHealth({ vspace, battery, faults, nodes, pace }) {
     const share = battery.percent === null ? "" : ` · ${Math.round(battery.percent)} %`;
     write(byId("battery"), `${battery.voltage.toFixed(1)} V${share}`);
   }
-  const over = nodes.filter(texts.overBudget), total = nodes.reduce((sum, node) => sum + node.cpu_percent, 0);
+  const total = nodes.reduce((sum, node) => sum + node.cpu_percent, 0);
   write(byId("cpu"), nodes.length ? `${Math.round(total)} %` : "–");
-  byId("cpu").className = over.length ? "warn" : "";
   replaceLines(byId("cpu-list"), nodes.map(texts.cpuText));
   replaceItems(byId("faults"), faults, ({ level, name, text }) => {
     const item = document.createElement("li"), bold = document.createElement("b");

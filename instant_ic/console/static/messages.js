@@ -103,7 +103,7 @@ const health = object({
   type: oneOf("health"),
   vspace: optional(vspace),
   battery: optional(object({ voltage: number, percent: optional(number) })),
-  nodes: list(object({ name: text, cpu_percent: number, budget_percent: optional(number) })),
+  nodes: list(object({ name: text, cpu_percent: number })),
   faults: list(object({ level: oneOf("warn", "error"), name: text, text })),
   pace: optional(text),
 });

@@ -34,14 +34,8 @@ const NODES = {
 /** @param {string} node */
 export const nodeText = (node) => (Object.hasOwn(NODES, node) ? NODES[node] : node);
 
-/** Whether a node uses more CPU than its budget. @param {NodeCpu} node */
-export const overBudget = ({ cpu_percent, budget_percent }) => budget_percent !== null && cpu_percent > budget_percent;
-
 /** CPU of a node, percent of one core. @param {NodeCpu} node */
-export function cpuText(node) {
-  const budget = node.budget_percent === null ? "" : ` of ${node.budget_percent} %`;
-  return `${node.name}: ${Math.round(node.cpu_percent)}${budget || " %"}${overBudget(node) ? ", over its budget" : ""}`;
-}
+export const cpuText = (node) => `${node.name}: ${Math.round(node.cpu_percent)} %`;
 
 /** @param {string | null | undefined} text */
 const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) : "");

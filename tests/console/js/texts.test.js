@@ -66,9 +66,6 @@ test("numbers for the operator", () => {
   assert.equal(texts.nodeText("constructor"), "constructor");
 });
 
-test("a node's CPU stands beside its budget", () => {
-  const nerf = { name: "nerf", cpu_percent: 17.4, budget_percent: 17 };
-  assert.equal(texts.cpuText(nerf), "nerf: 17 of 17 %, over its budget");
-  assert.equal(texts.cpuText({ ...nerf, cpu_percent: 12 }), "nerf: 12 of 17 %");
-  assert.equal(texts.cpuText({ ...nerf, budget_percent: null }), "nerf: 17 %");
+test("a node's CPU in percent of one core", () => {
+  assert.equal(texts.cpuText({ name: "nerf", cpu_percent: 17.4 }), "nerf: 17 %");
 });
