@@ -31,7 +31,6 @@ _EPILOG = """examples:
   ic topic hz /scan                     rate of a topic
   ic param set depth_estimator max_rate_hz 1
   ic top                                state and load of every node, live
-  ic graph -o stack.mmd                 nodes and topics as a Mermaid diagram
   ic bag record -o drive                record all topics into the folder drive
   ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again
   ic doctor                             check this machine

@@ -129,7 +129,6 @@ def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str])
             "param",
             "doctor",
             "completion",
-            "graph",
             "top",
             "log",
         },
