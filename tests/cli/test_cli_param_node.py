@@ -117,7 +117,7 @@ def test_node_list_and_info(ic, talker):
 def test_nobody_runs_here_but_in_a_folder_of_it(ic, talker, tmp_path, monkeypatch):
     """A fleet's robots have run directories inside the launcher's: whoever looks there is told where to look."""
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(talker.parent))
-    for words in (("node", "list"), ("param", "list"), ("param", "get", "x", "y"), ("graph",), ("top",)):
+    for words in (("node", "list"), ("param", "list"), ("param", "get", "x", "y"), ("top",)):
         status, out, error = ic(*words)
         assert status == (words == ("node", "list")) ^ 1 and out == ""
         assert f"no node is running in {talker.parent}; nodes are running in" in error and f"{talker}" in error, words
@@ -216,16 +216,6 @@ def test_completion(line, expected, tmp_path, monkeypatch):
     )
     assert set(found_file.read_text().split("\v")) == expected, result.stderr
     assert "heavy: []" in result.stderr
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion_code(ic, shell):
-    status, out, _ = ic("completion", shell)
-    assert (
-        status == 0
-        and "_ARGCOMPLETE" in out
-        and {"bash": "complete", "zsh": "compdef", "fish": "--command ic"}[shell] in out
-    )
 
 
 def test_hanging_process_is_told(ic, tmp_path_factory, monkeypatch):

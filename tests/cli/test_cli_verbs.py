@@ -128,7 +128,6 @@ def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str])
             "replay",
             "param",
             "doctor",
-            "completion",
             "top",
             "log",
         },
@@ -323,8 +322,8 @@ def test_a_full_disk_is_reported_in_a_line(monkeypatch: pytest.MonkeyPatch, caps
     def write(args: object) -> None:
         Path("/dev/full").write_text("figures")  # the error of a write has no file name
 
-    monkeypatch.setattr("instant_ic.cli.commands.completion.show", write)
-    status, _, error = ic(capsys, "completion", "bash")
+    monkeypatch.setattr("instant_ic.cli.commands.compile.run", write)
+    status, _, error = ic(capsys, "compile")
     assert (status, error) == (1, "ic: a file could not be written: No space left on device. Free some space.\n")
 
 
