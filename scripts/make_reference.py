@@ -136,7 +136,7 @@ def messages() -> list[str]:
         "## Messages",
         "",
         "The types of this project (`instant_ic/msg/definitions/`), then those of ROS 2 that the stack uses, with",
-        "units and frames. `ic interface show TYPE` also expands nested types.",
+        "units and frames. `ic topic type TYPE` also expands nested types.",
         "",
     ]
     for name in (*own, *sorted(ros_fields().keys() - own)):

@@ -55,13 +55,6 @@ def types(args: Any) -> Iterable[str]:
 
 
 @_quiet
-def packages(args: Any) -> Iterable[str]:
-    from instant_ic.msg import typestore
-
-    return sorted({name.split("/")[0] for name in typestore().types})
-
-
-@_quiet
 def programs(args: Any) -> Iterable[str]:
     from instant_ic.util import paths
 

@@ -48,10 +48,8 @@ def definition(name: str) -> str:
     return "\n".join(lines)
 
 
-def expanded_definition(name: str, all_comments: bool = False) -> str:
-    """Definition of a type; the fields of nested types follow each field, indented by a tab.
-
-    ``all_comments`` shows the comments of nested types, too.
+def expanded_definition(name: str) -> str:
+    """Return the definition of a type; the fields of nested types follow each field, indented, without comments.
 
     Raises:
         MessageError: no such type.
@@ -61,17 +59,15 @@ def expanded_definition(name: str, all_comments: bool = False) -> str:
     for line in definition(name).splitlines():
         # Indented comments continue the comment of the field above: the nested fields follow them.
         if not line[:1].isspace():
-            lines += _nested(nested, all_comments)
+            lines += _nested(nested)
             field = _FIELD.fullmatch(line)
             nested = field["type"] if field and "/" in field["type"] else ""
         lines.append(line)
-    return "\n".join(lines + _nested(nested, all_comments))
+    return "\n".join(lines + _nested(nested))
 
 
-def _nested(name: str, all_comments: bool) -> list[str]:
+def _nested(name: str) -> list[str]:
     if not name:
         return []
-    lines = expanded_definition(name, all_comments).splitlines()
-    if not all_comments:
-        lines = [stripped for line in lines if (stripped := line.split("#")[0].rstrip())]
-    return [f"\t{line}" for line in lines]
+    lines = (line.split("#")[0].rstrip() for line in expanded_definition(name).splitlines())
+    return [f"\t{line}" for line in lines if line]

@@ -49,6 +49,8 @@ def test_type_and_find(ic):
     for name in ("sensor_msgs/msg/LaserScan", "sensor_msgs/LaserScan", "LaserScan"):
         assert ic("topic", "find", name)[:2] == (0, "/scan\n")
     assert ic("topic", "find", "other_msgs/LaserScan")[:2] == (0, "")
+    assert "# frame" in ic("topic", "type", "LaserScan")[1]
+    assert "did you mean 'LaserScan'?" in ic("topic", "type", "LaserScam")[2]
     status, _, error = ic("topic", "type", "/scam")
     assert status == 1 and "did you mean '/scan'?" in error
 

@@ -25,7 +25,9 @@ def add_parser(subparsers: Any) -> None:
     add("-c", "--count-topics", action="store_true", help="print only their number")
     add("-v", "--verbose", action="store_true", help="also print type, QoS, publishers and subscribers")
 
-    topic(verb(verbs, "type", "type of a topic", show_type, "ic topic type /scan"))
+    text = "type of a topic, or the definition of a message type with units and frames"
+    named = verb(verbs, "type", text, show_type, "ic topic type /scan; ic topic type LaserScan")
+    named.add_argument("name", metavar="TOPIC_OR_TYPE", completer=completion.topics)
 
     add = verb(verbs, "find", "topics of a type", find, "ic topic find sensor_msgs/msg/Image").add_argument
     add("type", metavar="TYPE", help="full or short name", completer=completion.types)
@@ -108,12 +110,16 @@ def list_topics(args: argparse.Namespace) -> int:
 
 
 def show_type(args: argparse.Namespace) -> int:
-    from instant_ic.cli.names import absolute, near, topic_types
+    from instant_ic.cli.names import absolute, find_type, near, topic_types
+    from instant_ic.msg.definition import expanded_definition
 
     types = topic_types()
-    if absolute(args.topic) not in types:
-        raise UserError(f"no node publishes or subscribes to {args.topic} ({near(args.topic, types, 'ic topic list')})")
-    print(types[absolute(args.topic)])
+    if absolute(args.name) in types:
+        print(types[absolute(args.name)])
+    elif args.name.startswith("/"):
+        raise UserError(f"no node publishes or subscribes to {args.name} ({near(args.name, types, 'ic topic list')})")
+    else:
+        print(expanded_definition(find_type(args.name)))
     return 0
 
 

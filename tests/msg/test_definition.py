@@ -1,52 +1,23 @@
-"""``ic interface``: message types with units and frames."""
-
-import pytest
+"""Definitions of message types with units and frames."""
 
 from instant_ic.msg import typestore
 from instant_ic.msg.definition import definition, expanded_definition, own_types, ros_fields
 
 
-def test_show_expands_nested_types_and_keeps_comments(ic):
-    status, out, _ = ic("interface", "show", "velodyne_msgs/msg/VelodyneScan")
-    assert status == 0
-    assert out == (
+def test_nested_types_are_expanded_and_comments_kept():
+    assert expanded_definition("velodyne_msgs/msg/VelodyneScan") == (
         "# The raw packets of one revolution (layout of the ros-drivers message of this name).\n"
         'std_msgs/Header header                  # frame "velodyne"; stamp of the first packet\n'
         "\tbuiltin_interfaces/Time stamp\n\t\tint32 sec\n\t\tuint32 nanosec\n\tstring frame_id\n"
         "velodyne_msgs/VelodynePacket[] packets  # in the order of arrival\n"
-        "\tbuiltin_interfaces/Time stamp\n\t\tint32 sec\n\t\tuint32 nanosec\n\tuint8[1206] data\n"
+        "\tbuiltin_interfaces/Time stamp\n\t\tint32 sec\n\t\tuint32 nanosec\n\tuint8[1206] data"
     )
-    assert "\n\tuint8[1206] data                        # UDP payload" in ic(
-        "interface", "show", "VelodyneScan", "--all-comments"
-    )[1]  # fmt: skip
 
 
 def test_a_comment_of_two_lines_stays_with_its_field():
     lines = expanded_definition("Keyframe").splitlines()
     sigma = next(number for number, line in enumerate(lines) if line.startswith("sensor_msgs/Image sigma"))
     assert lines[sigma + 1].lstrip().startswith("# 0.002") and lines[sigma + 2] == "\tstd_msgs/Header header"
-
-
-def test_list_and_package(ic):
-    status, out, _ = ic("interface", "list")
-    assert status == 0 and out.startswith("Messages:\n") and "\n    instant_ic_msgs/msg/Keyframe\n" in out
-    assert len(out.splitlines()) == len(typestore().types) + 1
-    assert ic("interface", "package", "velodyne_msgs")[1].split() == [
-        "velodyne_msgs/msg/VelodynePacket", "velodyne_msgs/msg/VelodyneScan",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("words", "hint"),
-    [
-        (("show", "instant_ic_msgs/msg/KeyFrame"), "did you mean 'instant_ic_msgs/msg/Keyframe'?"),
-        (("show", "LaserScam"), "did you mean 'LaserScan'?"),
-        (("package", "sensor_msg"), "did you mean 'sensor_msgs'?"),
-    ],
-)
-def test_misspelt_names(ic, words, hint):
-    status, out, error = ic("interface", *words)
-    assert status == 2 and not out and hint in error
 
 
 def test_every_type_has_a_definition_and_every_field_of_ours_a_comment():
