@@ -124,18 +124,6 @@ def read_clouds(bag: BagReader, points_topic: str = "") -> tuple[TransformBuffer
     return _transforms(bag, types), _clouds(bag, topic, types[topic], lambda ns: True)
 
 
-def read_images(bag: BagReader) -> Iterator[Any]:
-    """The panoramas of a bag (CompressedImage), in its order.
-
-    Raises:
-        BagError: the bag is damaged.
-        CalibrationError: the bag has none.
-    """
-    types = {topic.topic: topic.type_name for topic in bag.topics}
-    topic = _choose(bag.path, types, (PICTURE,), "", ("/camera/image/compressed",))
-    return (deserialize(message.payload, message.type_name) for message in bag.messages([topic]))
-
-
 def _choose(path: Path, types: dict[str, str], kinds: tuple[str, ...], wanted: str, usual: tuple[str, ...]) -> str:
     found = sorted(topic for topic, kind in types.items() if kind in kinds)
     names = " or ".join(kind.rsplit("/", 1)[-1] for kind in kinds)

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli import depth_adapt, depth_train
+from instant_ic.cli import depth_train
 from instant_ic.cli.arguments import group, positive, positive_int, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user
@@ -28,7 +28,6 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     depth_train.add_parser(commands)
     depth_train.add_render_parser(commands)
-    depth_adapt.add_parser(commands)
     add = verb(
         commands, "textures", "unpack photographic textures for ic depth render", textures,
         "ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures",
