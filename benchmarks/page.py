@@ -29,7 +29,7 @@ from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayers
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.experiments.page_renderer import PageRenderer, launch_chromium
-from instant_ic.experiments.pictures import jpeg
+from instant_ic.experiments.plots import jpeg
 from instant_ic.experiments.vspace import path_poses, start_pose
 from instant_ic.experiments.vspace_sources import VspaceSettings, take_shot
 from instant_ic.geometry.image_quality import psnr_db

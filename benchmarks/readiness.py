@@ -18,7 +18,7 @@ from reporting import parser_of, report
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments.illusion import TeleopSettings
 from instant_ic.experiments.illusion_stack import LIVE, FilmedStack, IllusionFrame
-from instant_ic.experiments.pictures import new_figure, save_figure
+from instant_ic.experiments.plots import new_figure, save_figure
 from instant_ic.experiments.teleop import run_episode
 from instant_ic.vspace import readiness
 from instant_ic.vspace.view import perspective_rays

@@ -21,7 +21,7 @@ from instant_ic.console import ConsoleServer, Look, ServerConfig
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.experiments.page_renderer import launch_chromium
-from instant_ic.experiments.pictures import jpeg
+from instant_ic.experiments.plots import jpeg
 from instant_ic.experiments.teleop_stack import CAMERA_HEIGHT_M, STEP_S, SimulatedStack, StackConfig, _Page
 from instant_ic.experiments.teleop_worlds import make_course
 from instant_ic.geometry.poses import pose_matrix

@@ -12,7 +12,7 @@ import numpy as np
 
 from instant_ic.experiments import recorded
 from instant_ic.experiments.lab import WORLD, Options, Result, Unit, kind_of
-from instant_ic.experiments.pictures import Series, curves_svg, image_strip, jpeg
+from instant_ic.experiments.plots import Series, curves_svg, image_strip, jpeg
 from instant_ic.experiments.report import Figure, Part, Table, image_address
 from instant_ic.experiments.vspace import compare
 from instant_ic.experiments.vspace_sources import PATHS, VspaceSettings

@@ -20,7 +20,7 @@ from instant_ic.experiments.illusion_stack import (
     WEBGL,
     WEBGL_TRUE_DEPTH,
 )
-from instant_ic.experiments.pictures import image_strip, new_figure, save_figure
+from instant_ic.experiments.plots import image_strip, new_figure, save_figure
 
 _TILE = 400
 _COLUMNS = {

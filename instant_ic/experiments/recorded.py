@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from instant_ic.experiments.pictures import perspective_crop
+from instant_ic.experiments.plots import perspective_crop
 from instant_ic.experiments.vspace import FILLED, STRIP_AT_M, Comparison, Row, converge_on, filled, scores
 from instant_ic.experiments.vspace_sources import FOV_RAD, KEYFRAMES, Place, Shot, VspaceSettings, base_of, make_source
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.pictures import new_figure, perspective_crop, save_figure, save_map
+from instant_ic.experiments.plots import new_figure, perspective_crop, save_figure, save_map
 from instant_ic.experiments.teleop_figures import STEP_S, Drive, judge
 from instant_ic.experiments.teleop_plot import draw_modes
 from instant_ic.experiments.teleop_stack import Log

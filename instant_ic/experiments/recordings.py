@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
-from instant_ic.experiments.pictures import (
+from instant_ic.experiments.plots import (
     correlation,
     perspective_crop,
     save_depth,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.states import Mode
-from instant_ic.experiments.pictures import save_figure
+from instant_ic.experiments.plots import save_figure
 from instant_ic.experiments.teleop import decode, photograph
 from instant_ic.experiments.teleop_figures import TRACK_S, Drive
 from instant_ic.experiments.teleop_settings import TeleopSettings

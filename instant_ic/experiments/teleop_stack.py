@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from instant_ic.bag.replay import make_node
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.console.server import ConsoleServer
-from instant_ic.experiments.pictures import jpeg
+from instant_ic.experiments.plots import jpeg
 from instant_ic.geometry.poses import (
     compose2,
     matrix_from_quaternion,

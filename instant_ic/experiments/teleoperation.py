@@ -18,7 +18,7 @@ from instant_ic.experiments import illusion, teleop_results
 from instant_ic.experiments.compared import command_of
 from instant_ic.experiments.illusion_stack import SOURCES, FilmedStack
 from instant_ic.experiments.lab import Options, Result, Unit
-from instant_ic.experiments.pictures import jpeg
+from instant_ic.experiments.plots import jpeg
 from instant_ic.experiments.recorded_drive import Moment, read_drive
 from instant_ic.experiments.report import Answer, Figure, Part, Section, Table, Text, image_address
 from instant_ic.experiments.teleop import run_episode

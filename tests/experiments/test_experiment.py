@@ -29,8 +29,8 @@ from instant_ic.experiments import (
 from instant_ic.experiments.depth_lidar import measure_world
 from instant_ic.experiments.illusion_truth import moved_by, things
 from instant_ic.experiments.lab import Options, Result, Unit
-from instant_ic.experiments.pictures import curves_svg, image_strip, jpeg
 from instant_ic.experiments.places import Walker, make_place_world, world_after
+from instant_ic.experiments.plots import curves_svg, image_strip, jpeg
 from instant_ic.experiments.recorded_drive import Moment
 from instant_ic.experiments.scan import (
     QUALITIES,

@@ -134,7 +134,7 @@ def _evaluate_faults(
 
 
 def _plot(path: Path, run: LogResult) -> None:
-    from instant_ic.experiments.pictures import save_map
+    from instant_ic.experiments.plots import save_map
 
     grid = run.slam.grid()
     save_map(

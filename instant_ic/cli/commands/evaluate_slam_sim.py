@@ -30,7 +30,7 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_slam_sim(args: argparse.Namespace) -> int:
-    from instant_ic.experiments.pictures import save_map
+    from instant_ic.experiments.plots import save_map
     from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip
     from instant_ic.sim.worlds import make_world
 

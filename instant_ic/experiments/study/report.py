@@ -12,7 +12,7 @@ import numpy as np
 
 from instant_ic.experiments import report
 from instant_ic.experiments.lab import machine
-from instant_ic.experiments.pictures import figure_svg, new_figure, series_colour
+from instant_ic.experiments.plots import figure_svg, new_figure, series_colour
 from instant_ic.experiments.report import Figure, Part, Section, Table, Text
 from instant_ic.experiments.study import stats
 from instant_ic.experiments.study.plan import CONDITIONS, Questionnaire, Study

@@ -1,4 +1,4 @@
-"""Comparison images for reports: input next to result."""
+"""Figures and images of reports, with matplotlib and OpenCV."""
 
 from __future__ import annotations
 
