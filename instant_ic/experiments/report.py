@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -57,7 +56,6 @@ PAPER = {
 }
 """Claims of the paper."""
 _MARKS = {True: ("yes", "holds"), False: ("no", "does not hold"), None: ("", "not measured")}
-_SHIPPED_BYTES = 2_000_000
 _LONG_TEXT = 40
 """More characters wrap, as a participant's answer."""
 LEAST_UNITS = 3
@@ -167,48 +165,6 @@ def write(
             5,
         ),
     )
-
-
-def ship(path: Path, sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> int:
-    """Write the page with reduced images, at most about 2 MB, and return its size in bytes.
-
-    Raises:
-        ValueError: it is larger even with the smallest images.
-    """
-    for width in (1100, 800, 600, 440, 320):
-        reduced = {
-            name: replace(
-                section,
-                parts=[
-                    replace(part, source=_reduced(part.source, width))
-                    if isinstance(part, Figure) and part.source.startswith("data:image")
-                    else part
-                    for part in section.parts
-                ],
-            )
-            for name, section in sections.items()
-        }
-        page = _page("", reduced, results, conditions)
-        if len(page.encode()) <= _SHIPPED_BYTES:
-            save_text(path, page)
-            return len(page.encode())
-    raise ValueError(f"{path}: the report has {len(page.encode()) / 1e6:.1f} MB with the smallest images, not 2 MB")
-
-
-def _reduced(address: str, width: int) -> str:
-    """An image or film no wider than ``width``, as WebP; of a film every second frame."""
-    from PIL import Image, ImageSequence
-
-    image = Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2])))
-    size = (min(width, image.width), max(round(image.height * min(1.0, width / image.width)), 1))
-    frames = [frame.convert("RGB").resize(size, Image.Resampling.LANCZOS) for frame in ImageSequence.Iterator(image)]
-    out = io.BytesIO()
-    if len(frames) == 1:
-        frames[0].save(out, "WEBP", quality=60)
-    else:
-        each_ms = 2 * int(image.info.get("duration", 250))
-        frames[0].save(out, "WEBP", save_all=True, append_images=frames[2::2], duration=each_ms, loop=0, quality=40)
-    return image_address(out.getvalue(), "image/webp")
 
 
 _STYLE = """

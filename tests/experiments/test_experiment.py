@@ -30,7 +30,7 @@ from instant_ic.experiments.depth_lidar import measure_world
 from instant_ic.experiments.illusion_truth import moved_by, things
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.places import Walker, make_place_world, world_after
-from instant_ic.experiments.plots import curves_svg, image_strip, jpeg
+from instant_ic.experiments.plots import curves_svg, image_strip
 from instant_ic.experiments.recorded_drive import Moment
 from instant_ic.experiments.scan import (
     QUALITIES,
@@ -43,7 +43,7 @@ from instant_ic.experiments.scan import (
     station_places,
 )
 from instant_ic.experiments.teleop_operator import MANNERS, ScriptedOperator, Sight
-from instant_ic.experiments.teleoperation import _webp, stills
+from instant_ic.experiments.teleoperation import stills
 from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
@@ -237,19 +237,6 @@ def test_the_report_needs_no_other_file(tmp_path) -> None:
     assert list(kept["paper"]) == list(report.PAPER) and kept["paper"]["flow"]["held"] is None
 
 
-def test_the_shipped_report_has_smaller_images(tmp_path) -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (900, 1600, 3), np.uint8)
-    images = [report.Figure(f"{n}", report.image_address(jpeg(noise)), wide=True) for n in range(5)]
-    film = _webp([noise[:90, :160], noise[90:180, :160], noise[180:270, :160]], 0.25)
-    section = report.Section("Title", [*images, report.Figure("Film", report.image_address(film, "image/webp"))])
-    size = report.ship(tmp_path / "small.html", {"ablation": section}, [], {})
-    page = (tmp_path / "small.html").read_text()
-    assert size == len(page.encode()) <= 2_000_000 and page.count("data:image/webp") == 6
-    with pytest.raises(ValueError, match="with the smallest images"):
-        text = report.Text("x" * 2_000_000)
-        report.ship(tmp_path / "large.html", {"ablation": report.Section("Title", [text])}, [], {})
-
-
 def view_result(world: str, values: dict[str, float], path: str = "straight") -> Result:
     """A result with PSNR and SSIM (a hundredth) of each source, at 1 m."""
     rows = [
@@ -432,7 +419,6 @@ def test_a_recorded_drive_is_shown(tmp_path) -> None:
         (["--bag", "drive", "--meshes", "."], "leave out --world and --meshes"),
         (["--meshes", "/nowhere"], "has no mesh"),
         (["--unit-timeout", "0"], "--unit-timeout: must be > 0"),
-        (["--ship", "report.txt"], "must end in .html"),
     ],
 )
 def test_wrong_options_are_reported_before_anything_is_measured(arguments, words, tmp_path, capsys) -> None:

@@ -12,7 +12,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from instant_ic.cli.arguments import check_files, positive, positive_int, size, verb
+from instant_ic.cli.arguments import positive, positive_int, size, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user, use_one_thread_for_matrices
 from instant_ic.cli.progress import progress
@@ -45,12 +45,10 @@ def add_parser(subparsers: Any) -> None:
     add("--timeout", type=_limit, default=86400.0, metavar="S", help="limit for all units (default: %(default)g s)")
     text = "limit for one unit, which is then ended (default: %(default)g s)"
     add("--unit-timeout", type=_limit, default=1800.0, metavar="S", help=text)
-    add("--ship", type=Path, metavar="FILE.html", help="also write the report with reduced images, at most 2 MB")
 
 
 def run(args: argparse.Namespace) -> int:
     use_one_thread_for_matrices()
-    check_files(args.ship, suffix=".html")
     with errors_for_the_user():
         return _experiment(args)
 
@@ -93,8 +91,6 @@ def _experiment(args: argparse.Namespace) -> int:
         }
         conditions["wall time of this run"] = f"{time.monotonic() - began:.0f} s"
         report.write(args.out, sections, results, conditions)
-        if args.ship is not None:
-            report.ship(args.ship, sections, results, conditions)
 
     folder.mkdir(parents=True, exist_ok=True)
     write(found)  # what there is, before hours of work
