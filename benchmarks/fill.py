@@ -132,8 +132,8 @@ def measure(renderer: EquirectRenderer, kind: str, start: Any, number: int, olde
         frame = renderer.render_perspective(pose, WIDTH, HEIGHT, FOV, supersample=2)
         view = space.render(pose, WIDTH, HEIGHT, FOV)
         unseen = view.confidence == 0
-        assert space.keyframe is not None and space._shown is not None
-        plain = space._shown.keyframes[0].warp.render(pose, WIDTH, HEIGHT, FOV).rgb  # type: ignore[union-attr]
+        assert space.keyframe is not None and space.shown is not None
+        plain = space.shown.newest.warp.render(pose, WIDTH, HEIGHT, FOV).rgb
         exact = np.where(unseen[..., None], frame.rgb, view.rgb)
         images = (plain, view.rgb, cv2.inpaint(plain, unseen.astype(np.uint8), 3, cv2.INPAINT_TELEA), exact)
         rows.append(

@@ -39,7 +39,7 @@ from instant_ic.sim.worlds import make_world
 from instant_ic.util import paths
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.jobs import decode_panorama
-from instant_ic.vspace.layers import LayerEncoder
+from instant_ic.vspace.layers import encode
 
 FOV = math.pi / 2
 MOST_BELOW_DB = 0.3
@@ -84,7 +84,7 @@ def measure(
         space.set_keyframe(
             decode_panorama(np.frombuffer(images[0], np.uint8)), shot.result.depth_m, shot.pose, shot.result.sigma
         )
-    encoded = LayerEncoder().encode(space._shown, list(range(len(images), 0, -1)), images)
+    encoded = encode(space.shown.newest, len(images), images[0], 1)
     layers = PageLayers(1, (0.0, 0.0, 0.0), LayerMeshes().layers(encoded))
     for page in pages.values():
         page.load(layers)

@@ -127,18 +127,16 @@ class Background:
         rgb[mask], sure[mask] = colours, sures
         return replace(self, rgb=rgb, sure=sure)
 
-    def draw(
-        self, rays: Rays, gain: Floats, wanted: NDArray[np.bool_], picture: tuple[Floats, Floats, Floats]
-    ) -> Floats:
-        """Render the background into a perspective image.
+    def draw(self, rays: Rays, wanted: NDArray[np.bool_], view: tuple[Floats, Floats, Floats]) -> Floats:
+        """Render the background into a perspective view.
 
         Args:
-            rays: of the view; gain: (3,) factors of the colours.
-            wanted: (P,) where nothing has been seen.
-            image: in and out: colour (P, 3), depth (P,), confidence (P,), which is 1 on the sky, else left 0.
+            rays: P rays of the view.
+            wanted: pixels that no keyframe has seen, (P,).
+            view: colour (P, 3), depth (P,) and confidence (P,), updated in place; confidence becomes 1 on the sky.
 
         Returns:
-            Share of the guess in the image, (P,) in 0..1; 0 where nothing was rendered.
+            Weight of the estimate in the view, 0 to 1, (P,); 0 where nothing was rendered.
         """
         from instant_ic.vspace.background_kernels import draw_quads, paint
 
@@ -149,11 +147,11 @@ class Background:
         for mark, quads in ((1, self.guessed), (2, self.sky)):
             draw_quads(quads, mark, self.inverse, directions, view_from_camera, half, nearness, marks)
         drawn = wanted & (nearness.reshape(-1) > 0)
-        colour, depth, confidence = picture
+        colour, depth, confidence = view
         depth[drawn] = 1 / (rays.axial[drawn] * nearness.reshape(-1)[drawn])
         camera_from_map = np.linalg.inv(self.map_from_camera).astype(np.float32)
         share = np.zeros(len(depth), np.float32)
-        paint(self.rgb, self.sure, camera_from_map, gain, rays.origin, rays.directions, drawn, depth, colour, share)
+        paint(self.rgb, self.sure, camera_from_map, rays.origin, rays.directions, drawn, depth, colour, share)
         confidence[drawn & (marks.reshape(-1) == 2)] = 1
         return share
 

@@ -93,7 +93,7 @@ def draw_quads(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def paint(  # type: ignore[no-untyped-def]
-    rgb, shares, camera_from_map, gain, origin, directions, wanted, depth, colour, share
+    rgb, shares, camera_from_map, origin, directions, wanted, depth, colour, share
 ):
     """Colours (P, 3) of a panorama (h, w, 3), bilinear, at places ``depth`` (P,) along rays where ``wanted`` (P,);
     likewise ``share`` (P,) in 0..1 of ``shares`` (h, w) uint8.
@@ -109,7 +109,7 @@ def paint(  # type: ignore[no-untyped-def]
         for c in range(3):
             value = wa * np.float32(rgb[v0, left, c]) + wb * np.float32(rgb[v0, right, c])
             value += wc * np.float32(rgb[v1, left, c]) + wd * np.float32(rgb[v1, right, c])
-            colour[n, c] = value * np.float32(1 / 255) * gain[c]
+            colour[n, c] = value * np.float32(1 / 255)
         value = wa * np.float32(shares[v0, left]) + wb * np.float32(shares[v0, right])
         value += wc * np.float32(shares[v1, left]) + wd * np.float32(shares[v1, right])
         share[n] = value * np.float32(1 / 255)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.vspace.canvas import Drawing, draw
-from instant_ic.vspace.compose import exposure_gains
+from instant_ic.vspace.agreement import exposure_gains
+from instant_ic.vspace.composition import Rendering, compose
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.store import KeyframeSet, spread
 from instant_ic.vspace.view import perspective_rays
@@ -46,22 +46,22 @@ def trials(shown: KeyframeSet) -> tuple[Trial, ...]:
 
     Places hidden from the shown keyframes are left out: the warp has them from the very images that it is judged by.
     """
-    newest, found = shown.keyframes[0], []
+    newest, found = shown.newest, []
     for older in spread((newest, *shown.kept), TRIALS):
         pose = newest.prior.map_from_camera.copy()
         pose[:3, 3] = older.prior.map_from_camera[:3, 3]
         rays = perspective_rays(pose, *_SIZE, _FOV)
         colour, _, known = older.warp.draw(rays)
-        warped = draw(rays, shown, None, {})
+        warped = compose(rays, newest, None)
         truth = np.clip(colour * exposure_gains([newest.prior, older.prior])[1], 0, 1).astype(np.float32)
         found.append(Trial.of(rays, truth, (known > 0) & (warped.confidence > 0), warped.colour))
     return tuple(found)
 
 
-def gain_db(trials: Sequence[Trial], drawings: Sequence[Drawing]) -> float:
-    """PSNR of the field's drawings above the warp's over all judged pixels that both render; NaN without any."""
+def gain_db(trials: Sequence[Trial], renderings: Sequence[Rendering]) -> float:
+    """PSNR of the field's renderings above the warp's over all judged pixels that both render; NaN without any."""
     warp = field = 0.0
-    for trial, (colour, _, confidence) in zip(trials, drawings, strict=True):
+    for trial, (colour, _, confidence) in zip(trials, renderings, strict=True):
         both = np.isfinite(trial.warp_error) & (confidence > 0)
         warp += float(trial.warp_error[both].sum())
         field += float(_error(colour, trial.truth)[both].sum())

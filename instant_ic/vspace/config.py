@@ -123,7 +123,7 @@ class VirtualSpaceConfig:
         device: auto: triton where it works, else cpu (numba); cuda: triton where it works, else torch-cuda;
             torch-cpu (slow).
         panorama_width: px; wider panoramas are area-averaged to this.
-        keyframes: newest keyframes that are kept and shown together, 1..8; the time per view grows with it.
+        keyframes: newest keyframes that the field is trained on together, 1..8.
         older: older keyframes, from up to 3 m away, whose pixels show what is hidden from the newest; costs nothing per
             view.
         picture: the keyframe's panorama warped by its depth, or the field.

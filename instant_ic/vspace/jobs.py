@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from instant_ic.util.limits import decode_image, load_image
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_device_fault
-from instant_ic.vspace.layers import LayerEncoder
+from instant_ic.vspace.layers import encode
 from instant_ic.vspace.mesh_file import MeshError
 from instant_ic.vspace.mesh_space import Space, make_space
 from instant_ic.vspace.prior import KeyframeError
@@ -151,7 +151,7 @@ class SpaceWorker:
         self.space: Space | None = None
         self._robot, self._warm = robot, warm
         self._newest: EncodedView | None = None  # view of the space as it is
-        self._encoder = LayerEncoder()
+        self._version = 0  # of the layers
         self._sources: dict[int, Incoming] = {}  # of the keyframes by their place in the store
 
     def run(self, job: Job) -> Outcome:
@@ -190,9 +190,9 @@ class SpaceWorker:
             self._sources[prepared.keyframes[0].place] = job.keyframe
             return Outcome(job, prepared)
         if job.kind is JobKind.LAYERS:
-            sources = [self._sources[keyframe.place] for keyframe in job.made.keyframes]
-            ids, images = [source.id for source in sources], [source.image for source in sources]
-            return Outcome(job, self._encoder.encode(job.made, ids, images))
+            source = self._sources[job.made.newest.place]
+            self._version += 1
+            return Outcome(job, encode(job.made.newest, source.id, source.image, self._version))
         if job.kind is JobKind.SCENE and isinstance(space, VirtualSpace):
             return Outcome(job, space.scene_of(job.made))
         if job.kind is JobKind.SHOW and isinstance(space, VirtualSpace):

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -78,59 +77,45 @@ class Layer:
 
 @dataclass(frozen=True)
 class Layers:
-    """One version of the space: of each keyframe what was seen and what lies behind, newest first."""
+    """One version of the space: what the newest keyframe has seen, and what lies behind it."""
 
     version: int
     layers: tuple[Layer, ...]
 
 
-class LayerEncoder:
-    """Encodes what a space shows; what has not changed since the last call is not encoded again."""
+def encode(keyframe: Keyframe, number: int, image: bytes | None, version: int) -> Layers:
+    """Encode the keyframe that views show.
 
-    def __init__(self) -> None:
-        self._version = 0
-        self._before: dict[tuple[Kind, int], tuple[Keyframe, Layer]] = {}
-
-    def encode(self, shown: KeyframeSet, ids: Sequence[int], images: Sequence[bytes | None]) -> Layers:
-        """The next version.
-
-        Args:
-            shown: the keyframes, prepared for rendering by the warp.
-            ids: of the keyframes.
-            images: the camera's encoded image of each; None: the panorama is encoded here.
-        """
-        self._version += 1
-        made: list[tuple[Keyframe, Layer]] = []
-        for keyframe, gain, number, image in zip(shown.keyframes, shown.gains, ids, images, strict=True):
-            for kind in Kind:
-                if kind is Kind.BEHIND and keyframe.background is None:
-                    continue
-                made.append((keyframe, self._layer(kind, keyframe, gain, number, image)))
-        self._before = {(layer.kind, layer.keyframe_id): (keyframe, layer) for keyframe, layer in made}
-        return Layers(self._version, tuple(layer for _, layer in made))
-
-    def _layer(self, kind: Kind, keyframe: Keyframe, gain: Floats, number: int, image: bytes | None) -> Layer:
-        before, old = self._before.get((kind, number), (None, None))
-        if old is not None and before is keyframe:
-            return replace(old, gain=gain)
-        background = keyframe.background
-        if kind is Kind.SEEN:
-            near_m, png = _encoded_geometry(keyframe.prior.inverse_depth, _marks(keyframe))
-            colour = image or _jpeg(keyframe.prior.rgb)
-        else:
-            assert background is not None
-            marks = np.rint(background.sure * np.float32(_SURE / 255)).astype(np.uint8) << 3
-            for quads, content in ((background.guessed, Content.SURFACE), (background.sky, Content.SKY)):
-                marks[tuple(quads.T)] |= np.uint8(content)
-            near_m, png = _encoded_geometry(background.inverse, marks)
-            colour = _jpeg(background.rgb)
-        versions = [self._version] * 2
-        if old is not None and colour == old.colour:
-            versions[0] = old.colour_version
-        if old is not None and (near_m, png) == (old.near_m, old.geometry_png):
-            versions[1] = old.geometry_version
-        prior = keyframe.prior
-        return Layer(kind, number, prior.map_from_camera, gain, prior.relative_sigma, colour, near_m, png, *versions)
+    Args:
+        keyframe: the keyframe, prepared for rendering by the warp.
+        number: its id.
+        image: the camera's encoded panorama; None to encode it here.
+        version: number of this version of the space.
+    """
+    prior, background = keyframe.prior, keyframe.background
+    seen = _encoded_geometry(prior.inverse_depth, _marks(keyframe))
+    parts = [(Kind.SEEN, image or _jpeg(prior.rgb), seen)]
+    if background is not None:
+        marks = np.rint(background.sure * np.float32(_SURE / 255)).astype(np.uint8) << 3
+        for quads, content in ((background.guessed, Content.SURFACE), (background.sky, Content.SKY)):
+            marks[tuple(quads.T)] |= np.uint8(content)
+        parts.append((Kind.BEHIND, _jpeg(background.rgb), _encoded_geometry(background.inverse, marks)))
+    layers = [
+        Layer(
+            kind,
+            number,
+            prior.map_from_camera,
+            np.ones(3, np.float32),
+            prior.relative_sigma,
+            colour,
+            near_m,
+            png,
+            version,
+            version,
+        )
+        for kind, colour, (near_m, png) in parts
+    ]
+    return Layers(version, tuple(layers))
 
 
 def _marks(keyframe: Keyframe) -> NDArray[np.uint8]:
@@ -199,26 +184,22 @@ def decode_layer(layer: Layer) -> DecodedLayer:
 
 
 def decode(layers: Layers, panorama_width: int) -> KeyframeSet:
-    """The keyframes of whole layers, to be rendered as the space's own (``VirtualSpace.show``).
+    """Decode the newest keyframe of whole layers, to be rendered as the space's own (``VirtualSpace.show``).
 
     Args:
         layers: a whole version.
-        panorama_width: wider panoramas are area-averaged to this.
+        panorama_width: pixels; wider panoramas are area-averaged to this.
 
     Raises:
         LayersError: a layer cannot be decoded, or there is none that the camera saw.
     """
-    seen = [layer for layer in layers.layers if layer.kind is Kind.SEEN]
-    behind = {layer.keyframe_id: layer for layer in layers.layers if layer.kind is Kind.BEHIND}
-    if not seen:
+    seen = next((layer for layer in layers.layers if layer.kind is Kind.SEEN), None)
+    if seen is None:
         raise LayersError("the layers hold no keyframe")
-    keyframes = []
-    for place, layer in enumerate(seen):
-        prior = _prior(layer, panorama_width)
-        guess = behind.get(layer.keyframe_id)
-        background = None if guess is None else _background(guess)
-        keyframes.append(Keyframe(place, prior, PanoramaWarp(prior), background))
-    return KeyframeSet(tuple(keyframes), np.stack([np.asarray(layer.gain, np.float32) for layer in seen]))
+    behind = (layer for layer in layers.layers if (layer.kind, layer.keyframe_id) == (Kind.BEHIND, seen.keyframe_id))
+    prior = _prior(seen, panorama_width)
+    keyframe = Keyframe(0, prior, PanoramaWarp(prior), next((_background(layer) for layer in behind), None))
+    return KeyframeSet((keyframe,), np.ones((1, 3), np.float32))
 
 
 def _prior(layer: Layer, panorama_width: int) -> PanoramaPrior:

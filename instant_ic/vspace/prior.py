@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +18,6 @@ MOST_COORDINATE_M = 100_000.0
 """Places farther from the map's origin have no centimetres in float32."""
 DEPTH_EDGE_RATIO = 0.10
 """Neighbouring depths that differ by more than this share are an edge, unless they lie on one plane."""
-EDGE_RAD = 0.05
-"""Distance to each side of an edge within which depth may belong to either surface."""
 
 ROBOT, SKY, MOVED, ROOM = range(4)
 """Content of a pixel: the robot itself; the sky; something that has moved away; a part of the place. As in
@@ -98,15 +95,6 @@ class PanoramaPrior:
         content = np.where(self.content == MOVED, ROOM, self.content)
         content[moved & (content == ROOM)] = MOVED
         return self if np.array_equal(content, self.content) else replace(self, content=content.astype(np.uint8))
-
-    @functools.cached_property
-    def beside_edge(self) -> NDArray[np.uint8]:
-        """1 within ``EDGE_RAD`` of a quad with a depth edge, (h, w) uint8."""
-        pixels = max(1, round(EDGE_RAD / np.pi * self.depth_edge.shape[0]))
-        near = np.pad(self.depth_edge, ((pixels, pixels), (0, 0)))
-        for axis in (0, 1):  # columns wrap
-            near = np.maximum.reduce([np.roll(near, k, axis) for k in range(-pixels, pixels + 1)])
-        return np.ascontiguousarray(near[pixels:-pixels])
 
     @property
     def median_depth_m(self) -> float:

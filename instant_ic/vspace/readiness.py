@@ -11,7 +11,6 @@ the warp renders older keyframes.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,31 +53,30 @@ class Texture:
 
 
 def error_terms(
-    priors: Sequence[PanoramaPrior], texture: Texture, rays: Rays, depth: Floats, confidence: Floats
+    prior: PanoramaPrior, texture: Texture, rays: Rays, depth: Floats, confidence: Floats
 ) -> tuple[float, float]:
-    """Squared errors (0..1 units) of a view from shifts and from unseen parts, before weighting.
+    """Return the squared errors (0 to 1 units) of a view from shifts and from unseen parts, before weighting.
 
     Args:
-        priors: keyframes that the view is rendered from, with each pixel's sigma; a surface counts for the one by whose
-            depth it is shifted least.
-        texture: of the newest.
-        rays, depth, confidence: the view, (P,) each, as rendered.
+        prior: keyframe that the view is rendered from, with each pixel's sigma.
+        texture: texture of its panorama.
+        rays: P rays of the view.
+        depth: metres along the rays as rendered, (P,).
+        confidence: confidence as rendered, (P,); 0 is unseen.
     """
     seen = confidence > 0
     unseen = float(1 - seen.mean())
     if not seen.any():
         return 0.0, unseen * texture.variance
     points = rays.origin + depth[seen, None] * rays.directions[seen]
-    shift = np.full(len(points), np.inf, np.float32)
-    for prior in priors:
-        back = prior.map_from_camera[:3, 3].astype(np.float32) - points
-        away = np.maximum(np.linalg.norm(back, axis=1), 1e-3)
-        cosine = -np.einsum("ij,ij->i", back, rays.directions[seen]) / away
-        ratio = away / np.maximum(depth[seen], 1e-3)
-        sine = np.sqrt(np.clip(1 - cosine * cosine, 0, 1))
-        height, width = prior.sigma.shape
-        sigma = prior.sigma[nearest_pixels(prior.in_camera(points), width, height)]
-        shift = np.minimum(shift, sigma * ratio * sine)
+    back = prior.map_from_camera[:3, 3].astype(np.float32) - points
+    away = np.maximum(np.linalg.norm(back, axis=1), 1e-3)
+    cosine = -np.einsum("ij,ij->i", back, rays.directions[seen]) / away
+    ratio = away / np.maximum(depth[seen], 1e-3)
+    sine = np.sqrt(np.clip(1 - cosine * cosine, 0, 1))
+    height, width = prior.sigma.shape
+    sigma = prior.sigma[nearest_pixels(prior.in_camera(points), width, height)]
+    shift = (sigma * ratio * sine).astype(np.float32)
     return (1 - unseen) * float(texture.cost(shift).mean()), unseen * texture.variance
 
 

@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
-from instant_ic.vspace import canvas
-from instant_ic.vspace.canvas import Drawing, Painted, Picture
+from instant_ic.vspace.agreement import exposure_gains, moved
 from instant_ic.vspace.choice import Choice, Trial, gain_db, trials
-from instant_ic.vspace.compose import exposure_gains, moved
+from instant_ic.vspace.composition import ComposedView, Rendering, compose, dissolve, filled_image, to_8bit
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_out_of_memory, make_device
 from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
@@ -137,7 +136,7 @@ class VirtualSpace(Drawn):
         # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
         self._store = KeyframeStore(self.config.keyframes + 2 + (RECENT - 1 if self.config.older else 0))
         self._shown: KeyframeSet | None = None
-        self._before: KeyframeSet | None = None  # what images showed before, until these have taken over
+        self._before: KeyframeSet | None = None  # shown before, until the newest has taken over
         self._pictures = 0  # rendered since then
         self._scene: Scene | None = None  # what the field learns
         self._held: tuple[Keyframe, ...] = ()  # whose arrays the scene looks at
@@ -159,17 +158,17 @@ class VirtualSpace(Drawn):
 
     @property
     def shown(self) -> KeyframeSet | None:
-        """The keyframes that views show, prepared for rendering; another space may ``show`` them too."""
+        """The keyframes in use, prepared for rendering; another space may ``show`` them too."""
         return self._shown
 
     @property
     def keyframe(self) -> PanoramaPrior | None:
         """The newest keyframe that views show."""
-        return None if self._shown is None else self._shown.keyframes[0].prior
+        return None if self._shown is None else self._shown.newest.prior
 
     @property
     def keyframes(self) -> tuple[PanoramaPrior, ...]:
-        """All keyframes that views show, newest first."""
+        """All keyframes that the field learns from, newest first."""
         return () if self._shown is None else self._shown.priors
 
     @property
@@ -214,10 +213,10 @@ class VirtualSpace(Drawn):
     ) -> KeyframeSet:
         """Prepare a new keyframe, with the earlier ones that are kept; changes nothing that is shown.
 
-        Of the keyframes before it ``config.keyframes`` − 1 are shown too (0, the paper's way), in the new one's
-        exposure and without what has moved, and ``config.older`` give their pixels of what is hidden from it; none
-        where its images have another size. May run in a thread of its own beside all
-        other calls; one keyframe at a time, and each must be shown before the next.
+        The field learns from ``config.keyframes`` − 1 earlier keyframes too, in the new one's exposure and without
+        moved objects. ``config.older`` keyframes give their pixels of what is hidden from the new one. Keyframes of
+        another size are dropped. This may run in another thread beside all other calls; each keyframe must be shown
+        before the next is prepared.
 
         Args: as ``prior.prepare``.
 
@@ -233,7 +232,7 @@ class VirtualSpace(Drawn):
         size = (newest.prior.rgb.shape, newest.prior.inverse_depth.shape)
         before = tuple(one for one in before if (one.prior.rgb.shape, one.prior.inverse_depth.shape) == size)
         shown = self._together((newest, *before[: config.keyframes - 1]))
-        first = shown.keyframes[0]
+        first = shown.newest
         kept = tuple(one for one in before if all(one.place != other.place for other in shown.keyframes))
         if first.background is None or not config.older:
             return shown
@@ -342,9 +341,9 @@ class VirtualSpace(Drawn):
 
     def _choose(self) -> None:
         """Show the field or the warp, whichever renders the older keyframes better."""
-        drawings = [self._on_device(functools.partial(_field_alone, trial.rays)) for trial in self._trials]
+        renderings = [self._on_device(functools.partial(_field_alone, trial.rays)) for trial in self._trials]
         left = (self.config.train.iterations - self._schedule.iteration) / self.config.readiness.plateau_iterations
-        self._choice.take(gain_db(self._trials, drawings), left)
+        self._choice.take(gain_db(self._trials, renderings), left)
 
     def _note(self, colour_error: float) -> None:
         first = math.isnan(self._colour_error)
@@ -400,12 +399,8 @@ class VirtualSpace(Drawn):
         rays = perspective_rays(checked_pose(map_from_camera), *_PROBE, fov_rad)
         self._learn_what_is_drawn(around=False)
 
-        def draw(device: Device) -> Painted:
-            picture = self._drawn(device, rays, shown, True, {})
-            return canvas.painted(picture, picture.colour)
-
-        _, depth, confidence = self._on_device(draw)
-        return self._judge(rays, depth, confidence)
+        view = self._on_device(lambda device: self._composed(device, rays, shown, around=False))
+        return self._judge(rays, view.depth, view.confidence)
 
     def _judge(self, rays: Rays, depth: Floats, confidence: Floats) -> float:
         """Expected PSNR of a view as it was rendered, (P,) each, from a few thousand of its pixels."""
@@ -414,22 +409,24 @@ class VirtualSpace(Drawn):
         chosen = np.arange(step // 2, height, step)[:, None] * width + np.arange(step // 2, width, step)
         chosen = chosen.reshape(-1)
         some = rays.some(chosen)
-        priors = self.keyframes
-        if self._texture is None or self._texture[0] is not priors[0]:
-            self._texture = priors[0], Texture.of(priors[0].rgb)
-        terms = error_terms(priors, self._texture[1], some, depth[chosen], confidence[chosen])
+        prior = self.keyframe
+        assert prior is not None
+        if self._texture is None or self._texture[0] is not prior:
+            self._texture = prior, Texture.of(prior.rgb)
+        terms = error_terms(prior, self._texture[1], some, depth[chosen], confidence[chosen])
         return expected_psnr_db(terms, self._psnr_db, self._panorama_share)
 
     def _view(self, rays: Rays, projection: str) -> View:
         if self._shown is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
         self._learn_what_is_drawn(projection == "equirect")
-        rgb, depth, confidence = self._on_device(lambda device: self._painted(device, rays, projection == "equirect"))
+        view, image = self._on_device(lambda device: self._dissolved(device, rays, projection == "equirect"))
         if self._before is not None:
             self._pictures += 1
             self._let_go()
-        expected = self._judge(rays, depth, confidence)
-        return View(rgb, depth.reshape(rays.shape), confidence.reshape(rays.shape), projection, expected)
+        expected = self._judge(rays, view.depth, view.confidence)
+        depth, confidence = view.depth.reshape(rays.shape), view.confidence.reshape(rays.shape)
+        return View(to_8bit(image), depth, confidence, projection, expected)
 
     def _learn_what_is_drawn(self, around: bool) -> None:
         """Train on the shown keyframes if the field is rendered too and has no scene yet."""
@@ -437,27 +434,28 @@ class VirtualSpace(Drawn):
             assert self._shown is not None
             self.learn(self.scene_of(self._shown))
 
-    def _painted(self, device: Device, rays: Rays, around: bool) -> Painted:
-        """Render the shown keyframes, blended with those shown before; ``around``: a panorama, not warped."""
-        assert self._shown is not None
-        warps = not around
-        layers: dict[int, Drawing] = {}  # a keyframe of both sets is rendered once
-        picture = self._drawn(device, rays, self._shown, warps, layers)
-        image = canvas.continued(picture, rays.shape, around)
-        if self._before is not None:
-            before = self._drawn(device, rays, self._before, warps, layers)
-            share = (self._pictures + 1) / self.config.picture.refresh_pictures
-            image = canvas.passed(canvas.continued(before, rays.shape, around), image, share)
-        return canvas.painted(picture, image)
+    def _dissolved(self, device: Device, rays: Rays, around: bool) -> tuple[ComposedView, Floats]:
+        """Render the newest keyframe, and its image (H, W, 3) blended with that of the keyframe shown before.
 
-    def _drawn(
-        self, device: Device, rays: Rays, shown: KeyframeSet, warps: bool, layers: dict[int, Drawing]
-    ) -> Picture:
-        """Render keyframes: their panoramas warped (``warps``), or the field."""
+        Args:
+            device: backend of the field.
+            rays: rays of the view.
+            around: the view is a panorama, which is rendered by the field and not warped.
+        """
+        assert self._shown is not None
+        view = self._composed(device, rays, self._shown, around)
+        image = filled_image(view, rays.shape, around)
+        if self._before is not None:
+            before = filled_image(self._composed(device, rays, self._before, around), rays.shape, around)
+            image = dissolve(before, image, (self._pictures + 1) / self.config.picture.refresh_pictures)
+        return view, image
+
+    def _composed(self, device: Device, rays: Rays, shown: KeyframeSet, around: bool) -> ComposedView:
+        """Render a keyframe: its panorama warped, or the field."""
         share, field = self._panorama_share, None
-        if share == 0 or not warps:
+        if share == 0 or around:
             field = device.draw(rays, share, max(share, _LEAST_DEPTH_SHARE))
-        return canvas.draw(rays, shown if warps else None, field, layers)
+        return compose(rays, None if around else shown.newest, field)
 
     @property
     def _panorama_share(self) -> float:
@@ -552,7 +550,7 @@ def _renewed(keyframe: Keyframe, prior: PanoramaPrior) -> Keyframe:
     return ready(keyframe.place, prior, keyframe.warp.pyramid)
 
 
-def _field_alone(rays: Rays, device: Device) -> Drawing:
+def _field_alone(rays: Rays, device: Device) -> Rendering:
     return device.draw(rays, 0.0, _LEAST_DEPTH_SHARE)
 
 

@@ -32,9 +32,12 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class KeyframeSet:
-    """Keyframes that views show together, newest first; ``gains`` (K, 3) bring their colours to the newest's.
+    """The newest keyframe, which views show, and the older ones used with it.
 
-    ``kept``: older ones, newest first, for their pixels of what is hidden from the newest.
+    Attributes:
+        keyframes: keyframes that the field learns from together, newest first.
+        gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3).
+        kept: older keyframes, newest first, whose pixels show what is hidden from the newest.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -42,8 +45,13 @@ class KeyframeSet:
     kept: tuple[Keyframe, ...] = ()
 
     @property
+    def newest(self) -> Keyframe:
+        """The keyframe that views show."""
+        return self.keyframes[0]
+
+    @property
     def priors(self) -> tuple[PanoramaPrior, ...]:
-        """Of the keyframes, newest first."""
+        """Priors of ``keyframes``, newest first."""
         return tuple(keyframe.prior for keyframe in self.keyframes)
 
 

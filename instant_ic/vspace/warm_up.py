@@ -34,12 +34,11 @@ def warm_up(config: VirtualSpaceConfig | None = None) -> None:
     depth[12:20, 28:36] = 2.0  # something behind which nobody has seen
     aside = np.eye(4)
     aside[1, 3] = 1.0
-    for pose in (np.eye(4), aside)[: config.keyframes]:
+    for pose in (aside, np.eye(4))[-config.keyframes :]:
         space.set_keyframe(rgb, depth, pose, np.full_like(depth, 0.05))
-    pose = aside if config.keyframes == 1 else np.eye(4)
-    space.render(pose, 32, 16, math.pi / 2)
+    space.render(aside, 32, 16, math.pi / 2)
     if space.config.source == "field":
         space.train(iterations=1)
         space.render_equirect(np.eye(4), 64)
         space.config = dataclasses.replace(space.config, picture=dataclasses.replace(config.picture, field_alone=True))
-        space.render(pose, 32, 16, math.pi / 2)
+        space.render(aside, 32, 16, math.pi / 2)

@@ -17,7 +17,7 @@ from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import serialize
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace.layers import LayerEncoder
+from instant_ic.vspace.layers import encode
 
 POSE = pose_matrix(0.0, -0.3, 0.1, yaw=0.4)
 
@@ -29,10 +29,10 @@ def bag(tmp_path_factory):
     space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu", keyframes=1))
     space.set_keyframe(room.rgb, room.depth_m, POSE, 0.02)
     image = cv2.imencode(".jpg", room.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-    encoder, folder = LayerEncoder(), tmp_path_factory.mktemp("scene")
+    folder = tmp_path_factory.mktemp("scene")
     with BagWriter(folder / "bag") as writer:
         for version in (1, 2):
-            message = layers_message(encoder.encode(space._shown, [version], [image]), version)
+            message = layers_message(encode(space.shown.newest, version, image, version), version)
             writer.write("/vspace/layers", "instant_ic_msgs/msg/VspaceLayers", bytes(serialize(message)), version)
     return folder / "bag"
 

@@ -14,7 +14,7 @@ from instant_ic.experiments.page_renderer import PageRenderer
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace.layers import LayerEncoder
+from instant_ic.vspace.layers import encode
 
 pytestmark = BROWSER_TEST
 WIDTH, HEIGHT, FOV = 480, 270, math.pi / 2
@@ -28,7 +28,7 @@ def test_the_page_shows_what_the_cpu_renders(browser, full):
     space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))
     space.set_keyframe(room.rgb, cv2.resize(room.depth_m, (512, 256), interpolation=cv2.INTER_NEAREST), KEYFRAME, 0.02)
     png = cv2.imencode(".png", room.rgb[..., ::-1])[1].tobytes()  # both sides have the same colours
-    layers = LayerMeshes().layers(LayerEncoder().encode(space._shown, [1], [png]))
+    layers = LayerMeshes().layers(encode(space.shown.newest, 1, png, 1))
     page = PageRenderer(browser, WIDTH, HEIGHT, full)
     page.load(PageLayers(1, (0.0, 0.0, 0.0), layers))
     for ahead, left, turn in STEPS:

@@ -11,7 +11,7 @@ from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace import KeyframeError, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.background import Background, level_planes
 from instant_ic.vspace.background_kernels import in_front
-from instant_ic.vspace.canvas import Picture, continued
+from instant_ic.vspace.composition import ComposedView, filled_image
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
 from instant_ic.vspace.view import perspective_rays
@@ -111,7 +111,7 @@ def test_the_guess_lies_fixed_in_the_map():
     for pose in (pose_matrix(y=0.6, yaw=-0.2), pose_matrix(x=0.2, y=0.9, yaw=-0.3)):
         rays = perspective_rays(pose, 96, 64, 1.2)
         picture = np.zeros((96 * 64, 3), np.float32), np.zeros(96 * 64, np.float32), np.zeros(96 * 64, np.float32)
-        done = background.draw(rays, np.ones(3, np.float32), np.ones(96 * 64, bool), picture)
+        done = background.draw(rays, np.ones(96 * 64, bool), picture)
         ends = rays.origin + picture[1][:, None] * rays.directions
         azimuth = np.arctan2(ends[:, 1], ends[:, 0])
         inside = (done > 0) & (np.abs(azimuth) < 0.2) & (np.abs(ends[:, 2]) < 0.5)
@@ -189,7 +189,7 @@ def test_guesses_are_mixed_in_by_hand():
     colour[[0, 5, 6, 11]], colour[1:5], colour[7:11] = 0.2, 1.0, 1.0
     seen = np.tile(np.array([1, 0, 0, 0, 0, 1], np.float32), 2)
     share = np.tile(np.array([0, 1, 0.5, 0.25, 0, 0], np.float32), 2)
-    image = continued(Picture(colour, depth, seen, share), (2, 6), False)
+    image = filled_image(ComposedView(colour, depth, seen, share), (2, 6), False)
     # From around it is 0.2 everywhere: 0.2 + share · 0.8.
     assert image[0, :, 0] == pytest.approx([0.2, 1.0, 0.6, 0.4, 0.2, 0.2])
 

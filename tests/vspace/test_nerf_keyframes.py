@@ -10,15 +10,11 @@ import pytest
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.vspace import FieldConfig, ReadinessConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace import compose as composing
-from instant_ic.vspace.compose import Layer, compose, exposure_gain, exposure_gains, moved
+from instant_ic.vspace.agreement import exposure_gain, exposure_gains, moved
 from instant_ic.vspace.config import GeometryConfig
-from instant_ic.vspace.nerf.field import Rays
 from instant_ic.vspace.prior import MOVED, ROOM, prepare
 from instant_ic.vspace.store import Keyframe, recent, spread
-from instant_ic.vspace.view import perspective_rays
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",
@@ -38,22 +34,12 @@ def prior_of(pose, gain=1.0, depth=None, height=64):
     return prepare(rgb, picture.depth_m if depth is None else depth, pose, 0.02, GeometryConfig(), 2048)
 
 
-def learn(space, *poses, gains=(1.0, 1.0, 1.0, 1.0)):
-    for pose, gain in zip(poses, gains, strict=False):
+def learn(space, *poses):
+    for pose in poses:
         picture = box_room.panorama(pose, 96)
-        rgb = np.clip(picture.rgb * np.asarray(gain), 0, 255).astype(np.uint8)
-        space.set_keyframe(rgb, picture.depth_m, pose, 0.02)
+        space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
         space.train()
     return space
-
-
-def test_two_keyframes_show_what_one_has_not_seen():
-    truth = box_room.perspective(VIEW, 96, 64, 1.5).rgb
-    one = learn(VirtualSpace(dataclasses.replace(CONFIG, keyframes=1)), SECOND, FIRST).render(VIEW, 96, 64, 1.5)
-    both = learn(VirtualSpace(CONFIG), SECOND, FIRST).render(VIEW, 96, 64, 1.5)
-    assert (both.confidence > 0).mean() > (one.confidence > 0).mean() + 0.02
-    assert psnr_db(both.rgb, truth) > psnr_db(one.rgb, truth) + 1
-    assert both.confidence.max() <= 1
 
 
 @pytest.mark.parametrize("keyframes", [1, 2, 3])
@@ -112,10 +98,6 @@ def test_exposure_is_fitted_where_both_have_seen():
     black = dataclasses.replace(older, rgb=older.rgb // 100)
     assert exposure_gain(newest, black) is None  # nothing to fit on
     assert exposure_gains([newest, black]).tolist() == [[1, 1, 1], [1, 1, 1]]
-    # A picture of both has the newest's exposure throughout: as if the other had been taken with it.
-    uneven = learn(VirtualSpace(CONFIG), SECOND, FIRST, gains=(0.6, 1.0)).render(VIEW, 96, 64, 1.5)
-    even = learn(VirtualSpace(CONFIG), SECOND, FIRST).render(VIEW, 96, 64, 1.5)
-    assert psnr_db(uneven.rgb, even.rgb) > 28
 
 
 def test_a_gain_without_strong_evidence_is_1():
@@ -129,21 +111,6 @@ def test_a_gain_without_strong_evidence_is_1():
         assert fitted == pytest.approx([expected] * 3, rel=0.1 if factor < 0.9 else 0)
     assert exposure_gain(newest, prior_of(FIRST, gain=0.9)) == pytest.approx([1 / 0.9] * 3, rel=0.02)  # one factor
     assert exposure_gain(newest, prior_of(FIRST, gain=0.98)).tolist() == [1, 1, 1]  # rounding makes as much
-
-
-def test_the_order_of_keyframes_does_not_matter():
-    space = VirtualSpaceConfig(device="cpu", source="warp", keyframes=3, older=0)
-    views = []
-    for poses in ((FIRST, SECOND, pose_matrix()), (pose_matrix(), FIRST, SECOND), (SECOND, pose_matrix(), FIRST)):
-        made = VirtualSpace(space)
-        for pose in poses:
-            picture = box_room.panorama(pose, 96)
-            made.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
-        view = made.render(VIEW, 96, 64, 1.5)
-        views.append(view)
-    for view in views[1:]:
-        assert np.array_equal(view.rgb, views[0].rgb)
-        assert np.array_equal(view.confidence, views[0].confidence)
 
 
 def test_which_older_keyframes_are_chosen_and_kept():
@@ -256,87 +223,14 @@ def test_a_thing_that_has_moved_away_is_left_out():
     picture = box_room.panorama(pose, 96)
     space = VirtualSpace(CONFIG)
     learn(space, other)
-    view = pose_matrix(x=0.0, y=-1.0, yaw=0.6)
-    rays = perspective_rays(view, 96, 64, 1.2)
-
-    def pixels_on_the_box():
-        drawn = space.render(view, 96, 64, 1.2)
-        ends = rays.origin + drawn.depth_m.reshape(-1, 1) * rays.directions
-        near = np.all((ends > box_room.BOX_LOW - 0.02) & (ends < box_room.BOX_HIGH + 0.02), axis=1)
-        # At its foot the floor behind it is hardly farther than the box: that may be an error of the depth.
-        return np.count_nonzero(near & (ends[:, 2] > -0.7) & (drawn.confidence.reshape(-1) > 0))
-
-    assert pixels_on_the_box() > 100
     space.set_keyframe(picture.rgb, depth, pose, 0.02)
-    assert pixels_on_the_box() < 5
     assert (space.keyframes[1].content == MOVED).sum() > 100
     assert not space._scene.priors[1].usable.all()  # nor does the field learn from it
 
 
-def layer(prior, depth, confidence, colour, gain=1.0):
-    depth, confidence = np.array(depth, np.float32), np.array(confidence, np.float32)
-    colours = np.repeat(np.array(colour, np.float32)[:, None], 3, 1)
-    return Layer(prior, np.full(3, gain, np.float32), colours, depth, confidence)
-
-
-def test_composing_by_hand():
-    # Both keyframes stand where the view does; three pixels straight ahead, far beyond what either has looked through.
-    near, rays = prior_of(np.eye(4)), perspective_rays(np.eye(4), 16, 16, 0.01)
-    rays = Rays(rays.origin, np.tile(np.array([[1.0, 0, 0]], np.float32), (5, 1)), rays.axial, rays.shape)
-    newest = layer(near, [5, 9, 0, 5, 0], [1, 1, 0, 0.5, 0], [0.2, 0.2, 0.2, 0.2, 0.1])
-    older = layer(near, [5.1, 6, 7, 9, 0], [1, 1, 1, 1, 0], [0.3, 0.3, 0.3, 0.3, 0.9], gain=2.0)
-    colour, depth, confidence = compose([newest, older], rays)
-    # One surface: half of each, as both stand at the view's place. Then the nearer; the only one; the one that is known
-    # rather than filled; nobody's: as the newest has it.
-    assert colour[:, 0] == pytest.approx([0.5 * 0.2 + 0.5 * 0.6, 0.6, 0.6, 0.6, 0.1], abs=0.01)
-    assert depth == pytest.approx([5.05, 6, 7, 9, 0], abs=0.01)
-    assert confidence.tolist() == [1, 1, 1, 1, 0]
-
-
-def test_an_older_keyframe_shows_its_edges_only_where_it_sees_more_than_the_newest():
-    # A surface 5 m ahead, which the newest only guesses; all of the older one's depth is edges.
-    rays = perspective_rays(np.eye(4), 16, 16, 0.01)
-    rays = Rays(rays.origin, np.array([[1.0, 0, 0]], np.float32), rays.axial, rays.shape)
-
-    def confidence(x, y):
-        newest = prior_of(np.eye(4))
-        older = dataclasses.replace(
-            newest, map_from_camera=pose_matrix(x=x, y=y), depth_edge=np.ones_like(newest.depth_edge)
-        )
-        layers = [layer(newest, [5], [0], [0.2]), layer(older, [5], [1], [0.9])]
-        return float(compose(layers, rays)[2][0])
-
-    assert confidence(-0.3, 0.5) == confidence(0.3, 0.5) == 0  # 5.32 m and 4.73 m off, 5 and 6 degrees beside
-    assert confidence(0.8, 0.5) == 1  # 4.23 m off: nearer than 4.5 m
-    assert confidence(2.0, 4.0) == 1  # 5 m off, 53 degrees beside
-
-
-def test_what_a_newer_keyframe_has_looked_through_is_left_out_of_an_older_one():
-    newest, rays = prior_of(np.eye(4)), perspective_rays(np.eye(4), 16, 16, 0.01)
-    rays = Rays(rays.origin, np.array([[1.0, 0, 0]], np.float32), rays.axial, rays.shape)
-    height, width = newest.inverse_depth.shape
-    wall = 1 / newest.inverse_depth[height // 2, width // 2]
-    layers = [layer(newest, [wall], [1], [0.2]), layer(prior_of(pose_matrix(x=-0.3)), [0.5 * wall], [1], [0.9])]
-    colour, depth, confidence = compose(layers, rays)
-    assert (colour[0, 0], depth[0], confidence[0]) == (pytest.approx(0.2), pytest.approx(wall), 1)
-    # The other way round nobody newer has looked there: the nearer surface counts.
-    colour, depth, _ = compose([layer(newest, [0.5 * wall], [1], [0.9]), layer(newest, [wall], [1], [0.2])], rays)
-    assert (colour[0, 0], depth[0]) == (pytest.approx(0.9), pytest.approx(0.5 * wall))
-
-
-def test_the_keyframe_that_is_nearer_to_a_surface_has_more_say():
-    rays = perspective_rays(np.eye(4), 16, 16, 0.01)
-    rays = Rays(rays.origin, np.array([[1.0, 0, 0]], np.float32), rays.axial, rays.shape)
-    layers = [layer(prior_of(pose_matrix(x=x)), [8], [1], [value]) for x, value in ((-2.5, 0.0), (2.0, 1.0))]
-    # Surface at 8 m, seen from 10.5 and from 6: penalties 0.05 + 10.5/8 − 1 = 0.3625 and 0.05, to the power of −6.
-    colour, _, _ = compose(layers, rays)
-    assert colour[0, 0] == pytest.approx(1 / (1 + (0.05 / 0.3625) ** 6), abs=1e-3)
-
-
-@pytest.mark.parametrize("keyframes", [1, 3])
-def test_a_refresh_costs_no_picture_more_than_a_decibel(keyframes):
+def test_a_refresh_costs_no_picture_more_than_a_decibel():
     """A drive with a keyframe every 0.6 m: each picture against what the older keyframes would show."""
-    config = dataclasses.replace(CONFIG, source="warp", keyframes=keyframes)
+    config = dataclasses.replace(CONFIG, source="warp", keyframes=1)
     space, without = VirtualSpace(config), VirtualSpace(config)
     worst, taken = math.inf, []
     for number in range(16):
@@ -354,74 +248,3 @@ def test_a_refresh_costs_no_picture_more_than_a_decibel(keyframes):
         if len(taken) > 1:
             worst = min(worst, shown - psnr_db(without.render(view, 64, 36, 1.5).rgb, truth))
     assert worst > -1.0
-
-
-def composed_plainly(layers, rays):
-    """The rules of ``compose`` in plain numpy."""
-    depth, confidence = (np.stack([getattr(one, key) for one in layers]) for key in ("depth", "confidence"))
-
-    def angle(prior, points, directions):
-        seen = points - prior.map_from_camera[:3, 3]
-        cosine = np.einsum("ij,ij->i", seen, directions) / np.linalg.norm(seen, axis=1)
-        return np.arccos(np.clip(cosine, -1, 1))
-
-    rank = confidence.copy()
-    for number, one in enumerate(layers):
-        at = np.flatnonzero(confidence[number])
-        points = rays.origin + depth[number, at, None] * rays.directions[at]
-        local = (points - one.prior.map_from_camera[:3, 3]) @ one.prior.map_from_camera[:3, :3]
-        height, width = one.prior.depth_edge.shape
-        u, v = equirect_pixels(local, width, height)
-        row, column = np.clip(np.floor(v), 0, height - 1).astype(int), np.floor(u).astype(int) % width
-        own, first = (points - prior.map_from_camera[:3, 3] for prior in (one.prior, layers[0].prior))
-        near, far = np.linalg.norm(own, axis=1), np.linalg.norm(first, axis=1)
-        between = np.arccos(np.clip(np.einsum("ij,ij->i", own, first) / (near * far), -1, 1))
-        anew = (near < composing.NEARER * far) | (between > composing.OTHER_SIDE_RAD)
-        lax = anew | (number == 0)
-        edge = np.where(lax, one.prior.depth_edge[row, column], one.prior.beside_edge[row, column]) > 0
-        edge &= angle(one.prior, points, rays.directions[at]) > 0.02
-        rank[number, at] -= np.where(edge, np.where(lax, composing.EDGE, rank[number, at]), 0)
-        for newer, other in enumerate(layers[:number]):
-            room = 1 + composing.disagreement(other.prior, one.prior)
-            local = (points - other.prior.map_from_camera[:3, 3]) @ other.prior.map_from_camera[:3, :3]
-            u, v = equirect_pixels(local, width, height)
-            row, column = np.clip(np.floor(v), 0, height - 1).astype(int), np.floor(u).astype(int) % width
-            rows, columns = np.stack([row, np.minimum(row + 1, height - 1)]), np.stack([column, (column + 1) % width])
-            corners = rows[:, None], columns[None]
-            ratios = other.prior.inverse_depth[corners] * np.linalg.norm(local, axis=1)
-            sure = (other.prior.known[corners] == 1).all(axis=(0, 1)) & (ratios.min(axis=(0, 1)) <= room)
-            t = depth[number, at]
-            drawn = (confidence[newer, at] > 0) & (np.abs(depth[newer, at] - t) <= composing.SAME_PLACE * t)
-            through = ratios.max(axis=(0, 1)) * room < 1
-            rank[number, at] = np.where(sure & (through | ~(drawn | anew)), 0, rank[number, at])
-    met = rank.max(axis=0) > 0
-    candidate = (rank > 0) & (rank == rank.max(axis=0))
-    nearest = np.where(candidate, depth, np.inf).min(axis=0)
-    candidate &= depth <= nearest * (1 + composing.SAME_PLACE)
-    penalty = np.full(depth.shape, np.inf)
-    points = rays.origin + nearest[met, None] * rays.directions[met]
-    for number, one in enumerate(layers):
-        away = np.linalg.norm(points - one.prior.map_from_camera[:3, 3], axis=1)
-        aside = angle(one.prior, points, rays.directions[met])
-        penalty[number, met] = composing.LEAST_PENALTY + aside + np.maximum(0, away / nearest[met] - 1)
-    penalty[~candidate] = np.inf
-    surface = np.take_along_axis(depth, penalty.argmin(axis=0)[None], axis=0)[0]
-    candidate &= np.abs(depth - surface) <= surface * composing.SAME_SURFACE
-    weight = np.where(candidate, penalty, np.inf) ** -composing.SHARPNESS
-    weight[0, ~met] = 1
-    weight /= weight.sum(axis=0)
-    colour = sum(w[:, None] * one.gain * one.colour for w, one in zip(weight, layers, strict=True))
-    return colour, (weight * depth).sum(axis=0), np.where(candidate, confidence, 0).max(axis=0)
-
-
-def test_the_kernel_composes_as_plain_numpy_does():
-    from instant_ic.vspace import PanoramaWarp
-
-    rays = perspective_rays(VIEW, 48, 32, 1.5)
-    layers = []
-    for pose, gain in ((FIRST, 1.0), (SECOND, 0.8), (pose_matrix(x=0.4, y=-0.5), 1.2)):
-        prior = prior_of(pose)
-        layers.append(Layer(prior, np.full(3, gain, np.float32), *PanoramaWarp(prior).draw(rays)))
-    for fast, plain in zip(compose(layers, rays), composed_plainly(layers, rays), strict=True):
-        off = np.abs(fast - plain).reshape(len(rays.axial), -1).max(axis=1)
-        assert np.count_nonzero(off > 2e-3) <= 3  # a pixel on the border of two rules may fall to either side

@@ -19,8 +19,8 @@ from instant_ic.vspace import (
     TrainConfig,
     VirtualSpace,
     VirtualSpaceConfig,
-    canvas,
 )
+from instant_ic.vspace.composition import dissolve
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.vspace.prior import area_average, edge_quads, fill_holes, prepare
@@ -175,7 +175,7 @@ def test_what_is_shown_passes_into_a_new_keyframe():
     shown = [space.render(CAMERA, 64, 36, 1.5).rgb.astype(float) for _ in range(6)]
     assert np.array_equal(shown[3], shown[5])
     for number, picture in enumerate(shown[:4], 1):
-        expected = 255 * canvas.passed(*(np.float32(image / 255) for image in (first, shown[5])), number / 4)
+        expected = 255 * dissolve(*(np.float32(image / 255) for image in (first, shown[5])), number / 4)
         assert picture == pytest.approx(expected, abs=2)
     # The field has not learnt it yet, and can at any time.
     assert len(space._scene.priors) == 1 and np.array_equal(space._scene.prior.map_from_camera, CAMERA)
@@ -188,7 +188,7 @@ def test_parts_that_disagree_change_at_once_and_the_others_pass():
     before = np.full((20, 40, 3), 0.5, np.float32)
     after = before + np.float32(0.02)
     after[:, 20:] = 0.9  # a door elsewhere
-    image = canvas.passed(before, after, 0.25)
+    image = dissolve(before, after, 0.25)
     assert image[:, :16] == pytest.approx(0.505)  # a quarter of the way
     assert image[:, 24:] == pytest.approx(0.9)
 
@@ -346,10 +346,10 @@ def test_a_gpu_that_was_asked_for_fails_aloud_and_the_next_keyframe_recovers(mon
 
 @pytest.mark.parametrize("keyframes", [1, 2])
 def test_warm_up_leaves_nothing_to_compile(keyframes):
-    from instant_ic.vspace import background_kernels, compose_kernels, fill_kernels, warp_kernels
+    from instant_ic.vspace import agreement_kernels, background_kernels, fill_kernels, warp_kernels
     from instant_ic.vspace.nerf import kernels, march
 
-    modules = (background_kernels, compose_kernels, fill_kernels, kernels, march, warp_kernels)
+    modules = (background_kernels, agreement_kernels, fill_kernels, kernels, march, warp_kernels)
     compiled = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
     config = dataclasses.replace(CONFIG, keyframes=keyframes)
     warm_up(config)

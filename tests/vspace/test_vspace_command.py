@@ -15,7 +15,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import Empty, serialize, type_name
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.export import flight, surface
-from instant_ic.vspace.layers import LayerEncoder
+from instant_ic.vspace.layers import encode
 from instant_ic.vspace.space import NotReadyError
 
 
@@ -48,7 +48,7 @@ def test_the_newest_layers_of_a_bag_are_rendered(tmp_path, capsys):
     space, picture = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu")), box_room.panorama(np.eye(4), 96)
     space.set_keyframe(picture.rgb, picture.depth_m, np.eye(4), 0.02)
     image = cv2.imencode(".png", picture.rgb[..., ::-1])[1].tobytes()
-    message = layers_message(LayerEncoder().encode(space._shown, [3], [image]), 5)
+    message = layers_message(encode(space.shown.newest, 3, image, 1), 5)
     view = ["--size", "96x64", "--pose", "0.4,0,0,20", "-o", str(tmp_path / "a.png")]
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/vspace/layers", type_name(message), serialize(message), 5)
