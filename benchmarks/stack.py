@@ -26,10 +26,10 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+from cpu_usage import Usage, cpu_percent, reference_loop, usage
 from reporting import note, parser_of, report
 
 from instant_ic.bus import LATCHED, RELIABLE
-from instant_ic.experiments.budget import Usage, cpu_percent, reference_loop, usage
 from instant_ic.experiments.drive import DriveRecorder
 from instant_ic.experiments.page_renderer import launch_chromium
 from instant_ic.experiments.stack import Stack, StackError, free_ports, processes_of

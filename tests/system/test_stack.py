@@ -18,8 +18,8 @@ import pytest
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
+from benchmarks.cpu_usage import cpu_percent, reference_loop, usage
 from instant_ic.bus import registry
-from instant_ic.experiments.budget import cpu_percent, reference_loop, usage
 from instant_ic.experiments.drive import DriveRecorder, drive_through_obstacle
 from instant_ic.experiments.stack import Stack, free_ports, processes_of
 from instant_ic.geometry.poses import compose2
@@ -92,7 +92,7 @@ RECORDED_LOOPS = {
     "console": 12.2,  # with the triangles of the layers
     "crawler_base": 2.6,
     "depth_estimator": 1.9,
-    "depth_scaler": 8.9,  # 3.9 measured before, and 5.0 of the local model (benchmarks/local_model.py)
+    "depth_scaler": 8.9,  # 3.9 measured before, and 5.0 of the local model
     "grid_slam": 2.7,
     "launcher": 0.9,
     "navigator": 1.9,
