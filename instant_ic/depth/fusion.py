@@ -102,7 +102,7 @@ def likely_ceiling(seen_m: float, network: Corrected, usual_m: float) -> float:
     """Height of a ceiling over the camera in metres, from the network's depth and the usual height.
 
     Ceilings vary by a fifth around the usual one; a network's is off by about as much as it is at the points, and by
-    a third of the share that is plainly wrong there (measured on the worlds of benchmarks/depth_sigma.py).
+    a third of the share that is plainly wrong there (measured on simulated rooms).
     """
     variance = 0.02**2 + network.sigma**2 + (0.3 * float(network.wrong.mean())) ** 2
     share = variance / (variance + 0.22**2)

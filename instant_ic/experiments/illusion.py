@@ -32,7 +32,7 @@ from instant_ic.experiments.teleop_settings import TeleopSettings
 STEP_M = 0.5
 """Width of a row of ``by_distance``."""
 BEHIND_M = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)
-"""Rows of ``by_distance`` that ``benchmarks/local_model.py`` measures with a single keyframe."""
+"""Rows of ``by_distance`` behind the near face of an obstacle."""
 WITHIN_DB = 2.0
 """Error allowed in the expected PSNR."""
 Still = dict[str, NDArray[np.uint8]]
@@ -154,7 +154,7 @@ def by_distance(frames: Sequence[IllusionFrame], source: str) -> list[dict[str, 
 def behind_m(frames: Sequence[IllusionFrame], source: str) -> dict[str, float]:
     """Mean PSNR in dB by metres behind the near face, and that of 0.5 to 2 m; NaN without frames there.
 
-    The rows weigh alike, however long the v-bot was there, as in ``benchmarks/local_model.py``.
+    The rows weigh alike, however long the v-bot was there.
     """
     rows = {row["distance_m"]: row["psnr_mean_db"] for row in by_distance(frames, source)}
     found = {f"{at:g}": rows.get(at, math.nan) for at in BEHIND_M}
