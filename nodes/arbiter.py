@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from instant_ic import msg
-from instant_ic.adapters.control import ArbiterInbox, command_message, control_state
+from instant_ic.adapters.control import ArbiterInbox, command_limits, command_message, control_state
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import Arbiter, Decision
@@ -60,6 +60,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         # A doubt holds until the next report: silence is no trust. A SLAM that is gone is noticed by the age of /pose.
         integrity = self.latest("/slam/integrity", msg.PoseIntegrity, float("inf"))
         self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace, integrity)
+        self.inbox.gate.limits = command_limits(c.timeouts)
         self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
         self.subscribe_received("/operator/cmd_vel", self.on_command, qos=SENSOR, message_class=msg.TwistStamped)
         self.subscribe_received("/view/shown", self.on_shown, qos=SENSOR, message_class=msg.ShownPictures)
@@ -74,6 +75,7 @@ class ArbiterNode(Node[ArbiterConfig]):
 
     def reconfigure(self, config: ArbiterConfig) -> None:
         self.arbiter.reconfigure(config)
+        self.inbox.gate.limits = command_limits(config.timeouts)
         super().reconfigure(config)
         self.warn_of_protection()
 
@@ -113,7 +115,7 @@ class ArbiterNode(Node[ArbiterConfig]):
     def on_command(self, received: Received) -> None:
         """Obey the holder of the robot's lease, and step at once when his command has changed."""
         lease, before = self.inbox.lease, self.inbox.lease.holder
-        taken = self.inbox.take_command(received, self.config.timeouts.command)
+        taken = self.inbox.take_command(received)
         if lease.holder != before:
             self.log.info("%s", lease.diagnosis.text)
         if taken and self.times.command_steps(self.inbox.command):

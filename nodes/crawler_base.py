@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from instant_ic.adapters.base import estimate_message, read_command
-from instant_ic.base.command_gate import CommandGate
+from instant_ic.base.command_source import CommandSource
 from instant_ic.base.config import CrawlerBaseConfig, RoboclawConfig
 from instant_ic.base.controller import BaseController, BaseState, ControllerThread, Health, SteppedController
 from instant_ic.base.pace import refuse_pace
@@ -43,7 +43,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         )
         self.stepped_ns = clock.steady_ns()  # by the node's thread
         also = "/cmd_vel is also published by %s; it must be the arbiter alone"
-        self.gate = CommandGate(config, lambda publisher: self.log.warning(also, publisher))
+        self.source = CommandSource(config, lambda publisher: self.log.warning(also, publisher))
         self.report = BaseReport(config, self.controller, self.clock.steady_ns())
         self.latch = EstopLatch()
         self.button: bool | None = None  # whether the controller, or a faulty track, holds the base stopped
@@ -59,7 +59,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         if not config.roboclaw.estop_pin:
             text = "No stop button (roboclaw.estop_pin is empty): the robot is stopped by its operator's page alone"
             self.diagnose("button", WARN, f"{text}. Wire one to the controller")
-        self.diagnose_all(self.latch.diagnosis, self.gate.publishers, self.report.tracks())
+        self.diagnose_all(self.latch.diagnosis, self.source.publishers, self.report.tracks())
         self.timer(1.0, self.watch)
         self.timer(OWN_STEP_S, self.note_step)
         loop_class = SteppedController if self.lockstep else ControllerThread
@@ -79,14 +79,14 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def on_command(self, received: Received) -> None:
         """Pass on a command of the driving node unless it is stale, unstamped or not finite."""
         now_ns = self.clock.steady_ns()
-        if self.gate.admit_publisher(received.publisher, now_ns):
+        if self.source.admit_publisher(received.publisher, now_ns):
             command = read_command(received)
-            if self.gate.admit(command.v, command.w, command.stamp_ns, received.received_ns, now_ns):
+            if self.source.admit(command.v, command.w, command.stamp_ns, received.received_ns, now_ns):
                 self.controller.command(command.v, command.w, command.given_ns, command.hard)
                 if command.hard and not self.hard:
                     self.loop.hurry()
                 self.hard = command.hard
-        self.diagnose_all(self.gate.publishers, self.gate.command)
+        self.diagnose_all(self.source.publishers, self.source.command)
 
     def on_estop(self, received: Received) -> None:
         """Obey any client's emergency stop here too, whatever the arbiter does."""
@@ -164,8 +164,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def watch(self) -> None:
         """Report the last ``recent_s``: repeats, impossible readings, dropped commands."""
         now_ns = self.clock.steady_ns()
-        self.gate.update(now_ns)
-        self.diagnose_all(*self.report.recent(now_ns), self.gate.publishers, self.gate.command)
+        self.source.update(now_ns)
+        self.diagnose_all(*self.report.recent(now_ns), self.source.publishers, self.source.command)
 
     def on_end(self, fault: BaseException | None, unstopped: str) -> None:
         """Report why the loop ended, and end the node unless it is ending anyway; called on the serial thread."""

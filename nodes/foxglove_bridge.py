@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bridge.commands import CommandGate, CommandLimits
+from instant_ic.bridge.commands import CommandLimits
 from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerConfig
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.bus.registry import TopicWatch
@@ -49,7 +49,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         config = self.config
         if self.run_dir is None:
             raise NodeError("the bridge needs the real bus: it cannot run in lockstep")
-        self.gate = CommandGate(config.limits)
+        self.gate = config.limits.gate()
         self._watch = TopicWatch(self.run_dir)
         choice = TopicChoice(config.topics, config.exclude)
         try:
@@ -104,7 +104,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         nodes = registry.list_nodes(self.run_dir)
         self.server.parameters.nodes = tuple(node.name for node in nodes)
         self.server.reconcile(self._watch.topics(), nodes)
-        refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
+        refused = {f"refused: {verdict.name.lower()}": count for verdict, count in self.gate.refused.items()}
         text = f"{len(self.server.watched)} of {len(self.server.topics)} topics watched"
         self.diagnose(
             "topics",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from instant_ic.bridge.commands import CommandGate
 from instant_ic.bridge.zenoh_config import ZenohGatewayConfig
 from instant_ic.bridge.zenoh_incoming import Incoming, topic_counts
 from instant_ic.bridge.zenoh_outgoing import Outgoing
@@ -43,7 +42,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
                 f"--namespace {self.namespace}: to set the names in Zenoh, use the parameter namespace instead"
             )
         config = self.config
-        self.gate = CommandGate(config.limits)
+        self.gate = config.limits.gate()
         self._watch = TopicWatch(self.run_dir)
         self._lost = 0
         try:
@@ -111,7 +110,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         text, lost, values = topic_counts(self.outgoing, self.incoming)
         level = WARN if lost > self._lost else OK
         self._lost = lost
-        refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
+        refused = {f"refused: {verdict.name.lower()}": count for verdict, count in self.gate.refused.items()}
         self.diagnose("topics", level, text, **values, **refused)
 
     def teardown(self) -> None:

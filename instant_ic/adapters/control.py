@@ -13,6 +13,7 @@ from instant_ic.bus import Latest
 from instant_ic.bus.clock import Clock
 from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import STANDS_M_S, STANDS_RAD_S, Decision
+from instant_ic.control.command_gate import CommandGate, GateLimits
 from instant_ic.control.estop import KeptEstop
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.interruptions import WATCHED
@@ -63,8 +64,8 @@ class ArbiterInbox:
     vspace: Latest
     integrity: Latest | None = None
     """Trust in the pose; None: not used."""
-    lease: Lease = field(default_factory=lambda: Lease(LEASE_S))
-    """Who drives the robot."""
+    gate: CommandGate = field(default_factory=lambda: command_gate(TimeoutConfig()))
+    """Decides who drives the robot."""
     button_ns: int | None = None
     """Last report of the robot's own emergency stop, steady clock."""
     _was_gone: bool = False  # at the page's last report
@@ -97,27 +98,33 @@ class ArbiterInbox:
         still = self._twist("command") == NO_MOTION == self._twist("odometry")
         return still and mode in (Mode.REAL, Mode.STOPPED)
 
-    def take_command(self, received: Received, timeout_s: float) -> bool:
+    @property
+    def lease(self) -> Lease:
+        """Who drives the robot."""
+        assert self.gate.lease is not None
+        return self.gate.lease
+
+    def take_command(self, received: Received) -> bool:
         """Take a command if its sender has the robot's lease, or gets it; return whether it was taken.
 
         Args:
             received: TwistStamped; its frame names the client of the node that published it.
-            timeout_s: age in seconds above which a command takes no lease.
         """
         message = deserialize(received.payload, received.type_name)
-        if not all(math.isfinite(value) for value in twist_values(message)):
+        twist = twist_values(message)
+        if self.gate.check_twist(*twist) is not None:
             return False  # neither a motion nor a release: it refreshes no age
         sender, given_ns = f"{received.publisher}/{message.header.frame_id}", received.given_ns(stamp_ns(message))
-        moves = twist_values(message) != NO_MOTION
+        moves = twist != NO_MOTION
         if sender.endswith(RELEASED):
             taken = not moves and self.lease.release(sender.removesuffix(RELEASED))
         else:
             now_ns = self.clock.steady_ns()
-            refusal = self.lease.refusal(sender, moves, now_ns, self._stands())
-            new = sender == self.lease.holder or now_ns - given_ns <= timeout_s * 1e9
-            taken = refusal is None and new
+            # The holder's command is taken at any age, which counts from then on; another sender's must be recent.
+            age_s = 0.0 if sender == self.lease.holder else (now_ns - given_ns) / 1e9
+            stands = self._stands()
+            taken = self.gate.admit(*twist, age_s, sender, now_ns, given_ns=given_ns, stands=stands) is None
             if taken:
-                self.lease.grant(sender, given_ns)
                 self._zeros_of = self._zeros_of if moves else sender
                 if not self._counts(self._shown_by):
                     self.shown.forget()
@@ -235,6 +242,16 @@ class ArbiterInbox:
 
     def _arrived_ns(self, latest: Latest) -> int:
         return self.clock.steady_ns() - round(latest.age_s * 1e9)
+
+
+def command_gate(timeouts: TimeoutConfig) -> CommandGate:
+    """Return the arbiter's gate: a recent command takes the robot's lease if that is free."""
+    return CommandGate(command_limits(timeouts), Lease(LEASE_S))
+
+
+def command_limits(timeouts: TimeoutConfig) -> GateLimits:
+    """Return the limits of the arbiter's gate; the age of a command stamped ahead counts from its arrival."""
+    return GateLimits(max_age_s=timeouts.command, max_ahead_s=math.inf)
 
 
 def page_report(shown: ShownPictures | None) -> PageReport | None:

@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from instant_ic.bridge.commands import DRIVE, STOP, CommandGate, CommandRefused
+from instant_ic.bridge.commands import DRIVE, STOP
 from instant_ic.bridge.foxglove_protocol import ClientChannel
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, Node, Publisher
-from instant_ic.control.robot_lease import RELEASED
+from instant_ic.control.command_gate import CommandGate
+from instant_ic.control.robot_lease import RELEASED, Refusal
 from instant_ic.msg import MessageError, deserialize, message_type, stamp_ns, twist_stamped, twist_values
 
 _COMMAND_TYPES = {DRIVE: ("TwistStamped", "Twist"), STOP: ("Bool",)}
@@ -47,7 +48,8 @@ class Commands:
     def unadvertised(self, client: int, channel_id: int) -> None:
         """Handle a client's ``unadvertise``. If the client drove, stop the robot immediately."""
         channel = self._channels.pop((client, channel_id), None)
-        if channel is not None and channel.topic == DRIVE and self._gate.release(_name(client)):
+        lease = self._gate.lease
+        if channel is not None and channel.topic == DRIVE and lease is not None and lease.release(_name(client)):
             self._drive.publish(twist_stamped(0.0, 0.0, self._node.clock.now_ns(), _name(client) + RELEASED))
 
     def left(self, client: int) -> None:
@@ -62,23 +64,25 @@ class Commands:
             return
         try:
             if channel.topic == STOP:
-                self._stop_by(client, channel.encoding, data)
+                refusal = self._stop_by(client, channel.encoding, data)
             else:
-                self._drive_by(client, channel.schema_name.rsplit("/", 1)[-1], channel.encoding, data)
-        except CommandRefused as error:
-            self._refused(client, f"command refused: {error}")
+                refusal = self._drive_by(client, channel.schema_name.rsplit("/", 1)[-1], channel.encoding, data)
+            if refusal is not None:
+                self._refused(client, f"command refused: {refusal.text}")
         except (MessageError, AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:  # any JSON
             self._refused(client, f"command refused: {channel.topic}: {type(error).__name__}: {error}")
 
-    def _stop_by(self, client: int, encoding: str, data: bytes) -> None:
+    def _stop_by(self, client: int, encoding: str, data: bytes) -> Refusal | None:
         value = _json(data)["data"] if encoding == "json" else deserialize(data, "Bool").data
         if not isinstance(value, bool):
             raise MessageError(f"data must be true or false (got {value!r})")
-        if not value:
-            self._gate.check_release(_name(client), time.monotonic_ns())
+        refusal = None if value else self._gate.admit_release(_name(client), 0.0, time.monotonic_ns())
+        if refusal is not None:
+            return refusal
         self._stop.publish(message_type("Bool")(value))
+        return None
 
-    def _drive_by(self, client: int, name: str, encoding: str, data: bytes) -> None:
+    def _drive_by(self, client: int, name: str, encoding: str, data: bytes) -> Refusal | None:
         now_ns = self._node.clock.now_ns()
         sent_ns = 0
         if encoding == "cdr":
@@ -92,10 +96,13 @@ class Commands:
             stamp = content.get("header", {}).get("stamp", {})
             sent_ns = int(stamp.get("sec", 0)) * 1_000_000_000 + int(stamp.get("nanosec", stamp.get("nsec", 0)))
         # Foxglove's Teleop panel has no clock and sends no stamp: the time of arrival counts
-        self._gate.check_drive(_name(client), v, w, time.monotonic_ns(), (sent_ns, now_ns) if sent_ns else None)
+        age_s = (now_ns - sent_ns) / 1e9 if sent_ns else 0.0
+        if (refusal := self._gate.admit(v, w, age_s, _name(client), time.monotonic_ns())) is not None:
+            return refusal
         self._drive.publish(twist_stamped(v, w, sent_ns or now_ns, _name(client)))
         if self._told.pop(client, None) is not None:
             self._node.call_soon(self._node.diagnose, "commands", OK, "commands are accepted")
+        return None
 
     def _refused(self, client: int, words: str) -> None:
         """Send a refusal to the client, once until its text changes."""

@@ -24,7 +24,6 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bridge import foxglove_protocol as protocol
-from instant_ic.bridge.commands import CommandGate
 from instant_ic.bridge.foxglove_commands import Commands
 from instant_ic.bridge.foxglove_parameters import Parameters
 from instant_ic.bus import ERROR, OK, WARN, Node, Subscription
@@ -32,6 +31,7 @@ from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Received
 from instant_ic.config.ranges import Range, check_ranges
+from instant_ic.control.command_gate import CommandGate
 from instant_ic.util.web_access import SIGN_IN, TokenBucket, refusal, sign_in_needed
 
 _START_S = 10.0

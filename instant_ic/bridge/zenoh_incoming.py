@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from instant_ic.bridge.commands import COMMANDS, DRIVE, STOP, CommandGate, CommandRefused
+from instant_ic.bridge.commands import COMMANDS, DRIVE, STOP
 from instant_ic.bridge.zenoh_format import Attachment, Token, TopicQoS
 from instant_ic.bridge.zenoh_outgoing import Outgoing
 from instant_ic.bridge.zenoh_session import RosNode, RosSubscription
@@ -23,7 +23,8 @@ from instant_ic.bridge.zenoh_topics import (
 )
 from instant_ic.bus import ERROR, OK, Node, Publisher
 from instant_ic.bus.registry import RegistryError
-from instant_ic.control.robot_lease import RELEASED, sender_name
+from instant_ic.control.command_gate import CommandGate
+from instant_ic.control.robot_lease import RELEASED, Refusal, Verdict, sender_name
 from instant_ic.msg import MessageError, deserialize, message_type, serialize, twist_stamped, twist_values, type_hash
 
 _TF = "tf2_msgs/msg/TFMessage"
@@ -214,11 +215,10 @@ class Incoming:
 
         def command(payload: bytes, attachment: Attachment) -> None:
             with self._gate_lock:
-                try:
-                    passed = self._check(topic, entry, payload, attachment)
-                except CommandRefused as error:
+                passed = self._check(topic, entry, payload, attachment)
+                if isinstance(passed, Refusal):
                     self._refusing.add(topic)
-                    self._tell(topic, ERROR, f"command refused: {error}")
+                    self._tell(topic, ERROR, f"command refused: {passed.text}")
                     return
                 if topic in self._refusing:
                     self._refusing.discard(topic)
@@ -227,25 +227,24 @@ class Incoming:
 
         return command if topic in self._commands else plain
 
-    def _check(self, topic: str, entry: _In, payload: bytes, attachment: Attachment) -> bytes | memoryview:
-        """Return the command to publish; a drive command names its sender, whatever that claims to be."""
-        now_ns = time.time_ns()
+    def _check(self, topic: str, entry: _In, payload: bytes, attachment: Attachment) -> bytes | memoryview | Refusal:
+        """Return the command to publish, or why not; a drive command names its sender, whatever that claims to be."""
+        gate, age_s, steady_ns = self._gate, (time.time_ns() - attachment.source_ns) / 1e9, time.monotonic_ns()
         try:
             message = deserialize(payload, COMMANDS[topic])
         except MessageError as error:
-            raise self._gate.refuse("not readable", str(error)) from None
+            return gate.refuse(Verdict.UNREADABLE, str(error))
         if topic == STOP:
             # A stop is never too old, and every sender may stop. Only the driver may release, with a recent message.
-            if not message.data:
-                if self._no_commands:
-                    raise self._gate.refuse("link not secure", f"release: {self._no_commands}")
-                self._gate.check_age(attachment.source_ns, now_ns)
-                self._gate.check_release(attachment.sender, time.monotonic_ns())
-            return payload
+            if message.data:
+                return payload
+            if self._no_commands:
+                return gate.refuse(Verdict.INSECURE, f"release: {self._no_commands}")
+            return gate.admit_release(attachment.sender, age_s, steady_ns) or payload
         if not entry.sources:
-            raise self._gate.refuse("no sender", "the ROS graph has no publisher of this topic")
-        sent = attachment.source_ns, now_ns
-        self._gate.check_drive(attachment.sender, *twist_values(message), time.monotonic_ns(), sent)
+            return gate.refuse(Verdict.NO_SENDER, "the ROS graph has no publisher of this topic")
+        if (refusal := gate.admit(*twist_values(message), age_s, attachment.sender, steady_ns)) is not None:
+            return refusal
         self._driver = message.header.frame_id = sender_name(attachment.sender, message.header.frame_id)
         return serialize(message)
 

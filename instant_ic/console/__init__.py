@@ -5,7 +5,7 @@ The package does not depend on the bus. :class:`ConsoleServer` takes a :class:`B
 """
 
 from instant_ic.console.client import ConsoleClient
-from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.console.drive import DriveConfig, DriveGate
 from instant_ic.console.protocol import Frame, FrameKind, ProtocolError, decode_frame, encode_frame
 from instant_ic.console.server import Backend, ConsoleError, ConsoleServer, ServerConfig
 from instant_ic.console.view import Look, ViewConfig
@@ -22,7 +22,6 @@ __all__ = [
     "Look",
     "ProtocolError",
     "ServerConfig",
-    "Verdict",
     "ViewConfig",
     "decode_frame",
     "encode_frame",

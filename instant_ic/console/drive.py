@@ -6,12 +6,13 @@ The caller passes the time, in seconds of one monotonic clock, so that tests nee
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
-from enum import Enum
 from typing import Annotated
 
 from instant_ic.config.ranges import Plausible, check_ranges
+from instant_ic.control.command_gate import CommandGate, GateLimits
+from instant_ic.control.robot_lease import Verdict
 from instant_ic.util.step_gap import StepGap
 
 RATE_COMMANDS = 200  # newest commands kept to measure the rate
@@ -57,18 +58,6 @@ class DriveConfig:
             raise ValueError(f"watchdog_s must span two commands of rate_hz (got {self.watchdog_s} s)")
 
 
-class Verdict(Enum):
-    """Result of a drive command."""
-
-    ACCEPTED = "accepted"
-    NOT_DRIVER = "another client drives"
-    OUT_OF_ORDER = "sequence number not newer"
-    OLD = "command too old"
-    NOT_FINITE = "command is not a number"
-    STOPPED = "emergency stop is set"
-    HELD = "the console stood still for too long: let go of the controls, then drive on"
-
-
 class DriveGate:
     """Lease of one driver, and the newest command that is still valid; zero whenever in doubt.
 
@@ -79,11 +68,12 @@ class DriveGate:
 
     def __init__(self, config: DriveConfig) -> None:
         self.config = config
+        self._gate = CommandGate(GateLimits(max_age_s=config.max_command_age_s, max_ahead_s=config.max_command_age_s))
         self.driver: int | None = None
         self.estop = False
         self._robot_known = False  # the robot reports its emergency stop
         self._pressed = -math.inf  # emergency stop pressed here and not confirmed by the robot
-        self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
+        self.counts: Counter[Verdict] = Counter()
         self.watchdog_trips = 0
         self.last_age_s: float | None = None
         self._accepted: deque[float] = deque(maxlen=RATE_COMMANDS)
@@ -171,8 +161,8 @@ class DriveGate:
         if client == self.driver and moves:
             self._held &= now - self._let_go_since < self.config.watchdog_s
             self._let_go_since = now
-        finite = math.isfinite(age_s) and math.isfinite(linear) and math.isfinite(angular)
-        verdict = self._judge(client, sequence, age_s, moves) if finite else Verdict.NOT_FINITE
+        refusal = self._gate.check_twist(linear, angular)
+        verdict = self._judge(client, sequence, age_s, moves) if refusal is None else refusal.verdict
         self.counts[verdict] += 1
         if verdict is not Verdict.ACCEPTED:
             return verdict
@@ -197,9 +187,8 @@ class DriveGate:
             return Verdict.NOT_DRIVER
         if sequence <= self._sequence.get(client, -1):
             return Verdict.OUT_OF_ORDER
-        # A stamp in the future proves no freshness either.
-        if abs(age_s) > self.config.max_command_age_s:
-            return Verdict.OLD
+        if (refusal := self._gate.check_age(age_s)) is not None:
+            return refusal.verdict
         if self.estop:
             return Verdict.STOPPED
         return Verdict.HELD if self._held and moves else Verdict.ACCEPTED

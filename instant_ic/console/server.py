@@ -35,13 +35,13 @@ from instant_ic.console.connections import (
     Listener,
     network_of,
 )
-from instant_ic.console.drive import LOOK_S, DriveConfig, DriveGate, Verdict
+from instant_ic.console.drive import LOOK_S, DriveConfig, DriveGate
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, short_text, whole
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
-from instant_ic.control.robot_lease import sender_name
+from instant_ic.control.robot_lease import Verdict, sender_name
 from instant_ic.util.pace import current, suspended_ns
 from instant_ic.util.web_access import TokenBucket, host_allowed, is_loopback
 

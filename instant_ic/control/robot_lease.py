@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import NamedTuple
 
 from instant_ic.util.diagnosis import Diagnosis, Level
@@ -14,10 +15,30 @@ LEASE_S = 2.0
 _MOST_CHARACTERS = 64
 
 
-class Refusal(NamedTuple):
-    """Why a sender may not drive: a reason to count by, and a text."""
+class Verdict(Enum):
+    """Result of the check of a command; the value is a text for the operator."""
 
-    reason: str
+    ACCEPTED = "accepted"
+    NOT_FINITE = "command is not a number"
+    TOO_FAST = "command is faster than allowed"
+    NOT_DRIVER = "another client drives"
+    MOVING = "the robot must stand before another client drives"
+    HELD = "the controls were held for too long: let go of them, then drive on"
+    UNSTAMPED = "command has no stamp"
+    OLD = "command too old"
+    FUTURE = "command is stamped ahead of this clock: set the clocks"
+    OUT_OF_ORDER = "sequence number not newer"
+    STOPPED = "emergency stop is set"
+    RELEASE = "only the driver may release the emergency stop"
+    NO_SENDER = "the sender of the command is unknown"
+    UNREADABLE = "message cannot be read"
+    INSECURE = "the link is not secure"
+
+
+class Refusal(NamedTuple):
+    """Why a command may not drive: a verdict to decide and count by, and a text with the details."""
+
+    verdict: Verdict
     text: str
 
 
@@ -64,11 +85,11 @@ class Lease:
         if moves and (second or rolls or sender in self._held):
             self._held[sender] = now_ns
         if second:
-            return Refusal("second driver", f"{sender} may not drive while {self.holder} does")
+            return Refusal(Verdict.NOT_DRIVER, f"{sender} may not drive while {self.holder} does")
         if rolls:
-            return Refusal("moving", f"{sender} may drive once the robot stands")
+            return Refusal(Verdict.MOVING, f"{sender} may drive once the robot stands")
         if sender in self._held:
-            return Refusal("held", f"{sender} must let go of the controls once before it drives")
+            return Refusal(Verdict.HELD, f"{sender} must let go of the controls once before it drives")
         return None
 
     def grant(self, sender: str, now_ns: int) -> None:

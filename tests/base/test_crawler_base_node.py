@@ -92,14 +92,14 @@ def test_old_and_senseless_commands_are_dropped_and_told(bench: Bench) -> None:
     bench.run(0.2)
     now_ns = bench.bus.clock.now_ns()
     bench.command(twist_stamped(0.5, 0.0, now_ns - 310 * MILLISECOND))
-    assert bench.node.diagnoses()["command"][:2] == (WARN, "dropped: command is 0.31 s old")
+    assert bench.node.diagnoses()["command"][:2] == (WARN, "dropped: command is 0.31 s old, at most 0.25 s allowed")
     bench.command(twist_stamped(0.5, 0.0, now_ns + 900 * MILLISECOND))
     assert "0.90 s ahead" in bench.node.diagnoses()["command"][1]
     bench.command(twist_stamped(float("nan"), 0.0, now_ns))
     assert "not finite" in bench.node.diagnoses()["command"][1]
     bench.run(0.2)
     assert bench.emulator.target_speed_pps.tolist() == [0.0, 0.0]
-    assert bench.node.gate.dropped == 3
+    assert bench.node.source.dropped == 3
 
 
 def test_unstamped_twist_is_refused_or_counts_from_its_arrival() -> None:
@@ -117,7 +117,7 @@ def test_unstamped_twist_is_refused_or_counts_from_its_arrival() -> None:
     refusing.command(twist_stamped(0.2, 0.0, 0))
     refusing.run(0.2)
     assert refusing.emulator.target_speed_pps.max() == 0.0
-    assert "has no stamp" in refusing.node.diagnoses()["command"][1] and refusing.node.gate.dropped == 2
+    assert "has no stamp" in refusing.node.diagnoses()["command"][1] and refusing.node.source.dropped == 2
 
 
 def test_controllers_watchdog_stops_the_motors_when_the_node_is_dead(bench: Bench) -> None:

@@ -12,7 +12,7 @@ from live_nodes import LiveNode, cdr, wait_for
 from websockets.exceptions import ConnectionClosed
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
-from instant_ic.control.robot_lease import RELEASED
+from instant_ic.control.robot_lease import RELEASED, Verdict
 from instant_ic.experiments.stack import free_port
 from instant_ic.msg import (
     Bool,
@@ -371,7 +371,7 @@ def test_robot_is_told_to_stand_when_its_driver_leaves_and_a_second_one_waits(dr
     frames = [deserialize(drive.payload, "TwistStamped").header.frame_id for drive in drives]
     assert frames == ["client 1", "client 1" + RELEASED]
     second.publish(b'{"linear": {"x": -0.2}, "angular": {"z": 0}}')
-    second.until(lambda: bridge.gate.refused == {"second driver": 1, "held": 1}, "the refusal of a held key")
+    second.until(lambda: bridge.gate.refused == {Verdict.NOT_DRIVER: 1, Verdict.HELD: 1}, "the refusal of a held key")
     assert last_drive(drives) == (0.0, 0.0)
     second.publish(b'{"linear": {"x": 0}, "angular": {"z": 0}}')
     second.publish(b'{"linear": {"x": -0.2}, "angular": {"z": 0}}')

@@ -21,6 +21,7 @@ from instant_ic.bridge.zenoh_session import (
     open_zenoh,
 )
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
+from instant_ic.control.robot_lease import Verdict
 from instant_ic.experiments.stack import free_port
 from instant_ic.msg import (
     Bool,
@@ -338,7 +339,7 @@ def test_fresh_commands_come_in_and_old_or_mad_ones_do_not(operator):
     listener.spin(0.3)  # what the fixture sent is through
     for send, words in [
         (lambda: command(0.3, age_s=1.0), "s old, at most 0.3 s allowed"),
-        (lambda: command(0.3, age_s=-5.0), "ahead of this machine's clock"),
+        (lambda: command(0.3, age_s=-5.0), "s ahead: set the clocks"),
         (lambda: command(float("nan")), "not finite"),
         (lambda: command(50.0), "beyond"),
     ]:
@@ -353,8 +354,8 @@ def test_fresh_commands_come_in_and_old_or_mad_ones_do_not(operator):
     assert message.header.frame_id == f"{drive.gid[:SENDER_SIZE].hex()}/base_link"  # who sent it, and what it claims
     wait_for(lambda: gateway.told("in /operator/cmd_vel") == "commands are accepted", "all clear")
     refused = dict(gateway.node.gate.refused)
-    refused.pop("no sender", None)  # what the fixture sent before the graph knew it
-    assert refused == {"old": 1, "future": 1, "not finite": 1, "too fast": 1}
+    refused.pop(Verdict.NO_SENDER, None)  # what the fixture sent before the graph knew it
+    assert refused == {Verdict.OLD: 1, Verdict.FUTURE: 1, Verdict.NOT_FINITE: 1, Verdict.TOO_FAST: 1}
 
 
 def test_second_driver_is_refused_until_the_first_is_silent(operator, world):
@@ -365,13 +366,13 @@ def test_second_driver_is_refused_until_the_first_is_silent(operator, world):
     def both():
         command(0.1)
         second.put(cdr(twist_stamped(-0.1, 0.0, time.time_ns())), time.time_ns())
-        return "while" in gateway.told("in /operator/cmd_vel") and gateway.node.gate.refused.get("second driver", 0) > 2
+        return "while" in gateway.told("in /operator/cmd_vel") and gateway.node.gate.refused[Verdict.NOT_DRIVER] > 2
 
     listener.wait(both, "refusals of the second driver")
     assert all(twist_values(deserialize(m.payload, TWIST))[0] > 0 for m in driven)
 
     def alone():
-        if gateway.node.gate.refused.get("held", 0) > 2:  # held from before: it lets go once
+        if gateway.node.gate.refused[Verdict.HELD] > 2:  # held from before: it lets go once
             second.put(cdr(twist_stamped(0.0, 0.0, time.time_ns())), time.time_ns())
         second.put(cdr(twist_stamped(-0.1, 0.0, time.time_ns())), time.time_ns())
         return driven and twist_values(deserialize(driven[-1].payload, TWIST))[0] < 0
@@ -414,7 +415,7 @@ def test_nobody_but_the_driver_releases_the_emergency_stop_and_everybody_presses
     def refused():
         command(0.0)
         stranger.put(cdr(Bool(False)), time.time_ns())
-        return gateway.node.gate.refused.get("release", 0) >= 3
+        return gateway.node.gate.refused[Verdict.RELEASE] >= 3
 
     listener.wait(refused, "refusals of the stranger's release")
     listener.spin(0.2)
@@ -442,7 +443,7 @@ def test_without_tls_no_command_comes_in_but_the_pressing_of_the_emergency_stop(
 
     listener.wait(press, "the stop")
     stop.put(cdr(Bool(False)), time.time_ns())
-    wait_for(lambda: gateway.node.gate.refused.get("link not secure"), "the refusal of the release")
+    wait_for(lambda: gateway.node.gate.refused[Verdict.INSECURE], "the refusal of the release")
     listener.spin(0.2)
     assert driven == [] and "/operator/cmd_vel" not in world.topics("robot")
     assert deserialize(stops[-1].payload, "std_msgs/msg/Bool").data

@@ -2,7 +2,8 @@
 
 import pytest
 
-from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.console.drive import DriveConfig, DriveGate
+from instant_ic.control.robot_lease import Verdict
 
 CONFIG = DriveConfig(max_linear_mps=0.4, max_angular_rps=0.8, rate_hz=20, watchdog_s=0.25, stop_repeat_s=0.3)
 
@@ -193,7 +194,7 @@ def test_fault_silent_driver_keeps_the_lease():
 def test_fault_old_future_and_out_of_order_commands_are_obeyed():
     gate = driving_gate()
     assert gate.receive(1, 2, 0.31, 0.4, 0.0, 0.01) is Verdict.OLD
-    assert gate.receive(1, 2, -0.31, 0.4, 0.0, 0.01) is Verdict.OLD
+    assert gate.receive(1, 2, -0.31, 0.4, 0.0, 0.01) is Verdict.FUTURE
     assert gate.receive(1, 1, 0.0, 0.4, 0.0, 0.01) is Verdict.OUT_OF_ORDER
     assert gate.command == (0.3, 0.1)
     assert gate.receive(1, 2, 0.29, 0.4, 0.0, 0.01) is Verdict.ACCEPTED

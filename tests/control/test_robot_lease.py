@@ -1,6 +1,6 @@
 """The lease of the robot: who drives, and whom others must wait for."""
 
-from instant_ic.control.robot_lease import Lease, may_release_estop, sender_name
+from instant_ic.control.robot_lease import Lease, Verdict, may_release_estop, sender_name
 
 SECOND = 1_000_000_000
 
@@ -27,7 +27,7 @@ def test_controls_held_in_vain_must_be_let_go_and_the_refused_are_named():
     assert lease.release("a") and not lease.release("a") and lease.holder == ""
     assert lease.held_in_vain(2 * SECOND) and not lease.held_in_vain(3 * SECOND)
     refused = lease.refusal("b", True, SECOND)
-    assert refused is not None and refused.reason == "held"
+    assert refused is not None and refused.verdict is Verdict.HELD
     assert lease.refusal("b", False, SECOND) is None
     assert lease.refusal("b", True, SECOND) is None
     assert lease.diagnosis.text == "nobody drives" and lease.diagnosis.level == 0

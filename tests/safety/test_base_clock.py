@@ -39,7 +39,7 @@ def test_a_command_stamped_ahead_is_refused() -> None:
         bench.command(0.4, ahead_s=ahead_s)
         assert "ahead" in bench.diagnosis("command")[1]
     bench.run(1.0)
-    assert bench.line.travelled_m == 0.0 and bench.node.gate.dropped == 5
+    assert bench.line.travelled_m == 0.0 and bench.node.source.dropped == 5
 
 
 def test_the_time_on_the_way_counts_to_the_age() -> None:

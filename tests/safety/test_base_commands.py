@@ -22,7 +22,7 @@ def test_a_second_publisher_is_refused_named_and_drives_nothing(caplog: pytest.L
     assert level == WARN and "bag_player" in text
     named = [record for record in caplog.records if "also published by bag_player" in record.getMessage()]
     assert len(named) == 2  # the warning once and the diagnosis once, not a line a message
-    assert bench.node.gate.dropped == 20
+    assert bench.node.source.dropped == 20
     bench.run(11.2)
     assert bench.diagnosis("publishers")[0] == OK
 

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from instant_ic.base.config import LimitsConfig
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.config.robot import MotionLimits
-from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.console.drive import DriveConfig, DriveGate
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import accelerate, extrapolate
 from instant_ic.control.navigator import Navigator, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.robot_lease import Verdict
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.slam.contradiction import ContradictionMonitor

@@ -122,7 +122,7 @@ const recording = object({
   notice: object({ number, text, level: text }),
 });
 const refused = object({
-  type: oneOf("refused"), reason: oneOf("not_driver", "watch_only", "old", "out_of_order", "stopped", "held"), text,
+  type: oneOf("refused"), reason: oneOf("not_driver", "watch_only", "old", "future", "out_of_order", "stopped", "held"), text,
 });
 const error = object({ type: oneOf("error"), text });
 

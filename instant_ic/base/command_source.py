@@ -1,16 +1,16 @@
-"""Decides which commands the base obeys: one node's, recent and finite."""
+"""The node whose commands the base obeys, and a warning of every other one."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 from instant_ic.base.config import CrawlerBaseConfig
+from instant_ic.control.command_gate import CommandGate, GateLimits
 from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 
-class CommandGate:
-    """Checks commands, and counts those that are dropped and the nodes that may not drive.
+class CommandSource:
+    """Passes on the commands of one node if they may drive; reports dropped commands and other publishers.
 
     Args:
         config: parameters.
@@ -27,6 +27,9 @@ class CommandGate:
         self.config = config
         self.driver = config.command_source
         self.dropped = 0
+        # The clock of /cmd_vel's sender is the base's own: no stamp can be ahead.
+        limits = GateLimits(config.command_timeout_s, max_ahead_s=0.0, accept_unstamped=config.accept_unstamped)
+        self._gate = CommandGate(limits)
         self.publishers = Diagnosis("publishers", Level.OK, "no second publisher of /cmd_vel")
         self.command: Diagnosis | None = None
         self._drops = RecentCount(config.recent_s)
@@ -34,7 +37,7 @@ class CommandGate:
         self._strangers: dict[str, int] = {}  # second publishers, with the time of their last message
 
     def admit_publisher(self, publisher: str, steady_ns: int) -> bool:
-        """Whether a node's commands are obeyed; every publisher besides the driving node is a warning."""
+        """Return whether a node's commands are obeyed; any other publisher besides the driving node is a warning."""
         if not self.config.command_source and publisher != self.driver:
             if self.driver:
                 self._warn_of(self.driver, steady_ns)
@@ -46,30 +49,21 @@ class CommandGate:
         return False
 
     def admit(self, v: float, w: float, stamp_ns: int, received_ns: int, steady_ns: int) -> bool:
-        """Whether a command of the driving node is obeyed.
+        """Return whether a command of the driving node is obeyed.
 
         Args:
-            v: speed along x, m/s.
-            w: turn rate, rad/s.
-            stamp_ns: of the message; 0 without one.
+            v: speed along x in m/s.
+            w: turn rate in rad/s.
+            stamp_ns: stamp of the message; 0 without one.
             received_ns: arrival on the same clock.
             steady_ns: present steady time.
         """
-        age_s = (received_ns - stamp_ns) * 1e-9
-        if not (math.isfinite(v) and math.isfinite(w)):
-            reason = f"command is not finite (v={v}, w={w})"
-        elif stamp_ns == 0 and not self.config.accept_unstamped:
-            reason = f"command of {self.driver} has no stamp (accept_unstamped is false)"
-        elif stamp_ns and age_s > self.config.command_timeout_s:
-            reason = f"command is {age_s:.2f} s old"
-        elif age_s < 0:
-            reason = f"command's stamp is {-age_s:.2f} s ahead: set the clocks"
-        else:
-            if not self._drops.count(steady_ns):
-                self._set(Level.OK, "driving by /cmd_vel")
-            return True
-        self._refuse(reason, steady_ns)
-        return False
+        refusal = self._gate.admit(v, w, (received_ns - stamp_ns) / 1e9 if stamp_ns else None)
+        if refusal is not None:
+            self._refuse(refusal.text, steady_ns)
+        elif not self._drops.count(steady_ns):
+            self._set(Level.OK, "driving by /cmd_vel")
+        return refusal is None
 
     def update(self, steady_ns: int) -> None:
         """End warnings whose cause is older than ``recent_s``."""

@@ -1,0 +1,128 @@
+"""May this command drive? The checks that every receiver of a drive command shares.
+
+A command passes if
+
+1. its numbers are finite, and within the limits of the gate;
+2. its sender has the right to drive (:class:`~instant_ic.control.robot_lease.Lease`), where the gate has a lease;
+3. it is recent: neither too old, nor stamped ahead of the receiver's clock, nor without a stamp.
+
+Each receiver asks for what it alone knows in addition. The console has an explicit driver, who is the page that took
+control, and numbered commands. The base obeys one node by its name. The arbiter takes an old command of the driver: it
+follows the command's age from then on, and stops the robot by it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+
+from instant_ic.control.robot_lease import Lease, Refusal, Verdict
+
+
+@dataclass(frozen=True)
+class GateLimits:
+    """Limits of a gate.
+
+    Attributes:
+        max_age_s: age in seconds on arrival above which a command is refused.
+        max_ahead_s: lead of a stamp over the receiver's clock above which a command is refused, in seconds.
+        max_linear_mps: m/s; a faster command is refused.
+        max_angular_rps: rad/s; a faster command is refused.
+        accept_unstamped: accept a command without a stamp, whose age is unknown.
+    """
+
+    max_age_s: float
+    max_ahead_s: float
+    max_linear_mps: float = math.inf
+    max_angular_rps: float = math.inf
+    accept_unstamped: bool = False
+
+
+class CommandGate:
+    """Decides whether a command may drive; knows no bus and no clock.
+
+    Args:
+        limits: limits of the commands.
+        lease: who drives; None: the caller knows its sender.
+
+    Attributes:
+        refused: number of refused commands by verdict.
+    """
+
+    def __init__(self, limits: GateLimits, lease: Lease | None = None) -> None:
+        self.limits = limits
+        self.lease = lease
+        self.refused: Counter[Verdict] = Counter()
+
+    def refuse(self, verdict: Verdict, text: str) -> Refusal:
+        """Count a refusal and return it."""
+        self.refused[verdict] += 1
+        return Refusal(verdict, text)
+
+    def check_twist(self, v: float, w: float) -> Refusal | None:
+        """Check the numbers of a command: speed in m/s and turn rate in rad/s."""
+        if not (math.isfinite(v) and math.isfinite(w)):
+            return self.refuse(Verdict.NOT_FINITE, f"command is not finite (v={v}, w={w})")
+        limits = self.limits
+        if abs(v) > limits.max_linear_mps or abs(w) > limits.max_angular_rps:
+            most = f"{limits.max_linear_mps:g} m/s, {limits.max_angular_rps:g} rad/s"
+            return self.refuse(Verdict.TOO_FAST, f"{v:g} m/s, {w:g} rad/s: beyond {most}")
+        return None
+
+    def check_age(self, age_s: float | None) -> Refusal | None:
+        """Check the age of a command in seconds, by its stamp; None: it has no stamp."""
+        limits = self.limits
+        if age_s is None:
+            return None if limits.accept_unstamped else self.refuse(Verdict.UNSTAMPED, "command has no stamp")
+        if not math.isfinite(age_s):
+            return self.refuse(Verdict.NOT_FINITE, f"age of the command is not finite ({age_s} s)")
+        if age_s > limits.max_age_s:
+            return self.refuse(Verdict.OLD, f"command is {age_s:.2f} s old, at most {limits.max_age_s:g} s allowed")
+        if age_s < -limits.max_ahead_s:  # a stamp in the future proves no freshness
+            return self.refuse(Verdict.FUTURE, f"command's stamp is {-age_s:.2f} s ahead: set the clocks")
+        return None
+
+    def admit(
+        self,
+        v: float,
+        w: float,
+        age_s: float | None,
+        sender: str = "",
+        now_ns: int = 0,
+        *,
+        given_ns: int | None = None,
+        stands: bool = True,
+    ) -> Refusal | None:
+        """Check a command; return why it must not drive, or None. A command that passes prolongs its sender's lease.
+
+        Args:
+            v: speed in m/s.
+            w: turn rate in rad/s.
+            age_s: age in seconds by its stamp; None without a stamp.
+            sender: name of the sender.
+            now_ns: steady time.
+            given_ns: steady time of the command, from which the lease runs; ``now_ns`` if None.
+            stands: whether the robot stands; only then does the lease pass to another sender.
+        """
+        if (refusal := self.check_twist(v, w)) is not None:
+            return refusal
+        if self.lease is None:
+            return self.check_age(age_s)
+        # An old command, too, shows that a control is held: the lease notes it before the age is checked.
+        denied = self.lease.refusal(sender, (v, w) != (0.0, 0.0), now_ns, stands)
+        if (refusal := self.check_age(age_s)) is not None:
+            return refusal
+        if denied is not None:
+            return self.refuse(*denied)
+        self.lease.grant(sender, now_ns if given_ns is None else given_ns)
+        return None
+
+    def admit_release(self, sender: str, age_s: float | None, now_ns: int) -> Refusal | None:
+        """Check a release of the emergency stop: it must be recent, and its sender must be the present driver."""
+        if (refusal := self.check_age(age_s)) is not None:
+            return refusal
+        if self.lease is None or not self.lease.holds(sender, now_ns):
+            text = f"{sender} does not drive; only the driver may release the emergency stop"
+            return self.refuse(Verdict.RELEASE, text)
+        return None
