@@ -5,10 +5,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from instant_ic.experiments.study.trial import ARBITERS
 from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
 from instant_ic.launch.parameters import check_parameters
-from instant_ic.launch.source import LaunchFileError
 from instant_ic.sim.real_time import SERIAL_LINK
 from instant_ic.util import paths
 
@@ -91,18 +89,6 @@ def test_depth_is_taken_unchecked_only_where_it_is_asked_for() -> None:
     for name in NAMES:
         assert "as_estimated" not in nodes(name).get("depth_scaler", "")
     assert all("trust_depth" not in {a.name for a in read_arguments(find_launch_file(n))} for n in ("robot", "full"))
-
-
-def test_only_the_simulated_robot_is_driven_by_another_arbiter() -> None:
-    file = ARBITERS["shared"]
-    found = nodes("sim", arbiter=str(file))
-    assert set(found) == set(nodes("sim")) and str(file) in found["arbiter"]
-    words = [set(one["arbiter"].partition(" --")[2].split()) for one in (found, nodes("sim"))]
-    assert words[0] == words[1]  # the same parameters
-    assert "arbiter" not in nodes("robot", own_arbiter="true")
-    for name in set(NAMES) - {"sim"}:
-        with pytest.raises(LaunchFileError, match="there is no argument 'arbiter'"):
-            nodes(name, arbiter=str(file))
 
 
 def test_only_simulated_robots_are_driven_and_watched_without_a_token() -> None:

@@ -1,60 +1,44 @@
-"""``ic study`` end to end: a simulated participant through the real pages drives a real stack, up to the report."""
+"""A drive of ``ic study`` with a real stack, which an operator's program drives over the page's WebSocket."""
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
+import asyncio
+import time
 from pathlib import Path
 
 import pytest
-import yaml
 
 from instant_ic.bag import BagReader
-from instant_ic.cli.main import main
-from instant_ic.experiments.study.plan import save
+from instant_ic.console.client import ConsoleClient
+from instant_ic.experiments.study.plan import StudyPlan
+from instant_ic.experiments.study.trial import Trial, arguments
 
-pytestmark = [
-    pytest.mark.system,
-    pytest.mark.browser,
-    pytest.mark.xdist_group("stack"),
-    pytest.mark.timeout(900),
-    pytest.mark.skipif(
-        shutil.which("chromium") is None and os.environ.get("CI") != "true",
-        reason="chromium is missing: apt install chromium",
-    ),
-]
+pytestmark = [pytest.mark.system, pytest.mark.xdist_group("stack"), pytest.mark.timeout(300)]
 
 
-def test_a_simulated_participant_from_the_plan_to_the_report(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """One drive of one metre, without a virtual space: the cheapest stack that is real."""
-    folder, out = tmp_path / "study", tmp_path / "report"
-    assert main(["study", "new", str(folder), "--participants", "4"]) == 0
-    plan = yaml.safe_load((folder / "study.yaml").read_text())
-    plan |= {"worlds": ["corridor-free"], "participants": {"P01": ["stop"]}, "goal_m": 1.0}
-    plan |= {"arguments": {"vspace": False, "depth_source": "lidar"}}
-    save(folder / "study.yaml", yaml.safe_dump(plan))
-    assert main(["study", "simulate", str(folder), "--timeout", "800"]) == 0, capsys.readouterr().err
-    kept = json.loads((folder / "participants/P01/answers.json").read_text())
-    drive = kept["steps"]["drive1"]
-    assert (kept["state"], drive["end"], drive["contacts"]) == ("done", "arrived", 0)
-    assert 0.9 < drive["driven_m"] < 2.0 and 0.0 < drive["obedience"] <= 1.0
-    with BagReader(folder / "participants/P01/drive1") as bag:
+def test_a_drive_is_recorded_and_measured(tmp_path: Path) -> None:
+    """One metre with the robot that stops: the cheapest stack that is real."""
+    plan = StudyPlan(worlds=("corridor-free",) * 3)
+    given = arguments(tmp_path, plan, 0, "stop", tmp_path / "drive1") | {"depth_source": "lidar"}
+    trial = Trial(given, goal_m=1.0, limit_s=60.0)
+
+    async def drive() -> None:
+        async with ConsoleClient(trial.console) as console:
+            await console.acquire()
+            while trial.status == "ready":
+                console.drive(0.4, 0.0)
+                await asyncio.sleep(0.05)
+
+    try:
+        deadline = time.monotonic() + 240.0
+        while trial.status == "starting" and time.monotonic() < deadline:
+            time.sleep(0.1)
+        asyncio.run(drive())
+    finally:
+        trial.end(60.0)
+    assert trial.status == "done"
+    assert (trial.result["end"], trial.result["contacts"]) == ("arrived", 0)
+    assert 0.9 < trial.result["driven_m"] < 2.0 and 0.0 < trial.result["obedience"] <= 1.0
+    with BagReader(tmp_path / "drive1") as bag:
         topics = {one.topic for one in bag.topics}
-        begin_ns, end_ns = (one.stamp_ns for one in bag.messages({"/study/event"}))
-        states_ns = [one.stamp_ns for one in bag.messages({"/ic/state"})]
-    assert begin_ns < end_ns <= states_ns[-1]  # in slow motion too
-    assert {
-        "/study/event",
-        "/study/answers",
-        "/operator/cmd_vel",
-        "/ic/state",
-        "/camera/image/compressed",
-        "/lidar/packets",
-    } <= topics
-    assert main(["study", "report", str(folder), "-o", str(out)]) == 0
-    assert "Too few participants" in (out / "report.html").read_text()
-    assert main(["study", "delete", str(folder), "P01"]) == 0
-    assert not (folder / "participants/P01").exists()
+    assert {"/operator/cmd_vel", "/ic/state", "/camera/image/compressed", "/lidar/packets"} <= topics

@@ -1,1 +1,1 @@
-"""``ic study``: a blind, counterbalanced user study (the paper's V.E with people) in the operator's page."""
+"""A blind user study as in the paper's section V.E: plan, drives, pages and table."""
