@@ -1,105 +1,29 @@
-"""Calls in several processes, none of which is left when they end, at whatever stage of its start-up."""
+"""Calls in several processes; a call that hangs or whose process dies does not end the others.
+
+joblib's ``Parallel`` gives up all calls when one times out or dies. Each process is therefore a loky executor of its
+own, with one worker, which can be killed and replaced alone.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import math
-import multiprocessing
 import os
 import signal
 import threading
 import time
-import traceback
+from collections import deque
 from collections.abc import Callable, Sequence
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
-from typing import Any, Self, TypeVar
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, TypeVar
+
+from joblib.externals.loky import ProcessPoolExecutor
 
 T = TypeVar("T")
-
-_GONE_S = 30.0
-"""A killed process is normally gone at once; a longer wait means that the kernel holds it (a hung file system)."""
-
-_REST_S = 60.0
-"""Longest time from the first byte of a result to the last."""
 
 
 class LostError(RuntimeError):
     """A call without a result: its process died, or was ended because the call took too long."""
-
-
-class ProcessPool:
-    """Processes that each run one call at a time; all are gone when the block is left.
-
-    They are killed: SIGTERM has no effect on a stopped process, or if this program was started with SIGTERM ignored.
-
-    ``prepare`` is called first in each process.
-
-    Raises:
-        RuntimeError: at the end of the block, a process is still there ``30 s`` after it was killed.
-    """
-
-    def __init__(self, prepare: Callable[[], None]) -> None:
-        self._prepare = prepare
-        self._processes: list[SpawnProcess] = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Kill the processes."""
-        self._end(self._processes)
-
-    def start(self) -> Connection:
-        """Start a process; send it (function, arguments), and it sends (result, None) or (None, exception)."""
-        ours, theirs = multiprocessing.get_context("spawn").Pipe()
-        process = SpawnProcess(target=_serve, args=(theirs, self._prepare), name=f"pipe{ours.fileno()}")
-        self._processes.append(process)  # first: an interrupt may come as soon as it has started
-        process.start()
-        theirs.close()  # so that ours ends when the process does
-        return ours
-
-    def receive(self, pipe: Connection) -> tuple[Any, Exception | None]:
-        """Result of a call, of which the first bytes have arrived.
-
-        Raises:
-            LostError: the process died, or the rest did not arrive within ``60 s``.
-        """
-        began, killer = time.monotonic(), threading.Timer(_REST_S, self._of(pipe).kill)  # its death ends the wait
-        killer.start()
-        try:
-            answer: tuple[Any, Exception | None] = pipe.recv()
-        except (OSError, EOFError):
-            if time.monotonic() - began < _REST_S:
-                raise LostError("its process died (out of memory?)") from None
-            raise LostError(f"the rest of its result did not arrive within {_REST_S:g} s") from None
-        finally:
-            killer.cancel()
-        return answer
-
-    def end(self, pipe: Connection) -> None:
-        """Kill the process of a pipe."""
-        own = self._of(pipe)
-        self._processes.remove(own)
-        pipe.close()
-        self._end([own])
-
-    def _of(self, pipe: Connection) -> SpawnProcess:
-        return next(process for process in self._processes if process.name == f"pipe{pipe.fileno()}")
-
-    @staticmethod
-    def _end(processes: Sequence[SpawnProcess]) -> None:
-        started = [process for process in processes if process.pid is not None]
-        for process in started:
-            process.kill()
-        left = {process.sentinel: process for process in started}
-        deadline = time.monotonic() + _GONE_S
-        while left:
-            for sentinel in wait(list(left), max(0.0, deadline - time.monotonic())):
-                del left[sentinel]  # type: ignore[arg-type]
-            if left and time.monotonic() > deadline:
-                pids = ", ".join(str(process.pid) for process in left.values())
-                raise RuntimeError(f"process {pids} was killed but is still there after {_GONE_S:g} s; end it by hand")
 
 
 def run_all(
@@ -114,15 +38,17 @@ def run_all(
 ) -> list[T]:
     """Call a function for each task's arguments, ``jobs`` at once.
 
-    With more than one job, or a time limit for each call, the calls run in processes of their own.
+    With one job and no time limit for each call, the calls run in this process.
 
     Args:
-        function: of a module, so that other processes find it.
+        function: function of a module, so that other processes find it.
         tasks: positional arguments of each call.
+        jobs: number of processes.
         prepare: called first in each process.
-        timeout_s: for all calls.
-        call_timeout_s: for one call; its process is then killed.
-        on_lost: gives the result of a call whose process died or was killed, from the task's number; None: raise.
+        on_result: called with each result as it arrives.
+        timeout_s: time limit for all calls.
+        call_timeout_s: time limit for one call; its process is then killed.
+        on_lost: returns the result of a call whose process died or was killed, from the task's number; None: raise.
 
     Returns:
         Results in the order of completion.
@@ -134,81 +60,108 @@ def run_all(
     """
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1 (got {jobs})")
+    deadline = time.monotonic() + timeout_s
     results: list[T] = []
-    began = time.monotonic()
+
+    def check_time() -> None:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"it took longer than {timeout_s:.0f} s; {len(results)} of {len(tasks)} are done")
 
     def take(result: T) -> None:
         results.append(result)
         if on_result is not None:
             on_result(result)
 
-    def left_s() -> float:
-        left = timeout_s - (time.monotonic() - began)
-        if left < 0:
-            raise TimeoutError(f"it took longer than {timeout_s:.0f} s; {len(results)} of {len(tasks)} are done")
-        return left
-
     if math.isinf(call_timeout_s) and (jobs == 1 or len(tasks) <= 1):
         if tasks:
             prepare()
         for task in tasks:
-            left_s()
+            check_time()
             take(function(*task))
         return results
-    waiting = list(reversed(range(len(tasks))))
-    idle: list[Connection] = []
-    busy: dict[Connection, tuple[int, float]] = {}  # task and the time at which it must be done
-    with ProcessPool(prepare) as pool:
-        while waiting or busy:
-            while waiting and len(busy) < jobs:
-                pipe, number = idle.pop() if idle else pool.start(), waiting.pop()
-                busy[pipe] = number, time.monotonic() + call_timeout_s
-                with contextlib.suppress(OSError):  # it has died: reading from it says so
-                    pipe.send((function, tasks[number]))
-            next_s = min(due for _, due in busy.values()) - time.monotonic()
-            ready = wait(list(busy), max(0.0, min(left_s(), next_s)))
-            for pipe, (number, due) in list(busy.items()):
-                answer: tuple[Any, Exception | None]
+    workers = _Workers(function, tasks, prepare, call_timeout_s)
+    try:
+        while workers.start(jobs):
+            check_time()
+            for number, call in workers.ended(deadline):
                 try:
-                    if pipe in ready:
-                        answer = pool.receive(pipe)
-                        idle.append(pipe)
-                    elif time.monotonic() > due:
-                        raise LostError(f"it took longer than {call_timeout_s:.0f} s and was ended")
-                    else:
-                        continue
+                    take(call.result(0))
                 except LostError as lost:
-                    pool.end(pipe)
                     if on_lost is None:
                         raise LostError(f"task {number}: {lost}; try --jobs 1") from None
-                    answer = on_lost(number, lost), None
-                del busy[pipe]
-                result, error = answer
-                if error is not None:
-                    raise error
-                take(result)
+                    take(on_lost(number, lost))
+    finally:
+        workers.kill()
     return results
 
 
-def _serve(pipe: Connection, prepare: Callable[[], None]) -> None:
-    """Run the calls that come over a pipe, until the parent ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes: the collecting one stops the others
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+class _Workers:
+    """Processes that each run one call at a time."""
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        tasks: Sequence[tuple[Any, ...]],
+        prepare: Callable[[], None],
+        call_timeout_s: float,
+    ) -> None:
+        self._function, self._tasks, self._prepare, self._call_timeout_s = function, tasks, prepare, call_timeout_s
+        self._waiting = deque(range(len(tasks)))
+        self._all: list[ProcessPoolExecutor] = []
+        self._idle: list[ProcessPoolExecutor] = []
+        self._busy: dict[Future[Any], tuple[int, ProcessPoolExecutor, float]] = {}
+        """Task's number, process, and time at which the call must be done."""
+
+    def start(self, jobs: int) -> bool:
+        """Start waiting calls while fewer than ``jobs`` run; return whether any runs."""
+        while self._waiting and len(self._busy) < jobs:
+            if not self._idle:
+                self._all.append(ProcessPoolExecutor(1, initializer=_prepare, initargs=(self._prepare, os.getpid())))
+                self._idle.append(self._all[-1])
+            number, executor = self._waiting.popleft(), self._idle.pop()
+            call = executor.submit(self._function, *self._tasks[number])
+            self._busy[call] = number, executor, time.monotonic() + self._call_timeout_s
+        return bool(self._busy)
+
+    def ended(self, deadline: float) -> list[tuple[int, Future[Any]]]:
+        """Wait until a call ends, its limit or ``deadline`` is over; return the calls that ended, with their tasks.
+
+        A call whose process died or was killed has a ``LostError``.
+        """
+        next_s = min(deadline, *(due for _, _, due in self._busy.values())) - time.monotonic()
+        wait(self._busy, max(0.0, next_s), FIRST_COMPLETED)
+        found = []
+        for call, (number, executor, due) in list(self._busy.items()):
+            if call.done():
+                lost = "its process died (out of memory?)" if isinstance(call.exception(), BrokenProcessPool) else ""
+            elif time.monotonic() > due:
+                lost = f"it took longer than {self._call_timeout_s:.0f} s and was ended"
+            else:
+                continue
+            del self._busy[call]
+            if lost:
+                executor.shutdown(kill_workers=True)
+                call = Future()
+                call.set_exception(LostError(lost))
+            else:
+                self._idle.append(executor)
+            found.append((number, call))
+        return found
+
+    def kill(self) -> None:
+        """Kill all processes."""
+        for executor in self._all:
+            executor.shutdown(kill_workers=True)
+
+
+def _prepare(prepare: Callable[[], None], parent: int) -> None:
+    """Prepare a process; it ignores Ctrl-C, which also reaches its parent, and ends when its parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
     prepare()
-    while True:
-        function, arguments = pipe.recv()
-        answer: tuple[Any, Exception | None]
-        try:
-            answer = function(*arguments), None
-        except Exception as error:  # noqa: BLE001 - the parent raises it again
-            error.add_note(traceback.format_exc())
-            answer = None, error
-        pipe.send(answer)
 
 
-def _end_with_parent() -> None:
-    """Exit when the parent dies, because a killed parent cannot stop its children."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
+def _end_with_parent(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
     os._exit(1)
