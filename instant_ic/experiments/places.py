@@ -21,6 +21,8 @@ KINDS = {
     "people": "corridor in which people walk",
 }
 """Kinds of worlds, each with seeds (``hall:3``)."""
+GENERATED = ("corridor", "corridor-free", "random", "long", *KINDS)
+"""Worlds that have seeds."""
 _PLANS = {"furnished": "room", "windows": "corridor", "people": "corridor"}
 _PEOPLE = (2, 4)
 _AHEAD_M = (1.5, 7.0)

@@ -1,4 +1,4 @@
-"""Results as JSON files: numbers that JSON has, written atomically."""
+"""Results as JSON files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from instant_ic.util.files import replacing
 
 
 def finite(value: Any, digits: int | None = None) -> Any:
-    """Replace NaN and infinity by None, which JSON has; with ``digits``, round other numbers to so many places."""
+    """Replace NaN and infinity, which JSON lacks, by None; with ``digits``, round other numbers to that many places."""
     if isinstance(value, dict):
         return {key: finite(one, digits) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -30,5 +30,5 @@ def save_json(path: Path, value: Any) -> None:
 
 def save_text(path: Path, text: str) -> None:
     """Write a file atomically: an interrupted program leaves the old file or the new one."""
-    with replacing(path) as file:
-        file.write(text.encode())
+    with replacing(path) as stream:
+        stream.write(text.encode())
