@@ -22,10 +22,8 @@ from console_pages import (
 pytestmark = BROWSER_TEST
 
 
-@pytest.mark.parametrize(("query", "viewer"), [("", "webgl"), ("?viewer=canvas", "canvas")])
-def test_page_draws_picture_and_map_without_errors(open_page, demo, query, viewer):
-    page = open_page(query)
-    expect_body(page, "viewer", viewer)
+def test_page_draws_picture_and_map_without_errors(open_page):
+    page = open_page()
     expect_body(page, "image", "live")
     expect_body(page, "map", "drawn")
     expect_body(page, "mode", "real")
@@ -45,6 +43,17 @@ def test_page_draws_picture_and_map_without_errors(open_page, demo, query, viewe
     obstacle, floor = shot[330:350, 470:490].mean(axis=(0, 1)), shot[390:410, 320:340].mean(axis=(0, 1))
     assert np.ptp(obstacle) < 25
     assert floor[0] > floor[2] + 10
+
+
+def test_without_webgl_the_page_says_what_to_do_and_does_not_connect(browser, demo):
+    context = browser.new_context(viewport=SIZE)
+    page = context.new_page()
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
+    page.goto(demo.server.url)
+    page.get_by_text("WebGL 2 is missing. Use a current Chrome, Edge, Firefox or Safari").wait_for(timeout=WAIT_MS)
+    assert not page.locator("#estop").count()
+    assert demo.server.gate.driver is None
+    context.close()
 
 
 def test_passage_to_the_rendered_view_and_back(open_page, demo):

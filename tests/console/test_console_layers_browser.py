@@ -116,18 +116,6 @@ def test_a_bad_frame_of_layers_is_refused_and_the_ones_before_stay(open_page, ro
     page.faults[:] = [fault for fault in page.faults if "layers.mount must be" not in fault]
 
 
-def test_a_page_without_webgl_gets_rendered_views(open_page, room):
-    demo = room
-    demo.place(*KEYFRAME)
-    page = open_layers(open_page, demo, "?viewer=canvas")
-    expect_body(page, "viewer", "canvas")
-    expect_body(page, "blend", "1.00")
-    assert demo.server.needs_views()
-    assert demo.server.drawn_ms() is None
-    page.wait_for_function("drawn.at(-1)?.place", timeout=WAIT_MS)
-    assert likeness_of(picture_of(page), room_seen(tuple(KEYFRAME), 0.0, demo.look.pitch)) > 0.9
-
-
 def test_the_cameras_image_is_shown_from_where_the_robot_is_now_until_a_key_switches_it_off(open_page, room):
     demo = room
     demo.forced_mode, demo.images = "real", True
@@ -168,7 +156,7 @@ def test_the_cameras_image_is_shown_from_where_the_robot_is_now_until_a_key_swit
 GLIDE = """async () => {
     const {Images} = await import("/static/images.js");
     let now = 0;
-    const viewer = {name: "webgl", slow: false, lost: false, sample() {}};
+    const viewer = {slow: false, lost: false, sample() {}};
     const images = new Images(viewer, {serverNow: () => now, roundTripMs: 0, connected: true, acknowledge() {}});
     images.layers = {version: 1, mount: [0.1, 0, 1.2]};
     images.colourReleaseMs = 0;
@@ -203,7 +191,7 @@ def test_the_shown_place_goes_steadily_also_through_a_switch_and_an_old_image_st
 KEY = """async () => {
     const {Images} = await import("/static/images.js");
     let now = 1000;
-    const images = new Images({name: "none", sample() {}}, {serverNow: () => now, roundTripMs: 10, connected: true,
+    const images = new Images({slow: true, sample() {}}, {serverNow: () => now, roundTripMs: 10, connected: true,
         acknowledge() {}});
     images.layers = {version: 1, mount: [0.1, 0, 1.2]};
     images.prediction.maxAccel = [0.8, 2];
@@ -234,7 +222,7 @@ def test_a_key_moves_the_view_before_a_new_state_arrives(open_page, room):
 BACK = """async () => {
     const {Images} = await import("/static/images.js");
     let now = 0;
-    const images = new Images({name: "none", sample() {}}, {serverNow: () => now, roundTripMs: 10, connected: true,
+    const images = new Images({slow: true, sample() {}}, {serverNow: () => now, roundTripMs: 10, connected: true,
         acknowledge() {}});
     images.layers = {version: 1, mount: [0.1, 0, 1.2]};
     images.colourReleaseMs = 0;

@@ -82,12 +82,10 @@ def pass_to(page, demo, mode):
     expect_body(page, "blend", "1.00" if mode == "virtual" else "0.00")
 
 
-@pytest.mark.parametrize("viewer", ["webgl", "canvas"])
-def test_a_tinted_view_has_the_cameras_colours_at_the_switch_and_the_camera_the_views(open_page, passages, viewer):
+def test_a_tinted_view_has_the_cameras_colours_at_the_switch_and_the_camera_the_views(open_page, passages):
     demo = passages(colour_release_s=3600)  # not let go of, however long a busy machine takes for a picture
     demo.tint = TINT
-    page = open_page(f"?viewer={viewer}", at=demo, bypass_csp=True)
-    expect_body(page, "viewer", viewer)
+    page = open_page(at=demo, bypass_csp=True)
     expect_body(page, "image", "live")
     wait_until(lambda: demo.server.gate.driver is not None, page, "the lease")
     never_grey(page)

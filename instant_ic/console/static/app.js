@@ -4,7 +4,6 @@
 /** @import { Frame, GridFrame, Message } from "./messages.js" */
 import { byId, elementOf, mark } from "./dom.js";
 import { attachStick, Drive, isDriveKey, isTyping } from "./drive.js";
-import { FlatViewer } from "./flatviewer.js";
 import { Gamepads } from "./gamepad.js";
 import * as hud from "./hud.js";
 import { Images } from "./images.js";
@@ -18,29 +17,29 @@ import { Screen } from "./screen.js";
 import { settingsOf } from "./settings.js";
 import { GlViewer } from "./viewer.js";
 
-const options = new URLSearchParams(location.search);
 const canvas = elementOf("view", HTMLCanvasElement), scale = elementOf("scale", HTMLInputElement);
 const helpDialog = elementOf("help", HTMLDialogElement);
+const viewer = makeViewer(); // before the link: a page that shows nothing must not drive
 const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
 const lease = new Lease(link);
 const drive = new Drive(link);
 const look = new Look(canvas);
-const viewer = makeViewer();
 const images = new Images(viewer, link);
 const screen = new Screen(viewer, images, look, link, lease);
 const recording = new Recording(link, drive);
 const pads = new Gamepads(drive, look);
 const wake = () => screen.wake();
 
+/** Returns the viewer. Without WebGL 2 the page shows what to do instead of its controls, and throws. */
 function makeViewer() {
-  if (options.get("viewer") !== "canvas") {
-    try {
-      return new GlViewer(canvas, options.get("quality") === "full");
-    } catch (error) {
-      console.info(`${error}: falling back to the 2D canvas`);
-    }
+  try {
+    return new GlViewer(canvas, new URLSearchParams(location.search).get("quality") === "full");
+  } catch (error) {
+    const text = byId("no-view");
+    document.body.replaceChildren(text);
+    text.hidden = false;
+    throw error;
   }
-  return new FlatViewer(canvas);
 }
 
 // ---- from the server -----------------------------------------------------------------------------
@@ -238,7 +237,6 @@ for (const [target, name] of /** @type {const} */ ([[link, "open"], [link, "lost
   target.addEventListener(name, wake);
 }
 
-mark("viewer", viewer.name);
 mark("quality", viewer.slow ? "plain" : "full");
 setScale(70);
 hud.showMode(null, lease.driver);

@@ -22,13 +22,6 @@ export function context2d(canvas, options) {
   return context;
 }
 
-/** 2D context of a canvas outside the page, for reading pixels. @param {number} width @param {number} height */
-export function offscreen(width, height) {
-  const context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
-  if (!context) throw new Error("2D canvas is missing");
-  return context;
-}
-
 /** Sets an element's text if it has changed: screen readers would repeat it. @param {Element} element @param {string} text */
 export function write(element, text) {
   if (element.textContent !== text) element.textContent = text;

@@ -2,7 +2,6 @@
 // The newest panorama and rendered view, and the scene composed of them.
 
 /** @import { Colour } from "./colour.js" */
-/** @import { FlatViewer } from "./flatviewer.js" */
 /** @import { Link } from "./link.js" */
 /** @import { Look } from "./look.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
@@ -16,7 +15,6 @@ import { PANORAMA, VIEW } from "./messages.js";
 import { Motion } from "./motion.js";
 import { Prediction } from "./prediction.js";
 
-/** @typedef {GlViewer | FlatViewer} Viewer */
 /** @typedef {1 | 2} Kind PANORAMA or VIEW. */
 /** @typedef {ViewHeader & {aspect: number}} View */
 /** @typedef {{from: Omit<Photo, "image">, to: Vec3}} Glide Where the camera's image was taken, and the place from which it is shown, m. */
@@ -44,7 +42,7 @@ const FROZEN_MS = 1000; // an older one too
 const LEAD_MS = 800; // time after a switch in which the way of a command to the robot comes to be predicted
 
 export class Images {
-  /** @param {Viewer} viewer @param {Link} link */
+  /** @param {GlViewer} viewer @param {Link} link */
   constructor(viewer, link) {
     this.viewer = viewer;
     this.link = link;
@@ -71,7 +69,7 @@ export class Images {
     this._rendered = null;
     this.shownMs = 0; // time of the newest state that is shown, server's clock
     this.moves = false; // the v-bot moves, as far as this page knows
-    this.glides = viewer.name === "webgl" && !viewer.slow; // the camera's image is shown from the robot's present place
+    this.glides = !viewer.slow; // the camera's image is shown from the robot's present place
     /** @type {[number, number] | null} Position in the map frame from which the view is shown. */
     this.place = null;
     /** @type {[number, number] | null} Position of the v-bot's camera. */
@@ -116,7 +114,7 @@ export class Images {
         this.viewer.setPanorama(bitmap);
         this.panorama = frame.header;
       }
-      if (this.viewer.name === "webgl") bitmap.close();
+      bitmap.close();
       this.changed = true;
       const arrivals = this._arrivals[frame.kind];
       arrivals.push(performance.now());
@@ -128,14 +126,9 @@ export class Images {
     }
   }
 
-  /**
-   * Decodes and loads layers, then acknowledges them. A viewer that renders none does not: it gets no more of them.
-   * @param {LayersFrame} frame
-   */
+  /** Decodes and loads layers, then acknowledges them. @param {LayersFrame} frame */
   async takeLayers(frame) {
-    const { viewer } = this;
-    if (!("loadLayers" in viewer)) return;
-    const load = this._loads;
+    const { viewer, _loads: load } = this;
     let loaded = false;
     try {
       const layers = await Promise.all(frame.layers.map((data) => this._decodedLayer(data)));

@@ -4,11 +4,12 @@
 
 /** @import { Settings } from "./settings.js" */
 /** @import { Plan, State } from "./messages.js" */
-/** @import { Images, Scene, Viewer } from "./images.js" */
+/** @import { Images, Scene } from "./images.js" */
 /** @import { Lease } from "./lease.js" */
 /** @import { Link } from "./link.js" */
 /** @import { Look } from "./look.js" */
 /** @import { Vec3 } from "./math.js" */
+/** @import { GlViewer } from "./viewer.js" */
 import { byId, elementOf, mark } from "./dom.js";
 import { FrameRate } from "./framerate.js";
 import { drawCompass, drawGuide } from "./guide.js";
@@ -31,7 +32,7 @@ const IDLE_MS = 200; // longest interval between two frames while messages arriv
 const COLOURS = { real: "#45c4b0", entering: "#45c4b0", virtual: "#f0ac45", returning: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
 
 export class Screen {
-  /** @param {Viewer} viewer @param {Images} images @param {Look} look @param {Link} link @param {Lease} lease */
+  /** @param {GlViewer} viewer @param {Images} images @param {Look} look @param {Link} link @param {Lease} lease */
   constructor(viewer, images, look, link, lease) {
     this.viewer = viewer;
     this.images = images;
@@ -55,11 +56,11 @@ export class Screen {
     /** Rotation and field of view of the last drawn image. @type {number[]} */
     this._direction = [];
     this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
-    this._reported = this._unreported;
+    this._reported = "";
     this._reportedAt = 0;
     link.addEventListener("open", () => {
       this._sentLook = "";
-      this._reported = this._unreported;
+      this._reported = "";
     });
     document.addEventListener("visibilitychange", () => { this._steppedAt = performance.now(); });
   }
@@ -70,14 +71,6 @@ export class Screen {
     this.state = state;
     if (!same || performance.now() - this._frameAt > IDLE_MS) this.wake();
     else if (!this._wanted) this._reportShown();
-  }
-
-  /**
-   * What the server takes for granted: a page that needs rendered views. The first report of one with WebGL says that it
-   * can do without.
-   */
-  get _unreported() {
-    return this.viewer.name === "webgl" ? "" : "0";
   }
 
   /** Reports that the newest state is on the screen, if this page renders the virtual space by itself. */

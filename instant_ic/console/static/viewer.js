@@ -45,7 +45,6 @@ export class GlViewer {
     if (!gl) throw new Error("WebGL 2 is missing");
     this.gl = gl;
     this.canvas = canvas;
-    this.name = "webgl";
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     const renderer = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     // Software rendering: the page then uses fewer pixels and plain look-ups.
@@ -216,7 +215,7 @@ export class GlViewer {
 
 /**
  * Averages RGBA pixels over the cells: 3 colours and 1 alpha per cell, 0..1.
- * @param {Uint8Array | Uint8ClampedArray} pixels
+ * @param {Uint8Array} pixels
  * @returns {{colours: number[], alpha: number[]}}
  */
 export function cells(pixels) {
