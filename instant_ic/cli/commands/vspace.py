@@ -258,12 +258,17 @@ def open_space(args: argparse.Namespace) -> VirtualSpace:
 
 def _space_of_bag(path: Path) -> VirtualSpace:
     from instant_ic.adapters.vspace import layers_of
-    from instant_ic.cli.commands.console import newest_of_bag
+    from instant_ic.bag import BagReader
     from instant_ic.msg import MessageError, deserialize
     from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
     from instant_ic.vspace.layers import LayersError, decode
 
-    newest = newest_of_bag(path)
+    newest = None
+    with BagReader(path) as bag:
+        for newest in bag.messages([_LAYERS]):  # noqa: B007
+            pass
+    if newest is None:
+        raise UserError(f"{path} holds no {_LAYERS}. Record it while the stack runs, with `ic bag record`.")
     space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))
     try:
         layers = layers_of(deserialize(newest.payload, newest.type_name))
