@@ -3,6 +3,7 @@
 import math
 
 from instant_ic.base.config import LimitsConfig
+from instant_ic.geometry.motion import step_towards
 
 
 class TwistLimiter:
@@ -32,20 +33,16 @@ class TwistLimiter:
         if dt_s < 0.0:
             raise ValueError(f"dt_s must be >= 0 (got {dt_s})")
         v, w = self.config.clip(v, w)
-        self.v = _towards(self.v, v, self.config.max_linear_accel_m_s2 * dt_s)
-        self.w = _towards(self.w, w, self.config.max_angular_accel_rad_s2 * dt_s)
+        self.v = step_towards(self.v, v, self.config.max_linear_accel_m_s2 * dt_s)
+        self.w = step_towards(self.w, w, self.config.max_angular_accel_rad_s2 * dt_s)
         return self.v, self.w
 
     def brake(self, deceleration: float, w_deceleration: float, dt_s: float) -> tuple[float, float]:
         """Next twist towards zero after ``dt_s`` seconds, at the given rates (m/s^2, rad/s^2)."""
-        self.v = _towards(self.v, 0.0, deceleration * dt_s)
-        self.w = _towards(self.w, 0.0, w_deceleration * dt_s)
+        self.v = step_towards(self.v, 0.0, deceleration * dt_s)
+        self.w = step_towards(self.w, 0.0, w_deceleration * dt_s)
         return self.v, self.w
 
     def reset(self) -> None:
         """Restart from standing, for example after an emergency stop."""
         self.v = self.w = 0.0
-
-
-def _towards(value: float, target: float, step: float) -> float:
-    return value + min(max(target - value, -step), step)

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
+from instant_ic.geometry.motion import along_arc
 from instant_ic.geometry.poses import planar_covariance
 
 _MAX_TRACK_SPEED = 3.0  # m/s; a reading that implies more is rejected
@@ -101,16 +102,10 @@ class WheelOdometry:
 
     def _integrate(self, step: NDArray[np.float64]) -> None:
         """Move the pose by a body displacement (x, y, yaw) along its arc, and grow the covariance."""
-        dx, dy, dyaw = step
-        # Exponential map of SE(2); the series replaces it where the turn is too small to divide by.
-        if abs(dyaw) > 1e-6:
-            a, b = np.sin(dyaw) / dyaw, (1.0 - np.cos(dyaw)) / dyaw
-        else:
-            a, b = 1.0 - dyaw * dyaw / 6.0, 0.5 * dyaw
-        local = np.array([a * dx - b * dy, b * dx + a * dy])
-        c, s = np.cos(self._pose[2]), np.sin(self._pose[2])
-        rotation = np.array([[c, -s], [s, c]])
-        moved = rotation @ local
+        dx, dy, dyaw = step.tolist()
+        x, y, yaw = self._pose.tolist()
+        x, y, yaw = along_arc(x, y, yaw, dx, dyaw, dy)
+        moved = np.array([x, y]) - self._pose[:2]
 
         jacobian = np.eye(3)
         jacobian[:2, 2] = (-moved[1], moved[0])
@@ -120,8 +115,7 @@ class WheelOdometry:
         gained[2, 2] = _YAW_PER_METRE * distance + _YAW_PER_RADIAN * abs(dyaw)
         self._covariance = jacobian @ self._covariance @ jacobian.T + gained
 
-        self._pose[:2] += moved
-        self._pose[2] = (self._pose[2] + dyaw + np.pi) % (2.0 * np.pi) - np.pi
+        self._pose = np.array([x, y, (yaw + np.pi) % (2.0 * np.pi) - np.pi])
 
     def _twist_covariance(self, step: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
         """Covariance of the mean twist over the step: growth of the pose variance per second plus a floor, (6, 6)."""

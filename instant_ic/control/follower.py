@@ -18,6 +18,7 @@ from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.planner import Plan
+from instant_ic.geometry.motion import along_arc
 from instant_ic.geometry.poses import relative2, wrap_angle
 
 LOOKAHEAD_TIME_S = 1.0
@@ -197,11 +198,9 @@ class PathFollower:
         self, pose: NDArray[np.float64], curvature: float, length_m: float, costmap: Costmap | None
     ) -> bool:
         count = max(2, math.ceil(abs(length_m) / 0.05))
-        along = length_m * np.arange(count + 1) / count
-        turn = curvature * along
-        chord, heading = along * np.sinc(turn / (2.0 * math.pi)), pose[2] + 0.5 * turn
-        x, y = pose[0] + chord * np.cos(heading), pose[1] + chord * np.sin(heading)
-        return self._is_free(np.stack([x, y, pose[2] + turn], axis=1), costmap)
+        along = [length_m * k / count for k in range(count + 1)]
+        x, y, yaw = pose.tolist()
+        return self._is_free(np.array([along_arc(x, y, yaw, way, curvature * way) for way in along]), costmap)
 
     def _straight_is_free(self, pose: NDArray[np.float64], goal: NDArray[np.float64], costmap: Costmap | None) -> bool:
         turn = wrap_angle(float(goal[2] - pose[2]))

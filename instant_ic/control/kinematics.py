@@ -8,11 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.config.robot import MotionLimits
+from instant_ic.geometry.motion import along_arc, step_towards
 from instant_ic.geometry.poses import wrap_angle
-
-
-def _towards(value: float, target: float, step: float) -> float:
-    return value + min(max(target - value, -step), step)
 
 
 def accelerate(
@@ -21,18 +18,15 @@ def accelerate(
     """Velocity (m/s, rad/s) after accelerating towards ``command`` for ``dt_s`` within the limits."""
     command = limits.clip(*command)
     return (
-        _towards(velocity[0], command[0], limits.max_linear_accel_m_s2 * dt_s),
-        _towards(velocity[1], command[1], limits.max_angular_accel_rad_s2 * dt_s),
+        step_towards(velocity[0], command[0], limits.max_linear_accel_m_s2 * dt_s),
+        step_towards(velocity[1], command[1], limits.max_angular_accel_rad_s2 * dt_s),
     )
 
 
 def move(pose: NDArray[np.float64], linear: float, angular: float, dt_s: float) -> NDArray[np.float64]:
-    """Pose (x, y, yaw) after ``dt_s`` of a constant twist: the exact arc, not a straight step."""
-    x, y, yaw = float(pose[0]), float(pose[1]), float(pose[2])
-    half = 0.5 * angular * dt_s
-    # sin(t/2)/(t/2) is chord over arc.
-    chord = linear * dt_s * (math.sin(half) / half if half else 1.0)
-    return np.array([x + chord * math.cos(yaw + half), y + chord * math.sin(yaw + half), wrap_angle(yaw + 2.0 * half)])
+    """Return the pose (x, y, yaw) after ``dt_s`` of a constant twist (m/s, rad/s)."""
+    x, y, yaw = along_arc(float(pose[0]), float(pose[1]), float(pose[2]), linear * dt_s, angular * dt_s)
+    return np.array([x, y, wrap_angle(yaw)])
 
 
 def extrapolate(pose: NDArray[np.float64], velocity: tuple[float, float], age_s: float) -> NDArray[np.float64]:

@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import Checked, NotNegative, PositiveInt
 from instant_ic.control.costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
 from instant_ic.control.footprint import Footprint
+from instant_ic.geometry.motion import along_arc
+
+_along_arc = njit(cache=True)(along_arc)
 
 SPACING_M = 0.05
 """Distance between the poses of a path."""
@@ -657,10 +660,8 @@ def _moved(x: float, y: float, heading: int, k: int, per_bin: float) -> tuple[fl
     length = LENGTHS[k]
     if length == 0.0:
         return x, y
-    middle = (heading + 0.5 * TURNS[k]) * per_bin
-    half = 0.5 * TURNS[k] * per_bin
-    chord = length * (math.sin(half) / half if TURNS[k] != 0 else 1.0)
-    return x + chord * math.cos(middle), y + chord * math.sin(middle)
+    to_x, to_y, _ = _along_arc(x, y, heading * per_bin, length, TURNS[k] * per_bin)
+    return to_x, to_y
 
 
 @njit(cache=True)

@@ -14,6 +14,10 @@ from instant_ic.config.ranges import Checked, Plausible
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
+from instant_ic.geometry.motion import along_arc, step_towards
+
+_along_arc = njit(cache=True)(along_arc)
+_step_towards = njit(cache=True)(step_towards)
 
 _YAW_MARGIN_RAD = 0.4
 """As ``margin_m``, when turning on the spot."""
@@ -155,16 +159,12 @@ def _roll_out(
     for k in range(most_steps):
         if k >= late_steps:
             for i in range(2):
-                v[i] += min(max(command[i] - v[i], -steepest[i]), steepest[i])
+                v[i] = _step_towards(v[i], command[i], steepest[i])
         stands = v[0] == 0.0 and v[1] == 0.0 and command[0] == 0.0 and command[1] == 0.0
         if travelled[k] >= length_m or stands:
             break
-        half = 0.5 * v[1] * _STEP_S
-        chord = v[0] * _STEP_S * (math.sin(half) / half if half != 0.0 else 1.0)
-        heading = poses[k, 2] + half
-        yaw = heading + half
-        poses[k + 1, 0] = poses[k, 0] + chord * math.cos(heading)
-        poses[k + 1, 1] = poses[k, 1] + chord * math.sin(heading)
+        x, y, yaw = _along_arc(poses[k, 0], poses[k, 1], poses[k, 2], v[0] * _STEP_S, v[1] * _STEP_S)
+        poses[k + 1, 0], poses[k + 1, 1] = x, y
         poses[k + 1, 2] = yaw - 2.0 * math.pi * math.floor(yaw / (2.0 * math.pi) + 0.5)
         travelled[k + 1] = travelled[k] + (abs(v[0]) + reach_m * abs(v[1])) * _STEP_S
         count += 1

@@ -21,6 +21,10 @@ from instant_ic.config.ranges import Checked, Plausible, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.moving import MOST_SPEED_M_S, NOTHING_MOVES, MovingPoints
+from instant_ic.geometry.motion import along_arc, step_towards
+
+_along_arc = njit(cache=True)(along_arc)
+_step_towards = njit(cache=True)(step_towards)
 
 STEP_S = 0.05
 """Seconds between the simulated poses."""
@@ -297,11 +301,8 @@ def _time_to_collision(
     now = twists[0].copy()
     for k in range(1, math.ceil(horizon / STEP_S) + 1):
         for i in range(2):
-            most = accelerations[i] * STEP_S
-            now[i] += min(max(twists[1, i] - now[i], -most), most)
-        half = 0.5 * now[1] * STEP_S
-        chord = now[0] * STEP_S * (math.sin(half) / half if half != 0.0 else 1.0)
-        x, y, yaw = x + chord * math.cos(yaw + half), y + chord * math.sin(yaw + half), yaw + 2.0 * half
+            now[i] = _step_towards(now[i], twists[1, i], accelerations[i] * STEP_S)
+        x, y, yaw = _along_arc(x, y, yaw, now[0] * STEP_S, now[1] * STEP_S)
         c, s = math.cos(yaw), math.sin(yaw)
         inside = 0
         for j in range(points.shape[0]):

@@ -108,7 +108,7 @@ class VirtualRobot:
         self.velocity = self.limits.clip(*velocity)
         moved = move(self.pose, *self.velocity, dt_s)
         share = min(1.0, dt_s / _EASE_TIME_S)
-        self.pose = _towards(moved, target, share, config.ease_m_s * dt_s, math.radians(config.ease_deg_s) * dt_s)
+        self.pose = _eased(moved, target, share, config.ease_m_s * dt_s, math.radians(config.ease_deg_s) * dt_s)
         self.slowed_by = ""
 
     def lead_back(self, robot_pose: NDArray[np.float64], dt_s: float, walls: WallMap | None = None) -> None:
@@ -119,7 +119,7 @@ class VirtualRobot:
         goal = np.asarray(robot_pose, dtype=np.float64) if straight else self._track[-1]
         self._led_m_s = min(_LEAD_BACK_M_S, self._led_m_s + 0.25 * self.limits.max_linear_accel_m_s2 * dt_s)
         share = min(1.0, dt_s / _EASE_TIME_S)
-        self.pose = _towards(self.pose, goal, share, self._led_m_s * dt_s, _LEAD_BACK_RAD_S * dt_s)
+        self.pose = _eased(self.pose, goal, share, self._led_m_s * dt_s, _LEAD_BACK_RAD_S * dt_s)
         self.velocity = (0.0, 0.0)
         self.slowed_by = ""
 
@@ -147,7 +147,7 @@ def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(math.hypot(a[0] - b[0], a[1] - b[1]))
 
 
-def _towards(
+def _eased(
     pose: NDArray[np.float64], goal: NDArray[np.float64], share: float, most_m: float, most_rad: float
 ) -> NDArray[np.float64]:
     """``pose`` (3,) moved towards ``goal`` by a share of the error, within the given limits."""

@@ -18,6 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from instant_ic.geometry.motion import along_arc
 from instant_ic.geometry.poses import relative2
 from instant_ic.slam.scan import FloatArray, Scan
 
@@ -365,8 +366,8 @@ def read_mines(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEnt
                 right = (ticks[1] - last_ticks[1]) * metres_per_tick
                 turn = (right - left) / (2 * _MINES_HALF_AXLE_M)
                 way = 0.5 * (left + right)
-                middle = pose[2] + 0.5 * turn
-                pose = pose + np.array([way * math.cos(middle), way * math.sin(middle), turn])
+                x, y, yaw = pose.tolist()
+                pose = np.array(along_arc(x, y, yaw, way, turn))
             last_ticks = ticks
             ranges[ranges < _MINES_RANGE_MIN_M] = np.nan
             scan = Scan(

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from instant_ic.experiments.slam import LogResult, run_log
 from instant_ic.experiments.slam_logs import LogEntry
 from instant_ic.experiments.slam_worlds import trajectory_errors
-from instant_ic.geometry.poses import compose2, relative2, wrap_angle
+from instant_ic.geometry.motion import along_arc
+from instant_ic.geometry.poses import relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 from instant_ic.sim.world import World
 from instant_ic.slam import Scan
@@ -64,13 +65,14 @@ def round_trip(
     driven, steps = 0.0, 0
     targets = [point for _ in range(rounds) for point in route[1:]]
     while targets or steps % SCAN_STEPS:
-        v, w = _towards(robot.pose, targets)
+        v, w = _steer(robot.pose, targets)
         if steps % SCAN_STEPS == 0:
             now = robot.encoder_pulses
             left, right = kinematics.tracks_from_motors(now - pulses)
             pulses = now
             forward, _, turn = kinematics.twist_from_tracks(np.array([left, right]))
-            odometry = compose2(odometry, [forward * math.cos(turn / 2), forward * math.sin(turn / 2), turn])
+            x, y, yaw = odometry.tolist()
+            odometry = np.array(along_arc(x, y, yaw, forward, turn))
             entries.append(_entry(world, np.asarray(robot.pose, dtype=np.float64), angles, odometry, len(entries), rng))
             truth.append(np.asarray(robot.pose, dtype=np.float64).copy())
         robot.step(kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w)), STEP_S)
@@ -82,7 +84,7 @@ def round_trip(
     return RoundTrip(entries, np.array([relative2(origin, pose) for pose in truth]), driven)
 
 
-def _towards(pose: NDArray[np.floating], targets: list[tuple[float, float]]) -> tuple[float, float]:
+def _steer(pose: NDArray[np.floating], targets: list[tuple[float, float]]) -> tuple[float, float]:
     """Speed and yaw rate to the first of ``targets``; targets already reached are removed."""
     while targets and math.hypot(targets[0][0] - pose[0], targets[0][1] - pose[1]) < 0.15:
         targets.pop(0)

@@ -11,6 +11,7 @@ from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
 from instant_ic.config.ranges import Checked, NotNegative, Positive, Range
 from instant_ic.config.robot import Rectangle
+from instant_ic.geometry.motion import along_arc
 from instant_ic.sim.contact import OccupancyMask
 from instant_ic.sim.motors import TrackMotors
 
@@ -142,9 +143,9 @@ class TrackedRobot:
         self._move(twist, dt_s)
 
     def _move(self, twist: FloatArray, dt_s: float) -> None:
-        yaw = self.pose[2] + 0.5 * twist[2] * dt_s
-        c, s = math.cos(yaw), math.sin(yaw)
-        target = self.pose + dt_s * np.asarray([c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2]])
+        forward, sideways, turn = (twist * dt_s).tolist()
+        x, y, yaw = self.pose.tolist()
+        target = np.array(along_arc(x, y, yaw, forward, turn, sideways))
         if bool(np.any(twist != 0)) and self.touches(target):
             if not self.contact:
                 self.contacts += 1

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from instant_ic.geometry.motion import along_arc
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.scan import FloatArray
 
@@ -67,16 +68,13 @@ class OdometryBuffer:
 
 def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
     """Fraction ``part`` of a planar step (3,) along its circular arc."""
-    turn = float(step[2])
-    if abs(turn) < 1e-9:
-        return np.array([part * step[0], part * step[1], part * turn])
-    # v = V(turn)⁻¹ t is the constant body velocity of the step (logarithm of SE(2)).
-    a, b = math.sin(turn) / turn, (1 - math.cos(turn)) / turn
-    norm = a * a + b * b
-    vx, vy = (a * step[0] + b * step[1]) / norm, (-b * step[0] + a * step[1]) / norm
-    angle = part * turn
-    c, d = math.sin(angle) / turn, (1 - math.cos(angle)) / turn
-    return np.array([c * vx - d * vy, d * vx + c * vy, angle])
+    x, y, turn = step.tolist()
+    half = 0.5 * turn
+    # The logarithm of SE(2): turn the chord back by half the turn, and stretch it to the arc.
+    arc_over_chord = half / math.sin(half) if half != 0.0 else 1.0
+    c, s = math.cos(half) * arc_over_chord, math.sin(half) * arc_over_chord
+    forward, sideways = c * x + s * y, c * y - s * x
+    return np.array(along_arc(0.0, 0.0, 0.0, part * forward, part * turn, part * sideways))
 
 
 SPEED_MPS, YAW_RATE_RADPS = 1.0, 1.0
