@@ -83,12 +83,6 @@ class Client:
         assert answer["id"] == request
         return {p["name"]: p["value"] for p in answer["parameters"]}
 
-    def advertise(self, topic, name, encoding="json", number=5):
-        self.send(op="advertise", channels=[{"id": number, "topic": topic, "encoding": encoding, "schemaName": name}])
-
-    def publish(self, data, number=5):
-        self.socket.send(struct.pack("<BI", 1, number) + data)
-
     def close(self):
         self._open.close()
 
