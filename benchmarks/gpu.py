@@ -362,15 +362,17 @@ def _warped_keyframe(taken: list[tuple[Any, ...]], pose: Any, config: VirtualSpa
     for keyframe in taken:
         space.set_keyframe(*keyframe)
     height, width = taken[0][0].shape[:2]
-    cube = space.render_cube(pose, width // 4)
     directions = equirect_directions(width, height)
     rgb, depth = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.float32)
-    for rotation, colours, depths in zip(CUBE_FACES.values(), cube.rgb, cube.depth_m, strict=True):
+    for rotation in CUBE_FACES.values():
+        turned = pose.copy()
+        turned[:3, :3] = pose[:3, :3] @ rotation
+        face = space.render(turned, width // 4, width // 4, np.pi / 2)
         x, y, z = np.moveaxis(directions @ rotation.astype(np.float32), -1, 0)
         inside = (x >= np.abs(y)) & (x >= np.abs(z))
         half = width // 8
         column, row = ((half * (1 - t[inside] / x[inside])).astype(int).clip(0, 2 * half - 1) for t in (y, z))
-        rgb[inside], depth[inside] = colours[row, column], depths[row, column]
+        rgb[inside], depth[inside] = face.rgb[row, column], face.depth_m[row, column]
     return rgb, depth, pose, 0.05
 
 

@@ -15,19 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.util.limits import decode_image
-from instant_ic.vspace.background import Background
 from instant_ic.vspace.nerf.field import Floats
-from instant_ic.vspace.prior import (
-    DEPTH_EDGE_RATIO,
-    MOST_SIGMA,
-    ROBOT,
-    ROOM,
-    PanoramaPrior,
-    edge_quads,
-    shrunk,
-)
-from instant_ic.vspace.store import Keyframe, KeyframeSet
-from instant_ic.vspace.warp import PanoramaWarp
+from instant_ic.vspace.store import Keyframe
 
 _CODES = 65535
 _QUALITY = 90
@@ -181,46 +170,3 @@ def decode_layer(layer: Layer) -> DecodedLayer:
     inverse_depth = code * np.float32(1 / (_CODES * layer.near_m))
     confidence = ((marks & _CONFIDENCE) >> 3).astype(np.float32) / np.float32(_SURE)
     return DecodedLayer(rgb, inverse_depth, marks & _CONTENT, confidence, marks & _EDGE > 0)
-
-
-def decode(layers: Layers, panorama_width: int) -> KeyframeSet:
-    """Decode the newest keyframe of whole layers, to be rendered as the space's own (``VirtualSpace.show``).
-
-    Args:
-        layers: a whole version.
-        panorama_width: pixels; wider panoramas are area-averaged to this.
-
-    Raises:
-        LayersError: a layer cannot be decoded, or there is none that the camera saw.
-    """
-    seen = next((layer for layer in layers.layers if layer.kind is Kind.SEEN), None)
-    if seen is None:
-        raise LayersError("the layers hold no keyframe")
-    behind = (layer for layer in layers.layers if (layer.kind, layer.keyframe_id) == (Kind.BEHIND, seen.keyframe_id))
-    prior = _prior(seen, panorama_width)
-    keyframe = Keyframe(0, prior, PanoramaWarp(prior), next((_background(layer) for layer in behind), None))
-    return KeyframeSet((keyframe,), np.ones((1, 3), np.float32))
-
-
-def _prior(layer: Layer, panorama_width: int) -> PanoramaPrior:
-    decoded = decode_layer(layer)
-    return PanoramaPrior(
-        rgb=np.ascontiguousarray(shrunk(decoded.rgb, panorama_width)),
-        inverse_depth=decoded.inverse_depth,
-        known=(decoded.confidence == 1).astype(np.uint8),
-        depth_edge=edge_quads(decoded.inverse_depth, DEPTH_EDGE_RATIO),
-        map_from_camera=np.array(layer.map_from_camera, np.float64),
-        relative_sigma=layer.relative_sigma,
-        sigma=np.full(decoded.content.shape, min(layer.relative_sigma, MOST_SIGMA), np.float32),
-        content=np.where(decoded.content <= ROOM, decoded.content, np.uint8(ROBOT)),
-    )
-
-
-def _background(layer: Layer) -> Background:
-    decoded = decode_layer(layer)
-    guessed, sky = (np.argwhere(decoded.content == kind).astype(np.int32) for kind in (Content.SURFACE, Content.SKY))
-    rgb = decoded.rgb
-    if rgb.shape[:2] != decoded.inverse_depth.shape:
-        raise LayersError(f"layer BEHIND of keyframe {layer.keyframe_id}: colour and geometry differ in size")
-    sure = np.rint(255 * decoded.confidence).astype(np.uint8)
-    return Background(decoded.inverse_depth, rgb, sure, guessed, sky, np.array(layer.map_from_camera, np.float64))

@@ -1,9 +1,8 @@
-"""A trained space as one file: version, configuration, parameters, keyframes, checksum."""
+"""A trained virtual space as one ``.npz`` file: configuration, keyframes, the field's parameters, and its progress."""
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import zipfile
 from dataclasses import dataclass
@@ -17,10 +16,9 @@ from instant_ic.util.files import replacing
 from instant_ic.util.limits import check_arrays
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.nerf.field import FieldParameters, Floats, Lattice
-from instant_ic.vspace.prior import MOVED, ROBOT, ROOM, SKY, PanoramaPrior
+from instant_ic.vspace.prior import PanoramaPrior
 
-FORMAT, VERSION = "instant_ic virtual space", 4
-_CONTENT_3 = np.array([ROOM, ROBOT, SKY, MOVED], np.uint8)  # codes of ``content`` in version 3
+FORMAT, VERSION = "instant_ic virtual space", 5
 FILE_NAME = "space.npz"
 """Name of the file in a folder."""
 
@@ -30,8 +28,8 @@ class SpaceFileError(ValueError):
 
 
 @dataclass(frozen=True)
-class Progress:
-    """Progress of training."""
+class TrainingProgress:
+    """Progress of training, with ``VirtualSpace``'s own fields."""
 
     psnr_db: float
     iteration: int
@@ -44,24 +42,37 @@ class Progress:
 
 @dataclass(frozen=True)
 class SavedSpace:
-    """Content of a file: the keyframes (newest first), their gains (K, 3), and the trained field."""
+    """Content of a file.
+
+    Attributes:
+        config: parameters of the space.
+        priors: the keyframes, newest first.
+        gains: factors that bring their colours to the newest's exposure, (K, 3).
+        lattice: lattice of the field.
+        parameters: the trained field.
+        progress: progress of its training.
+    """
 
     config: VirtualSpaceConfig
     priors: tuple[PanoramaPrior, ...]
     gains: Floats
     lattice: Lattice
     parameters: FieldParameters
-    progress: Progress
+    progress: TrainingProgress
 
 
 def space_file(path: str | Path) -> Path:
-    """The file itself, where ``path`` may be the folder it lies in."""
+    """Return the file of a space, which ``path`` names directly or by its folder."""
     path = Path(path)
     return path if path.suffix == ".npz" and not path.is_dir() else path / FILE_NAME
 
 
 def write(path: str | Path, saved: SavedSpace) -> Path:
-    """Write the file atomically, creating folders; returns its path.
+    """Write a space, creating folders, and return its file. An older file is replaced only by a complete one.
+
+    Args:
+        path: the file, or its folder.
+        saved: content of the file.
 
     Raises:
         OSError: it cannot be written.
@@ -81,88 +92,60 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
             arrays[f"{group}.{field.name}"] = np.asarray(getattr(part, field.name))
     file.parent.mkdir(parents=True, exist_ok=True)
     with replacing(file, sync=True) as stream:
-        np.savez(stream, allow_pickle=False, sha256=np.frombuffer(_checksum(arrays), np.uint8), **arrays)
+        np.savez(stream, allow_pickle=False, **arrays)
     return file
 
 
 def read(path: str | Path) -> SavedSpace:
-    """Reads a file that ``write`` has made.
+    """Read a file that ``write`` has made.
+
+    Args:
+        path: the file, or its folder.
 
     Raises:
-        SpaceFileError: missing, damaged, foreign, or of a newer version.
+        SpaceFileError: missing, damaged, foreign, or of another version.
     """
     file = space_file(path)
     try:
-        if file.is_file() and zipfile.is_zipfile(file):
+        if zipfile.is_zipfile(file):
             check_arrays(file)
         with np.load(file, allow_pickle=False) as loaded:
-            if not isinstance(loaded, np.lib.npyio.NpzFile) or not {"head", "sha256"} <= set(loaded.files):
-                raise SpaceFileError(f"{file}: not a saved virtual space")
             arrays = {name: loaded[name] for name in loaded.files}
     except FileNotFoundError as error:
-        raise SpaceFileError(f"{file}: no such file; make one with: ic vspace train") from error
-    except SpaceFileError:
-        raise
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        MemoryError,
-        zipfile.BadZipFile,
-        AttributeError,
-        NotImplementedError,
-    ) as error:
+        raise SpaceFileError(f"{file}: no such file. Make one with: ic vspace train") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError, NotImplementedError) as error:
         raise SpaceFileError(f"{file}: damaged, or not a saved virtual space: {error}") from error
-    if arrays.pop("sha256").tobytes() != _checksum(arrays):
-        raise SpaceFileError(f"{file}: damaged: its content does not have its own SHA-256")
     try:
         head = json.loads(arrays["head"].tobytes())
-        if head["format"] != FORMAT:
-            raise SpaceFileError(f"{file}: not a saved virtual space (format {head['format']!r})")
-        if head["version"] > VERSION:
-            raise SpaceFileError(f"{file}: version {head['version']}, this program reads up to {VERSION}: update it")
-        if head["version"] == 3:
-            for name in (f"prior.{number}.content" for number in range(head["keyframes"])):
-                arrays[name] = _CONTENT_3[arrays[name]]
-        elif head["version"] < VERSION:
-            raise SpaceFileError(f"{file}: version {head['version']}, of an older program: train it again")
+        if (head["format"], head["version"]) != (FORMAT, VERSION):
+            found = f"{head['format']!r}, version {head['version']}; this program reads version {VERSION}"
+            raise SpaceFileError(f"{file}: {found}. Train it again with: ic vspace train")
         priors = tuple(_group(PanoramaPrior, f"prior.{number}", arrays) for number in range(head["keyframes"]))
         if not priors:
-            raise SpaceFileError(f"{file}: holds no keyframe")
+            raise SpaceFileError(f"{file}: holds no keyframe. Train it again with: ic vspace train")
         return SavedSpace(
-            _built(VirtualSpaceConfig, head["config"], known_only=head["version"] == 3),
+            _built(VirtualSpaceConfig, head["config"]),
             priors,
             arrays["gains"],
             _group(Lattice, "lattice", arrays),
             _group(FieldParameters, "parameters", arrays),
-            _built(Progress, head["progress"]),
+            _built(TrainingProgress, head["progress"]),
         )
     except SpaceFileError:
         raise
-    except (IndexError, KeyError, TypeError, ValueError) as error:
-        raise SpaceFileError(f"{file}: does not fit this program: {error}") from error
-
-
-def _checksum(arrays: dict[str, NDArray[Any]]) -> bytes:
-    digest = hashlib.sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        digest.update(array.tobytes())
-    return digest.digest()
+    except (KeyError, TypeError, ValueError) as error:
+        raise SpaceFileError(f"{file}: not a saved virtual space of this program: {error}") from error
 
 
 def _group(kind: type[Any], group: str, arrays: dict[str, NDArray[Any]]) -> Any:
-    """A dataclass of arrays and numbers."""
-    names = [field.name for field in dataclasses.fields(kind)]
-    values = {name: arrays[f"{group}.{name}"] for name in names}
+    """Build a dataclass of arrays and numbers."""
+    values = {field.name: arrays[f"{group}.{field.name}"] for field in dataclasses.fields(kind)}
     return kind(**{name: value.item() if value.ndim == 0 else value for name, value in values.items()})
 
 
-def _built(kind: Any, value: Any, known_only: bool = False) -> Any:
-    """A configuration from nested dictionaries; a key that it does not know is an error, or left out."""
+def _built(kind: Any, value: Any) -> Any:
+    """Build a configuration from nested dictionaries; an unknown key is a TypeError."""
     if dataclasses.is_dataclass(kind):
         hints = get_type_hints(kind)
-        parts = {key: part for key, part in value.items() if key in hints or not known_only}
-        return kind(**{key: _built(hints.get(key), part, known_only) for key, part in parts.items()})  # type: ignore[operator]
+        return kind(**{key: _built(hints.get(key), part) for key, part in value.items()})  # type: ignore[operator]
     return tuple(value) if isinstance(value, list) else value  # JSON knows no tuples

@@ -27,7 +27,7 @@ from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattic
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import PanoramaPrior, prepare
 from instant_ic.vspace.readiness import Texture, error_terms, expected_psnr_db
-from instant_ic.vspace.saved import Progress, SavedSpace, read, write
+from instant_ic.vspace.saved import SavedSpace, TrainingProgress, read, write
 from instant_ic.vspace.store import RECENT, Keyframe, KeyframeSet, KeyframeStore, ready, recent, spread
 from instant_ic.vspace.view import Drawn, View, checked_pose, perspective_rays
 
@@ -484,9 +484,9 @@ class VirtualSpace(Drawn):
         return self._device.parameters()
 
     @property
-    def _progress(self) -> Progress:
+    def _progress(self) -> TrainingProgress:
         schedule = self._schedule
-        return Progress(
+        return TrainingProgress(
             *(self._psnr_db, schedule.iteration, schedule.refresh),
             *(self._ready_iterations, self._train_seconds, self._ready),
             shows_field=self._choice.field,

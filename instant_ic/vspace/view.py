@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import CUBE_FACES, equirect_directions, perspective_directions, sample_equirect
+from instant_ic.geometry.projections import equirect_directions, perspective_directions
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import fill_holes
 
@@ -25,15 +25,15 @@ _STRIDE_RAD = 0.025
 
 @dataclass(frozen=True)
 class View:
-    """An image of the space; of a cube map all arrays have a leading axis of six, in the order of ``CUBE_FACES``.
+    """An image of the space.
 
     Attributes:
         rgb: (H, W, 3) uint8; what is not known is continued from around it.
         depth_m: (H, W) along the ray, 0 where it meets nothing.
         confidence: (H, W): 1 where a keyframe has seen the place, 0.5 where it has but its depth was filled from
             around, 0 where none has: unknown.
-        projection: ``perspective``, ``equirect`` or ``cube``.
-        expected_psnr_db: that the image has, judged without its truth (``readiness``); NaN of a cube map.
+        projection: ``perspective`` or ``equirect``.
+        expected_psnr_db: that the image has, judged without its truth (``readiness``).
     """
 
     rgb: NDArray[np.uint8]
@@ -189,26 +189,3 @@ class Drawn(abc.ABC):
         if width % 2:
             raise ValueError(f"a panorama's width must be even (got {width})")
         return self._view(equirect_rays(checked_pose(map_from_camera), width), "equirect")
-
-    def render_cube(self, map_from_camera: NDArray[np.floating], size: int) -> View:
-        """Six faces of 90°, (6, size, size), in the order of ``geometry.projections.CUBE_FACES``. Raises as ``render``.
-
-        What is not known is continued across the faces' edges.
-        """
-        check_size(size, size)
-        pose, faces = checked_pose(map_from_camera), []
-        round_about: View | None = None
-        for rotation in CUBE_FACES.values():
-            turned = pose.copy()
-            turned[:3, :3] = pose[:3, :3] @ rotation
-            face = self._view(perspective_rays(turned, size, size, math.pi / 2), "cube")
-            unseen = face.confidence == 0
-            if unseen.any():
-                round_about = round_about or self.render_equirect(pose, min(4 * size, MAX_VIEW))
-                directions = perspective_directions(size, size, math.pi / 2)[unseen] @ rotation.T.astype(np.float32)
-                face.rgb[unseen] = np.rint(sample_equirect(round_about.rgb, directions))
-            faces.append(face)
-        rgb, depth, confidence = (
-            np.stack([getattr(f, key) for f in faces]) for key in ("rgb", "depth_m", "confidence")
-        )
-        return View(rgb, depth, confidence, "cube")

@@ -1,4 +1,4 @@
-"""The space in each projection: perspective, panorama, cube."""
+"""The space in each projection: perspective and panorama."""
 
 import math
 
@@ -8,7 +8,6 @@ import pytest
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.geometry.projections import CUBE_FACES, equirect_to_cube
 from instant_ic.vspace import FieldConfig, NotReadyError, TrainConfig, View, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.view import continue_unseen, equirect_rays, perspective_rays
 
@@ -48,21 +47,6 @@ def test_interpolation_between_traced_pixels_changes_a_panorama_little(space):
     relative = np.abs(coarse.depth_m[both] / full.depth_m[both] - 1)
     assert np.median(relative) < 0.003
     assert np.quantile(relative, 0.95) < 0.03
-
-
-def test_the_cubes_faces_are_the_pictures_along_them(space):
-    cube = space.render_cube(ASIDE, 48)
-    assert cube.rgb.shape == (6, 48, 48, 3)
-    assert cube.depth_m.shape == cube.confidence.shape == (6, 48, 48)
-    left = ASIDE.copy()
-    left[:3, :3] = ASIDE[:3, :3] @ CUBE_FACES["left"]
-    face = space.render(left, 48, 48, math.pi / 2)
-    seen = face.confidence > 0
-    assert np.array_equal(cube.rgb[1][seen], face.rgb[seen])
-    assert np.array_equal(cube.depth_m[1], face.depth_m)
-    # The panorama of the same place, cut into faces, is the same picture (but for the sampling).
-    cut = equirect_to_cube(space.render_equirect(ASIDE, 192).rgb, 48)
-    assert np.quantile(np.abs(cut - cube.rgb), 0.9) < 12
 
 
 def test_what_is_not_known_is_continued_across_the_seam():
@@ -112,11 +96,10 @@ def test_sizes_of_panoramas(space, width, words):
 
 def test_no_picture_of_nothing_and_none_from_nowhere(space):
     empty = VirtualSpace(CONFIG)
-    for draw in (lambda s, p: s.render_equirect(p, 64), lambda s, p: s.render_cube(p, 32)):
-        with pytest.raises(NotReadyError):
-            draw(empty, CAMERA)
-        with pytest.raises(ValueError, match="pose"):
-            draw(space, np.full((4, 4), np.nan))
+    with pytest.raises(NotReadyError):
+        empty.render_equirect(CAMERA, 64)
+    with pytest.raises(ValueError, match="pose"):
+        space.render_equirect(np.full((4, 4), np.nan), 64)
 
 
 def test_the_keyframes_own_panorama_comes_back(space):

@@ -1,4 +1,4 @@
-"""``ic vspace``: train a virtual space from one panorama; render, export or film it."""
+"""``ic vspace``: train a virtual space from one panorama, and render it."""
 
 from __future__ import annotations
 
@@ -19,21 +19,18 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from instant_ic.vspace import View, VirtualSpace, VirtualSpaceConfig
-
 DEVICES = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
-"""Same values as in ``VirtualSpaceConfig``; its module is too heavy to import here."""
-PREVIEW = "preview.png"
-PREVIEW_S = 1.0
-_LAYERS = "/vspace/layers"
-_SIZES = {"perspective": (640, 360), "equirect": (1024, 512), "cube": (512, 512)}
-_TRUE_SIGMA, _MODEL_SIGMA = 0.02, 0.1
-_LITTLE = 0.1
-"""Below this share of known pixels an image is little more than a guess."""
+"""Values of ``VirtualSpaceConfig.device``; that module is too heavy to import here."""
+SIZES = {"perspective": (640, 360), "equirect": (1024, 512)}
+"""Default width and height of a view in pixels."""
+GIVEN_SIGMA, MODEL_SIGMA = 0.02, 0.1
+"""Relative standard deviation of depth from a file, and of a model's estimate."""
+FEW_KNOWN = 0.1
+"""A view with a smaller share of known pixels gives a warning."""
 
 
 def degrees(text: str) -> float:
-    """A field of view."""
+    """Parse a field of view."""
     value = float(text)
     if not 1 <= value <= 170:
         raise argparse.ArgumentTypeError(f"must lie in 1..170 degrees (got {text})")
@@ -41,6 +38,7 @@ def degrees(text: str) -> float:
 
 
 def add_parser(subparsers: Any) -> None:
+    """Add the command and its verbs."""
     verbs = group(
         subparsers, "vspace", "train and render a virtual space from one panorama",
         "Train a virtual space from one panorama and render it (docs/nerf.md). Poses are relative to the "
@@ -50,46 +48,18 @@ def add_parser(subparsers: Any) -> None:
     )  # fmt: skip
     _add_train(verbs)
     _add_render(verbs)
-    kind = _of_space(
-        verbs, "export", "export the surfaces as PLY", export, "export room --mesh room.ply",
-        "Export the surfaces that the panorama has seen as binary PLY, in the frame of the space.",
-    )  # fmt: skip
-    kind.add_argument("--width", type=positive_int, default=1024, help="points around the horizon (%(default)s)")
-    kind = kind.add_mutually_exclusive_group(required=True)
-    kind.add_argument("--points", type=Path, metavar="OUT.ply", help="coloured points")
-    kind.add_argument("--mesh", type=Path, metavar="OUT.ply", help="coloured triangles, split at depth edges")
-    flight = _of_space(
-        verbs, "video", "record a flight through a space", video,
-        "video room --path 0,0,0,0 1,0,0,0 1,0.3,0,90 -o flight.mp4",
-        "Write a flight through a saved space as MP4, along a smooth curve through the waypoints.",
-    )  # fmt: skip
-    text = "two waypoints or more; the heading turns by the difference of the yaws (default: ahead, back, and one turn)"
-    flight.add_argument("--path", type=numbers("x,y,z,yaw"), nargs="+", metavar="x,y,z,yaw", help=text)
-    flight.add_argument("--seconds", type=positive, default=8.0, metavar="S", help="(%(default)g)")
-    flight.add_argument("--fps", type=positive, default=25.0, help="frames per second (%(default)g)")
-    _add_picture(flight)
-    flight.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.mp4", help="video to write")
-    _of_space(verbs, "info", "print the content of a saved space", info_, "info room")
+    info_parser = verb(verbs, "info", "print the content of a saved space", info, "ic vspace info room")
+    info_parser.add_argument("space", type=Path, metavar="DIR", help="folder written by ic vspace train")
     for parser in verbs.choices.values():
         # Makes "--pose -1,0,0,90" a value: argparse on its own only recognises single negative numbers.
         parser._negative_number_matcher = re.compile(r"-[\d.]")
 
 
-def _of_space(verbs: Any, name: str, words: str, run: Any, example: str, description: str = "") -> Any:
-    """Add a verb for a saved space."""
-    parser = verb(verbs, name, words, run, f"ic vspace {example}", description)
-    text = f"folder written by ic vspace train; to render or export, also a bag with {_LAYERS}, of which the newest "
-    parser.add_argument("space", type=Path, metavar="DIR", help=f"{text}counts")
-    parser.add_argument("--device", choices=DEVICES, help="(default: as in training)")
-    return parser
-
-
 def _add_train(verbs: Any) -> None:
     parser = verb(
         verbs, "train", "train on a panorama", train,
-        "ic vspace train room.jpg --depth room_depth.png --seconds 10 -o room",
-        "Train on one panorama and save the space in a folder. A preview from 0.5 m ahead in that folder "
-        f"({PREVIEW}) is updated every second. Ctrl-C ends the training early and saves the result.",
+        "ic vspace train room.jpg --depth room_depth.png -o room",
+        "Train on one panorama and save the space in a folder. Ctrl-C ends the training early and saves the result.",
     )  # fmt: skip
     add = parser.add_argument
     add("panorama", type=Path, help="equirectangular image, twice as wide as high")
@@ -98,51 +68,77 @@ def _add_train(verbs: Any) -> None:
     depth.add_argument("--depth", type=Path, metavar="D", help=text)
     text = "depth model, ONNX or manifest (default: the shipped one; its metres are an estimate, not scaled by a LiDAR)"
     depth.add_argument("--model", type=Path, metavar="M", help=text)
-    text = f"(default: {_TRUE_SIGMA:g} with --depth, {_MODEL_SIGMA:g} without)"
+    text = f"(default: {GIVEN_SIGMA:g} with --depth, {MODEL_SIGMA:g} without)"
     add("--depth-sigma", type=positive, metavar="SHARE", help=f"relative standard deviation of depth {text}")
     text = "height of the camera above the floor; the estimate is scaled to it (default: the model's metres)"
     add("--camera-height", type=positive, metavar="M", help=text)
     text = "use the model's depth unchanged; otherwise nearly level floors and ceilings and nearly upright walls are "
     add("--as-estimated", action="store_true", help=f"{text}straightened")
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--seconds", type=positive, metavar="S", help="train for about this time")
-    text = "train this many iterations (default: 600)"
-    length.add_argument("--iterations", type=positive_int, metavar="N", help=text)
+    add("--iterations", type=positive_int, default=600, metavar="N", help="length of the training (%(default)s)")
     add("--device", default="auto", choices=DEVICES, help="(%(default)s)")
     add("-o", "--out", type=Path, required=True, metavar="DIR", help="output folder, created if missing")
 
 
-def _add_picture(parser: argparse.ArgumentParser) -> None:
-    text = "horizontal field of view (%(default)g degrees)"
-    parser.add_argument("--fov", type=degrees, default=90.0, metavar="DEG", help=text)
-    sizes = ", ".join(f"{name} {w}x{h}" for name, (w, h) in _SIZES.items())
-    parser.add_argument("--size", type=size, metavar="WxH", help=f"pixels (default: {sizes})")
-
-
 def _add_render(verbs: Any) -> None:
-    parser = _of_space(
-        verbs, "render", "render an image of a space", render,
-        "render room --pose 0.5,-0.2,0,30 --fov 90 --size 640x360 -o view.png",
-        "Render an image of a saved space. A cube map is one row of faces: front, left, back, right, up, down.",
+    parser = verb(
+        verbs, "render", "render a view of a space", render,
+        "ic vspace render room --pose 0.5,-0.2,0,30 --fov 90 --size 640x360 -o view.png",
+        "Render a view of a saved space.",
     )  # fmt: skip
-    _add_picture(parser)
     add = parser.add_argument
+    add("space", type=Path, metavar="DIR", help="folder written by ic vspace train")
+    add("--device", choices=DEVICES, help="(default: as in training)")
+    add("--fov", type=degrees, default=90.0, metavar="DEG", help="horizontal field of view (%(default)g degrees)")
+    sizes = ", ".join(f"{name} {w}x{h}" for name, (w, h) in SIZES.items())
+    add("--size", type=size, metavar="WxH", help=f"pixels (default: {sizes})")
     add("--pose", type=numbers("x,y,z,yaw"), default=[0.0, 0.0, 0.0, 0.0], metavar="x,y,z,yaw", help="(0,0,0,0)")
-    add("--projection", choices=tuple(_SIZES), default="perspective", help="(%(default)s)")
+    add("--projection", choices=tuple(SIZES), default="perspective", help="(%(default)s)")
     add("-o", "--out", type=Path, required=True, metavar="PNG", help="image to write")
     add("--depth", type=Path, metavar="FILE", help="also write the depth: .png (16-bit, mm) or .npy (m)")
     text = "also write the confidence: white is seen, black is not"
     add("--confidence", type=Path, metavar="PNG", help=text)
 
 
-# -- the commands --------------------------------------------------------------------------------------
-
-
 def train(args: argparse.Namespace) -> int:
+    """Train a space and save it."""
+    import numpy as np
+
     from instant_ic.cli.progress import progress
-    from instant_ic.depth.files import load_depth, load_picture
-    from instant_ic.vspace import KeyframeError, VirtualSpaceConfig
+    from instant_ic.vspace import KeyframeError, TrainConfig, VirtualSpace, VirtualSpaceConfig
     from instant_ic.vspace.warm_up import warm_up
+
+    rgb, depth, sigma = _keyframe(args)
+    args.out.mkdir(parents=True, exist_ok=True)
+    config = VirtualSpaceConfig(device=args.device)
+    config = dataclasses.replace(config, train=dataclasses.replace(TrainConfig(), iterations=args.iterations))
+    began = time.monotonic()
+    warm_up(config)
+    if time.monotonic() - began > 5:
+        print("compiled the kernels (first run only)", file=sys.stderr)
+    space, ended = VirtualSpace(config), ""
+    try:
+        space.set_keyframe(rgb, depth, np.eye(4), sigma)
+    except KeyframeError as error:
+        raise UserError(f"{args.panorama}{f' with {args.depth}' if args.depth else ''}: {error}") from error
+    with progress("training") as advance:
+        try:
+            while not space.status.converged:
+                space.train(budget_ms=200)
+                advance(space.status.iterations / args.iterations)
+        except KeyboardInterrupt:
+            ended = "ended early: "
+    file, status = space.save(args.out), space.status
+    if status.warning:
+        print(f"warning: {status.warning}", file=sys.stderr)
+    print(f"{ended}{status.iterations} iterations in {status.train_seconds:.1f} s on "
+          f"{status.device}, {status.psnr_db:.1f} dB on the panorama's own rays; depth known in "
+          f"{(depth > 0).mean():.0%}, usable up to {status.ready_radius_m:.1f} m; wrote {file}")  # fmt: skip
+    return 0
+
+
+def _keyframe(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.float32], float]:
+    """Load the panorama, and load or estimate its depth in metres and the depth's relative standard deviation."""
+    from instant_ic.depth.files import load_depth, load_picture
 
     if args.camera_height and (args.depth or args.as_estimated):
         other = "--depth" if args.depth else "--as-estimated"
@@ -151,30 +147,11 @@ def train(args: argparse.Namespace) -> int:
         )
     rgb = load_picture(args.panorama)
     if args.depth:
-        depth, sigma = load_depth(args.depth), args.depth_sigma or _TRUE_SIGMA
-    else:
-        depth, sigma = estimated_depth(args.model, rgb), args.depth_sigma or _MODEL_SIGMA
-        if not args.as_estimated:
-            depth = _tidied(depth, args.camera_height, args.panorama)
-    args.out.mkdir(parents=True, exist_ok=True)
-    config = VirtualSpaceConfig(device=args.device)
-    began = time.monotonic()
-    warm_up(config)
-    if time.monotonic() - began > 5:
-        print("compiled the kernels (first run only)", file=sys.stderr)
-    try:
-        space = _space(config, rgb, depth, sigma, args)
-    except KeyframeError as error:
-        raise UserError(f"{args.panorama}{f' with {args.depth}' if args.depth else ''}: {error}") from error
-    with progress("training") as advance:
-        ended = _train(space, args, advance)
-    file, status = space.save(args.out), space.status
-    if status.warning:
-        print(f"warning: {status.warning}", file=sys.stderr)
-    print(f"{'ended early: ' if ended else ''}{status.iterations} iterations in {status.train_seconds:.1f} s on "
-          f"{status.device}, {status.psnr_db:.1f} dB on the panorama's own rays; depth known in "
-          f"{(depth > 0).mean():.0%}, usable up to {status.ready_radius_m:.1f} m; wrote {file}")  # fmt: skip
-    return 0
+        return rgb, load_depth(args.depth), args.depth_sigma or GIVEN_SIGMA
+    depth = estimated_depth(args.model, rgb)
+    if not args.as_estimated:
+        depth = _tidied(depth, args.camera_height, args.panorama)
+    return rgb, depth, args.depth_sigma or MODEL_SIGMA
 
 
 def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -209,184 +186,45 @@ def _tidied(depth: NDArray[np.float32], camera_height_m: float | None, panorama:
     return room.depth_m
 
 
-def _space(config: VirtualSpaceConfig, rgb: Any, depth: Any, sigma: float, args: argparse.Namespace) -> VirtualSpace:
-    """Virtual space with the panorama as its keyframe and a schedule of the requested length."""
-    import numpy as np
-
-    from instant_ic.vspace import VirtualSpace
-
-    iterations = args.iterations or config.train.iterations
-    if args.seconds:
-        trial = VirtualSpace(config)
-        trial.set_keyframe(rgb, depth, np.eye(4), sigma)
-        iterations = max(10, int(1e3 * args.seconds * 5 / trial.train(iterations=5).elapsed_ms))
-    config = dataclasses.replace(config, train=dataclasses.replace(config.train, iterations=iterations))
-    space = VirtualSpace(config)
-    space.set_keyframe(rgb, depth, np.eye(4), sigma)
-    return space
-
-
-def _train(space: VirtualSpace, args: argparse.Namespace, advance: Any) -> bool:
-    """Train to the end and report the progress; return whether the user ended it early."""
-    from instant_ic.geometry.poses import pose_matrix
-
-    preview = args.out / PREVIEW
-    next_preview, total = 0.0, space.config.train.iterations
-    deadline = 1.2 * args.seconds if args.seconds else math.inf
-    try:
-        while not space.status.converged and space.status.train_seconds < deadline:
-            space.train(budget_ms=200)
-            advance(space.status.iterations / total)
-            begin = time.monotonic()
-            if begin >= next_preview or space.status.converged:
-                write_picture(preview, space.render(pose_matrix(x=0.5), *_SIZES["perspective"], math.pi / 2).rgb)
-                took = time.monotonic() - begin
-                next_preview = begin + max(PREVIEW_S, 4 * took)  # on a slow machine, training has priority
-    except KeyboardInterrupt:
-        return True
-    return False
-
-
-def open_space(args: argparse.Namespace) -> VirtualSpace:
-    """Load the space given on the command line: a saved one, or the newest layers of a bag."""
-    from instant_ic.vspace import VirtualSpace
-
-    if args.space.suffix == ".mcap" or (args.space / "metadata.yaml").exists():
-        return _space_of_bag(args.space)
-    return VirtualSpace.load(args.space, args.device)
-
-
-def _space_of_bag(path: Path) -> VirtualSpace:
-    from instant_ic.adapters.vspace import layers_of
-    from instant_ic.bag import BagReader
-    from instant_ic.msg import MessageError, deserialize
-    from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
-    from instant_ic.vspace.layers import LayersError, decode
-
-    newest = None
-    with BagReader(path) as bag:
-        for newest in bag.messages([_LAYERS]):  # noqa: B007
-            pass
-    if newest is None:
-        raise UserError(f"{path} holds no {_LAYERS}. Record it while the stack runs, with `ic bag record`.")
-    space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))
-    try:
-        layers = layers_of(deserialize(newest.payload, newest.type_name))
-        space.show(decode(layers, space.config.panorama_width))
-    except (LayersError, MessageError) as error:
-        raise UserError(f"{path}, newest message of {_LAYERS}: {error}") from error
-    return space
-
-
-def placed(space: VirtualSpace, pose: list[float]) -> NDArray[np.float64]:
-    """Transform a pose relative to the panorama's camera (yaw in degrees) into the map of the space."""
-    from instant_ic.geometry.poses import pose_matrix
-
-    assert space.keyframe is not None
-    x, y, z, yaw = pose
-    return space.keyframe.map_from_camera @ pose_matrix(x, y, z, yaw=math.radians(yaw))
-
-
 def render(args: argparse.Namespace) -> int:
+    """Render a view of a saved space."""
     import numpy as np
 
-    space = open_space(args)
-    width, height = args.size or _SIZES[args.projection]
-    pose = placed(space, args.pose)
+    from instant_ic.geometry.poses import pose_matrix
+    from instant_ic.vspace import VirtualSpace
+
+    space = VirtualSpace.load(args.space, args.device)
+    assert space.keyframe is not None
+    x, y, z, yaw = args.pose
+    pose = space.keyframe.map_from_camera @ pose_matrix(x, y, z, yaw=math.radians(yaw))
+    width, height = args.size or SIZES[args.projection]
+    if args.projection == "equirect" and width != 2 * height:
+        raise UserError(f"--size of a panorama must be twice as wide as high (got {width}x{height})", 2)
     try:
         if args.projection == "perspective":
             view = space.render(pose, width, height, math.radians(args.fov))
-        elif args.projection == "equirect":
-            if width != 2 * height:
-                raise UserError(f"--size of a panorama must be twice as wide as high (got {width}x{height})", 2)
-            view = space.render_equirect(pose, width)
         else:
-            if width != height:
-                raise UserError(f"--size of a cube map must be that of one square face (got {width}x{height})", 2)
-            view = space.render_cube(pose, width)
+            view = space.render_equirect(pose, width)
     except ValueError as error:
         raise UserError(f"--size: {error}", 2) from error
-    write_picture(args.out, _row(view.rgb))
+    write_image(args.out, view.rgb)
     if args.depth:
-        write_depth(args.depth, _row(view.depth_m))
+        write_depth(args.depth, view.depth_m)
     if args.confidence:
-        write_picture(args.confidence, (255 * _row(view.confidence)).astype(np.uint8))
-    _warn_of_the_unknown(view, space, args.pose)
-    print(f"{view.mean_confidence:.0%} of the image is known; wrote {args.out}")
-    return 0
-
-
-def _row(faces: NDArray) -> NDArray:
-    """Faces of a cube map side by side; any other image unchanged."""
-    import numpy as np
-
-    return np.concatenate(list(faces), axis=1) if len(faces) == 6 else faces
-
-
-def _warn_of_the_unknown(view: View, space: VirtualSpace, pose: list[float]) -> None:
-    radius, away = space.status.ready_radius_m, math.dist(pose[:3], (0, 0, 0))
-    if view.mean_confidence < _LITTLE:
+        write_image(args.confidence, (255 * view.confidence).astype(np.uint8))
+    radius, away = space.status.ready_radius_m, math.dist(args.pose[:3], (0, 0, 0))
+    if view.mean_confidence < FEW_KNOWN:
         print(f"warning: the panorama has seen little of this view ({view.mean_confidence:.0%}): "
               "the rest is extrapolated or black", file=sys.stderr)  # fmt: skip
     elif away > radius > 0:
         print(f"warning: {away:.1f} m from the panorama; the space is usable up to {radius:.1f} m",
               file=sys.stderr)  # fmt: skip
-
-
-def export(args: argparse.Namespace) -> int:
-    from instant_ic.geometry.ply import write_ply
-    from instant_ic.vspace.export import surface
-
-    space, out = open_space(args), args.points or args.mesh
-    try:
-        found = surface(space, args.width)
-    except ValueError as error:
-        raise UserError(f"--width: {error}", 2) from error
-    write_ply(out, found.points, found.rgb, found.triangles if args.mesh else None)
-    triangles = f" and {len(found.triangles)} triangles" if args.mesh else ""
-    print(f"wrote {out}: {len(found.points)} points{triangles}")
+    print(f"{view.mean_confidence:.0%} of the image is known; wrote {args.out}")
     return 0
 
 
-def video(args: argparse.Namespace) -> int:
-    import cv2
-
-    from instant_ic.cli.progress import progress
-    from instant_ic.vspace.export import default_flight, flight
-
-    if args.out.suffix.lower() != ".mp4":
-        raise UserError(f"{args.out}: the name must end in .mp4", 2)
-    space = open_space(args)
-    waypoints = [(x, y, z, math.radians(yaw)) for x, y, z, yaw in args.path or []]
-    try:
-        poses = flight(waypoints or default_flight(space.status.ready_radius_m), round(args.seconds * args.fps))
-    except ValueError as error:
-        raise UserError(f"--path: {error}", 2) from error
-    width, height = args.size or _SIZES["perspective"]
-    if width % 2 or height % 2:
-        raise UserError(f"--size of a video must be even (got {width}x{height})", 2)
-    assert space.keyframe is not None
-    writer, known = None, 0.0
-    with progress("rendering") as advance:
-        for number, pose in enumerate(poses):
-            try:
-                view = space.render(space.keyframe.map_from_camera @ pose, width, height, math.radians(args.fov))
-            except ValueError as error:
-                raise UserError(f"--size: {error}", 2) from error
-            if writer is None:
-                writer = cv2.VideoWriter(str(args.out), cv2.VideoWriter.fourcc(*"mp4v"), args.fps, (width, height))
-                if not writer.isOpened():
-                    raise UserError(f"{args.out}: cannot be written")
-            writer.write(view.rgb[..., ::-1])
-            known += view.mean_confidence / len(poses)
-            advance((number + 1) / len(poses))
-    assert writer is not None
-    writer.release()
-    print(f"wrote {args.out}: {len(poses)} frames, {known:.0%} known")
-    return 0
-
-
-def info_(args: argparse.Namespace) -> int:
+def info(args: argparse.Namespace) -> int:
+    """Print the content of a saved space."""
     from instant_ic.vspace.saved import read, space_file
 
     saved = read(args.space)
@@ -404,15 +242,12 @@ def info_(args: argparse.Namespace) -> int:
     return 0
 
 
-# -- files ---------------------------------------------------------------------------------------------
-
-
-def write_picture(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+def write_image(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
     """Write an RGB or grey image in the format of the file suffix; never leave a partial file."""
     import cv2
 
     try:
-        done, content = cv2.imencode(path.suffix or ".png", picture[..., ::-1] if picture.ndim == 3 else picture)
+        done, content = cv2.imencode(path.suffix or ".png", image[..., ::-1] if image.ndim == 3 else image)
     except cv2.error:
         done = False
     if not done:
@@ -428,6 +263,6 @@ def write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
     if path.suffix == ".npy":
         np.save(path, depth_m)
     elif path.suffix == ".png":
-        write_picture(path, np.rint(np.clip(1000 * depth_m, 0, 65535)).astype(np.uint16))
+        write_image(path, np.rint(np.clip(1000 * depth_m, 0, 65535)).astype(np.uint16))
     else:
         raise UserError(f"{path}: the name of a depth file must end in .png (16-bit, mm) or .npy (m)", 2)
