@@ -70,6 +70,21 @@ def test_commands_of_a_page_make_what_the_later_ones_read_and_nothing_twice(page
         made |= set(new)
 
 
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.M)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", [*PAGES, "CHANGELOG.md"])
+def test_links_lead_to_a_file_and_a_heading(page):
+    file = ROOT / page
+    for target, anchor in re.findall(r"\]\((?!https?:|#)([^)#\s]+)(?:#([^)\s]+))?\)", file.read_text(encoding="utf-8")):
+        linked = (file.parent / target).resolve()
+        assert linked.exists(), f"{page}: {target} does not exist"
+        assert not anchor or anchor in anchors(linked), f"{page}: {target} has no heading #{anchor}"
+
+
 def test_explanation_stays_short():
     words = {page: len((ROOT / page).read_text(encoding="utf-8").split()) for page in PAGES}
     assert words["README.md"] <= 900
