@@ -10,7 +10,7 @@ from instant_ic.base.config import CrawlerBaseConfig, RoboclawConfig
 from instant_ic.base.controller import BaseController, BaseState, ControllerThread, Health, SteppedController
 from instant_ic.base.pace import refuse_pace
 from instant_ic.base.report import BaseReport
-from instant_ic.base.roboclaw import SerialPort, Status, open_serial
+from instant_ic.base.roboclaw import ControllerStatus, SerialPort, open_serial
 from instant_ic.bus import ERROR, LATCHED, SENSOR, WARN, Node, NodeError, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.estop import EstopLatch
@@ -47,7 +47,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.report = BaseReport(config, self.controller, self.clock.steady_ns())
         self.latch = EstopLatch()
         self.button: bool | None = None  # whether the controller, or a faulty track, holds the base stopped
-        self.status: Status | None = None  # the controller's newest; read by the serial thread alone
+        self.status: ControllerStatus | None = None  # the controller's newest; read by the serial thread alone
         self.hard = False  # the newest command is a hard stop
         self.odometry = self.publisher("/wheel/odom", Odometry, qos=SENSOR)
         self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)

@@ -22,7 +22,7 @@ from instant_ic.msg import (
 _TWISTS = (type_name(TwistStamped), type_name(Twist))
 
 
-class Command(NamedTuple):
+class BaseCommand(NamedTuple):
     """A command of ``/cmd_vel``: v in m/s, w in rad/s."""
 
     v: float
@@ -35,7 +35,7 @@ class Command(NamedTuple):
     """Stop without the soft ramp."""
 
 
-def read_command(received: Received) -> Command:
+def read_command(received: Received) -> BaseCommand:
     """The command of a Twist or TwistStamped.
 
     Raises:
@@ -47,7 +47,7 @@ def read_command(received: Received) -> Command:
     message: Any = deserialize(received.payload, name)
     stamp = stamp_ns(message) if hasattr(message, "header") else 0
     hard = stamp != 0 and message.header.frame_id == HARD_STOP
-    return Command(*twist_values(message), stamp, received.given_ns(stamp) if stamp else received.steady_ns, hard)
+    return BaseCommand(*twist_values(message), stamp, received.given_ns(stamp) if stamp else received.steady_ns, hard)
 
 
 def estimate_message(estimate: OdometryEstimate, odom_frame: str, base_frame: str) -> Any:

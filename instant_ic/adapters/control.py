@@ -23,7 +23,7 @@ from instant_ic.control.robot_lease import LEASE_S, RELEASED, Lease
 from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Vspace
 from instant_ic.control.states import Mode
 from instant_ic.control.static_map import StaticMap
-from instant_ic.control.surroundings import Cloud, Scan, Surroundings
+from instant_ic.control.surroundings import ArrivedCloud, ArrivedScan, Surroundings
 from instant_ic.control.walls import WallMap
 from instant_ic.msg import (
     HARD_STOP,
@@ -72,16 +72,16 @@ class ArbiterInbox:
     _shown_by: str = ""  # node of that report
     _zeros_of: str = ""  # sender of the last zero
 
-    def scan(self) -> Scan | None:
+    def scan(self) -> ArrivedScan | None:
         """The newest scan."""
         latest = self.sources["scan"]
         m = latest.message
         if m is None:
             return None
         beams = (m.ranges, m.angle_min, m.angle_increment, m.range_min, m.range_max)
-        return Scan(m.header.frame_id, stamp_ns(m), self._arrived_ns(latest), *beams)
+        return ArrivedScan(m.header.frame_id, stamp_ns(m), self._arrived_ns(latest), *beams)
 
-    def cloud(self) -> Cloud | None:
+    def cloud(self) -> ArrivedCloud | None:
         """The newest 3D points; a message that cannot be read is reported to the surroundings."""
         if self.points is None or self.points.message is None:
             return None
@@ -91,10 +91,10 @@ class ArbiterInbox:
         except MessageError as error:
             self.surroundings.refuse_points(str(error))
             return None
-        return Cloud(message.header.frame_id, stamp_ns(message), self._arrived_ns(self.points), points)
+        return ArrivedCloud(message.header.frame_id, stamp_ns(message), self._arrived_ns(self.points), points)
 
     def rests(self, mode: Mode) -> bool:
-        """Whether the robot stands and nobody wants it to move: nothing then depends on the newest scan."""
+        """Return whether the robot stands and nobody wants it to move: nothing then depends on the newest scan."""
         still = self._twist("command") == NO_MOTION == self._twist("odometry")
         return still and mode in (Mode.REAL, Mode.STOPPED)
 
@@ -159,7 +159,7 @@ class ArbiterInbox:
         return grid_message(costmap.occupancy(), costmap.resolution, (x, y), "map", scan.stamp_ns)
 
     def operator_gone(self) -> bool:
-        """Whether the console has lost its driver since the newest command."""
+        """Return whether the console has lost its driver since the newest command."""
         shown, command = self.shown.message, self.sources["command"].message
         return shown is not None and command is not None and stamp_ns(command) <= stamp_ns(shown.operator_lost)
 
@@ -224,7 +224,7 @@ class ArbiterInbox:
         )
 
     def _counts(self, node: str) -> bool:
-        """Whether the images at a node's pages are the driver's."""
+        """Return whether the images at a node's pages are the driver's."""
         return not self.lease.holder or self.lease.holder.startswith(f"{node}/")
 
     @property

@@ -11,7 +11,7 @@ from instant_ic.base.config import ControllerConfig, RoboclawConfig
 from instant_ic.base.following import TrackWatch
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_counts
-from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
+from instant_ic.base.roboclaw import ControllerRestarted, ControllerStatus, LinkError, Roboclaw, SerialPort, open_serial
 from instant_ic.util.pace import current, suspended_ns
 from instant_ic.util.reconnect import Backoff
 from instant_ic.util.step_gap import StepGap
@@ -58,7 +58,7 @@ class BaseState:
     fault: str = ""
     restarted: bool = False
     odometry: OdometryEstimate | None = None
-    status: Status | None = None
+    status: ControllerStatus | None = None
     health: Health | None = None
     command_fresh: bool = False
     v: float = 0.0
@@ -214,7 +214,7 @@ class BaseController:
         return health
 
     def _sure(self, asked_ns: int, read_ns: int) -> bool:
-        """Whether the time of a reading is known well enough; a reading left out costs no motion, the next has it."""
+        """Return whether the time of a reading is certain enough; the next one makes up for a dropped one."""
         before_ns = self._placed_ns
         late = read_ns - asked_ns > _SURE_WITHIN_S * 1e9
         if late and before_ns is not None and read_ns - before_ns < _UNSURE_AFTER_S * 1e9:
@@ -300,7 +300,7 @@ class BaseController:
             self.roboclaw.check_watchdog()
 
     def _near_zero(self, encoders: NDArray[np.int64]) -> bool:
-        """Whether both counts are small enough for a controller that has just restarted."""
+        """Return whether both counts are small enough for a controller that has just restarted."""
         metres = unwrap_counts(np.zeros(2, np.int64), encoders) / self.config.geometry.pulses_per_metre
         return bool(np.abs(metres).max() < _COUNTED_SINCE_M)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from instant_ic.base.config import CrawlerBaseConfig
 from instant_ic.base.controller import BaseController, Health
-from instant_ic.base.roboclaw import Status
+from instant_ic.base.roboclaw import ControllerStatus
 from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 
 _CONNECT_GRACE_S = 5.0  # after the start, for which a missing controller is not an error yet
@@ -54,7 +54,7 @@ class BaseReport:
         yield Diagnosis("encoders", Level.WARN if jumps else Level.OK, text, {"rejected": rejected})
 
     def tracks(self, fault: str = "") -> Diagnosis:
-        """Whether both tracks follow their commands; after a fault until the stop is released."""
+        """Return whether both tracks follow their commands; after a fault until the stop is released."""
         stopped = f"{fault}. The robot has stopped; release the emergency stop to try again"
         return Diagnosis("tracks", Level.ERROR if fault else Level.OK, stopped if fault else "both follow")
 
@@ -68,7 +68,7 @@ class BaseReport:
         """Note that the controller has restarted; a fault that is over until the stop is released."""
         self._fault = "the motor controller has restarted: check its supply voltage"
 
-    def controller(self, status: Status) -> Diagnosis:
+    def controller(self, status: ControllerStatus) -> Diagnosis:
         """Faults and warnings of the controller; a fault until the stop is released, under its name."""
         faults, warnings = ", ".join(status.faults), ", ".join(status.warnings)
         self._fault = faults or self._fault

@@ -54,7 +54,7 @@ class SerialPort(Protocol):
 
 
 @dataclass(frozen=True)
-class Status:
+class ControllerStatus:
     """Reply to command 90.
 
     Attributes:
@@ -67,7 +67,7 @@ class Status:
 
     @property
     def estop(self) -> bool:
-        """Whether the controller's emergency stop input is active."""
+        """True if the controller's emergency stop input is active."""
         return bool(self.value & ESTOP_BITS[self.size])
 
     @property
@@ -306,7 +306,7 @@ class Roboclaw:
         """Main battery voltage, volts (command 24)."""
         return int.from_bytes(self._read(Command.READ_MAIN_BATTERY, 2), "big") * 0.1
 
-    def status(self) -> Status:
+    def status(self) -> ControllerStatus:
         """Faults and warnings (command 90).
 
         Old firmware replies with 2 bytes, newer firmware with 4. The first reply determines the size, which is kept
@@ -315,7 +315,7 @@ class Roboclaw:
         size = self._status_size
         data = self._transact(Command.READ_STATUS, self._reply(2, 4) if size is None else self._reply(size))
         self._status_size = len(data)
-        return Status(int.from_bytes(data, "big"), len(data))
+        return ControllerStatus(int.from_bytes(data, "big"), len(data))
 
     def version(self) -> str:
         """Firmware version text (command 21)."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.bag import BagError, BagReader
-from instant_ic.calibration.mount import CalibrationError, Frame
+from instant_ic.calibration.mount import CalibrationError, CalibrationFrame
 from instant_ic.geometry.poses import Matrix, inverse, wrap_angle, yaw_of
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.lidar.deskew import points_at
@@ -45,7 +45,7 @@ class CalibrationRecording:
         moves: whether odometry was available to compensate the motion.
     """
 
-    frames: list[Frame]
+    frames: list[CalibrationFrame]
     camera_from_lidar: Matrix | None
     base_from_lidar: Matrix | None
     pictures: int
@@ -54,7 +54,7 @@ class CalibrationRecording:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class CalibrationCloud:
     points: NDArray[Any]
     stamp_ns: int
     frame_id: str
@@ -112,7 +112,7 @@ def read_recording(
     )
 
 
-def read_clouds(bag: BagReader, points_topic: str = "") -> tuple[TransformBuffer, Iterator[Cloud]]:
+def read_clouds(bag: BagReader, points_topic: str = "") -> tuple[TransformBuffer, Iterator[CalibrationCloud]]:
     """All transforms of a bag, and its LiDAR revolutions, from points or packets.
 
     Raises:
@@ -219,13 +219,13 @@ def _evenly(values: list[int], most: int) -> list[int]:
     return [values[round(k)] for k in np.linspace(0, len(values) - 1, most)] if most else []
 
 
-def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) -> Iterator[Cloud]:
+def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) -> Iterator[CalibrationCloud]:
     """Revolutions from points or packets whose messages are close in time to an image."""
     if kind == CLOUD:
         for message in bag.messages([topic]):
             if near(message.stamp_ns):
                 cloud = deserialize(message.payload, message.type_name)
-                yield Cloud(cloud_array(cloud), stamp_ns(cloud), cloud.header.frame_id)
+                yield CalibrationCloud(cloud_array(cloud), stamp_ns(cloud), cloud.header.frame_id)
         return
     from instant_ic.lidar.stream import PacketStream
 
@@ -235,14 +235,16 @@ def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) 
         for packet in scan.packets:
             revolution = stream.feed(bytes(packet.data), stamp_ns(packet))
             if revolution is not None and revolution.complete and near(revolution.end_ns):
-                yield Cloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
+                yield CalibrationCloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
 
 
-def _nearest_clouds(path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int]) -> dict[int, Cloud]:
+def _nearest_clouds(
+    path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int]
+) -> dict[int, CalibrationCloud]:
     """Revolution nearest in time to each stamp, where one is near enough."""
     # The bag stamps messages on arrival, up to a second late on a busy machine.
     at = np.array(stamps)
-    found: dict[int, Cloud] = {}
+    found: dict[int, CalibrationCloud] = {}
     count = 0
     for cloud in _clouds(bag, topic, kind, lambda ns: bool((np.abs(at - ns) < 1_500_000_000).any())):
         missing = [name for name in _FIELDS if name not in (cloud.points.dtype.names or ())]
@@ -275,8 +277,10 @@ def _decoded(path: Path, picture: Any) -> NDArray[np.uint8]:
     return np.ascontiguousarray(bgr[..., ::-1])
 
 
-def _frame(rgb: NDArray[np.uint8], cloud: Cloud, stamp: int, place: int, transforms: TransformBuffer | None) -> Frame:
-    """Frame of image and revolution, with the points moved to the LiDAR's pose at the time of the image."""
+def _frame(
+    rgb: NDArray[np.uint8], cloud: CalibrationCloud, stamp: int, place: int, transforms: TransformBuffer | None
+) -> CalibrationFrame:
+    """Build a frame of image and revolution, with the points moved to the LiDAR's pose at the time of the image."""
     cloud_points = cloud.points
     xyz = np.stack([cloud_points[name] for name in "xyz"], axis=1).astype(np.float64)
     usable = np.isfinite(xyz).all(axis=1) & np.isfinite(cloud_points["time"])
@@ -287,4 +291,4 @@ def _frame(rgb: NDArray[np.uint8], cloud: Cloud, stamp: int, place: int, transfo
         xyz = points_at(
             xyz, kept["time"], cloud.stamp_ns, lambda at: lidar_from_odom @ transforms.lookup(_ODOM, cloud.frame_id, at)
         )
-    return Frame(rgb, xyz, kept["intensity"].astype(np.float64), kept["ring"].astype(np.int64), place)
+    return CalibrationFrame(rgb, xyz, kept["intensity"].astype(np.float64), kept["ring"].astype(np.int64), place)

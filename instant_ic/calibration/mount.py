@@ -45,7 +45,7 @@ class CalibrationError(ValueError):
 
 
 @dataclass(frozen=True)
-class Frame:
+class CalibrationFrame:
     """Panorama and revolution of the same moment.
 
     Attributes:
@@ -98,10 +98,10 @@ class _Edges:
     counts: dict[str, int]
 
 
-class _Level:
+class _EdgeLevel:
     """Score of a pose at one blur level of the image edges."""
 
-    def __init__(self, edges: _Edges, frames: Sequence[Frame], blur_px: float) -> None:
+    def __init__(self, edges: _Edges, frames: Sequence[CalibrationFrame], blur_px: float) -> None:
         sigma_px = blur_px * frames[0].rgb.shape[1] / 1024.0
         # A strongly blurred image needs fewer pixels.
         smaller = 2 ** max(int(math.log2(sigma_px / 2)), 0) if sigma_px >= 4 else 1
@@ -134,7 +134,7 @@ def _reduced(rgb: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
 
 
 def calibrate(
-    frames: Sequence[Frame],
+    frames: Sequence[CalibrationFrame],
     camera_from_lidar: Matrix,
     full_circle: bool = True,
     report: Callable[[str], None] = lambda line: None,
@@ -161,13 +161,13 @@ def calibrate(
     edges = _edges(frames, camera_from_lidar)
     report(f"{len(frames)} frames, edges: " + ", ".join(f"{count} {cue}" for cue, count in edges.counts.items()))
     start, rival = camera_from_lidar, 0.0
-    level = _Level(edges, frames, blur_px[0])
+    level = _EdgeLevel(edges, frames, blur_px[0])
     if full_circle:
         start, rival = _around(level, camera_from_lidar, yaw_step_deg)
         report(f"yaw {_correction(camera_from_lidar, start)[5] / math.radians(1):+.1f} deg around the full circle")
     found = start
     for number, blur in enumerate(blur_px):
-        level = level if number == 0 else _Level(edges, frames, blur)
+        level = level if number == 0 else _EdgeLevel(edges, frames, blur)
         found = _climb(level, start, found)
         report(f"blur {blur:g} px: score {level.score(found):.3f}")
     found, rivals = _among_rivals(level, start, found)
@@ -206,7 +206,7 @@ def calibrate(
     )
 
 
-def _edges(frames: Sequence[Frame], camera_from_lidar: Matrix) -> _Edges:
+def _edges(frames: Sequence[CalibrationFrame], camera_from_lidar: Matrix) -> _Edges:
     floor = find_floor(np.concatenate([frame.points[::7] for frame in frames]))
     found = [lidar_edges(f.points, f.intensity, f.ring, floor) for f in frames]
     cue = np.concatenate([edges.cue for edges in found])
@@ -255,7 +255,7 @@ def _correction(before: Matrix, after: Matrix) -> NDArray[np.float64]:
     return np.concatenate([change[:3, 3], Rotation.from_matrix(change[:3, :3]).as_rotvec()])
 
 
-def _around(level: _Level, camera_from_lidar: Matrix, step_deg: float) -> tuple[Matrix, float]:
+def _around(level: _EdgeLevel, camera_from_lidar: Matrix, step_deg: float) -> tuple[Matrix, float]:
     """Pose with the best yaw of the full circle, and the score ratio of its closest rival."""
     count = round(360 / step_deg)
     yaws = np.arange(count) * (2 * np.pi / count)
@@ -267,7 +267,7 @@ def _around(level: _Level, camera_from_lidar: Matrix, step_deg: float) -> tuple[
     return _turned(camera_from_lidar, float(yaws[best])), max(rival, 0.0)
 
 
-def _climb(level: _Level, start: Matrix, found: Matrix) -> Matrix:
+def _climb(level: _EdgeLevel, start: Matrix, found: Matrix) -> Matrix:
     """Pose of the highest score near ``found``, with a weak prior towards ``start``."""
     from scipy.optimize import minimize
 
@@ -287,7 +287,7 @@ def _climb(level: _Level, start: Matrix, found: Matrix) -> Matrix:
     return _moved(start, result.x)
 
 
-def _among_rivals(level: _Level, start: Matrix, found: Matrix) -> tuple[Matrix, list[Matrix]]:
+def _among_rivals(level: _EdgeLevel, start: Matrix, found: Matrix) -> tuple[Matrix, list[Matrix]]:
     """Select the maximum, and return other maxima that fit as well because parallel edges can be confused.
 
     With a camera height that is too low, the foot of a wall falls on the upper edge of its skirting board. From several
@@ -314,13 +314,13 @@ def _among_rivals(level: _Level, start: Matrix, found: Matrix) -> tuple[Matrix, 
     return tied[0], tied[1:]
 
 
-def _difference(level: _Level, best: Matrix, other: Matrix) -> float:
+def _difference(level: _EdgeLevel, best: Matrix, other: Matrix) -> float:
     """Score difference between two poses in standard deviations of the scatter over the blocks."""
     apart = np.bincount(level.edges.block, level.each(best) - level.each(other))
     return float(apart.sum() / max(float(np.sqrt((apart**2).sum())), 1e-12))
 
 
-def _covariance(level: _Level, found: Matrix) -> NDArray[np.float64]:
+def _covariance(level: _EdgeLevel, found: Matrix) -> NDArray[np.float64]:
     """Covariance (6, 6) of the maximum in ``_UNIT``: H^-1 G H^-1 with the scatter G of the blocks' gradients."""
     edges, step = level.edges, 1.0
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.calibration.mount import Frame
+from instant_ic.calibration.mount import CalibrationFrame
 from instant_ic.depth.colour import depth_picture
 from instant_ic.depth.visibility import hidden, nearest_points
 from instant_ic.geometry.poses import Matrix, transform_points
 
 
-def overlay(frame: Frame, camera_from_lidar: Matrix, width: int = 1600) -> NDArray[np.uint8]:
+def overlay(frame: CalibrationFrame, camera_from_lidar: Matrix, width: int = 1600) -> NDArray[np.uint8]:
     """Points coloured by range (near bright, far dark) on a dimmed panorama, (width / 2, width, 3) RGB."""
     import cv2
 
@@ -26,7 +26,7 @@ def overlay(frame: Frame, camera_from_lidar: Matrix, width: int = 1600) -> NDArr
 
 
 def before_and_after(
-    frames: list[Frame], before: Matrix, after: Matrix, most: int = 3, width: int = 1600
+    frames: list[CalibrationFrame], before: Matrix, after: Matrix, most: int = 3, width: int = 1600
 ) -> NDArray[np.uint8]:
     """Sheet of some frames, each with the overlay before and after, cropped to the rows that the LiDAR sees."""
     import cv2

@@ -299,7 +299,7 @@ class Arbiter:
         return self._jumps("v-bot", pose, now_ns)
 
     def _jumps(self, robot: str, pose: NDArray[np.float64] | None, now_ns: int) -> bool:
-        """Whether a robot's pose is no number, or farther from the previous step's than the robot can have driven."""
+        """Return whether a pose is not finite, or farther from the previous one than the robot can have driven."""
         if pose is None:
             return False
         before, self._poses_before[robot] = self._poses_before.get(robot, (pose, now_ns)), (pose, now_ns)
@@ -355,7 +355,7 @@ class Arbiter:
         return choose_subgoal(s.inputs.costmap, s.vbot_pose, s.prediction, forward, s.inputs.walls, config)
 
     def _leads_back(self, s: Snapshot) -> bool:
-        """Whether the v-bot returns to the r-bot by itself: nobody drives it, and the r-bot cannot reach it."""
+        """Return whether the v-bot returns to the r-bot by itself: nobody drives it, and the r-bot cannot reach it."""
         after_s = self.config.switch.lead_back_after_s
         if s.mode != Mode.VIRTUAL or s.inputs.robot_pose is None or after_s == 0.0 or s.idle_s < after_s:
             return False

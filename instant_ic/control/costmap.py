@@ -94,7 +94,7 @@ class Costmap:
         return self.origin + (np.stack([columns, rows], axis=-1) + 0.5) * self.resolution
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether points (..., 2) lie in the window."""
+        """Return whether points (..., 2) lie in the window."""
         rows, columns = self.cells(points)
         height, width = self.costs.shape
         return (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)

@@ -38,17 +38,17 @@ class EstopLatch:
 
     @property
     def button(self) -> bool:
-        """Whether a button on the robot is pressed; no release counts until it is released."""
+        """True if a button on the robot is pressed; no release counts until it is released."""
         return bool(self.buttons)
 
     @property
     def stopped(self) -> bool:
-        """Whether nothing may move."""
+        """True if nothing may move."""
         return self.pressed or self.button
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """Whether the emergency stop is latched, by whom, and how to release it."""
+        """True if the emergency stop is latched, by whom, and how to release it."""
         if not self.stopped:
             return Diagnosis("emergency stop", Level.OK, "released")
         by = "the robot (its button, or a fault of its motor controller)" if self.button else self.publisher

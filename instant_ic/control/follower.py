@@ -208,7 +208,7 @@ class PathFollower:
         return self._is_free(pose + share * np.array([*(goal[:2] - pose[:2]), turn]), costmap)
 
     def _is_free(self, poses: NDArray[np.float64], costmap: Costmap | None) -> bool:
-        """Whether no pose overlaps more obstacle points than the first one, where the robot stands."""
+        """Return whether no pose overlaps more obstacle points than the first one, where the robot stands."""
         if costmap is None:
             return True
         overlap = costmap.lethal_overlap(poses, self._body)

@@ -154,7 +154,7 @@ def hold(s: Snapshot) -> Notice | None:
 
 
 def images_agree(s: Snapshot, within_m: float, within_deg: float) -> bool:
-    """Whether view and camera image show the same place, so that a switch between them does not jump.
+    """Return whether view and camera image show the same place, so that a switch between them does not jump.
 
     They arrive at different times. The distance driven between the two arrivals is motion, not an error; but the
     operator sees even that as a jump when it is large.

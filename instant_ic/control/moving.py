@@ -61,7 +61,7 @@ class _Look:
         return self.origin + self.ranges[index, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def free_at(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether every beam of this sweep near points (M, 2) went well past them."""
+        """Return whether every beam of this sweep near points (M, 2) went well past them."""
         away = points - self.origin
         column = np.floor((np.arctan2(away[:, 1], away[:, 0]) + math.pi) * (AZIMUTHS / (2 * math.pi))).astype(np.int64)
         around = self.ranges[(column[:, None] + np.arange(-2, 3)) % AZIMUTHS].min(axis=1)
@@ -70,7 +70,7 @@ class _Look:
 
 
 @dataclass
-class _Body:
+class _MovingBody:
     points: NDArray[np.float64]
     places: deque[tuple[float, NDArray[np.float64]]] = field(default_factory=lambda: deque(maxlen=8))
     """Times and middles (2,), newest last."""
@@ -87,7 +87,7 @@ class _Body:
 
     @property
     def stands(self) -> bool:
-        """Whether it has not moved on since it was found: a thing, or a person who has stopped."""
+        """True if it has not moved on since it was found: a thing, or a person who has stopped."""
         return len(self.places) >= 6 and float(np.hypot(*self.velocity)) < 0.5 * _LEAST_SPEED_M_S
 
     def at(self, time_s: float) -> NDArray[np.float64]:
@@ -100,7 +100,7 @@ class MovingThings:
 
     def __init__(self) -> None:
         self._looks: deque[_Look] = deque()
-        self._bodies: list[_Body] = []
+        self._bodies: list[_MovingBody] = []
 
     def update(self, sweep: SortedPoints, time_s: float) -> None:
         """Add a sweep of 3D points, measured at ``time_s`` (seconds, steady); earlier ones restart the tracks."""
@@ -123,9 +123,9 @@ class MovingThings:
         taken = np.logical_or.reduce([np.zeros(len(points), dtype=bool), *followed])
         for group in _groups(points[fresh & ~taken]):
             body = points[np.linalg.norm(points - group.mean(axis=0), axis=1) < _BODY_M]
-            self._bodies.append(_Body(body, deque([(time_s, _middle(body))], maxlen=8)))
+            self._bodies.append(_MovingBody(body, deque([(time_s, _middle(body))], maxlen=8)))
 
-    def _follow(self, body: _Body, points: NDArray[np.float64], time_s: float) -> NDArray[np.bool_]:
+    def _follow(self, body: _MovingBody, points: NDArray[np.float64], time_s: float) -> NDArray[np.bool_]:
         """Move a body on to its points (mask (M,)) in the newest sweep."""
         mine: NDArray[np.bool_] = np.linalg.norm(points - body.at(time_s), axis=1) < _BODY_M
         if mine.sum() >= _LEAST_POINTS:

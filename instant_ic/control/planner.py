@@ -525,7 +525,7 @@ def _line_cost(grid: _Map, ax: float, ay: float, bx: float, by: float, yaw: floa
 
 @njit(cache=True)
 def _turn_is_free(grid: _Map, x: float, y: float, yaw: float, turn: float) -> bool:
-    """Whether the footprint can turn on the spot from ``yaw`` by ``turn`` without contact."""
+    """Return whether the footprint can turn on the spot from ``yaw`` by ``turn`` without contact."""
     if grid.clearance[math.floor(y), math.floor(x)] > grid.reach:
         return True
     count = max(1, math.ceil(abs(turn) / 0.15))

@@ -97,7 +97,7 @@ def parse_polygon(text: str) -> NDArray[np.float64]:
 
 
 def contains(polygon: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
-    """Whether a convex polygon, counter-clockwise (N, 2), contains all points (M, 2); its edge counts as inside."""
+    """Return whether a convex polygon (N, 2), counter-clockwise, contains all points (M, 2); its edge is inside."""
     edges = np.roll(polygon, -1, axis=0) - polygon
     offsets = points[:, None] - polygon
     return bool((edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0] >= -1e-9).all())

@@ -180,15 +180,15 @@ class Snapshot:
 
     @property
     def pose_doubtful(self) -> bool:
-        """Whether the r-bot must drive slowly because its pose may be wrong."""
+        """True if the r-bot must drive slowly because its pose may be wrong."""
         return self.inputs.pose_lost_probability >= self.config.pose_trust.slow
 
     @property
     def must_be_slow(self) -> bool:
-        """Whether the r-bot must drive slowly: its pose, or its motion, may be wrong."""
+        """True if the r-bot must drive slowly: its pose, or its motion, may be wrong."""
         return self.pose_doubtful or self.inputs.contradiction != Contradiction.NONE
 
     @property
     def obstacle_ahead(self) -> bool:
-        """Whether the predicted path meets an obstacle."""
+        """True if the predicted path meets an obstacle."""
         return self.prediction is not None and self.prediction.hit_index is not None

@@ -42,12 +42,12 @@ class SourceMonitor:
         return tuple(found)
 
     def is_lost(self, stale: Stale, inputs: ArbiterInputs) -> bool:
-        """Whether a stale source is older than ``TimeoutConfig.lost_s``: the robot must go to STOPPED."""
+        """Return whether a stale source is older than ``TimeoutConfig.lost_s``: the robot must go to STOPPED."""
         source, age_s = stale
         return age_s > self.config.timeouts.lost_s(source.key, _usual_s(source, inputs))
 
     def command_is_fresh(self, inputs: ArbiterInputs) -> bool:
-        """Whether the operator's command counts: young enough, and its client is still there."""
+        """Return whether the operator's command counts: young enough, and its client is still there."""
         return inputs.age("command") <= self._command_s and not inputs.operator_gone
 
     def stale_in_s(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float, shown_s: float = math.inf) -> float:
@@ -103,7 +103,7 @@ class SourceMonitor:
 
 
 def images_too_rare(inputs: ArbiterInputs, config: ArbiterConfig) -> bool:
-    """Whether camera images are too rare to drive by, or their rate is not known yet."""
+    """Return whether camera images are too rare to drive by, or their rate is not known yet."""
     return inputs.usual.get("camera", 0.0) > config.timeouts.slowest_image_s
 
 

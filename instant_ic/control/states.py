@@ -25,7 +25,7 @@ class Mode(IntEnum):
 
     @property
     def shows_vbot(self) -> bool:
-        """Whether the operator sees the virtual space."""
+        """True if the operator sees the virtual space."""
         return self in (Mode.VIRTUAL, Mode.RETURNING)
 
 
@@ -98,7 +98,7 @@ class Reason(IntEnum):
 
     @property
     def holds(self) -> bool:
-        """Whether nothing may move."""
+        """True if nothing may move."""
         return self >= Reason.ESTOP
 
 

@@ -24,21 +24,21 @@ class StepTimes:
         self._stepped_ns = self._costmap_ns = 0
 
     def timer_steps(self, now_ns: int, rests: bool = False) -> bool:
-        """Whether this timer steps."""
+        """Return whether this timer steps."""
         self._early = False
         since_s = (now_ns - self._stepped_ns) / 1e9
         # Timers jitter: at 20 Hz every second one is meant.
         return not 0.0 <= since_s < 0.9 * REST_STEP_S or not rests
 
     def command_steps(self, command: tuple[float, float]) -> bool:
-        """Whether to obey a command at once: a changed one, since the next timer is half a period away on average."""
+        """Return whether to obey a command at once: a changed one does not wait half a period for the timer."""
         if self._early or command == self.obeyed:
             return False
         self._early = True
         return True
 
     def costmap_due(self, now_ns: int, rests: bool) -> bool:
-        """Whether to update the costmap; it then counts as updated."""
+        """Return whether to update the costmap; it then counts as updated."""
         if rests and 0.0 <= (now_ns - self._costmap_ns) / 1e9 < REST_COSTMAP_S:
             return False
         self._costmap_ns = now_ns

@@ -32,7 +32,7 @@ _JUMP_M, _JUMP_RAD = 0.5, 0.5
 
 
 @dataclass(frozen=True)
-class Scan:
+class ArrivedScan:
     """A flat scan as it arrived (LaserScan)."""
 
     frame: str
@@ -53,13 +53,13 @@ class Scan:
 
     @property
     def usable(self) -> bool:
-        """Whether its geometry is known, and a beam has measured a range or that nothing is within range."""
+        """True if its geometry is known, and a beam has measured a range or that nothing is within range."""
         known = math.isfinite(self.angle_min + self.angle_increment) and self.range_min < self.range_max
         return known and bool((np.asarray(self.ranges) >= self.range_min).any())
 
 
 @dataclass(frozen=True)
-class Cloud:
+class ArrivedCloud:
     """A sweep of 3D points as it arrived (PointCloud2)."""
 
     frame: str
@@ -114,7 +114,7 @@ class Surroundings:
         self._find("pose", True, "known")
         return pose
 
-    def near_points(self, scan: Scan | None) -> NDArray[np.float64] | None:
+    def near_points(self, scan: ArrivedScan | None) -> NDArray[np.float64] | None:
         """Hits (N, 2) of the newest scan and 3D points in ``base_link`` now, by odometry, which does not jump.
 
         None while there is no scan, or its place is unknown.
@@ -163,7 +163,9 @@ class Surroundings:
         self._used.pop("points", None)
         self._find("points", False, f"3D points cannot be used: {reason}")
 
-    def update_costmap(self, scan: Scan | None, cloud: Cloud | None, static: StaticMap | None) -> Costmap | None:
+    def update_costmap(
+        self, scan: ArrivedScan | None, cloud: ArrivedCloud | None, static: StaticMap | None
+    ) -> Costmap | None:
         """Add the newest scan and 3D points to the costmap; return it, None if nothing is new or known."""
         points_ns = -1 if cloud is None else self._take(cloud)
         pose = self.robot_pose()
@@ -189,7 +191,7 @@ class Surroundings:
         return self.costmap
 
     def publish_due(self, steady_ns: int) -> bool:
-        """Whether the costmap is to be published now, by ``publish_frequency``; it then counts as published."""
+        """Return whether the costmap is to be published now, by ``publish_frequency``; it then counts as published."""
         # A little early counts: updates come at the scan's rate, not at the publish frequency.
         due_ns = 0.9e9 / self.config.publish_frequency
         sent_ns = self._published_ns  # later than now if the clock went back: a bag player restarted
@@ -219,7 +221,7 @@ class Surroundings:
     def _find(self, name: str, ok: bool, text: str, **values: Any) -> None:
         self.findings[name] = Diagnosis(name, Level.OK if ok else Level.WARN, text, values)
 
-    def _place(self, scan: Scan) -> None:
+    def _place(self, scan: ArrivedScan) -> None:
         if not scan.usable:
             self._find("scan", False, "scan cannot be used: no beam has measured anything")
             return
@@ -234,8 +236,8 @@ class Surroundings:
         self._scan_hits = np.asarray(points @ odom_from_lidar[:2, :2].T + odom_from_lidar[:2, 3])
         self._used["scan"] = scan.stamp_ns, scan.arrived_ns
 
-    def _blind(self, scan: Scan) -> tuple[bool, bool]:
-        """Whether beams that earlier scans measured, and the last two did not, cross the lanes ahead and behind."""
+    def _blind(self, scan: ArrivedScan) -> tuple[bool, bool]:
+        """Return whether the last two scans lack beams, measured before, that cross the lanes ahead and behind."""
         unmeasured = np.isnan(scan.ranges)
         if len(unmeasured) != len(self._measured):
             self._measured = self._unmeasured = np.zeros(len(unmeasured), np.bool_)
@@ -255,7 +257,7 @@ class Surroundings:
         lane = (np.abs(y) < 0.5 * self._footprint.width_m) & (np.abs(x) > front) & (np.abs(x) < front + _LANE_M)
         return bool((lane & (x > 0)).any()), bool((lane & (x < 0)).any())
 
-    def _take(self, cloud: Cloud) -> int:
+    def _take(self, cloud: ArrivedCloud) -> int:
         """Sort new 3D points by height, in ``odom``; return their stamp, -1 if they cannot be used."""
         self.points_seen = True
         if cloud.stamp_ns == self._in_costmap[1]:
@@ -275,7 +277,7 @@ class Surroundings:
         self._find("points", True, f"{counts['obstacle']} obstacle points", **counts)
         return cloud.stamp_ns
 
-    def _sorted(self, cloud: Cloud) -> SortedPoints:
+    def _sorted(self, cloud: ArrivedCloud) -> SortedPoints:
         points = cloud.points
         time_s = points["time"] if "time" in (points.dtype.names or ()) else np.zeros(len(points), np.float32)
         duration_s = float(min(max(time_s.max(initial=0.0), 0.0), 1.0))

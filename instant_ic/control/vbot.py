@@ -158,7 +158,7 @@ def _eased(
 
 
 def _in_sight(a: NDArray[np.float64], b: NDArray[np.float64], walls: WallMap) -> bool:
-    """Whether no wall lies between two places."""
+    """Return whether no wall lies between two places."""
     steps = np.linspace(0.0, 1.0, max(2, math.ceil(_distance(a, b) / walls.static.resolution)))
     between = np.asarray(a)[:2] + steps[:, None] * (np.asarray(b)[:2] - np.asarray(a)[:2])
     return bool((walls.distance(between) > walls.static.resolution).all())

@@ -15,7 +15,7 @@ from instant_ic.config.ranges import Checked, NotNegative, Positive, Range, chec
 
 
 @dataclass(frozen=True)
-class FieldConfig(Checked):
+class LikelihoodFieldConfig(Checked):
     """Local map for scan matching: a likelihood field built from recent keyframes.
 
     Attributes:
@@ -79,7 +79,7 @@ class MapConfig:
 class SlamConfig:
     """All parameters of the grid SLAM."""
 
-    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    field: LikelihoodFieldConfig = dataclasses.field(default_factory=LikelihoodFieldConfig)
     match: MatchConfig = dataclasses.field(default_factory=MatchConfig)
     loop: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     map: MapConfig = dataclasses.field(default_factory=MapConfig)

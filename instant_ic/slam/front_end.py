@@ -11,10 +11,10 @@ import numpy as np
 
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, Keyframe, grown_drift, turned
-from instant_ic.slam.likelihood_field import LikelihoodField, Surface
+from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, ScanKeyframe, grown_drift, turned
+from instant_ic.slam.likelihood_field import FieldSurface, LikelihoodField
 from instant_ic.slam.loop_search import find_place
-from instant_ic.slam.matcher import Match, Window, match_scan
+from instant_ic.slam.matcher import Match, SearchWindow, match_scan
 from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
 MIN_POINTS = 20
@@ -73,7 +73,7 @@ class SlamStatus(enum.StrEnum):
 
     @property
     def matched(self) -> bool:
-        """Whether the pose comes from scan matching."""
+        """True if the pose comes from scan matching."""
         return self in (SlamStatus.FIRST, SlamStatus.TRACKED, SlamStatus.RECOVERED)
 
 
@@ -90,7 +90,7 @@ class Guess:
 
     pose: FloatArray
     sigma: FloatArray
-    window: Window
+    window: SearchWindow
     doubtful: bool = False
 
 
@@ -111,7 +111,7 @@ class Track:
     covariance: FloatArray
     score: float
     status: SlamStatus
-    keyframe: Keyframe | None
+    keyframe: ScanKeyframe | None
     scan_covariance: FloatArray | None = None
 
     @property
@@ -132,7 +132,7 @@ class FrontEnd:
 
     def __init__(self, config: SlamConfig) -> None:
         self.config = config
-        self.trajectory: list[Keyframe] = []
+        self.trajectory: list[ScanKeyframe] = []
         self._field = LikelihoodField(config.field.resolution_m, config.field.max_range_m + (RECOVERY_M + 0.5))
         self._lost_sigma_m = 0.0
         self._usual_score = 0.0
@@ -142,7 +142,7 @@ class FrontEnd:
 
     @property
     def in_known_map(self) -> bool:
-        """Whether scans are matched against a known map that stays unchanged."""
+        """True if scans are matched against a known map that stays unchanged."""
         return self._known is not None
 
     def use_known_map(self, points: FloatArray, pose: FloatArray) -> None:
@@ -182,7 +182,7 @@ class FrontEnd:
     def _guess(
         pose: FloatArray, sigma_m: float, sigma_rad: float, window_m: float, window_rad: float, doubtful: bool = False
     ) -> Guess:
-        window = Window(min(window_m, RECOVERY_M), min(window_rad, RECOVERY_RAD))
+        window = SearchWindow(min(window_m, RECOVERY_M), min(window_rad, RECOVERY_RAD))
         return Guess(pose, np.array([sigma_m, sigma_m, sigma_rad]), window, doubtful)
 
     def track(
@@ -200,7 +200,7 @@ class FrontEnd:
         status = SlamStatus.TRACKED
         match = match_scan(self._field, points, guess.pose, guess.sigma, guess.window)
         if match.score < RECOVERY_SCORE or match.at_border:
-            recovered = match_scan(self._field, points, guess.pose, guess.sigma, Window(RECOVERY_M, RECOVERY_RAD))
+            recovered = match_scan(self._field, points, guess.pose, guess.sigma, SearchWindow(RECOVERY_M, RECOVERY_RAD))
             # Unless the first window was too small, the wide search must be clearly better: a window this large always
             # contains a slightly better pose.
             margin = 0.0 if match.at_border else RECOVERY_MARGIN
@@ -217,7 +217,7 @@ class FrontEnd:
         self._lost_sigma_m = 0.0
         self._usual_score += SCORE_MEMORY * (match.score - self._usual_score)
         self._covariance = match.covariance
-        added: Keyframe | None = None
+        added: ScanKeyframe | None = None
         if self.in_known_map:
             if math.hypot(*(match.pose[:2] - self._built_at)) > KNOWN_MAP_STEP_M:
                 self._build_known(match.pose)
@@ -243,7 +243,7 @@ class FrontEnd:
         return thin(scan.points[near], scan.joined[near], self.config.match.max_points)
 
     def _doubtful(self, match: Match, guess: Guess) -> bool:
-        """Whether the scan may fit better at a heading that the local search does not reach."""
+        """Return whether the scan may fit better at a heading that the local search does not reach."""
         usual = max(RECOVERY_SCORE, self._usual_score - SCORE_DROP)
         return match.at_border or match.score < usual or guess.doubtful
 
@@ -269,7 +269,7 @@ class FrontEnd:
         return self._covariance
 
     def _first_was_poor(self, match: Match, status: SlamStatus) -> bool:
-        """Whether a robot that has not moved since the start sees more than its map holds.
+        """Return whether a robot that has not moved since the start sees more than its map holds.
 
         This happens when the first scan covered half a revolution, before odometry arrived. Without a further keyframe,
         each scan would start a wide search until the robot moves.
@@ -282,7 +282,7 @@ class FrontEnd:
         step = relative2(last, pose)
         return math.hypot(step[0], step[1]) >= KEYFRAME_M or abs(step[2]) >= KEYFRAME_RAD
 
-    def _add_keyframe(self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int) -> Keyframe:
+    def _add_keyframe(self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int) -> ScanKeyframe:
         step, step_covariance, drift = np.zeros(3), np.zeros((3, 3)), covariance.copy()
         if self.trajectory:
             last = self.trajectory[-1]
@@ -291,7 +291,7 @@ class FrontEnd:
             step_covariance = turned(covariance, -yaw)
             step_covariance += np.diag(np.square([STEP_SIGMA_M, STEP_SIGMA_M, STEP_SIGMA_RAD]))
             drift = grown_drift(last.drift, pose[:2] - last.map_from_base[:2], yaw, step_covariance)
-        keyframe = Keyframe(stamp_ns, pose.copy(), scan, step, step_covariance, drift)
+        keyframe = ScanKeyframe(stamp_ns, pose.copy(), scan, step, step_covariance, drift)
         self.trajectory.append(keyframe)
         self.rebuild_field()
         return keyframe
@@ -302,11 +302,11 @@ class FrontEnd:
             self._build_known(self._built_at)
             return
         recent = self.trajectory[-LOCAL_KEYFRAMES:]
-        surfaces = [Surface(k.map_from_base, k.scan.points, k.scan.joined) for k in recent]
+        surfaces = [FieldSurface(k.map_from_base, k.scan.points, k.scan.joined) for k in recent]
         self._field.rebuild(recent[-1].map_from_base, surfaces)
 
     def _build_known(self, centre: FloatArray) -> None:
         assert self._known is not None
         self._built_at = np.array(centre[:2])
         alone = np.zeros(len(self._known), dtype=np.bool_)
-        self._field.rebuild(self._built_at, [Surface(np.zeros(3), self._known, alone)])
+        self._field.rebuild(self._built_at, [FieldSurface(np.zeros(3), self._known, alone)])

@@ -16,9 +16,9 @@ from instant_ic.slam.config import GridSlamConfig, SlamConfig
 from instant_ic.slam.contradiction import ContradictionMonitor
 from instant_ic.slam.front_end import MIN_POINTS, FrontEnd, Guess, SlamStatus, Track
 from instant_ic.slam.integrity import Integrity, IntegrityMonitor, mixture
-from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, Keyframe
-from instant_ic.slam.localization import Place, SavedMap
-from instant_ic.slam.loop_closure import QUERY_KEYFRAMES, LoopClosure, Outcome, correction
+from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, ScanKeyframe
+from instant_ic.slam.localization import FoundPlace, SavedMap
+from instant_ic.slam.loop_closure import QUERY_KEYFRAMES, LoopClosure, LoopOutcome, correction
 from instant_ic.slam.map_files import load_graph, load_grid, save_graph, save_grid
 from instant_ic.slam.motion import MotionMonitor
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
@@ -77,7 +77,7 @@ class SlamResult:
 
     @property
     def trusted(self) -> bool:
-        """Whether the scan was matched and its pose may be used."""
+        """True if the scan was matched and its pose may be used."""
         return self.status.matched and self.localized and self.integrity.trusted
 
 
@@ -189,7 +189,7 @@ class GridSlam:
 
     @property
     def localized(self) -> bool:
-        """Whether the robot is located in the saved map; True without one."""
+        """True if the robot is located in the saved map; True without one."""
         return self.saved is None or self.saved.located
 
     def grid(self) -> OccupancyGrid:
@@ -212,7 +212,7 @@ class GridSlam:
             return files  # this map was loaded, and its graph, if any, exists where it came from
         return [*files, save_graph(stem, *self._graph())]
 
-    def _graph(self, count: int | None = None) -> tuple[list[Keyframe], list[Edge]]:
+    def _graph(self, count: int | None = None) -> tuple[list[ScanKeyframe], list[Edge]]:
         """The first ``count`` keyframes, or all, that have not been removed, and the edges between them."""
         keyframes = self.front_end.trajectory[:count]
         edges = [edge for edge in self._edges if max(edge.a, edge.b) < len(keyframes)]
@@ -245,7 +245,7 @@ class GridSlam:
 
     # -- background work --------------------------------------------------------------------------
 
-    def background_job(self) -> Callable[[], Place | Outcome] | None:
+    def background_job(self) -> Callable[[], FoundPlace | LoopOutcome] | None:
         """Return pending work, which may run on another thread; pass its result to `take_over`.
 
         That is the loop closure for the keyframes since the last job, or the search in the saved map. None if there are
@@ -253,7 +253,7 @@ class GridSlam:
         """
         if self._busy:
             return None
-        job: Callable[[], Place | Outcome] | None = None
+        job: Callable[[], FoundPlace | LoopOutcome] | None = None
         if self.saved is not None and not self.saved.located:
             recent = self.front_end.trajectory[-QUERY_KEYFRAMES:]
             if self._points is not None and self._stamp_ns is not None:
@@ -266,7 +266,7 @@ class GridSlam:
         self._job_of = self.front_end.trajectory
         return job
 
-    def take_over(self, outcome: Place | Outcome | None) -> None:
+    def take_over(self, outcome: FoundPlace | LoopOutcome | None) -> None:
         """Apply the result of a background job: corrected poses change map_from_odom, never odometry.
 
         Args:
@@ -278,7 +278,7 @@ class GridSlam:
             return  # of the session before
         if outcome is None:
             self._broken = self.localized
-        elif isinstance(outcome, Outcome):
+        elif isinstance(outcome, LoopOutcome):
             self._take_over_loops(outcome)
         elif outcome.found is not None and self.saved is not None and not self.saved.located:
             moved = correction(outcome.pose, outcome.found.pose)
@@ -303,7 +303,7 @@ class GridSlam:
             "loops_refused": self.loop_closure.refused,
         }
 
-    def _take_over_loops(self, outcome: Outcome) -> None:
+    def _take_over_loops(self, outcome: LoopOutcome) -> None:
         """Apply optimised poses, the rebuilt map and merged keyframes."""
         keyframes = self.front_end.trajectory
         if self._before is not None:
@@ -420,7 +420,7 @@ class GridSlam:
         return self.front_end.restart(points, guess, stamp_ns)
 
     def _recognized(self, saved: SavedMap, moved: FloatArray, here: FloatArray) -> bool:
-        """Whether the place that ``moved`` (3,) moves the recent keyframes, and a scan at ``here`` (3,), to is theirs.
+        """Return whether ``moved`` (3,) takes the recent keyframes, and a scan at ``here`` (3,), to their true place.
 
         They must not contradict the map there. The map of a session before is not complete: the true place may be
         missing in it, and another one look like it. A place far from where odometry says must therefore be found
@@ -553,11 +553,11 @@ class JobResult(NamedTuple):
     """Outcome of a background job of one SLAM; None with a diagnosis if it failed."""
 
     slam: GridSlam
-    outcome: Place | Outcome | None
+    outcome: FoundPlace | LoopOutcome | None
     diagnosis: Diagnosis | None = None
 
 
-def run_job(item: tuple[GridSlam, Callable[[], Place | Outcome]]) -> JobResult:
+def run_job(item: tuple[GridSlam, Callable[[], FoundPlace | LoopOutcome]]) -> JobResult:
     """Run a ``background_job``, on any thread."""
     slam, job = item
     try:

@@ -160,7 +160,7 @@ class Integrity:
 
     @property
     def trusted(self) -> bool:
-        """Whether the pose may be used."""
+        """True if the pose may be used."""
         return self.lost_probability < UNTRUSTED
 
 
@@ -190,12 +190,12 @@ class IntegrityMonitor:
 
     @property
     def doubts(self) -> bool:
-        """Whether scans must stay out of the map."""
+        """True if scans must stay out of the map."""
         return self._suspicious or self._log_odds > DOUBT
 
     @property
     def lost(self) -> bool:
-        """Whether the pose must no longer be used, and the map be left as it is."""
+        """True if the pose must no longer be used, and the map be left as it is."""
         return max(self._log_odds, self._provisional_log_odds) >= LOST
 
     @property

@@ -17,7 +17,7 @@ NO_SCAN = ScanPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.bool_), np.zeros(2),
 
 
 @dataclass
-class Keyframe:
+class ScanKeyframe:
     """A scan kept for matching and for the map.
 
     Attributes:
@@ -37,7 +37,7 @@ class Keyframe:
     step: FloatArray
     step_covariance: FloatArray
     drift: FloatArray
-    merged_into: tuple[Keyframe, FloatArray] | None = None
+    merged_into: tuple[ScanKeyframe, FloatArray] | None = None
 
     def pose(self) -> FloatArray:
         """Current map_from_base (3,); for a removed keyframe, computed from the keyframe it was merged into."""

@@ -141,7 +141,7 @@ def _forget(weight, sum_x, sum_y, touched, count):  # type: ignore[no-untyped-de
 
 
 @dataclass(frozen=True)
-class Surface:
+class FieldSurface:
     """Contribution of a keyframe to the field: pose (3,), points (n, 2) in its base frame, joined (n,)."""
 
     pose: FloatArray
@@ -173,7 +173,7 @@ class LikelihoodField:
         self._sum_y = np.zeros((size, size))
         self._touched = np.zeros((200_000, 2), dtype=np.int32)
 
-    def rebuild(self, centre: FloatArray, surfaces: Sequence[Surface]) -> None:
+    def rebuild(self, centre: FloatArray, surfaces: Sequence[FieldSurface]) -> None:
         """Rebuild the field from ``surfaces``, shifted by whole cells so that ``centre`` (2,) is in the middle."""
         half = self.values.shape[0] // 2
         self.origin = (np.round(np.asarray(centre[:2]) / self.resolution) - half) * self.resolution

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.keyframes import Keyframe
-from instant_ic.slam.likelihood_field import LikelihoodField, Surface
+from instant_ic.slam.keyframes import ScanKeyframe
+from instant_ic.slam.likelihood_field import FieldSurface, LikelihoodField
 from instant_ic.slam.loop_closure import LoopClosure, gather
 from instant_ic.slam.loop_search import MIN_PLACE_SCORE, POOL, ROTATION_STEP_RAD, Found, apart, pool, refined
 from instant_ic.slam.map_files import occupied_points
@@ -85,7 +85,7 @@ def bound_nodes(field, origin, resolution, points, nodes, sums, counts, floor, r
 
 
 @dataclass
-class _Level:
+class _SearchLevel:
     """Nodes of one level of a search that have not been divided: (k, 3), with their sums and counts (k,)."""
 
     nodes: NDArray[np.int32]
@@ -93,11 +93,11 @@ class _Level:
     counts: NDArray[np.int32]
 
     @classmethod
-    def of(cls, nodes: NDArray[np.int32]) -> _Level:
+    def of(cls, nodes: NDArray[np.int32]) -> _SearchLevel:
         return cls(nodes, np.zeros(len(nodes), dtype=np.float32), np.zeros(len(nodes), dtype=np.int32))
 
     def add(self, nodes: NDArray[np.int32]) -> None:
-        new = _Level.of(nodes)
+        new = _SearchLevel.of(nodes)
         self.nodes = np.concatenate([self.nodes, new.nodes])
         self.sums = np.concatenate([self.sums, new.sums])
         self.counts = np.concatenate([self.counts, new.counts])
@@ -135,7 +135,7 @@ class Localizer:
         self._field = LikelihoodField(config.field.resolution_m, float((high - low).max() / 2 + 1.0) + 0.5)
         self._field.rebuild(
             np.array([*centre, 0.0]),
-            [Surface(np.zeros(3), self.points, np.zeros(len(self.points), dtype=np.bool_))],
+            [FieldSurface(np.zeros(3), self.points, np.zeros(len(self.points), dtype=np.bool_))],
         )
         self._pooled = [pool(self._field.values, POOL << level) for level in range(LEVELS)]
         cells = np.floor((free - self._field.origin) / (POOL * self._field.resolution)).astype(np.int64)
@@ -191,13 +191,13 @@ class Localizer:
         """Score of another place from which on a place with ``score`` is ambiguous."""
         return (score - MIN_GAIN) / (1.0 - MIN_GAIN)
 
-    def _levels(self, nodes: NDArray[np.intp]) -> list[_Level]:
+    def _levels(self, nodes: NDArray[np.intp]) -> list[_SearchLevel]:
         """The levels of a search in ``nodes`` (n, 2) of the last one, at all headings."""
         rotations = np.repeat(np.arange(self._rotations), len(nodes))
         first = np.column_stack([rotations, np.tile(nodes, (self._rotations, 1))]).astype(np.int32)
-        return [*(_Level.of(np.zeros((0, 3), dtype=np.int32)) for _ in range(LEVELS - 1)), _Level.of(first)]
+        return [*(_SearchLevel.of(np.zeros((0, 3), dtype=np.int32)) for _ in range(LEVELS - 1)), _SearchLevel.of(first)]
 
-    def _bound(self, levels: list[_Level], points: FloatArray, floor: float, left: int) -> int:
+    def _bound(self, levels: list[_SearchLevel], points: FloatArray, floor: float, left: int) -> int:
         """Divide the nodes whose bound is ``floor`` or more, down to the first level.
 
         Returns what remains of ``left`` bounds; a negative value: they were too few, and the search has stopped.
@@ -223,7 +223,7 @@ class Localizer:
             levels[k - 1].add(nodes)
         return left
 
-    def _starts(self, level: _Level, count: int, floor: float) -> FloatArray:
+    def _starts(self, level: _SearchLevel, count: int, floor: float) -> FloatArray:
         """Poses (k, 3), best bound first, around which every score of ``floor`` or more lies."""
         good = (level.counts == count) & (level.sums >= floor * count)
         order = np.flatnonzero(good)[np.argsort(-level.sums[good], kind="stable")]
@@ -262,7 +262,7 @@ def keep_peaks(nodes, rotations, count):  # type: ignore[no-untyped-def]
 
 
 @dataclass(frozen=True)
-class Place:
+class FoundPlace:
     """Result of a search in the saved map.
 
     Attributes:
@@ -293,7 +293,7 @@ class SavedMap:
     """
 
     def __init__(
-        self, config: SlamConfig, grid: OccupancyGrid, graph: tuple[list[Keyframe], list[Edge]] | None = None
+        self, config: SlamConfig, grid: OccupancyGrid, graph: tuple[list[ScanKeyframe], list[Edge]] | None = None
     ) -> None:
         self.grid = grid
         self.localizer = Localizer(grid, config)
@@ -301,23 +301,28 @@ class SavedMap:
         self.located = False
         self.ambiguous = False
         self._config = config
-        self._searched: Keyframe | None = None
+        self._searched: ScanKeyframe | None = None
         self._searched_ns = 0
         self._unconfirmed: FloatArray | None = None
 
     @property
     def extends(self) -> bool:
-        """Whether the map is extended once the robot is located."""
+        """True if the map is extended once the robot is located."""
         return bool(self.keyframes)
 
     @property
     def unchanged(self) -> bool:
-        """Whether the map is still as it was read."""
+        """True if the map is still as it was read."""
         return not (self.extends and self.located)
 
     def search_job(
-        self, recent: Sequence[Keyframe], pose: FloatArray, scan: ScanPoints, stamp_ns: int, reach_m: float = math.inf
-    ) -> Callable[[], Place] | None:
+        self,
+        recent: Sequence[ScanKeyframe],
+        pose: FloatArray,
+        scan: ScanPoints,
+        stamp_ns: int,
+        reach_m: float = math.inf,
+    ) -> Callable[[], FoundPlace] | None:
         """Return a job that searches the map for the recent keyframes and the newest scan, whose pose is ``pose`` (3,).
 
         A finite ``reach_m`` limits the search to the surroundings of ``pose``.
@@ -331,17 +336,17 @@ class SavedMap:
         self._searched, self._searched_ns = recent[-1], stamp_ns
         query = gather([*(k.map_from_base for k in recent), pose], [*(k.scan for k in recent), scan])
 
-        def search() -> Place:
+        def search() -> FoundPlace:
             near = pose[:2] if math.isfinite(reach_m) else None
             found, self.ambiguous = self.localizer.find(query, near, reach_m)
             if not self._confirmed(found, pose):
                 found = None
-            return Place(pose, found, self.build_map() if found is not None and self.extends else None)
+            return FoundPlace(pose, found, self.build_map() if found is not None and self.extends else None)
 
         return search
 
     def _confirmed(self, found: Found | None, pose: FloatArray) -> bool:
-        """Whether the place agrees with that of the scan before; it then waits no longer."""
+        """Return whether the place agrees with that of the scan before; it then waits no longer."""
         before = self._unconfirmed
         # The saved map's pose of the other map's origin is the same for every scan.
         self._unconfirmed = None if found is None else compose2(found.pose, relative2(pose, np.zeros(3)))
@@ -360,7 +365,7 @@ class SavedMap:
             built.insert(keyframe.map_from_base, keyframe.scan)
         return built
 
-    def join(self, own: Sequence[Keyframe], covariance: FloatArray) -> LoopClosure:
+    def join(self, own: Sequence[ScanKeyframe], covariance: FloatArray) -> LoopClosure:
         """Tie keyframes ``own``, located with ``covariance`` (3, 3), to the saved graph; return its loop closure."""
         first = own[0]
         # The motion from the last saved keyframe is unknown; the first new keyframe is tied by its pose in the map.

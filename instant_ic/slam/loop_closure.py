@@ -1,6 +1,6 @@
 """Loop closure: finds loops over the keyframes and optimises their poses, in parallel to the scan thread.
 
-It keeps its own copy of the poses. Only new keyframes go in, and only an `Outcome` comes out. The result does not
+It keeps its own copy of the poses. Only new keyframes go in, and only an `LoopOutcome` comes out. The result does not
 depend on timing: the same keyframes give the same result.
 """
 
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, NO_SCAN, Keyframe, grown_drift, turned
-from instant_ic.slam.likelihood_field import LikelihoodField, Surface
+from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, NO_SCAN, ScanKeyframe, grown_drift, turned
+from instant_ic.slam.likelihood_field import FieldSurface, LikelihoodField
 from instant_ic.slam.loop_search import MIN_PLACE_SCORE, Found, find_place, spread
 from instant_ic.slam.occupancy import OccupancyMap
 from instant_ic.slam.pose_graph import Edge, optimise, residuals
@@ -60,7 +60,7 @@ PENDING_KEYFRAMES = 40
 
 
 @dataclass(frozen=True)
-class Outcome:
+class LoopOutcome:
     """Result of an update.
 
     Attributes:
@@ -81,7 +81,7 @@ class Outcome:
     merged: list[tuple[int, int, FloatArray]]
     edges: list[Edge]
 
-    def apply(self, keyframes: Sequence[Keyframe]) -> FloatArray | None:
+    def apply(self, keyframes: Sequence[ScanKeyframe]) -> FloatArray | None:
         """Move, merge and update the trajectory's keyframes, also those added since the update began.
 
         Returns:
@@ -128,7 +128,7 @@ class LoopClosure:
         self.edges: list[Edge] = []
         self.closed = 0
         self.refused = 0
-        self._keyframes: list[Keyframe] = []
+        self._keyframes: list[ScanKeyframe] = []
         self._poses: FloatArray = np.zeros((256, 3))
         self._drifts: list[FloatArray] = []
         self._travelled: list[float] = []
@@ -148,7 +148,7 @@ class LoopClosure:
         """Poses of all keyframes (n, 3)."""
         return self._poses[: len(self._keyframes)]
 
-    def update(self, new: Sequence[Keyframe], last: bool = False) -> Outcome:
+    def update(self, new: Sequence[ScanKeyframe], last: bool = False) -> LoopOutcome:
         """Add new keyframes, search for loops, and optimise when it improves the graph.
 
         Args:
@@ -170,9 +170,9 @@ class LoopClosure:
         merged, self._merged = self._merged, []
         poses = self.poses.copy() if changed else None
         alive = np.flatnonzero(self._alive[: len(self)])
-        return Outcome(len(self), poses, alive, drift, rebuilt, merged, list(self.edges))
+        return LoopOutcome(len(self), poses, alive, drift, rebuilt, merged, list(self.edges))
 
-    def load(self, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> None:
+    def load(self, keyframes: Sequence[ScanKeyframe], edges: Sequence[Edge]) -> None:
         """Start with a saved graph; its first keyframe stays fixed."""
         for keyframe in keyframes:
             self._add(keyframe)
@@ -189,7 +189,7 @@ class LoopClosure:
 
     # -- keyframes --------------------------------------------------------------------------------
 
-    def _add(self, keyframe: Keyframe) -> None:
+    def _add(self, keyframe: ScanKeyframe) -> None:
         here = len(self._keyframes)
         if here == len(self._poses):
             self._poses = np.concatenate([self._poses, np.zeros_like(self._poses)])
@@ -236,7 +236,8 @@ class LoopClosure:
             half = CHAIN_KEYFRAMES // 2
             members = chain[max(0, at - half) : at + half + 1]
             surfaces = [
-                Surface(self._poses[k], self._keyframes[k].scan.points, self._keyframes[k].scan.joined) for k in members
+                FieldSurface(self._poses[k], self._keyframes[k].scan.points, self._keyframes[k].scan.joined)
+                for k in members
             ]
             self._field.rebuild(pose, surfaces)
             found = find_place(self._field, query, pose, reach_m, reach_rad)
@@ -304,7 +305,7 @@ class LoopClosure:
         return [other.edge for other in agreeing] + [candidate.edge]
 
     def _consistent(self, one: Edge, two: Edge) -> bool:
-        """Whether two loops agree: the cycle through both loops and the graph closes without error."""
+        """Return whether two loops agree: the cycle through both loops and the graph closes without error."""
         start = relative2(self._poses[one.a], self._poses[two.a])
         end = relative2(self._poses[one.b], self._poses[two.b])
         rest = relative2(compose2(one.a_from_b, end), compose2(start, two.a_from_b))

@@ -176,7 +176,7 @@ def refined(field: LikelihoodField, points: FloatArray, start: FloatArray) -> Fo
 
 
 def apart(a: FloatArray, b: FloatArray) -> bool:
-    """Whether two poses (3,) are different places."""
+    """Return whether two poses (3,) are different places."""
     turn = abs(wrap_angle(float(a[2] - b[2])))
     return math.hypot(a[0] - b[0], a[1] - b[1]) >= APART_M or turn >= APART_RAD
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from instant_ic.config.scalars import to_float
 from instant_ic.config.yaml_text import read_spelled, resolved
-from instant_ic.slam.keyframes import Keyframe
+from instant_ic.slam.keyframes import ScanKeyframe
 from instant_ic.slam.occupancy import OccupancyGrid
 from instant_ic.slam.pose_graph import Edge
 from instant_ic.slam.scan import FloatArray, ScanPoints
@@ -165,7 +165,7 @@ def occupied_points(grid: OccupancyGrid) -> FloatArray:
     return points
 
 
-def save_graph(stem: Path, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Path:
+def save_graph(stem: Path, keyframes: Sequence[ScanKeyframe], edges: Sequence[Edge]) -> Path:
     """Write keyframes and edges to ``stem.graph.npz`` and return it.
 
     Raises:
@@ -200,7 +200,7 @@ def save_graph(stem: Path, keyframes: Sequence[Keyframe], edges: Sequence[Edge])
 _MATRICES = ("step_covariance", "drift")
 
 
-def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
+def load_graph(stem: Path) -> tuple[list[ScanKeyframe], list[Edge]]:
     """Read a file written by `save_graph`.
 
     Raises:
@@ -219,7 +219,7 @@ def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
         joined = np.split(data["joined"], cuts)
         clear = np.split(data["clear_ends"].astype(np.float64), np.cumsum(data["clear_counts"])[:-1])
         keyframes = [
-            Keyframe(
+            ScanKeyframe(
                 int(data["stamps"][k]), data["map_from_base"][k],
                 ScanPoints(points[k], joined[k], data["origins"][k], clear[k]),
                 data["step"][k], data["step_covariance"][k], data["drift"][k],

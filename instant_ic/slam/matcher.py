@@ -225,7 +225,7 @@ def refine(field, origin, resolution, points, start, guess, information, weight,
 
 
 @dataclass(frozen=True)
-class Window:
+class SearchWindow:
     """Half widths of a search, in metres and radians."""
 
     translation_m: float
@@ -252,7 +252,7 @@ class Match:
 
 
 def match_scan(
-    field: LikelihoodField, points: FloatArray, guess: FloatArray, sigma: FloatArray, window: Window
+    field: LikelihoodField, points: FloatArray, guess: FloatArray, sigma: FloatArray, window: SearchWindow
 ) -> Match:
     """Find the pose of ``points`` (n, 2), n > 0, in a likelihood field, in a window around a guess.
 

@@ -38,7 +38,7 @@ class MotionState(enum.StrEnum):
 
 
 @dataclass(frozen=True)
-class _Step:
+class _MotionStep:
     seconds: float
     wheels_m: float
     wheels_rad: float
@@ -64,7 +64,7 @@ class MotionMonitor:
         self.slip = 0.0
         self.turn_factor = 1.0
         self.turn_factor_sigma = math.inf
-        self._steps: deque[_Step] = deque()
+        self._steps: deque[_MotionStep] = deque()
         self._span_s = 0.0
         # Sums of the regression of encoder yaw on matched yaw, in blocks of about half a radian.
         self._block_wheels = self._block_seen = 0.0
@@ -82,7 +82,7 @@ class MotionMonitor:
         """
         wheels_m = math.copysign(math.hypot(wheels[0], wheels[1]), wheels[0])
         seen_m = math.copysign(math.hypot(seen[0], seen[1]), seen[0])
-        self._steps.append(_Step(elapsed_s, wheels_m, float(wheels[2]), seen_m, float(seen[2]), matched))
+        self._steps.append(_MotionStep(elapsed_s, wheels_m, float(wheels[2]), seen_m, float(seen[2]), matched))
         self._span_s += elapsed_s
         while len(self._steps) > 1 and self._span_s - self._steps[0].seconds >= WINDOW_S:
             self._span_s -= self._steps.popleft().seconds

@@ -102,7 +102,7 @@ class ScanQueue:
 
     @property
     def waiting(self) -> bool:
-        """Whether scans wait for odometry."""
+        """True if scans wait for odometry."""
         return bool(self._waiting)
 
     def ready(self, now_ns: int) -> Iterator[tuple[QueuedScan, FloatArray | None]]:
@@ -120,7 +120,7 @@ class ScanQueue:
             yield queued, odometry
 
     def _worth_waiting(self, queued: QueuedScan, now_ns: int) -> bool:
-        """Whether odometry for this scan may still come."""
+        """Return whether odometry for this scan may still come."""
         newest = self._wheel.newest_ns
         if newest is None:
             self._first_wait_ns = self._first_wait_ns or queued.arrived_ns

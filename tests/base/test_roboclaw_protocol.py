@@ -23,7 +23,7 @@ from instant_ic.base.protocol import (
     read_request,
     write_frame,
 )
-from instant_ic.base.roboclaw import LinkError, Roboclaw, Status
+from instant_ic.base.roboclaw import ControllerStatus, LinkError, Roboclaw
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
 
@@ -72,7 +72,7 @@ def test_status_bits_differ_between_old_and_new_firmware() -> None:
 
 @pytest.mark.parametrize(("value", "size", "pressed"), [(1, 4, True), (4, 4, False), (4, 2, True), (1, 2, False)])
 def test_the_emergency_stop_input_has_another_bit_in_a_short_status(value, size, pressed):
-    assert Status(value, size).estop is pressed
+    assert ControllerStatus(value, size).estop is pressed
 
 
 def test_emulator_waits_for_a_whole_frame_and_drops_it_after_a_gap() -> None:

@@ -14,7 +14,7 @@ from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bus.node_files import node_class
 from instant_ic.calibration.bag import read_recording
 from instant_ic.calibration.edges import CUES, FloorPlane, find_floor, lidar_edges, picture_edges
-from instant_ic.calibration.mount import AXES, CalibrationError, Frame, _correction, _moved, calibrate
+from instant_ic.calibration.mount import AXES, CalibrationError, CalibrationFrame, _correction, _moved, calibrate
 from instant_ic.calibration.overlay import before_and_after, overlay
 from instant_ic.cli.main import main
 from instant_ic.config.params import build, load_file
@@ -170,7 +170,7 @@ def test_what_standing_still_does_not_constrain_is_kept(drive):
 
 def test_a_bare_room_gives_no_calibration():
     points, intensity, ring = scan(lambda azimuth, elevation: 4.0 / np.cos(elevation))
-    bare = Frame(np.full((128, 256, 3), 128, np.uint8), points, intensity, ring)
+    bare = CalibrationFrame(np.full((128, 256, 3), 128, np.uint8), points, intensity, ring)
     with pytest.raises(CalibrationError, match=r"only 0 edge points in 1 frames, 500 are needed"):
         calibrate([bare], np.eye(4), **QUICK)
     with pytest.raises(CalibrationError, match="no pair"):
@@ -178,7 +178,7 @@ def test_a_bare_room_gives_no_calibration():
     # Edges enough, but the picture shows nothing of them: lens cap on.
     jagged = scan(lambda azimuth, elevation: np.where(np.sin(20 * azimuth) > 0, 2.0, 4.0))
     with pytest.raises(CalibrationError, match="nowhere better than by chance"):
-        calibrate([Frame(bare.rgb, *jagged)], np.eye(4), **QUICK)
+        calibrate([CalibrationFrame(bare.rgb, *jagged)], np.eye(4), **QUICK)
 
 
 def copy(bag: Path, target: Path, keep, shift_ns: int = 0) -> Path:
@@ -230,7 +230,7 @@ def test_overlay_puts_points_where_they_belong():
     # One wall 2 m ahead, seen on every ring: its points lie around the centre column, and nowhere else.
     points, intensity, ring = scan(lambda azimuth, elevation: np.full(azimuth.shape, 2.0))
     ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) < math.radians(30)
-    frame = Frame(np.full((128, 256, 3), 90, np.uint8), points[ahead], intensity[ahead], ring[ahead])
+    frame = CalibrationFrame(np.full((128, 256, 3), 90, np.uint8), points[ahead], intensity[ahead], ring[ahead])
     picture = overlay(frame, np.eye(4), width=256)
     coloured = np.ptp(picture.astype(int), axis=2) > 30
     columns = np.flatnonzero(coloured.any(axis=0))

@@ -11,7 +11,7 @@ from control_world import Loop, World, corridor, draw_map, matrix
 from instant_ic.control.costmap import CostmapConfig
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.states import Mode, Reason
-from instant_ic.control.surroundings import Scan, Surroundings
+from instant_ic.control.surroundings import ArrivedScan, Surroundings
 from instant_ic.geometry.transforms import TransformBuffer
 
 BEAMS = 720
@@ -36,7 +36,7 @@ class Driver:
         self.tf.set("odom", "base_link", self.stamp_ns, np.eye(4))
         ranges = np.where(np.roll(unmeasured, -BEAMS // 4), value, 3.0)[:beams]
         angle = 2 * math.pi / beams
-        scan = Scan("velodyne", self.stamp_ns, self.stamp_ns, ranges, -math.pi, angle, 0.4, 100.0)
+        scan = ArrivedScan("velodyne", self.stamp_ns, self.stamp_ns, ranges, -math.pi, angle, 0.4, 100.0)
         self.surroundings.near_points(scan)
         return self.surroundings.blind
 

@@ -12,7 +12,7 @@ from instant_ic.control.commands import CommandRules
 from instant_ic.control.costmap import CostmapConfig
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.snapshot import ArbiterInputs
-from instant_ic.control.surroundings import Cloud, Scan, Surroundings
+from instant_ic.control.surroundings import ArrivedCloud, ArrivedScan, Surroundings
 from instant_ic.geometry.poses import compose2, inverse2, matrix_from_pose2, pose_matrix
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.lidar.decode import POINT_DTYPE
@@ -43,8 +43,8 @@ class Drive:
         points = np.zeros(len(BOX) if sees_box else 0, POINT_DTYPE)
         if sees_box:
             points["x"], points["y"], points["z"] = (BOX + [self.start_m - self.x_m, 0.0, -0.6]).T
-        scan = Scan("velodyne", now, now, np.full(720, 7.0), -math.pi, 2 * math.pi / 720, 0.4, 20.0)
-        self.surroundings.update_costmap(scan, Cloud("velodyne", now, now, points), None)
+        scan = ArrivedScan("velodyne", now, now, np.full(720, 7.0), -math.pi, 2 * math.pi / 720, 0.4, 20.0)
+        self.surroundings.update_costmap(scan, ArrivedCloud("velodyne", now, now, points), None)
         near = self.surroundings.near_points(scan)
         return ArbiterInputs(
             robot_pose=self.surroundings.robot_pose(),

@@ -12,7 +12,7 @@ from slam_planar_world import PlanarWorld, rectangle
 from instant_ic.experiments.slam_worlds import LASERS, Drive, Laser, cells, drive, trajectory_errors
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
-from instant_ic.slam.likelihood_field import LikelihoodField, Surface
+from instant_ic.slam.likelihood_field import FieldSurface, LikelihoodField
 from instant_ic.slam.loop_closure import LoopClosure, _Candidate, _chained, _reversed
 from instant_ic.slam.loop_search import find_place, peaks, pool, score_volume, spread
 from instant_ic.slam.pose_graph import Edge
@@ -153,7 +153,7 @@ def field_of(walls: PlanarWorld, poses: list[tuple[float, float, float]]) -> Lik
         points = ranges[near, None] * np.column_stack([np.cos(angles), np.sin(angles)])[near]
         joined = np.zeros(len(points), dtype=bool)
         joined[1:] = np.hypot(*np.diff(points, axis=0).T) < 2.0  # else the far walls would be dotted lines
-        surfaces.append(Surface(np.array(pose), points, joined))
+        surfaces.append(FieldSurface(np.array(pose), points, joined))
     field.rebuild(np.zeros(3), surfaces)
     return field
 

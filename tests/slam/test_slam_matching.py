@@ -9,8 +9,8 @@ import pytest
 from slam_planar_world import PlanarWorld, box_room, corridor
 
 from instant_ic.slam.config import MatchConfig
-from instant_ic.slam.likelihood_field import LikelihoodField, Surface
-from instant_ic.slam.matcher import Window, match_scan
+from instant_ic.slam.likelihood_field import FieldSurface, LikelihoodField
+from instant_ic.slam.matcher import SearchWindow, match_scan
 from instant_ic.slam.scan import ScanPoints, scan_points, thin
 
 WIDE = np.array([0.3, 0.3, 0.3])
@@ -25,7 +25,7 @@ def field_of(world: PlanarWorld, *poses: list[float], noise_m: float = 0.0) -> L
     surfaces = []
     for index, pose in enumerate(poses):
         points = points_at(world, pose, noise_m, stamp=index + 1)
-        surfaces.append(Surface(np.array(pose), points.points, points.joined))
+        surfaces.append(FieldSurface(np.array(pose), points.points, points.joined))
     field.rebuild(np.array(poses[-1]), surfaces)
     return field
 
@@ -62,7 +62,7 @@ def test_noisy_hits_are_averaged_to_one_surface() -> None:
 def test_a_scan_moved_and_turned_by_known_amounts_is_found(moved: list[float]) -> None:
     room = box_room()
     field = field_of(room, [0.0, 0.0, 0.0])
-    match = match_scan(field, match_points(points_at(room, moved)), np.zeros(3), WIDE, Window(0.35, 0.35))
+    match = match_scan(field, match_points(points_at(room, moved)), np.zeros(3), WIDE, SearchWindow(0.35, 0.35))
     assert np.hypot(*(match.pose[:2] - moved[:2])) < 0.01
     assert abs(match.pose[2] - moved[2]) < 0.003
     assert match.score > 0.9
@@ -73,7 +73,7 @@ def test_a_heading_near_half_a_turn_is_wrapped() -> None:
     field = field_of(room, [0.0, 0.0, math.pi - 0.01])
     match = match_scan(
         field, match_points(points_at(room, [0.0, 0.0, -math.pi + 0.02])), np.array([0.0, 0.0, math.pi - 0.01]), WIDE,
-        Window(0.1, 0.1),
+        SearchWindow(0.1, 0.1),
     )  # fmt: skip
     assert match.pose[2] == pytest.approx(-math.pi + 0.02, abs=0.003)
 
@@ -84,7 +84,7 @@ def test_two_matches_are_the_same_bit_for_bit() -> None:
     for _ in range(2):
         field = field_of(room, [0.0, 0.0, 0.0], [0.3, 0.0, 0.1], noise_m=0.02)
         points = match_points(points_at(room, [0.2, 0.1, 0.1], 0.02, stamp=9))
-        match = match_scan(field, points, np.zeros(3), WIDE, Window(0.35, 0.35))
+        match = match_scan(field, points, np.zeros(3), WIDE, SearchWindow(0.35, 0.35))
         results.append((match.pose.tobytes(), match.covariance.tobytes(), match.score))
     assert results[0] == results[1]
 
@@ -94,14 +94,14 @@ def test_covariance_is_wide_along_a_corridor_and_narrow_across() -> None:
     field = field_of(world, [0.0, 0.0, 0.0], noise_m=0.01)
     sigma = np.array([0.05, 0.05, 0.05])
     match = match_scan(
-        field, match_points(points_at(world, [0.02, 0.0, 0.0], 0.01, 7)), np.zeros(3), sigma, Window(0.1, 0.1)
+        field, match_points(points_at(world, [0.02, 0.0, 0.0], 0.01, 7)), np.zeros(3), sigma, SearchWindow(0.1, 0.1)
     )
     along, across = np.sqrt(np.diag(match.covariance)[:2])
     assert along > 3 * across
     room = box_room()
     match = match_scan(
         field_of(room, [0.0, 0.0, 0.0]), match_points(points_at(room, [0.02, 0.0, 0.0])), np.zeros(3), sigma,
-        Window(0.1, 0.1),
+        SearchWindow(0.1, 0.1),
     )  # fmt: skip
     assert np.sqrt(np.diag(match.covariance)[:2]).max() < 0.01
     assert np.linalg.eigvalsh(match.covariance).min() > 0
@@ -112,7 +112,7 @@ def test_the_prior_decides_along_a_corridor_even_when_the_guess_is_off_across() 
     field = field_of(world, *[[0.25 * k, 0.0, 0.0] for k in range(-8, 1)], noise_m=0.01)
     points = match_points(points_at(world, [0.1, 0.0, 0.0], 0.01, 99))
     guess = np.array([0.1, 0.08, 0.05])
-    match = match_scan(field, points, guess, np.array([0.02, 0.1, 0.05]), Window(0.3, 0.2))
+    match = match_scan(field, points, guess, np.array([0.02, 0.1, 0.05]), SearchWindow(0.3, 0.2))
     assert abs(match.pose[0] - 0.1) < 0.03
     assert abs(match.pose[1]) < 0.01
     assert abs(match.pose[2]) < 0.005

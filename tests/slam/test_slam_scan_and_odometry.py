@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import Scan
-from instant_ic.slam.config import FieldConfig, MapConfig, MatchConfig
+from instant_ic.slam.config import LikelihoodFieldConfig, MapConfig, MatchConfig
 from instant_ic.slam.odometry import CorrectionLimiter, OdometryBuffer
 from instant_ic.slam.scan import scan_points, thin
 
@@ -87,7 +87,7 @@ def test_a_scan_that_makes_no_sense_is_refused(arguments: dict) -> None:
 @pytest.mark.parametrize(
     ("make", "key"),
     [
-        (lambda: FieldConfig(resolution_m=0.0), "resolution_m"),
+        (lambda: LikelihoodFieldConfig(resolution_m=0.0), "resolution_m"),
         (lambda: MatchConfig(max_points=5), "max_points"),
         (lambda: MapConfig(max_size_m=10.0), "max_size_m"),
     ],
