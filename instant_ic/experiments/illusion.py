@@ -26,8 +26,7 @@ from instant_ic.experiments.illusion_stack import (
 )
 from instant_ic.experiments.processes import run_all
 from instant_ic.experiments.results import finite
-from instant_ic.experiments.teleop import run_episode
-from instant_ic.experiments.teleop_settings import TeleopSettings
+from instant_ic.experiments.teleop import TeleopSettings, run_episode
 
 STEP_M = 0.5
 """Width of a row of ``by_distance``."""

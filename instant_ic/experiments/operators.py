@@ -1,4 +1,4 @@
-"""V.E with simulated operators of several manners: obedience, time, path, image at the switch; no claim on people."""
+"""V.E with a simulated operator: obedience, time, path and the image at a switch; nothing about people."""
 
 from __future__ import annotations
 
@@ -14,19 +14,17 @@ from instant_ic.experiments.illusion_truth import without
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.report import Part, Section, Table, Text
 from instant_ic.experiments.scan import QUALITIES, scan_world
-from instant_ic.experiments.teleop import run_episode
-from instant_ic.experiments.teleop_operator import MANNERS
-from instant_ic.experiments.teleop_settings import TeleopSettings
+from instant_ic.experiments.teleop import TeleopSettings, run_episode
 from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS
 
-METHODS = ("ic", "mesh", "stop", "shared")
+METHODS = ("ic", "mesh", "stop")
 """``mesh``: illusory control with the mesh of a ``tripod`` scan without the obstacles."""
-COST_S = {"ic": 22.0, "mesh": 20.0, "stop": 9.0, "shared": 9.0}
+COST_S = {"ic": 22.0, "mesh": 20.0, "stop": 9.0}
 """CPU seconds of a drive."""
 
 
 def units(options: Options) -> list[Unit]:
-    """Each manner by each method; quick: the plain operator only.
+    """Return a drive by each method for each seed.
 
     Raises:
         ValueError: a recording was given.
@@ -34,10 +32,9 @@ def units(options: Options) -> list[Unit]:
     if options.bag is not None:
         raise ValueError("operators: --bag: a recorded robot does not react to another operator. Leave out --bag")
     return [
-        Unit("operators", {"world": world, "seed": seed, "manner": manner, "method": method}, COST_S[method])
+        Unit("operators", {"world": world, "seed": seed, "method": method}, COST_S[method])
         for world in options.worlds or (RANDOM_CORRIDORS,)
         for seed in range(1 if options.quick else options.seeds)
-        for manner in (("plain",) if options.quick else MANNERS)
         for method in METHODS
     ]
 
@@ -45,8 +42,7 @@ def units(options: Options) -> list[Unit]:
 def measure(arguments: dict[str, Any]) -> dict[str, Any]:
     """Drive one course by one method."""
     method, seed = arguments["method"], arguments["seed"]
-    shown = "ic" if method == "mesh" else method
-    settings = TeleopSettings(1, seed, arguments["world"], (shown,), manner=arguments["manner"])
+    settings = TeleopSettings(1, seed, arguments["world"], ("ic" if method == "mesh" else method,))
     with tempfile.TemporaryDirectory() as folder:
         if method == "mesh":
             course, file = settings.course(0), Path(folder) / "scan.glb"
@@ -59,44 +55,36 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def section(results: Sequence[Result], options: Options) -> Section:
-    """A table of all manners and methods."""
+    """Return a table of all methods."""
     lines: list[list[Any]] = []
-    done = [one for one in results if one.data]
-    for manner in MANNERS:
-        for method in METHODS:
-            own = [
-                one.data["drive"]
-                for one in done
-                if (one.unit.arguments["manner"], one.unit.arguments["method"]) == (manner, method)
-            ]
-            if own:
-                into, back = (
-                    [s["psnr_db"] for drive in own for s in drive["switches"] if s["to_virtual"] is way]
-                    for way in (True, False)
-                )
-                lines.append(
-                    [
-                        f"{manner}, {method}",
-                        f"{sum(drive['completed'] for drive in own)} of {len(own)}",
-                        sum(drive["contacts"] for drive in own),
-                        [drive["obedience"] for drive in own],
-                        [drive["seconds"] for drive in own if drive["completed"]],
-                        [drive["driven_m"] / drive["way_m"] for drive in own if drive["completed"] and drive["way_m"]],
-                        into,
-                        back,
-                    ]
-                )
+    for method in METHODS:
+        own = [one.data["drive"] for one in results if one.data and one.unit.arguments["method"] == method]
+        if own:
+            done = [drive for drive in own if drive["completed"]]
+            into, back = (
+                [s["psnr_db"] for drive in own for s in drive["switches"] if s["to_virtual"] is way]
+                for way in (True, False)
+            )
+            lines.append(
+                [
+                    method,
+                    f"{len(done)} of {len(own)}",
+                    sum(drive["contacts"] for drive in own),
+                    [drive["obedience"] for drive in own],
+                    [drive["seconds"] for drive in done],
+                    [drive["driven_m"] / drive["way_m"] for drive in done if drive["way_m"]],
+                    into,
+                    back,
+                ]
+            )
     columns = (
-        "manner, method", "completed", "contacts", "obedience", "time, s", "path ratio",
-        "PSNR into, dB", "PSNR back, dB",
+        "method", "completed", "contacts", "obedience", "time, s", "path ratio", "PSNR into, dB", "PSNR back, dB",
     )  # fmt: skip
-    manners = [[name, *vars(manner).values()] for name, manner in MANNERS.items()]
     parts: list[Part] = [
-        Text("Simulated operators; nothing is claimed about people."),
-        Table("Operators", ("manner", "speed, share", "delay, s", "noise, share", "looks around after, s"), manners),
         Text(
-            "mesh is conventional IC with a tripod scan made without the obstacles. PSNR: the two images on either "
-            "side of a switch into the virtual space and back. Poses are those of the stack's own SLAM."
+            "A simulated operator; nothing is claimed about people. mesh is conventional IC with a tripod scan made "
+            "without the obstacles. PSNR: the two images on either side of a switch into the virtual space and back. "
+            "Poses are those of the stack's own SLAM."
         ),
         Table("Drives", columns, lines, command_of(options, "operators")),
     ]

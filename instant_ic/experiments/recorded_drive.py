@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.plots import new_figure, perspective_crop, save_figure, save_map
-from instant_ic.experiments.teleop_figures import STEP_S, Drive, judge
+from instant_ic.experiments.teleop_figures import STEP_S, TeleopDrive, judge
 from instant_ic.experiments.teleop_plot import draw_modes
 from instant_ic.experiments.teleop_stack import Log
 from instant_ic.geometry.poses import pose_matrix
@@ -44,7 +44,7 @@ class RecordedDrive:
         plot, modes: PNG of both trajectories on the map, and of the arbiter's mode over time.
     """
 
-    drive: Drive
+    drive: TeleopDrive
     moments: list[Moment]
     plot: bytes
     modes: bytes
@@ -84,7 +84,7 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
             time_s = (one.stamp_ns - begin_ns) / 1e9
             if times[0] - 1.0 <= time_s <= times[-1] and (not photos or time_s >= photos[-1][0] + 0.5 * frame_s):
                 photos.append((time_s, bytes(deserialize(one.payload, one.type_name).data)))
-    drive = Drive(0, "ic", True, seconds=log.time_s[-1] - log.time_s[0])
+    drive = TeleopDrive(0, "ic", True, seconds=log.time_s[-1] - log.time_s[0])
     judge(drive, log, np.empty((0, 2)))
     return RecordedDrive(drive, _moments(log, times, photos, keyframes), _plot(drive, grid), _modes(drive))
 
@@ -175,7 +175,7 @@ def _moments(
     return found
 
 
-def _plot(drive: Drive, grid: Any) -> bytes:
+def _plot(drive: TeleopDrive, grid: Any) -> bytes:
     """PNG of both tracks on the recorded map, on white without one."""
     from instant_ic.msg import grid_array
 
@@ -195,7 +195,7 @@ def _plot(drive: Drive, grid: Any) -> bytes:
     return out.getvalue()
 
 
-def _modes(drive: Drive) -> bytes:
+def _modes(drive: TeleopDrive) -> bytes:
     figure, axes = new_figure(1, 1, (9.0, 1.4))
     draw_modes(axes[0, 0], [drive])
     out = io.BytesIO()

@@ -1,17 +1,18 @@
 """``ic evaluate teleop``: an operator drives through corridors with obstacles that the operator does not look at.
 
-The whole stack runs in simulated time (``teleop_stack``) with three methods: illusory control, a robot that stops at
-obstacles, and shared control that drives around them by itself. ``teleop_figures`` computes the figures.
+The whole stack runs in simulated time (``teleop_stack``) with two methods: illusory control, and a robot that stops at
+obstacles. ``teleop_figures`` computes the figures.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +21,19 @@ from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import teleop_figures as figures
 from instant_ic.experiments.processes import run_all
-from instant_ic.experiments.teleop_figures import Drive, Switch
-from instant_ic.experiments.teleop_operator import MANNERS, RecordedOperator, ScriptedOperator, Sight, read_commands
-from instant_ic.experiments.teleop_results import in_order
-from instant_ic.experiments.teleop_settings import TeleopSettings
+from instant_ic.experiments.results import finite
+from instant_ic.experiments.teleop_figures import Switch, TeleopDrive
+from instant_ic.experiments.teleop_operator import ScriptedOperator, Sight
 from instant_ic.experiments.teleop_stack import (
     CAMERA_HEIGHT_M,
+    METHODS,
     NODES,
     VSPACE_NODES,
     Shown,
     SimulatedStack,
     StackConfig,
 )
-from instant_ic.experiments.teleop_worlds import Course, floor_plan
+from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS, Course, floor_plan, make_course
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 
@@ -44,6 +45,47 @@ FloatArray: TypeAlias = NDArray[np.float64]
 AT_GOAL_M = 0.35
 READY_S = 10.0
 """Longest time until the stack is ready for the first command."""
+
+_course = functools.lru_cache(maxsize=2)(make_course)
+"""Cached: all methods drive the same course."""
+
+
+@dataclass(frozen=True)
+class TeleopSettings:
+    """Settings of one evaluation.
+
+    Attributes:
+        episodes, seed: number of courses, and their seed; the same seed gives the same drives.
+        world: ``corridors`` (random ones), or a world of the simulator.
+        methods: some of ``METHODS``.
+        depth: depth source, see ``StackConfig``.
+        pictures: render and compare the images on either side of a switch.
+        overrides: parameters ``node.key:=value`` on top of the shipped ones.
+    """
+
+    episodes: int = 50
+    seed: int = 0
+    world: str = RANDOM_CORRIDORS
+    methods: tuple[str, ...] = METHODS
+    depth: str = "completed"
+    pictures: bool = True
+    overrides: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
+        if not self.methods:
+            raise ValueError(f"methods must be some of {', '.join(METHODS)} (got none)")
+        for method in self.methods:
+            StackConfig(method, overrides=self.overrides)  # raises ValueError on a wrong one
+
+    def course(self, index: int) -> Course:
+        """Return course ``index``.
+
+        Raises:
+            ValueError: no such world, or no possible drive in it.
+        """
+        return _course(self.world, self.seed, index)
 
 
 class _Episode:
@@ -58,23 +100,17 @@ class _Episode:
         filmed: bool = False,
         make_stack: Callable[[World, StackConfig], SimulatedStack] = SimulatedStack,
     ) -> None:
-        seed, words = 1000 * settings.seed + index, settings.overrides
-        config = StackConfig(method, settings.depth, seed, whole_views=filmed, overrides=words)
+        seed, overrides = 1000 * settings.seed + index, settings.overrides
+        config = StackConfig(method, settings.depth, seed, whole_views=filmed, overrides=overrides)
         self.settings, self.course = settings, course
-        self.drive = Drive(index, method, way_m=course.way_m)
-        self.operator: ScriptedOperator | RecordedOperator
-        if settings.log is None:
-            self.operator = ScriptedOperator(course.goals, floor_plan(course.world), MANNERS[settings.manner], seed)
-            self.limit_s = READY_S + (20.0 + 4.0 * course.way_m + 20.0 * len(course.obstacles))
-        else:
-            self.operator = RecordedOperator(read_commands(settings.log))
-            self.limit_s = READY_S + (self.operator.log[-1, 0] + 20.0)
+        self.drive = TeleopDrive(index, method, way_m=course.way_m)
+        self.operator = ScriptedOperator(course.goals, floor_plan(course.world))
+        self.limit_s = READY_S + (20.0 + 4.0 * course.way_m + 20.0 * len(course.obstacles))
         self.stack = make_stack(course.world, config)
         self.began_s: float | None = None
         self.ended_s: float | None = None
-        self.contacts = 0
 
-    def run(self, on_step: Callable[[SimulatedStack], None] | None = None) -> Drive:
+    def run(self, on_step: Callable[[SimulatedStack], None] | None = None) -> TeleopDrive:
         """Drive until the goal is reached, the operator gives up, or the time limit is over.
 
         Raises:
@@ -124,11 +160,9 @@ class _Episode:
         return command
 
     def _there(self) -> bool:
-        """Whether the operator is done, and the r-bot is at the goal and is the robot shown."""
+        """Return whether the operator is done, and the r-bot is at the goal and is the robot shown."""
         if not self.operator.done or self.stack.page.virtual:
             return False
-        if isinstance(self.operator, RecordedOperator):
-            return True
         return float(np.linalg.norm(self.stack.robot[:2] - self.course.goals[-1])) < AT_GOAL_M
 
     def _over(self) -> bool:
@@ -174,9 +208,19 @@ def run_episode(
     on_step: Callable[[SimulatedStack], None] | None = None,
     methods: tuple[str, ...] = (),
     make_stack: Callable[[World, StackConfig], SimulatedStack] = SimulatedStack,
-) -> list[Drive]:
-    """Drive one course by each method in turn; the same settings and index give the same result, except for times."""
-    course, filmed = settings.course(index), on_step is not None
+    course: Course | None = None,
+) -> list[TeleopDrive]:
+    """Drive one course by each method in turn; the same settings and index give the same result, except for times.
+
+    Args:
+        settings: methods, depth and parameters.
+        index: number of the course.
+        on_step: called with the stack after each step.
+        methods: methods to drive by; those of the settings if empty.
+        make_stack: returns the stack of a world.
+        course: course to drive; that of the settings and the index if None.
+    """
+    course, filmed = course or settings.course(index), on_step is not None
     with _quiet():
         return [
             _Episode(settings, course, index, name, filmed, make_stack).run(on_step)
@@ -201,27 +245,48 @@ def _quiet() -> Iterator[None]:
 def evaluate(
     settings: TeleopSettings,
     jobs: int = 1,
-    on_drive: Callable[[Drive], None] | None = None,
+    on_drive: Callable[[TeleopDrive], None] | None = None,
     timeout_s: float = 7200.0,
-    done: Sequence[Drive] = (),
-) -> list[Drive]:
+) -> list[TeleopDrive]:
     """Drive all courses by all methods, ``jobs`` drives in parallel; with more than one job, each in its own process.
 
-    The drives in ``done`` are not repeated; ``timeout_s`` is for all drives.
+    Args:
+        settings: courses and methods.
+        jobs: number of processes.
+        on_drive: called with each drive as it ends.
+        timeout_s: time limit for all drives.
+
+    Returns:
+        Drives by course, then method.
 
     Raises:
-        ValueError: nothing to do, no such world, no such log.
+        ValueError: no such world.
         TimeoutError: the drives took longer than ``timeout_s``.
         RuntimeError: a process died, or a stack did not become ready.
     """
-    if settings.log is not None:
-        read_commands(settings.log)  # fail before anything is started
-    known = {(drive.index, drive.method) for drive in done}
     tasks = [(settings, i, name) for i in range(settings.episodes) for name in settings.methods]
-    tasks = [task for task in tasks if task[1:] not in known]
     # The kernels are compiled first, so that no episode includes that time.
-    return in_order([*done, *run_all(_drive, tasks, jobs, warm_up, on_drive, timeout_s)])
+    drives = run_all(_drive, tasks, jobs, warm_up, on_drive, timeout_s)
+    return sorted(drives, key=lambda drive: (drive.index, METHODS.index(drive.method)))
 
 
-def _drive(settings: TeleopSettings, index: int, method: str) -> Drive:
+def _drive(settings: TeleopSettings, index: int, method: str) -> TeleopDrive:
     return run_episode(settings, index, methods=(method,))[0]
+
+
+def report(drives: Sequence[TeleopDrive], settings: TeleopSettings) -> dict[str, Any]:
+    """Return the figures by method, the targets, and each drive without its tracks, ready for JSON."""
+    by_method = {name: [d for d in drives if d.method == name] for name in settings.methods}
+    stop = by_method.get("stop")
+    methods = {name: figures.summary(own, stop if name != "stop" else None) for name, own in by_method.items() if own}
+    rows = [{key: value for key, value in asdict(drive).items() if key != "tracks"} for drive in drives]
+    return {
+        "seed": settings.seed,
+        "world": settings.world,
+        "depth": settings.depth,
+        "parameters": list(settings.overrides),
+        "drives": len(drives),
+        "methods": finite(methods),
+        "targets": figures.targets(methods["ic"]) if "ic" in methods else {},
+        "each": finite(rows),
+    }

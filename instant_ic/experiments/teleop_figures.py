@@ -63,7 +63,7 @@ class Switch:
 
 
 @dataclass
-class Drive:
+class TeleopDrive:
     """One episode by one method."""
 
     index: int
@@ -235,7 +235,7 @@ def obstacles_met(log: Log, centres: FloatArray) -> int:
     return int((away.min(axis=0) < MET_M).sum())
 
 
-def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
+def judge(drive: TeleopDrive, log: Log, centres: FloatArray) -> None:
     """Fill in the figures that follow from the log; image figures of the switches are set elsewhere."""
     drive.obedience = obedience(log)
     drive.switches = find_switches(log)
@@ -267,7 +267,7 @@ def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
     }
 
 
-def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, Any]:
+def summary(drives: list[TeleopDrive], stop: list[TeleopDrive] | None = None) -> dict[str, Any]:
     """Figures of one method over its episodes; ``stop`` are the drives of the robot that only stops."""
     switches = [switch for drive in drives for switch in drive.switches]
     into, back = ([s for s in switches if s.to_virtual == to_virtual] for to_virtual in (True, False))

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.states import Mode
 from instant_ic.experiments.plots import save_figure
-from instant_ic.experiments.teleop import decode, photograph
-from instant_ic.experiments.teleop_figures import TRACK_S, Drive
-from instant_ic.experiments.teleop_settings import TeleopSettings
+from instant_ic.experiments.teleop import TeleopSettings, decode, photograph
+from instant_ic.experiments.teleop_figures import TRACK_S, TeleopDrive
 from instant_ic.experiments.teleop_stack import METHODS, SimulatedStack
 from instant_ic.experiments.teleop_worlds import Course, floor_plan
 from instant_ic.sim.contact import OccupancyMask
@@ -26,7 +25,7 @@ from instant_ic.sim.contact import OccupancyMask
 FloatArray: TypeAlias = NDArray[np.float64]
 
 # Okabe and Ito's palette, distinguishable for colour-blind readers.
-_COLOURS = {"ic": "#0072B2", "stop": "#E69F00", "shared": "#009E73"}
+_COLOURS = {"ic": "#0072B2", "stop": "#E69F00"}
 _MODE_COLOURS = {
     Mode.REAL: "#BBBBBB", Mode.ENTERING: "#F0E442", Mode.VIRTUAL: "#56B4E9", Mode.RETURNING: "#CC79A7",
     Mode.STOPPED: "#D55E00",
@@ -46,7 +45,11 @@ FPS = 10
 
 
 def save_plot(
-    path: Path | io.BytesIO, drives: Sequence[Drive], report: dict[str, Any], settings: TeleopSettings, most: int = 4
+    path: Path | io.BytesIO,
+    drives: Sequence[TeleopDrive],
+    report: dict[str, Any],
+    settings: TeleopSettings,
+    most: int = 4,
 ) -> None:
     """Save figures by method, every course's time and obedience, and maps of the worst courses.
 
@@ -88,7 +91,7 @@ def save_plot(
     save_figure(figure, path)
 
 
-def _how_well(drives: Sequence[Drive]) -> tuple[float, ...]:
+def _how_well(drives: Sequence[TeleopDrive]) -> tuple[float, ...]:
     """Sort key of courses: not completed first, then contacts, flicker, disobedience of the first method."""
     contacts, flicker = (sum(getattr(d, name) for d in drives) for name in ("contacts", "flicker"))
     obedience = drives[0].obedience
@@ -107,7 +110,7 @@ def _draw_bars(axis: Any, label: str, values: dict[str, float | None]) -> None:
     axis.tick_params(labelsize=7)
 
 
-def _draw_courses(axis: Any, key: str, label: str, drives: Sequence[Drive], names: Sequence[str]) -> None:
+def _draw_courses(axis: Any, key: str, label: str, drives: Sequence[TeleopDrive], names: Sequence[str]) -> None:
     """Plot a dot per drive, by course; a ring if it was not completed, a cross if it touched something."""
     for name in names:
         of = [d for d in drives if d.method == name]
@@ -124,26 +127,26 @@ def _draw_courses(axis: Any, key: str, label: str, drives: Sequence[Drive], name
     axis.grid(alpha=0.3)
 
 
-def _tracks(drives: Sequence[Drive]) -> FloatArray:
+def _tracks(drives: Sequence[TeleopDrive]) -> FloatArray:
     """(N, 2) all positions of the robots of these drives."""
     return np.concatenate(
         [np.array(t).reshape(-1, 3)[:, :2] for d in drives for n, t in d.tracks.items() if n != "modes"]
     )
 
 
-def _extent(course: Course, drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
+def _extent(course: Course, drives: Sequence[TeleopDrive]) -> tuple[FloatArray, FloatArray]:
     """Lowest and highest corner (2,) of the map of these drives."""
     things = [(one.x, one.y) for one in course.obstacles]
     places = np.concatenate([_tracks(drives), course.goals, np.array(things).reshape(-1, 2), [course.world.spawn[:2]]])
     return places.min(axis=0) - _MARGIN_M, places.max(axis=0) + _MARGIN_M
 
 
-def _map_height(course: Course, drives: Sequence[Drive]) -> float:
+def _map_height(course: Course, drives: Sequence[TeleopDrive]) -> float:
     low, high = _extent(course, drives)
     return float(np.clip(5.8 * (high[1] - low[1]) / (high[0] - low[0]), 1.2, 4.0))
 
 
-def _draw_course(axis: Any, course: Course, drives: Sequence[Drive]) -> None:
+def _draw_course(axis: Any, course: Course, drives: Sequence[TeleopDrive]) -> None:
     plan = floor_plan(course.world)
     rows, columns = plan.cells.shape
     x, y = plan.origin
@@ -170,13 +173,13 @@ def _draw_course(axis: Any, course: Course, drives: Sequence[Drive]) -> None:
     axis.tick_params(labelsize=6)
 
 
-def _where(drive: Drive, time_s: float) -> FloatArray:
+def _where(drive: TeleopDrive, time_s: float) -> FloatArray:
     """Position (2,) of the r-bot at a time."""
     track, modes = drive.tracks["robot"], drive.tracks["modes"]
     return np.array(track[min(max(0, round((time_s - modes[0][0]) / TRACK_S)), len(track) - 1)])[:2]
 
 
-def draw_modes(axis: Any, drives: Sequence[Drive]) -> None:
+def draw_modes(axis: Any, drives: Sequence[TeleopDrive]) -> None:
     """Plot the arbiter's mode over time, one bar per method."""
     for k, drive in enumerate(drives):
         modes = drive.tracks["modes"]

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
-METHODS = ("ic", "stop", "shared")
+METHODS = ("ic", "stop")
 NODES = ("crawler_base", "vlp16_driver", "grid_slam", "virtual_robot", "navigator", "arbiter", "console")
 VSPACE_NODES = ("depth_estimator", "depth_scaler", "nerf")
 STEP_S = 1 / 60
@@ -303,10 +303,6 @@ class SimulatedStack:
         mount = pose_matrix(*camera.camera_mount.pose)
         self.nodes["console"].tf_broadcast_static("base_link", "camera", mount)
         self.nodes["console"].feed.server = self.page
-        if config.method == "shared":
-            from instant_ic.experiments.teleop_shared import SharedControl
-
-            self.nodes["arbiter"].arbiter = SharedControl(self.nodes["arbiter"].config)
 
     def _on_record(self, record: Record) -> None:
         topic = record.topic

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -72,26 +72,21 @@ class Course:
         return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def make_course(name: str, seed: int, index: int, from_spawn: bool = False) -> Course:
+def make_course(name: str, seed: int, index: int) -> Course:
     """Create a course: a random corridor, a drive along the simulator's corridor, or one across another world.
 
     Args:
         name: ``corridors``, or any name of ``sim.worlds.make_world``.
         seed, index: which course; the same values give the same course.
-        from_spawn: start where the simulator starts robots, without goals; for recorded commands.
 
     Raises:
         ValueError: no such world, or no possible drive in it.
     """
     if name == RANDOM_CORRIDORS:
-        course = random_corridor(np.random.default_rng([47, seed, index]), f"corridors {seed}/{index}")
-    elif name.partition(":")[0] in ("corridor", "corridor-free"):
-        course = straight_ahead(_world(name))
-    elif not from_spawn:
-        return across(_world(name), np.random.default_rng([59, seed, index]))
-    else:
-        course = Course(_world(name), np.empty((0, 2)), ())
-    return replace(course, goals=np.empty((0, 2))) if from_spawn else course
+        return random_corridor(np.random.default_rng([47, seed, index]), f"corridors {seed}/{index}")
+    if name.partition(":")[0] in ("corridor", "corridor-free"):
+        return straight_ahead(_world(name))
+    return across(_world(name), np.random.default_rng([59, seed, index]))
 
 
 @functools.lru_cache(maxsize=1)

@@ -14,16 +14,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments import illusion, teleop_results
+from instant_ic.experiments import illusion, teleop
 from instant_ic.experiments.compared import command_of
 from instant_ic.experiments.illusion_stack import SOURCES, FilmedStack
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.plots import jpeg
 from instant_ic.experiments.recorded_drive import Moment, read_drive
 from instant_ic.experiments.report import Answer, Figure, Part, Section, Table, Text, image_address
-from instant_ic.experiments.teleop import run_episode
+from instant_ic.experiments.teleop import TeleopSettings, run_episode
 from instant_ic.experiments.teleop_plot import save_plot, screen_frames
-from instant_ic.experiments.teleop_settings import TeleopSettings
 
 _FRAME_S = 0.25
 _SIZE = (500, 180)
@@ -81,7 +80,7 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
     if arguments["images"] and frames:
         images = _shown(frames, _FRAME_S)
         plot = io.BytesIO()
-        save_plot(plot, [drive], teleop_results.report([drive], settings), settings, 1)
+        save_plot(plot, [drive], teleop.report([drive], settings), settings, 1)
         images["Trajectories of r-bot and v-bot, state over time"] = image_address(plot.getvalue(), "image/png")
     row = {key: value for key, value in asdict(drive).items() if key != "tracks"}
     views = {source: illusion.figures(film.frames, source) for source in SOURCES} if film.frames else {}

@@ -13,15 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
-from instant_ic.bag.writer import BagWriter
 from instant_ic.cli.main import main
 from instant_ic.control.states import Mode
-from instant_ic.experiments import teleop, teleop_figures, teleop_results, teleop_worlds
-from instant_ic.experiments.teleop_figures import Drive, Switch
-from instant_ic.experiments.teleop_operator import RecordedOperator, ScriptedOperator, Sight, read_commands
+from instant_ic.experiments import teleop, teleop_figures, teleop_worlds
+from instant_ic.experiments.teleop_figures import Switch, TeleopDrive
+from instant_ic.experiments.teleop_operator import ScriptedOperator, Sight
 from instant_ic.experiments.teleop_plot import Video, save_plot
 from instant_ic.experiments.teleop_stack import Log, Shown, SimulatedStack, StackConfig
-from instant_ic.msg import message_type, serialize
 from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.contact import OccupancyMask
 
@@ -115,7 +113,7 @@ class TestSwitches:
 
     def test_the_virtual_way_is_that_of_the_vbot_while_it_is_shown(self) -> None:
         log = log_of([0.4] * 8, [0.4] * 8, [False, False, True, True, True, False, False, False])
-        drive = Drive(0, "ic", seconds=0.4)
+        drive = TeleopDrive(0, "ic", seconds=0.4)
         teleop_figures.judge(drive, log, np.zeros((1, 2)))
         assert drive.virtual_m == pytest.approx(2 * 0.02)  # two steps of 0.05 s between the three shown places
         figures = teleop_figures.summary([drive])
@@ -145,9 +143,9 @@ class TestSwitches:
 
 
 def test_summary_by_hand() -> None:
-    def drive(index: int, method: str, seconds: float, completed: bool, switches: int) -> Drive:
+    def drive(index: int, method: str, seconds: float, completed: bool, switches: int) -> TeleopDrive:
         made = [Switch(float(k), k % 2 == 0, 0.01 * (k + 1), 0.1, 0.02, 0.03, 0.0, 20.0 + k) for k in range(switches)]
-        return Drive(
+        return TeleopDrive(
             index, method, completed, seconds=seconds, way_m=8.0, driven_m=8.8, obstacles=1,
             obedience=1.0 - 0.1 * index, switches=made, mode_seconds={"real": seconds}, gap_max_m=math.nan,
         )  # fmt: skip
@@ -167,94 +165,15 @@ def test_summary_by_hand() -> None:
     assert not teleop_figures.targets(standing)["one switch each way an obstacle"]
     settings = teleop.TeleopSettings(episodes=2, methods=("ic", "stop"))
     assert teleop_figures.targets(standing)["switch_position_error_m <= 0.02"] is None  # there was no switch
-    told = json.loads(json.dumps(teleop_results.report(ic + stop, settings), allow_nan=False))
+    told = json.loads(json.dumps(teleop.report(ic + stop, settings), allow_nan=False))
     assert set(told["methods"]) == {"ic", "stop"} and len(told["each"]) == 4 and "tracks" not in told["each"][0]
 
 
 def test_without_obstacles_nothing_is_divided_by_them() -> None:
-    figures = teleop_figures.summary([Drive(0, "ic", True, seconds=9.0, way_m=0.0, driven_m=3.0)])
+    figures = teleop_figures.summary([TeleopDrive(0, "ic", True, seconds=9.0, way_m=0.0, driven_m=3.0)])
     assert figures["switches_per_obstacle"] is None and figures["path_ratio_mean"] is None
     met = teleop_figures.targets(figures)
     assert met["one switch each way an obstacle"] is None and met["contacts == 0"] is True
-
-
-class TestResults:
-    settings = teleop.TeleopSettings(episodes=2, methods=("ic", "stop"))
-    drives = (
-        Drive(
-            0, "ic", True, seconds=9.5, way_m=8.0, mode_seconds={"real": 9.5},
-            switches=[Switch(1.0, True, math.nan, 0.1, 0.02, 0.03, 0.0)],
-            tracks={"robot": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], "vbot": [], "modes": [[0.0, 0], [9.5, 0]]},
-        ),
-        Drive(1, "stop", False, reason="an obstacle ahead", tracks={"robot": [], "vbot": [], "modes": []}),
-    )  # fmt: skip
-
-    def test_what_was_saved_is_taken_up_again(self, tmp_path: Path) -> None:
-        file = tmp_path / "out.json"
-        teleop_results.save(file, self.drives, self.settings)
-        assert list(tmp_path.iterdir()) == [file]
-        again = teleop_results.load(file, self.settings)
-        # NaN is not equal to itself: by their words.
-        assert repr(again) == repr(list(self.drives))
-        told = json.loads(file.read_text())
-        assert told["drives"] == 2 and told["drives_planned"] == 4 and told["each"][0]["obedience"] is None
-
-    def test_only_what_is_asked_for_is_taken_up(self, tmp_path: Path) -> None:
-        teleop_results.save(tmp_path / "out.json", self.drives, self.settings)
-        fewer = teleop.TeleopSettings(episodes=1, methods=("ic", "shared"))
-        assert [d.method for d in teleop_results.load(tmp_path / "out.json", fewer)] == ["ic"]
-
-    def test_what_cannot_be_taken_up(self, tmp_path: Path) -> None:
-        file = tmp_path / "out.json"
-        teleop_results.save(file, self.drives, self.settings)
-        with pytest.raises(ValueError, match="driven with seed 0, not 3"):
-            teleop_results.load(file, teleop.TeleopSettings(episodes=2, methods=("ic", "stop"), seed=3))
-        for words in ("{}", "[1]", "no JSON", file.read_text()[:-20], file.read_text().replace("contacts", "bumps")):
-            file.write_text(words)
-            with pytest.raises(ValueError, match="not a report of ic evaluate teleop"):
-                teleop_results.load(file, self.settings)
-
-
-def _instead(drives: list[Drive], ends: BaseException | None):
-    """In place of ``teleop.evaluate``: these are driven, then it ends so."""
-
-    def evaluate(settings, jobs, on_drive, timeout_s, done):
-        assert all((d.index, d.method) not in {(k.index, k.method) for k in done} for d in drives)
-        for drive in drives:
-            on_drive(drive)
-        if ends is not None:
-            raise ends
-
-    return evaluate
-
-
-@pytest.mark.parametrize(
-    ("ends", "status", "told"),
-    [
-        (KeyboardInterrupt(), 130, "interrupted; 1 of 4 drives are done"),
-        (RuntimeError("a process died"), 1, "a process died; 1 of 4 drives are done"),
-    ],
-)
-def test_an_interrupted_run_keeps_what_was_driven_and_goes_on(
-    ends: BaseException,
-    status: int,
-    told: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    file, (first, last) = tmp_path / "out.json", TestResults.drives
-    words = ["evaluate", "teleop", "--episodes", "2", "--methods", "ic,stop", "--json", str(file)]
-    monkeypatch.setattr(teleop, "evaluate", _instead([first], ends))
-    assert main(words) == status
-    output = capsys.readouterr()
-    assert told in " ".join(output.err.split()) and "--resume" in output.err
-    assert json.loads(output.out)["methods"]["ic"]["completed_fraction"] == 1.0
-    assert [row["method"] for row in json.loads(file.read_text())["each"]] == ["ic"]
-    monkeypatch.setattr(teleop, "evaluate", _instead([last], None))
-    assert main([*words, "--resume"]) == 0
-    assert [row["method"] for row in json.loads(file.read_text())["each"]] == ["ic", "stop"]
-    assert set(json.loads(capsys.readouterr().out)["methods"]) == {"ic", "stop"}
 
 
 def furnished(thing: tuple[float, float] | None) -> teleop_worlds.World:
@@ -312,14 +231,6 @@ class TestWorlds:
         with pytest.raises(ValueError, match=r"'closet': no straight drive of 3.5 m .* can be reached"):
             teleop_worlds.across(world, np.random.default_rng(0), attempts=100)
 
-    def test_recorded_commands_begin_where_the_simulator_starts_robots(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(teleop_worlds, "_world", lambda name: furnished((2.0, 0.1)))
-        course = teleop_worlds.make_course("random:1", 0, 0, from_spawn=True)
-        assert course.world.spawn == (0.0, 0.0, 0.0) and len(course.goals) == 0 and course.way_m == 0.0
-        assert teleop_worlds.make_course("random:1", 0, 0).way_m > 3.5
-        along = teleop_worlds.make_course("corridor", 0, 0, from_spawn=True)
-        assert len(along.goals) == 0 and len(along.obstacles) == 1
-
 
 def sight(time_s: float, pose: tuple[float, float, float], speed: float = 0.4, **given: bool) -> Sight:
     here = np.array(pose)
@@ -355,72 +266,6 @@ class TestOperator:
         assert he.command(sight(0.5, (0.0, 0.0, 0.0))) == (0.0, 0.0)
         assert he.command(sight(1.1, (0.0, 0.0, 0.0))) == (0.4, 0.0)
 
-    def test_a_log_is_repeated_by_its_own_times(self, tmp_path: Path) -> None:
-        file = tmp_path / "drive.csv"
-        file.write_text("time_s,linear_m_s,angular_rad_s\n5.0,0.1,0\n5.1,0.2,0.3\n7.0,0,0\n")
-        he = RecordedOperator(read_commands(file))
-        told = {t: he.command(sight(t, (0, 0, 0))) for t in (20.0, 20.05, 20.1, 20.5, 21.0, 22.1)}
-        assert told == {
-            20.0: (0.1, 0.0), 20.05: (0.1, 0.0), 20.1: (0.2, 0.3), 20.5: (0.2, 0.3),
-            21.0: (0.0, 0.0),  # not renewed for 0.5 s
-            22.1: (0.0, 0.0),
-        }  # fmt: skip
-        assert he.done
-
-    @pytest.mark.parametrize(
-        ("text", "words"),
-        [
-            ("", "column time_s, linear_m_s, angular_rad_s is missing"),
-            ("time_s,linear_m_s,angular_rad_s\n", "no commands"),
-            ("time_s,linear_m_s,angular_rad_s\n1,x,0\n", "drive.csv:2: not a row of numbers"),
-            ("time_s,linear_m_s,angular_rad_s\n2,1,0\n1,0,0\n", "goes back by 1.000 s at command 2 of 2"),
-            ("time_s,linear_m_s,angular_rad_s\n1,0,0\n1,nan,0\n", "command 2 of 2 is not finite"),
-            ("time_s,linear_m_s,angular_rad_s\n1,0,0\n2,0,0\n", "commands are zero"),
-        ],
-    )
-    def test_a_log_that_is_none(self, tmp_path: Path, text: str, words: str) -> None:
-        file = tmp_path / "drive.csv"
-        file.write_text(text)
-        with pytest.raises(ValueError, match=words):
-            read_commands(file)
-
-
-def bag_of(path: Path, topic: str, message: str, commands: list[tuple[float, float]]) -> Path:
-    """A bag with a command each tenth of a second."""
-    kind, vector = message_type(message), message_type("Vector3")
-    with BagWriter(path) as writer:
-        for k, (linear, angular) in enumerate(commands):
-            twist = message_type("Twist")(vector(linear, 0.0, 0.0), vector(0.0, 0.0, angular))
-            one = (
-                kind(message_type("Header")(message_type("Time")(0, 0), ""), twist) if message != "Bool" else kind(True)
-            )
-            writer.write(topic, f"{kind.__msgtype__}", bytes(serialize(one)), 10**18 + k * 10**8)
-    return path
-
-
-class TestRecordedInABag:
-    def test_what_is_before_and_after_the_drive_is_left_out(self, tmp_path: Path) -> None:
-        commands = [(0.0, 0.0)] * 30 + [(0.3, -0.2)] * 5 + [(0.0, 0.0)] * 90
-        log = read_commands(bag_of(tmp_path / "bag", "/operator/cmd_vel", "TwistStamped", commands))
-        assert log[0] == pytest.approx([0.0, 0.3, -0.2]) and log[4] == pytest.approx([0.4, 0.3, -0.2])
-        assert log[-1] == pytest.approx([2.4, 0.0, 0.0]) and len(log) == 25
-
-    @pytest.mark.parametrize(
-        ("topic", "message", "told"),
-        [
-            ("/cmd_vel", "TwistStamped", "/operator/cmd_vel is missing; the bag has these topics: /cmd_vel"),
-            ("/operator/cmd_vel", "Bool", "has the type Bool, not TwistStamped"),
-        ],
-    )
-    def test_another_bag(self, topic: str, message: str, told: str, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match=told):
-            read_commands(bag_of(tmp_path / "bag", topic, message, [(0.1, 0.0)]))
-
-    def test_no_bag(self, tmp_path: Path) -> None:
-        (tmp_path / "drive.mcap").write_bytes(b"no bag")
-        with pytest.raises(ValueError, match=r"drive\.mcap"):
-            read_commands(tmp_path / "drive.mcap")
-
 
 @pytest.mark.parametrize(
     ("words", "told"),
@@ -429,11 +274,7 @@ class TestRecordedInABag:
         (["--methods", "ic,magic"], "method must be one of"),
         (["--world", "nowhere"], "neither corridor"),
         (["--jobs", "0"], "jobs must be at least 1"),
-        (["--operator", "recorded"], "needs --log"),
-        (["--log", "x.csv"], "needs --operator recorded"),
-        (["--operator", "recorded", "--log", "/no/such.csv"], "no such bag or CSV file"),
         (["--video", "film.avi"], "must end in .mp4"),
-        (["--resume"], "--resume needs --json"),
         (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),
         (["-p", "arbiter.no_key:=1"], "unknown parameter 'no_key'"),
         (["--json", "/no/such/folder/out.json"], "does not exist"),
@@ -451,11 +292,11 @@ def short_course() -> teleop_worlds.Course:
     return teleop_worlds.Course(world, np.array([[0.7, 0.0]]), ())
 
 
-@pytest.mark.parametrize("method", ["ic", "stop", "shared"])
+@pytest.mark.parametrize("method", ["ic", "stop"])
 def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp_path: Path) -> None:
     settings = teleop.TeleopSettings(episodes=1, world="corridor", depth="lidar", methods=(method,), pictures=False)
     episode = teleop._Episode(settings, short_course, 0, method)
-    if method == "shared":  # its film and its plot, once
+    if method == "stop":  # its film and its plot, once
         with Video(tmp_path / "drive.mp4") as video:
             drive = episode.run(video.on_step)
         read = cv2.VideoCapture(str(tmp_path / "drive.mp4"))
@@ -463,7 +304,7 @@ def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp
         picture, plan = np.hsplit(read.read()[1], [640])
         assert frames > 10 * (drive.seconds - 0.5) and plan.shape == (360, 360, 3)
         assert picture.std() > 20 and (plan > 240).mean() > 0.5  # a corridor, and a drawing on white
-        save_plot(tmp_path / "drive.png", [drive], teleop_results.report([drive], settings), settings)
+        save_plot(tmp_path / "drive.png", [drive], teleop.report([drive], settings), settings)
         assert cv2.imread(str(tmp_path / "drive.png")).std() > 10
     else:
         drive = episode.run()
@@ -486,47 +327,8 @@ def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp
     assert ("nerf" in nodes) == (method == "ic")
 
 
-def test_shared_control_goes_round_by_itself_and_gives_back() -> None:
-    """On a costmap written by hand: a box straight ahead, seen from its front."""
-    from instant_ic.control.costmap import CostmapConfig, RollingCostmap, scan_rays
-    from instant_ic.control.footprint import Footprint
-    from instant_ic.control.snapshot import ArbiterInputs
-    from instant_ic.experiments.teleop_shared import SharedControl
-
-    angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
-    ranges = np.minimum(4.0, 1.5 / np.maximum(np.abs(np.sin(angles)), 1e-6))  # walls 1.5 m to either side
-    ahead = np.abs(angles) < math.atan2(0.25, 0.9)
-    ranges[ahead] = 0.9 / np.cos(angles[ahead])  # a box 0.9 m ahead, 0.5 m wide
-    config = CostmapConfig(width=8.0)
-    rays = scan_rays(ranges, -math.pi, 2 * math.pi / 720, 0.4, 20.0, np.eye(4), config)
-    costmap = RollingCostmap(config, Footprint()).update(np.zeros(3), None, rays, None)
-    shared = SharedControl()
-    names = ("scan", "odometry", "pose", "camera", "command", "vspace", "nav", "vbot")
-    fresh = ArbiterInputs(robot_pose=np.zeros(3), costmap=costmap, ages=dict.fromkeys(names, 0.0))
-
-    def step(k: int, command: tuple[float, float]) -> SimpleNamespace:
-        decision = shared.step(replace(fresh, operator_command=command), 50_000_000 * k)
-        return SimpleNamespace(command=decision.command, reason=decision.reason, mode=decision.mode)
-
-    for k in range(40):
-        step(k, (0.0, 0.0))
-    bent = [step(40 + k, (0.4, 0.0)) for k in range(20)]
-    assert bent[-1].mode == Mode.REAL and "goes round by itself" in bent[-1].reason
-    assert any(abs(one.command[1]) > 0.1 for one in bent), "it turns although straight on was commanded"
-    assert shared.goal is not None and shared.goal[0] > 1.4  # behind the box's unseen body
-    for lost in ("pose", "odometry", "camera", "scan"):
-        late = replace(fresh, operator_command=(0.4, 0.0), ages={**fresh.ages, lost: 0.6})
-        decision = shared.step(late, 50_000_000 * 60)
-        assert (decision.command, decision.mode) == ((0.0, 0.0), Mode.REAL), f"{lost} is stale: it must brake"
-        step(60, (0.4, 0.0))
-    assert step(60, (0.0, 0.0)).command == (0.0, 0.0)
-    step(61, (-0.2, 0.0))
-    assert shared.goal is None
-    assert step(62, (-0.2, 0.0)).command[0] < 0.0
-
-
 def test_the_stack_refuses_what_it_cannot_run() -> None:
-    with pytest.raises(ValueError, match="method must be one of ic, stop, shared"):
+    with pytest.raises(ValueError, match="method must be one of ic, stop"):
         StackConfig(method="magic")
 
 

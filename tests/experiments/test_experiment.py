@@ -42,7 +42,6 @@ from instant_ic.experiments.scan import (
     scan_world,
     station_places,
 )
-from instant_ic.experiments.teleop_operator import MANNERS, ScriptedOperator, Sight
 from instant_ic.experiments.teleoperation import stills
 from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.geometry.image_quality import psnr_db
@@ -484,25 +483,6 @@ def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
         with BagWriter(tmp_path / "empty"):
             pass
         reconstruction.units(Options(5, bag=tmp_path / "empty"))
-
-
-def sight(time_s: float) -> Sight:
-    return Sight(time_s, np.zeros(3), False, False, (0.4, 0.0), np.zeros(3))
-
-
-def test_operators_differ_as_their_manners_say() -> None:
-    ahead = np.array([[10.0, 0.0]])
-
-    def commands(manner: str, seed: int = 0) -> list[tuple[float, float]]:
-        operator = ScriptedOperator(ahead, None, MANNERS[manner], seed)
-        return [operator.command(sight(0.05 * step)) for step in range(20)]
-
-    assert commands("plain") == [(0.4, 0.0)] * 20
-    assert commands("cautious") == [(0.2, 0.0)] * 20
-    assert commands("late") == [(0.0, 0.0)] * 10 + [(0.4, 0.0)] * 10
-    noisy = np.array(commands("noisy"))
-    assert noisy[:, 1].std() > 0.01 and noisy.tolist() == np.array(commands("noisy")).tolist()
-    assert noisy.tolist() != np.array(commands("noisy", 1)).tolist()
 
 
 def test_stills_are_before_first_middle_last_and_after() -> None:
