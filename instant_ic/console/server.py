@@ -31,7 +31,7 @@ from instant_ic.console.connections import (
     CLOSE_S,
     HEADERS_S,
     AddressBuckets,
-    Connection,
+    LimitedConnection,
     Listener,
     network_of,
 )
@@ -329,11 +329,18 @@ class ConsoleServer:
         app.router.add_post("/estop", self._estop)
         app.router.add_get("/ws", self._websocket)
         app.router.add_static("/static/", STATIC)
-        runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
+        runner = web.AppRunner(
+            app,
+            access_log=None,
+            handle_signals=False,
+            shutdown_timeout=1.0,
+            keepalive_timeout=HEADERS_S,  # from the start of the connection, then from each answer
+            lingering_time=CLOSE_S,  # for the rest of a refused body
+        )
         await runner.setup()
         assert runner.server is not None
         limits = self.config.max_connections, self.config.max_connections_per_address
-        self._listener = listener = Listener(runner.server, *limits, self._tls, SECURITY_HEADERS, self._known)
+        self.listener = listener = Listener(runner.server, *limits, self._tls, self._known)
         try:
             self.port = await listener.open(self.config.host, self.config.port)
             drive_task = asyncio.create_task(self._drive_forever())
@@ -522,8 +529,8 @@ class ConsoleServer:
         places = self.config.max_clients if may_drive else max(1, self.config.max_clients - RESERVED_FOR_DRIVERS)
         if len(self._sessions) >= places:
             raise web.HTTPServiceUnavailable(text=f"too many pages: {len(self._sessions)} are connected\n")
-        connection = request.protocol
-        assert isinstance(connection, Connection)
+        connection = request.transport.get_protocol()
+        assert isinstance(connection, LimitedConnection)
         # Without autoping the reader sees the protocol's pings too, so that the message limit covers them.
         socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=CLOSE_S, autoping=False)
         limit = self.config.max_messages_per_s

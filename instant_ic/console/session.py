@@ -11,7 +11,7 @@ from typing import Any
 
 from aiohttp import web
 
-from instant_ic.console.connections import Connection
+from instant_ic.console.connections import LimitedConnection
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
 from instant_ic.util.web_access import TokenBucket
@@ -45,7 +45,7 @@ class Session:
         self,
         number: int,
         socket: web.WebSocketResponse,
-        connection: Connection,
+        connection: LimitedConnection,
         bucket: TokenBucket,
         may_drive: bool = True,
         cookie: str = "",

@@ -314,7 +314,7 @@ def test_fault_old_commands_are_obeyed(serve):
             await client.send_drive(0.3, 0.0, age_s=60.0)
             await client.wait_for(lambda c: c.refused == ["old"], WAIT_S)
             await client.send_drive(0.3, 0.0, age_s=-60.0)
-            await client.wait_for(lambda c: c.refused == ["old", "old"], WAIT_S)
+            await client.wait_for(lambda c: c.refused == ["old", "future"], WAIT_S)
 
     asyncio.run(scenario())
     assert motion(backend) == []

@@ -391,7 +391,7 @@ def test_fault_maps_are_packed_for_clients_that_have_left(serve):
     async def scenario():
         for number in range(1, 11):
             await ask_and_leave(server, "/export/map.zip", lambda number=number: waiting["exports"] >= number)
-        await until(lambda: not server._listener._connections)
+        await until(lambda: not server.listener.admitted)
         go.set()
         async with aiohttp.ClientSession() as http, http.get(server.url + "export/map.zip") as response:
             assert response.status == 404  # it waits until the others have had their turn
@@ -438,9 +438,9 @@ def test_fault_idle_connections_starve_the_driver(serve, sent):
             held.append((reader, writer))
         async with ConsoleClient(server.url) as driver:
             await driver.acquire()
-            listener = server._listener
-            assert len(listener._connections) <= 20
-            counts = Counter(connection.network for connection in listener._connections)
+            listener = server.listener
+            assert len(listener.admitted) <= 20
+            counts = Counter(connection.network for connection in listener.admitted)
             assert max(counts.values()) <= 10
             # The address that holds them still gets in itself, by its oldest.
             async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(local_addr=ELSEWHERE)) as http:
@@ -460,7 +460,7 @@ def test_a_request_that_is_no_websockets_keeps_no_place(serve):
         async with aiohttp.ClientSession() as http:
             async with http.get(server.url + "ws") as response:
                 assert response.status == 400
-            (connection,) = server._listener._connections
+            (connection,) = server.listener.admitted
             assert not connection.kept and not server._sessions
 
     run(scenario)
@@ -499,7 +499,7 @@ def test_fault_a_tls_handshake_takes_for_ever(serve, monkeypatch, certificate):
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
         assert await reader.read() == b""
         writer.close()
-        await until(lambda: not server._listener._connections)
+        await until(lambda: not server.listener.admitted)
 
     run(scenario)
 
@@ -531,7 +531,7 @@ def test_more_connections_a_second_than_a_page_needs_are_refused_without_a_log_f
         for _ in range(50):
             _, writer = await asyncio.open_connection("127.0.0.1", server.port, local_addr=ELSEWHERE)
             writer.write(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        await until(lambda: server._listener.refused == 45)
+        await until(lambda: server.listener.refused == 45)
         async with ConsoleClient(server.url) as driver:  # from another address
             await driver.acquire()
 
