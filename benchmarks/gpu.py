@@ -41,7 +41,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import CUBE_FACES, equirect_directions
 from instant_ic.vspace import FieldConfig, GeometryConfig, PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.nerf import reference
-from instant_ic.vspace.nerf.field import Device, Lattice, Scene, sample_weights
+from instant_ic.vspace.nerf.field import Device, Lattice, TrainingScene, sample_weights
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.nerf.torch_device import TorchDevice
 from instant_ic.vspace.prior import prepare
@@ -152,11 +152,13 @@ def kernels(setup: Setup) -> dict[str, Any]:
         priors = [prepare(*place.keyframe(x), setup.geometry, setup.panorama) for x in reversed(KEYFRAMES[name])]
         lattice = Lattice.for_prior(priors[0], setup.field)
         gains = np.array([[1, 1, 1], [0.9, 1.1, 1.2], [1.1, 1.0, 0.9]], np.float32)[: len(priors)]
-        result[name] = _compared(Scene(tuple(priors), lattice, build_occupancy(priors, setup.geometry), gains), setup)
+        result[name] = _compared(
+            TrainingScene(tuple(priors), lattice, build_occupancy(priors, setup.geometry), gains), setup
+        )
     return result
 
 
-def _compared(scene: Scene, setup: Setup) -> dict[str, Any]:
+def _compared(scene: TrainingScene, setup: Setup) -> dict[str, Any]:
     torch_name = "cpu" if setup.dry else "cuda"
     peer = TorchDevice(setup.field, setup.train, torch_name)
     ours, result = _judged(setup), {}

@@ -19,9 +19,9 @@ from instant_ic.msg import (
     VspaceStatus,
     matrix_from_pose,
 )
-from instant_ic.vspace import State
+from instant_ic.vspace import SpaceState
 from instant_ic.vspace.config import NerfConfig
-from instant_ic.vspace.jobs import Incoming, Outcome, SpaceWorker, ViewOrder, load_robot_mask
+from instant_ic.vspace.jobs import IncomingKeyframe, JobOutcome, SpaceWorker, ViewOrder, load_robot_mask
 from instant_ic.vspace.layers import Layers
 from instant_ic.vspace.schedule import JobSchedule, Turns
 
@@ -67,11 +67,11 @@ class NerfNode(Node[NerfConfig]):
     def on_keyframe(self, keyframe: Any) -> None:
         decode = functools.partial(decode_keyframe, keyframe)
         image = np.asarray(keyframe.panorama.data, np.uint8).tobytes()
-        self.schedule.offer_keyframe(Incoming(keyframe.id, keyframe, self.clock.now_ns(), decode, image))
+        self.schedule.offer_keyframe(IncomingKeyframe(keyframe.id, keyframe, self.clock.now_ns(), decode, image))
 
     def on_request(self, request: Any) -> None:
         most = self.config.max_view_pixels
-        if self.schedule.state == State.EMPTY:
+        if self.schedule.state == SpaceState.EMPTY:
             self.diagnose("view", WARN, f"no view can be rendered yet: {self.schedule.text()}")
         elif int(request.width) * int(request.height) > most:
             text = f"{request.width} x {request.height} requested, max_view_pixels is {most}"
@@ -81,7 +81,7 @@ class NerfNode(Node[NerfConfig]):
             size = request.width, request.height, request.fov_rad
             self.schedule.request_view(ViewOrder(request.id, request, pose, *size, self.config.jpeg_quality))
 
-    def on_prepared(self, outcome: Outcome) -> None:
+    def on_prepared(self, outcome: JobOutcome) -> None:
         self.schedule.take_prepared(outcome)
         self.report(outcome)
         if isinstance(outcome.made, Layers):
@@ -93,7 +93,7 @@ class NerfNode(Node[NerfConfig]):
         self.schedule.next()
         self.publish_status()
 
-    def on_rendered(self, outcome: Outcome) -> None:
+    def on_rendered(self, outcome: JobOutcome) -> None:
         changed = self.schedule.take(outcome, self.clock.now_ns())
         self.report(outcome)
         if outcome.encoded is not None:
@@ -102,12 +102,12 @@ class NerfNode(Node[NerfConfig]):
             self.publish_status()
         self.schedule.next()
 
-    def report(self, outcome: Outcome) -> None:
+    def report(self, outcome: JobOutcome) -> None:
         self.diagnose_all(*self.schedule.findings(outcome))
         if outcome.error is not None and outcome.is_bug:
             self.fault(f"virtual space, {outcome.job.kind.value}", outcome.error)
 
-    def publish_view(self, outcome: Outcome) -> None:
+    def publish_view(self, outcome: JobOutcome) -> None:
         assert outcome.job.view is not None and outcome.encoded is not None
         view = view_message(outcome.job.view, outcome.encoded, self.schedule, self.clock.now_ns())
         self.view_out.publish(view)

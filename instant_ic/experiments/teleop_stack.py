@@ -46,7 +46,7 @@ from instant_ic.msg import (
     stamp_ns,
     to_time,
 )
-from instant_ic.vspace.jobs import EncodedView, Job, Outcome, SpaceWorker
+from instant_ic.vspace.jobs import EncodedView, Job, JobOutcome, SpaceWorker
 
 if TYPE_CHECKING:
     from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
@@ -325,7 +325,7 @@ class SimulatedStack:
         stack = self
 
         class SmallViews(SpaceWorker):
-            def do(self, job: Job) -> Outcome:
+            def do(self, job: Job) -> JobOutcome:
                 order = job.view
                 if order is None:
                     return super().do(job)
@@ -484,7 +484,7 @@ class SimulatedStack:
         log.reason.append(str(state.reason))
 
 
-def _encoded(outcome: Outcome) -> EncodedView:
+def _encoded(outcome: JobOutcome) -> EncodedView:
     assert outcome.encoded is not None
     return outcome.encoded
 

@@ -12,7 +12,7 @@ from instant_ic.vspace.mesh_file import MeshError
 from instant_ic.vspace.mesh_space import MeshSpace, Space, make_space
 from instant_ic.vspace.prior import KeyframeError
 from instant_ic.vspace.saved import SpaceFileError
-from instant_ic.vspace.space import NotReadyError, State, Status, TrainStats, VirtualSpace
+from instant_ic.vspace.space import NotReadyError, SpaceState, SpaceStatus, TrainStats, VirtualSpace
 from instant_ic.vspace.view import View
 from instant_ic.vspace.warp import PanoramaWarp
 
@@ -28,8 +28,8 @@ __all__ = [
     "ReadinessConfig",
     "Space",
     "SpaceFileError",
-    "State",
-    "Status",
+    "SpaceState",
+    "SpaceStatus",
     "TrainConfig",
     "TrainStats",
     "View",

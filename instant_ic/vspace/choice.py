@@ -22,7 +22,7 @@ _SIZE, _FOV = (256, 144), math.pi / 2
 
 
 @dataclass(frozen=True)
-class Trial:
+class WarpTrial:
     """A view of an older keyframe as it was, and how well the warp renders it.
 
     Attributes:
@@ -36,12 +36,12 @@ class Trial:
     warp_error: Floats
 
     @classmethod
-    def of(cls, rays: Rays, truth: Floats, judged: NDArray[np.bool_], warped: Floats) -> Trial:
+    def of(cls, rays: Rays, truth: Floats, judged: NDArray[np.bool_], warped: Floats) -> WarpTrial:
         """Of the warp's colours (P, 3); ``judged`` (P,): both sides have seen the place."""
         return cls(rays, truth, np.where(judged, _error(warped, truth), np.float32(np.nan)))
 
 
-def trials(shown: KeyframeSet) -> tuple[Trial, ...]:
+def trials(shown: KeyframeSet) -> tuple[WarpTrial, ...]:
     """The older keyframes that are kept but neither shown nor learnt, rendered by the warp of those that are.
 
     Places hidden from the shown keyframes are left out: the warp has them from the very images that it is judged by.
@@ -54,11 +54,11 @@ def trials(shown: KeyframeSet) -> tuple[Trial, ...]:
         colour, _, known = older.warp.draw(rays)
         warped = compose(rays, newest, None)
         truth = np.clip(colour * exposure_gains([newest.prior, older.prior])[1], 0, 1).astype(np.float32)
-        found.append(Trial.of(rays, truth, (known > 0) & (warped.confidence > 0), warped.colour))
+        found.append(WarpTrial.of(rays, truth, (known > 0) & (warped.confidence > 0), warped.colour))
     return tuple(found)
 
 
-def gain_db(trials: Sequence[Trial], renderings: Sequence[Rendering]) -> float:
+def gain_db(trials: Sequence[WarpTrial], renderings: Sequence[Rendering]) -> float:
     """PSNR of the field's renderings above the warp's over all judged pixels that both render; NaN without any."""
     warp = field = 0.0
     for trial, (colour, _, confidence) in zip(trials, renderings, strict=True):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from instant_ic.vspace.config import FieldConfig, GeometryConfig, TrainConfig, VirtualSpaceConfig
-from instant_ic.vspace.nerf.field import Device, Lattice, Rays, Scene
+from instant_ic.vspace.nerf.field import Device, Lattice, Rays, TrainingScene
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import prepare
 from instant_ic.vspace.view import perspective_rays
@@ -133,7 +133,7 @@ def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfi
         raise DeviceError(f"only {alike.mean():.0%} of an image's pixels are as plain torch renders them")
 
 
-def _scratch(field: FieldConfig) -> tuple[Scene, Rays]:
+def _scratch(field: FieldConfig) -> tuple[TrainingScene, Rays]:
     """A striped sphere of 2 m seen from its middle, and a view from aside."""
     rgb = np.zeros((32, 64, 3), np.uint8)
     rgb[:, ::8] = (250, 120, 30)
@@ -141,6 +141,6 @@ def _scratch(field: FieldConfig) -> tuple[Scene, Rays]:
     prior = prepare(rgb, np.full((32, 64), 2.0, np.float32), np.eye(4), 0.05, geometry, 64)
     pose = np.eye(4)
     pose[0, 3] = 0.3
-    return Scene((prior,), Lattice.for_prior(prior, field), build_occupancy([prior], geometry)), perspective_rays(
-        pose, 16, 9, 1.0
-    )
+    return TrainingScene(
+        (prior,), Lattice.for_prior(prior, field), build_occupancy([prior], geometry)
+    ), perspective_rays(pose, 16, 9, 1.0)

@@ -23,7 +23,7 @@ from instant_ic.vspace.layers import encode
 from instant_ic.vspace.mesh_file import MeshError
 from instant_ic.vspace.mesh_space import Space, make_space
 from instant_ic.vspace.prior import KeyframeError
-from instant_ic.vspace.space import Status, VirtualSpace
+from instant_ic.vspace.space import SpaceStatus, VirtualSpace
 from instant_ic.vspace.view import View
 from instant_ic.vspace.warm_up import warm_up
 
@@ -57,7 +57,7 @@ _INPUT_JOBS = (JobKind.PREPARE, JobKind.SHOW, JobKind.RENDER)
 
 
 @dataclass(frozen=True)
-class Incoming:
+class IncomingKeyframe:
     """A keyframe and its arrival time; ``decode`` runs on the preparing thread and may raise ``KeyframeError``;
     ``image``: the camera's encoded panorama, None where there is none.
     """
@@ -100,7 +100,7 @@ class Job:
     """
 
     kind: JobKind
-    keyframe: Incoming | None = None
+    keyframe: IncomingKeyframe | None = None
     view: ViewOrder | None = None
     made: Any = None
     iterations: int | None = None
@@ -118,7 +118,7 @@ class EncodedView:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobOutcome:
     """Result of a job.
 
     Attributes:
@@ -131,7 +131,7 @@ class Outcome:
     job: Job
     made: Any = None
     encoded: EncodedView | None = None
-    status: Status | None = None
+    status: SpaceStatus | None = None
     refused: str = ""
     error: Exception | None = None
     is_bug: bool = False
@@ -152,29 +152,29 @@ class SpaceWorker:
         self._robot, self._warm = robot, warm
         self._newest: EncodedView | None = None  # view of the space as it is
         self._version = 0  # of the layers
-        self._sources: dict[int, Incoming] = {}  # of the keyframes by their place in the store
+        self._sources: dict[int, IncomingKeyframe] = {}  # of the keyframes by their place in the store
 
-    def run(self, job: Job) -> Outcome:
+    def run(self, job: Job) -> JobOutcome:
         """Do a job; errors are part of the outcome."""
         try:
             outcome = self.do(job)
         except Exception as error:  # noqa: BLE001 - reported on the node's thread, which must know that this one is free
             if job.kind in _INPUT_JOBS and isinstance(error, ValueError):
-                outcome = Outcome(job, refused=str(error))
+                outcome = JobOutcome(job, refused=str(error))
             else:
                 expected = is_device_fault(error) or isinstance(error, MeshError)
-                outcome = Outcome(job, error=error, is_bug=not expected)
+                outcome = JobOutcome(job, error=error, is_bug=not expected)
         status = None if self.space is None else self.space.status
         return replace(outcome, status=status)
 
-    def do(self, job: Job) -> Outcome:
+    def do(self, job: Job) -> JobOutcome:
         """Do a job; errors are raised."""
         if job.kind is JobKind.WARM_UP:
             if self._warm:
                 self._yield_to_others()
                 warm_up(self.config)
             self.space = make_space(self.config, self._robot)
-            return Outcome(job)
+            return JobOutcome(job)
         space = self.space
         assert space is not None
         if job.kind in _CHANGES:
@@ -185,16 +185,16 @@ class SpaceWorker:
                 self._yield_to_others()
             arrays = job.keyframe.decode()
             if not isinstance(space, VirtualSpace):
-                return Outcome(job, arrays)
+                return JobOutcome(job, arrays)
             prepared = space.prepare(*arrays)
             self._sources[prepared.keyframes[0].place] = job.keyframe
-            return Outcome(job, prepared)
+            return JobOutcome(job, prepared)
         if job.kind is JobKind.LAYERS:
             source = self._sources[job.made.newest.place]
             self._version += 1
-            return Outcome(job, encode(job.made.newest, source.id, source.image, self._version))
+            return JobOutcome(job, encode(job.made.newest, source.id, source.image, self._version))
         if job.kind is JobKind.SCENE and isinstance(space, VirtualSpace):
-            return Outcome(job, space.scene_of(job.made))
+            return JobOutcome(job, space.scene_of(job.made))
         if job.kind is JobKind.SHOW and isinstance(space, VirtualSpace):
             space.show(job.made, dissolve=True)
         elif job.kind is JobKind.SHOW:
@@ -205,8 +205,8 @@ class SpaceWorker:
             space.train(job.budget_ms, job.iterations)
         elif job.kind is JobKind.RENDER:
             assert job.view is not None
-            return Outcome(job, encoded=self._rendered(space, job.view))
-        return Outcome(job)
+            return JobOutcome(job, encoded=self._rendered(space, job.view))
+        return JobOutcome(job)
 
     def _rendered(self, space: Space, order: ViewOrder) -> EncodedView:
         """The view of an order; the newest one again where it would be the same: a standing robot costs nothing."""

@@ -20,8 +20,8 @@ from instant_ic.vspace.mesh_file import MeshError, load_mesh
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import KeyframeError, area_average
 from instant_ic.vspace.readiness import UNSEEN_GAIN, Texture
-from instant_ic.vspace.space import State, Status, TrainStats, VirtualSpace
-from instant_ic.vspace.view import Drawn, View, checked_pose, continue_unseen, equirect_rays, perspective_rays
+from instant_ic.vspace.space import SpaceState, SpaceStatus, TrainStats, VirtualSpace
+from instant_ic.vspace.view import RayRenderer, View, checked_pose, continue_unseen, equirect_rays, perspective_rays
 
 EDGE_RATIO = 0.03
 """Neighbouring depths that differ by more than this share are an edge; its pixels are rendered by four rays."""
@@ -37,7 +37,7 @@ _ASIDE = math.sin(math.radians(22.5))
 """Floor and ceiling agree wherever the mesh lies: directions flatter than this count."""
 
 
-class MeshSpace(Drawn):
+class MeshSpace(RayRenderer):
     """A mesh in the map, rendered by ray casting. One thread at a time.
 
     Raises:
@@ -144,11 +144,11 @@ class MeshSpace(Drawn):
         return psnr_of_mse(self._mse)
 
     @property
-    def status(self) -> Status:
+    def status(self) -> SpaceStatus:
         """READY at once. ``psnr_db``: of the mesh at the newest keyframe against the camera; NaN before the first."""
         low, high = self._mesh.bounds
-        return Status(
-            state=State.READY,
+        return SpaceStatus(
+            state=SpaceState.READY,
             refreshing=False,
             psnr_db=self._psnr_db,
             iterations=0,

@@ -10,8 +10,8 @@ from typing import Any
 
 from instant_ic.util.diagnosis import Diagnosis, Level
 from instant_ic.vspace.config import VirtualSpaceConfig
-from instant_ic.vspace.jobs import Incoming, Job, JobKind, Outcome, ViewOrder
-from instant_ic.vspace.space import State, Status
+from instant_ic.vspace.jobs import IncomingKeyframe, Job, JobKind, JobOutcome, ViewOrder
+from instant_ic.vspace.space import SpaceState, SpaceStatus
 
 LEAST_SHARE = 0.25
 """Least training time as a share of a view's rendering time, also where views alone take longer than their period."""
@@ -88,13 +88,13 @@ class JobSchedule:
         lockstep: bool,
     ) -> None:
         self.config, self.turns = config, turns
-        self.keyframe: Incoming | None = None  # newest one that views show
-        self.status: Status | None = None
+        self.keyframe: IncomingKeyframe | None = None  # newest one that views show
+        self.status: SpaceStatus | None = None
         self.failure = ""
         self.preparing = False
         self.wants_layers = False  # somebody receives them
         self._render, self._prepare, self._lockstep = render, prepare, lockstep
-        self._waiting_keyframe: Incoming | None = None
+        self._waiting_keyframe: IncomingKeyframe | None = None
         self._waiting_view: ViewOrder | None = None
         self._busy = False  # the rendering thread
         self._todo: deque[Job] = deque()  # the rendering thread's jobs for the keyframe in preparation
@@ -111,7 +111,7 @@ class JobSchedule:
         """Start with the warm-up."""
         self._start(Job(JobKind.WARM_UP))
 
-    def offer_keyframe(self, keyframe: Incoming) -> None:
+    def offer_keyframe(self, keyframe: IncomingKeyframe) -> None:
         """Prepare and show a keyframe; it replaces one that still waits."""
         self._waiting_keyframe = keyframe
         self.next()
@@ -166,7 +166,7 @@ class JobSchedule:
         """Whether anything is left to train."""
         return self._learns and not self.failure and self.status is not None and not self.status.converged
 
-    def take_prepared(self, outcome: Outcome) -> None:
+    def take_prepared(self, outcome: JobOutcome) -> None:
         """Pass the preparing thread's result to the rendering thread."""
         job = outcome.job
         if outcome.error is not None or outcome.refused or job.kind is JobKind.LAYERS:
@@ -175,7 +175,7 @@ class JobSchedule:
             kind = JobKind.SHOW if job.kind is JobKind.PREPARE else JobKind.LEARN
             self._todo.append(Job(kind, job.keyframe, made=outcome.made))
 
-    def take(self, outcome: Outcome, now_ns: int) -> bool:
+    def take(self, outcome: JobOutcome, now_ns: int) -> bool:
         """Take the rendering thread's result; returns whether the state, the text or the keyframe has changed."""
         self._busy = False
         job, self.status = outcome.job, outcome.status
@@ -202,18 +202,18 @@ class JobSchedule:
         if failed and job.kind in _LASTING:
             self.failure = f"{job.kind.value}: {type(outcome.error).__name__}: {outcome.error}"
             changed = True
-        if self.keyframe is not None and not self._is_ready and self.state == State.READY:
+        if self.keyframe is not None and not self._is_ready and self.state == SpaceState.READY:
             self._is_ready = changed = True
             self._ready_seconds = (now_ns - self.keyframe.arrival_ns) / 1e9
         return changed
 
     @property
-    def state(self) -> State:
+    def state(self) -> SpaceState:
         """What the space can show."""
         if self.failure:
-            return State.FAILED
+            return SpaceState.FAILED
         if self.status is None or (self.keyframe is None and self.config.source != "mesh"):
-            return State.EMPTY
+            return SpaceState.EMPTY
         return self.status.state
 
     def text(self) -> str:
@@ -240,7 +240,7 @@ class JobSchedule:
             text += f" (older keyframes by the field: {status.gain_db:+.1f} dB against the warp)"
         return text
 
-    def findings(self, outcome: Outcome) -> list[Diagnosis]:
+    def findings(self, outcome: JobOutcome) -> list[Diagnosis]:
         """Diagnoses that follow from a job's outcome, after it was taken."""
         kind, status, keyframe, view = outcome.job.kind, outcome.status, outcome.job.keyframe, outcome.job.view
         found = []
@@ -284,7 +284,7 @@ class JobSchedule:
             "expected_psnr_db": self._expected_psnr_db,
             "unseen_share": self._unseen_share,
             "train_seconds": 0.0 if keyframe is None else (now_ns - keyframe.arrival_ns) / 1e9,
-            "ready_seconds": self._ready_seconds if keyframe is not None and state == State.READY else 0.0,
+            "ready_seconds": self._ready_seconds if keyframe is not None and state == SpaceState.READY else 0.0,
             "iterations": 0 if of_keyframe is None else of_keyframe.iterations,
             "ms_per_iteration": 0.0 if of_keyframe is None or self._lockstep else of_keyframe.ms_per_iteration,
             "render_ms": self._render_ms,

@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.vspace.agreement import exposure_gains, moved
-from instant_ic.vspace.choice import Choice, Trial, gain_db, trials
+from instant_ic.vspace.choice import Choice, WarpTrial, gain_db, trials
 from instant_ic.vspace.composition import ComposedView, Rendering, compose, dissolve, filled_image, to_8bit
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_out_of_memory, make_device
-from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
+from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, Schedule, TrainingScene
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import PanoramaPrior, prepare
 from instant_ic.vspace.readiness import Texture, error_terms, expected_psnr_db
 from instant_ic.vspace.saved import SavedSpace, TrainingProgress, read, write
 from instant_ic.vspace.store import RECENT, Keyframe, KeyframeSet, KeyframeStore, ready, recent, spread
-from instant_ic.vspace.view import Drawn, View, checked_pose, perspective_rays
+from instant_ic.vspace.view import RayRenderer, View, checked_pose, perspective_rays
 
 T = TypeVar("T")
 _PROBE = (64, 36)  # pixels of the image that readiness is judged by
@@ -37,7 +37,7 @@ _PARALLAX_RAD = 0.035  # displacement of surfaces by the depth's error that is s
 _LEAST_DEPTH_SHARE = 0.5  # of the keyframe's depth in where the field's surfaces lie
 
 
-class State(enum.IntEnum):
+class SpaceState(enum.IntEnum):
     """Numbers as in VspaceStatus.msg."""
 
     EMPTY = 0
@@ -59,13 +59,13 @@ class TrainStats:
 
 
 @dataclass(frozen=True)
-class Status:
-    """State of the space; fields as in VspaceStatus.msg.
+class SpaceStatus:
+    """SpaceState of the space; fields as in VspaceStatus.msg.
 
     Training figures are since the newest keyframe. ``refreshing``: the field has not learnt that one yet.
     """
 
-    state: State
+    state: SpaceState
     refreshing: bool
     psnr_db: float
     iterations: int
@@ -92,15 +92,15 @@ class NotReadyError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedScene:
     """A scene to train on, its keyframes, and the older ones that field and warp are compared by."""
 
-    scene: Scene
+    scene: TrainingScene
     keyframes: KeyframeSet
-    trials: tuple[Trial, ...] = ()
+    trials: tuple[WarpTrial, ...] = ()
 
 
-class VirtualSpace(Drawn):
+class VirtualSpace(RayRenderer):
     """The newest keyframes, shown at once by warping, and one hash-grid field trained on all of them.
 
     A new keyframe is shown from the moment it is taken; the field goes on from what it has learnt. One thread at a
@@ -138,9 +138,9 @@ class VirtualSpace(Drawn):
         self._shown: KeyframeSet | None = None
         self._before: KeyframeSet | None = None  # shown before, until the newest has taken over
         self._pictures = 0  # rendered since then
-        self._scene: Scene | None = None  # what the field learns
+        self._scene: TrainingScene | None = None  # what the field learns
         self._held: tuple[Keyframe, ...] = ()  # whose arrays the scene looks at
-        self._trials: tuple[Trial, ...] = ()
+        self._trials: tuple[WarpTrial, ...] = ()
         self._choice = Choice(self.config.picture.field_gain_db)
         self._texture: tuple[PanoramaPrior, Texture] | None = None
         self._ready = False
@@ -270,16 +270,16 @@ class VirtualSpace(Drawn):
         shown = [(*one.keyframes, *one.kept) for one in (self._shown, self._before) if one is not None]
         self._store.keep(itertools.chain(*shown, self._held))
 
-    def scene_of(self, prepared: KeyframeSet) -> Prepared:
-        """Scene to train on; may run in another thread, as ``prepare``, and before the next keyframe's ``prepare``."""
+    def scene_of(self, prepared: KeyframeSet) -> PreparedScene:
+        """Build the scene to train on. May run in another thread, as ``prepare``, before the next keyframe is prepared."""
         priors, config = prepared.priors, self.config
         lattice, scene = Lattice.for_prior(priors[0], config.field), self._scene
         if scene is not None and scene.lattice.suits(lattice):
             lattice = scene.lattice
-        scene = Scene(priors, lattice, build_occupancy(priors, config.geometry), prepared.gains)
-        return Prepared(scene, prepared, () if config.picture.field_alone else trials(prepared))
+        scene = TrainingScene(priors, lattice, build_occupancy(priors, config.geometry), prepared.gains)
+        return PreparedScene(scene, prepared, () if config.picture.field_alone else trials(prepared))
 
-    def learn(self, prepared: Prepared) -> None:
+    def learn(self, prepared: PreparedScene) -> None:
         """Train on these keyframes from now on, starting from the present parameters.
 
         Where the scale has changed by more than a factor of 2 it starts again. A failing device leaves the old space.
@@ -297,7 +297,7 @@ class VirtualSpace(Drawn):
         self._choice.gain_db = math.nan  # on other images
         self._choose()
 
-    def _start_anew(self, scene: Scene, old: Scene) -> None:
+    def _start_anew(self, scene: TrainingScene, old: TrainingScene) -> None:
         learnt = self._device.parameters()
 
         def start(device: Device) -> None:
@@ -357,14 +357,14 @@ class VirtualSpace(Drawn):
             self._ready_iterations, self._ready = self._schedule.iteration, True
 
     @property
-    def status(self) -> Status:
+    def status(self) -> SpaceStatus:
         """The present state."""
         iterations = self._schedule.iteration
         if self._shown is None:
-            state = State.EMPTY
+            state = SpaceState.EMPTY
         else:
-            state = State.READY if self._ready else State.TRAINING
-        return Status(
+            state = SpaceState.READY if self._ready else SpaceState.TRAINING
+        return SpaceStatus(
             state=state,
             refreshing=self._ready and not self._ready_iterations,
             psnr_db=self._psnr_db,
@@ -372,7 +372,7 @@ class VirtualSpace(Drawn):
             train_seconds=self._train_seconds,
             ready_iterations=self._ready_iterations if self.config.source == "field" else 0,
             ms_per_iteration=self._train_seconds * 1e3 / iterations if iterations else 0.0,
-            ready_radius_m=self._ready_radius_m() if state == State.READY else 0.0,
+            ready_radius_m=self._ready_radius_m() if state == SpaceState.READY else 0.0,
             converged=self._shown is not None and self._done,
             source=self.config.source,
             device=self._device.name,
@@ -530,7 +530,7 @@ class VirtualSpace(Drawn):
         shown = KeyframeSet(tuple(space._store.put(prior) for prior in saved.priors), saved.gains)
         occupancy = build_occupancy(saved.priors, saved.config.geometry)
         space._device.load(saved.parameters)
-        space.learn(Prepared(Scene(shown.priors, saved.lattice, occupancy, saved.gains), shown))
+        space.learn(PreparedScene(TrainingScene(shown.priors, saved.lattice, occupancy, saved.gains), shown))
         space.show(shown)
         progress = saved.progress
         space._schedule = Schedule(saved.config.train, progress.refresh, progress.iteration)

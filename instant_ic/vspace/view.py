@@ -166,7 +166,7 @@ def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: b
     return continue_unseen(image[:, around], depth_m[:, around], confidence[:, around])[:, side : side + width]
 
 
-class Drawn(abc.ABC):
+class RayRenderer(abc.ABC):
     """A space that is rendered ray by ray: its images in each projection."""
 
     @abc.abstractmethod

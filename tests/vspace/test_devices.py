@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from instant_ic.experiments import box_room
-from instant_ic.vspace import FieldConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig, devices
+from instant_ic.vspace import FieldConfig, SpaceState, TrainConfig, VirtualSpace, VirtualSpaceConfig, devices
 from instant_ic.vspace.devices import DeviceError, check_device, make_device
 from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.torch_device import TorchDevice
@@ -107,7 +107,7 @@ def test_kernels_that_fail_are_left_for_plain_torch_with_a_warning(gpu, fault, w
     picture = box_room.panorama(np.eye(4), 32)
     space.set_keyframe(picture.rgb, picture.depth_m, np.eye(4), 0.05)
     assert space.train(iterations=2).iterations == 2  # and it works
-    assert space.status.state != State.FAILED
+    assert space.status.state != SpaceState.FAILED
     with pytest.raises(DeviceError, match="device is triton, but the Triton kernels do not work"):
         make_device(with_device("triton"))
     device, warning = make_device(with_device("auto"))

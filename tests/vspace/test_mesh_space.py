@@ -9,7 +9,7 @@ import pytest
 from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.vspace import KeyframeError, State, VirtualSpaceConfig
+from instant_ic.vspace import KeyframeError, SpaceState, VirtualSpaceConfig
 from instant_ic.vspace.mesh_file import MeshError, load_mesh
 from instant_ic.vspace.mesh_space import MeshSpace, make_space
 from instant_ic.vspace.space import VirtualSpace
@@ -124,7 +124,7 @@ def test_a_scanned_room_looks_like_its_panorama(room):
     path, picture, camera = room
     space = space_of(path)
     assert isinstance(space, MeshSpace)
-    assert space.status.state == State.READY
+    assert space.status.state == SpaceState.READY
     assert math.isnan(space.expected_psnr_db(camera))
     before = space.render_equirect(camera, 128)
     dim = np.rint(picture.rgb * [0.5, 0.7, 0.6]).astype(np.uint8)  # the light has changed since the scan

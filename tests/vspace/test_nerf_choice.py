@@ -8,8 +8,8 @@ import pytest
 
 from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.vspace import FieldConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace.choice import Choice, Trial, gain_db
+from instant_ic.vspace import FieldConfig, SpaceState, TrainConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.choice import Choice, WarpTrial, gain_db
 from instant_ic.vspace.config import ReadinessConfig
 
 CONFIG = VirtualSpaceConfig(
@@ -27,14 +27,14 @@ def flat(value, pixels=4):
 def test_the_gain_by_hand():
     # Errors of four pixels: the warp's 0.2² = 0.04; the third is not judged, the fourth not rendered by the field.
     judged = np.array([True, True, False, True])
-    trial = Trial.of(None, flat(0.5), judged, flat(0.7))
+    trial = WarpTrial.of(None, flat(0.5), judged, flat(0.7))
     assert trial.warp_error[:2] == pytest.approx(0.04) and math.isnan(trial.warp_error[2])
     colour = flat(0.5)
     colour[0], colour[2:] = 0.6, 0.0  # errors 0.01 and 0 where both count: 0.08 against 0.01 in sum
     drawing = colour, np.ones(4, np.float32), np.array([1, 1, 1, 0], np.float32)
     assert gain_db([trial], [drawing]) == pytest.approx(10 * math.log10(8), abs=1e-3)
     # A second image where the field is off by 0.3: 0.08 + 4 · 0.01 against 0.01 + 4 · 0.09.
-    other = Trial.of(None, flat(0.5), np.ones(4, bool), flat(0.6))
+    other = WarpTrial.of(None, flat(0.5), np.ones(4, bool), flat(0.6))
     off = flat(0.8), np.ones(4, np.float32), np.ones(4, np.float32)
     assert gain_db([trial, other], [drawing, off]) == pytest.approx(10 * math.log10(0.12 / 0.37), abs=1e-3)
     assert math.isnan(gain_db([], []))
@@ -88,7 +88,7 @@ def test_a_field_that_loses_is_not_shown_and_stops():
     space.train()
     status = space.status
     assert not status.shows_field and status.gain_db < 0
-    assert status.converged and status.state == State.READY
+    assert status.converged and status.state == SpaceState.READY
 
 
 def test_a_field_that_wins_is_shown_until_it_loses(monkeypatch):

@@ -12,7 +12,7 @@ from instant_ic.geometry.projections import CUBE_FACES
 from instant_ic.vspace import FieldConfig, TrainConfig
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf import kernels, march, reference
-from instant_ic.vspace.nerf.field import FieldParameters, Lattice, Scene, StackedPriors, ray_sources
+from instant_ic.vspace.nerf.field import FieldParameters, Lattice, StackedPriors, TrainingScene, ray_sources
 from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.vspace.nerf.reference import TorchField
@@ -130,7 +130,7 @@ def scene():
     depth = picture.depth_m.copy()
     depth[60:64, 40:60] = 0  # a patch without depth
     prior = prepare(picture.rgb, depth, pose, 0.02, GeometryConfig(), 2048)
-    return Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy((prior,), GeometryConfig()))
+    return TrainingScene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy((prior,), GeometryConfig()))
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def two_keyframes():
     occupancy = build_occupancy(priors, config)
     priors[1].content[:, :64] = MOVED
     gains = np.array([[1, 1, 1], [1.25, 1.25, 1.2]], F)
-    return Scene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), occupancy, gains)
+    return TrainingScene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), occupancy, gains)
 
 
 def sampled(scene, uniform, columns, rows, sources):
@@ -212,11 +212,11 @@ def test_half_of_the_rays_are_the_newests():
 def test_a_scene_checks_its_keyframes(scene, two_keyframes):
     lattice, grid = scene.lattice, scene.occupancy
     with pytest.raises(ValueError, match="needs a keyframe"):
-        Scene((), lattice, grid)
+        TrainingScene((), lattice, grid)
     with pytest.raises(ValueError, match="one size"):
-        Scene((scene.prior, two_keyframes.prior), lattice, grid)
+        TrainingScene((scene.prior, two_keyframes.prior), lattice, grid)
     with pytest.raises(ValueError, match=r"\(1, 3\)"):
-        Scene((scene.prior,), lattice, grid, np.ones((2, 3), F))
+        TrainingScene((scene.prior,), lattice, grid, np.ones((2, 3), F))
 
 
 def test_a_point_belongs_to_the_keyframe_that_sees_it(two_keyframes):
@@ -337,7 +337,9 @@ def test_the_march_by_hand():
     # 2 m round the camera, the band 5 %.
     rgb = np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8)
     prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(), 2048)
-    scene = Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy((prior,), GeometryConfig()))
+    scene = TrainingScene(
+        (prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy((prior,), GeometryConfig())
+    )
     config = FieldConfig(levels=2, log2_table=10, hidden=4)
     rays = perspective_rays(np.eye(4), 32, 16, 1.0)
     for distance in (-1.0, 1.0):

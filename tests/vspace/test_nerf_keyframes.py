@@ -10,7 +10,7 @@ import pytest
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.vspace import FieldConfig, ReadinessConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace import FieldConfig, ReadinessConfig, SpaceState, TrainConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.agreement import exposure_gain, exposure_gains, moved
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import MOVED, ROOM, prepare
@@ -52,7 +52,7 @@ def test_the_newest_so_many_are_kept(keyframes):
     # A new one is shown from the first moment, and what was fit to show stays so.
     picture = box_room.panorama(FIRST, 96)
     space.set_keyframe(picture.rgb, picture.depth_m, FIRST, 0.02)
-    assert (space.status.state, space.status.refreshing) == (State.READY, True)
+    assert (space.status.state, space.status.refreshing) == (SpaceState.READY, True)
     assert [prior.map_from_camera[0, 3] for prior in space.keyframes] == [-1.5, 0.5, 0.0][:keyframes]
     space.train()
     assert not space.status.refreshing

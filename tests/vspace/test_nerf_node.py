@@ -21,7 +21,7 @@ from instant_ic.msg import (
     pose_message,
 )
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
-from instant_ic.vspace.jobs import Incoming, Job, JobKind, load_robot_mask
+from instant_ic.vspace.jobs import IncomingKeyframe, Job, JobKind, load_robot_mask
 from nodes.nerf import NerfConfig, NerfNode
 
 EMPTY, TRAINING, READY = 0, 1, 2
@@ -330,7 +330,7 @@ def test_pictures_go_on_while_a_keyframe_is_prepared():
 
         node.work.space.prepare = slow
         second = keyframe_message(2)
-        job = Job(JobKind.PREPARE, Incoming(2, second, 0, lambda: decode_keyframe(second)))
+        job = Job(JobKind.PREPARE, IncomingKeyframe(2, second, 0, lambda: decode_keyframe(second)))
         thread = threading.Thread(target=lambda: results.append(node.work.run(job)))
         thread.start()
         for number in (1, 2, 3):

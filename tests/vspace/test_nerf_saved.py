@@ -14,7 +14,7 @@ from instant_ic.vspace import (
     FieldConfig,
     NotReadyError,
     SpaceFileError,
-    State,
+    SpaceState,
     TrainConfig,
     VirtualSpace,
     VirtualSpaceConfig,
@@ -75,14 +75,14 @@ def test_what_pictures_show_is_saved(tmp_path):
     space = VirtualSpace(CONFIG)
     keyframe(space, CAMERA)
     space.train()
-    assert space.status.state == State.READY
+    assert space.status.state == SpaceState.READY
     keyframe(space, ASIDE)
     space.train(iterations=1)
     assert space.status.refreshing
     space.save(tmp_path)
     loaded = VirtualSpace.load(tmp_path)
     assert same(space, loaded)
-    assert (loaded.status.state, loaded.status.refreshing, loaded.status.iterations) == (State.READY, True, 1)
+    assert (loaded.status.state, loaded.status.refreshing, loaded.status.iterations) == (SpaceState.READY, True, 1)
     assert np.array_equal(loaded.keyframe.map_from_camera, ASIDE)
 
 

@@ -15,7 +15,7 @@ from instant_ic.vspace import (
     NotReadyError,
     PictureConfig,
     ReadinessConfig,
-    State,
+    SpaceState,
     TrainConfig,
     VirtualSpace,
     VirtualSpaceConfig,
@@ -99,7 +99,7 @@ def _looking(direction):
 
 
 def test_training_stops_at_its_end_and_becomes_ready(space):
-    assert space.status.state == State.READY
+    assert space.status.state == SpaceState.READY
     assert space.status.converged
     stats = space.train(budget_ms=1000)
     assert stats.iterations == 0
@@ -121,7 +121,7 @@ def test_a_budget_is_kept_to_one_iteration():
 def test_readiness_by_psnr_plateau_and_radius():
     rule = ReadinessConfig(psnr_db=90, plateau_iterations=20, plateau_db=50, max_radius_m=9)
     space = trained(20, VirtualSpaceConfig(device="cpu", field=CONFIG.field, train=CONFIG.train, readiness=rule), 0.05)
-    assert space.status.state == State.TRAINING
+    assert space.status.state == SpaceState.TRAINING
     assert space.status.ready_radius_m == 0
     space.train(iterations=5)  # the 21st value shows less than 50 dB gained over 20 iterations
     assert space.status.ready_iterations == 21
@@ -151,16 +151,16 @@ def test_a_second_keyframe_goes_on_from_the_first():
 
 def test_a_space_that_is_fit_stays_so_and_the_next_keyframe_is_shown_at_once():
     space = trained(120)
-    assert space.status.state == State.READY
+    assert space.status.state == SpaceState.READY
     refreshed(space)
     status = space.status
-    assert (status.state, status.refreshing, status.ready_iterations) == (State.READY, True, 0)
+    assert (status.state, status.refreshing, status.ready_iterations) == (SpaceState.READY, True, 0)
     assert np.array_equal(space.keyframe.map_from_camera, NEXT)
     truth = box_room.perspective(NEXT, 80, 45, 1.5).rgb
     assert psnr_db(space.render(NEXT, 80, 45, 1.5).rgb, truth) > 23
     space.train()
     status = space.status
-    assert (status.state, status.refreshing) == (State.READY, False)
+    assert (status.state, status.refreshing) == (SpaceState.READY, False)
     assert 5 <= status.ready_iterations < 120
 
 
@@ -195,7 +195,7 @@ def test_parts_that_disagree_change_at_once_and_the_others_pass():
 
 def test_a_keyframe_that_replaces_one_that_is_not_fit_is_shown_at_once():
     space = refreshed(trained(2))
-    assert (space.status.state, space.status.refreshing) == (State.TRAINING, False)
+    assert (space.status.state, space.status.refreshing) == (SpaceState.TRAINING, False)
     assert np.array_equal(space.keyframe.map_from_camera, NEXT)
 
 
@@ -217,7 +217,7 @@ def test_another_scale_starts_anew():
 
 def test_nothing_before_the_first_keyframe():
     space = VirtualSpace(CONFIG)
-    assert space.status.state == State.EMPTY
+    assert space.status.state == SpaceState.EMPTY
     with pytest.raises(NotReadyError):
         space.train(10)
     with pytest.raises(NotReadyError):
@@ -341,7 +341,7 @@ def test_a_gpu_that_was_asked_for_fails_aloud_and_the_next_keyframe_recovers(mon
         assert np.array_equal(space.render(CAMERA, 64, 36, 1.5).rgb, before.rgb)
     refreshed(space)
     assert space.train(iterations=3).psnr_db > 5
-    assert space.status.state == State.TRAINING
+    assert space.status.state == SpaceState.TRAINING
 
 
 @pytest.mark.parametrize("keyframes", [1, 2])

@@ -11,7 +11,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf import volume, volume_reference
-from instant_ic.vspace.nerf.field import VOLUME_SAMPLES, FieldParameters, Lattice, Scene, ray_sources
+from instant_ic.vspace.nerf.field import VOLUME_SAMPLES, FieldParameters, Lattice, TrainingScene, ray_sources
 from instant_ic.vspace.nerf.kernels import no_marks
 from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.occupancy import build_occupancy
@@ -34,7 +34,7 @@ def scene():
     ]
     occupancy = build_occupancy(priors, GeometryConfig())
     priors[1].content[:, :64] = MOVED
-    return Scene(tuple(priors), Lattice.for_prior(priors[0], FIELD), occupancy)
+    return TrainingScene(tuple(priors), Lattice.for_prior(priors[0], FIELD), occupancy)
 
 
 def random_parameters():
@@ -141,7 +141,7 @@ def test_a_dense_wall_is_drawn_where_it_stands():
     # One that lets nearly everything through: the mean of the band, which is the guiding depth.
     rgb = np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8)
     prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(), 2048)
-    scene = Scene((prior,), Lattice.for_prior(prior, FIELD), build_occupancy([prior], GeometryConfig()))
+    scene = TrainingScene((prior,), Lattice.for_prior(prior, FIELD), build_occupancy([prior], GeometryConfig()))
     rays = perspective_rays(np.eye(4), 32, 16, 1.0)
     for raw, expected in ((6.0, 2 * (1 - 0.05 * 7 / 8)), (-8.0, 2.0)):
         p = FieldParameters.random(FIELD, 1)

@@ -24,7 +24,7 @@ from instant_ic.vspace.config import GeometryConfig  # noqa: E402
 from instant_ic.vspace.devices import check_device  # noqa: E402
 from instant_ic.vspace.nerf import reference  # noqa: E402
 from instant_ic.vspace.nerf import triton_kernels as kernels  # noqa: E402
-from instant_ic.vspace.nerf.field import FieldParameters, Lattice, Scene, ray_sources  # noqa: E402
+from instant_ic.vspace.nerf.field import FieldParameters, Lattice, TrainingScene, ray_sources  # noqa: E402
 from instant_ic.vspace.nerf.occupancy import build_occupancy  # noqa: E402
 from instant_ic.vspace.nerf.reference import TorchField  # noqa: E402
 from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors  # noqa: E402
@@ -53,7 +53,7 @@ def room_scene(keyframes=1):
         priors.append(prepare(picture.rgb, depth, pose, 0.02, GeometryConfig(), 2048))
     gains = np.array([[1, 1, 1], [0.9, 1.1, 1.2]], F)[:keyframes]
     occupancy = build_occupancy(priors, GeometryConfig(cell_m=0.2))
-    return Scene(tuple(priors), Lattice.for_prior(priors[0], FIELD), occupancy, gains)
+    return TrainingScene(tuple(priors), Lattice.for_prior(priors[0], FIELD), occupancy, gains)
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["one keyframe", "two"])

@@ -12,7 +12,7 @@ from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.vspace import (
     FieldConfig,
     KeyframeError,
-    State,
+    SpaceState,
     TrainConfig,
     VirtualSpace,
     VirtualSpaceConfig,
@@ -167,7 +167,7 @@ def test_a_space_shows_the_warp_from_the_first_moment(room, warp):
     seen = first.confidence > 0
     assert np.array_equal(first.rgb[seen], warp.render(pose, 96, 54, FOV).rgb[seen])
     assert psnr_db(first.rgb, truth.rgb) > 24
-    assert space.status.state == State.TRAINING
+    assert space.status.state == SpaceState.TRAINING
     space.train(iterations=1)
     assert np.array_equal(space.render(pose, 96, 54, FOV).rgb, first.rgb)  # no jump while the field is worse
 
@@ -180,7 +180,7 @@ def test_the_warp_as_the_source_is_ready_at_once_and_trains_nothing(room):
     assert space.train(iterations=10).iterations == 0
     assert np.array_equal(space.parameters().table, before)
     status = space.status
-    assert (status.state, status.converged, status.iterations) == (State.READY, True, 0)
+    assert (status.state, status.converged, status.iterations) == (SpaceState.READY, True, 0)
     other = camera @ pose_matrix(0.3)
     moved = box_room.panorama(other, 128)
     space.set_keyframe(moved.rgb, moved.depth_m, other, 0.02)  # the next one takes over at once

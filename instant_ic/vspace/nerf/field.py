@@ -97,7 +97,7 @@ class FieldParameters:
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrainingScene:
     """Input of training and rendering: keyframes, lattice and occupancy.
 
     Attributes:
@@ -180,7 +180,7 @@ class StackedPriors:
     gains: Floats
 
     @classmethod
-    def of(cls, scene: Scene) -> StackedPriors:
+    def of(cls, scene: TrainingScene) -> StackedPriors:
         def stacked(key: str) -> Any:
             if len(scene.priors) == 1:
                 return getattr(scene.prior, key)[None]  # no copy
@@ -240,7 +240,7 @@ class Device(Protocol):
     def load(self, parameters: FieldParameters) -> None:
         """Load parameters and reset the optimiser's moments."""
 
-    def set_scene(self, scene: Scene) -> None:
+    def set_scene(self, scene: TrainingScene) -> None:
         """Train and render this scene from now on, with the present parameters; resets the moments."""
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:

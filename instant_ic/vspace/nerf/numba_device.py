@@ -17,8 +17,8 @@ from instant_ic.vspace.nerf.field import (
     FieldParameters,
     Floats,
     Rays,
-    Scene,
     StackedPriors,
+    TrainingScene,
     adam_step_size,
     level_rates,
     ray_sources,
@@ -61,7 +61,7 @@ class NumbaDevice:
         self._network_moments = tuple((np.zeros_like(a), np.zeros_like(a)) for a in parameters.network())
         self._steps = 0
 
-    def set_scene(self, scene: Scene) -> None:
+    def set_scene(self, scene: TrainingScene) -> None:
         self._scene, self._focus, self._priors = scene, scene.focus, StackedPriors.of(scene)
         for moments in (self._table_moments, *self._network_moments):
             for moment in moments:

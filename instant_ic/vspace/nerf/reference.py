@@ -35,7 +35,7 @@ LOOKED_THROUGH = 3.0
 
 @dataclass
 class TorchField:
-    """Parameters and lattice as tensors; shapes as in ``field.FieldParameters``, ``field.Lattice``, ``field.Scene``."""
+    """A field's parameters, lattice and keyframes as tensors, in the shapes of the dataclasses of ``field``."""
 
     table: Tensor
     w1: Tensor

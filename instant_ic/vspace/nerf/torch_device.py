@@ -15,7 +15,7 @@ from instant_ic.vspace.nerf.field import (
     FieldParameters,
     Floats,
     Rays,
-    Scene,
+    TrainingScene,
     depth_trust,
     level_rates,
     ray_sources,
@@ -28,7 +28,7 @@ from instant_ic.vspace.view import LensRays
 RAYS_AT_ONCE = 1 << 18
 
 
-def torch_priors(scene: Scene, device: str) -> list[TorchPrior]:
+def torch_priors(scene: TrainingScene, device: str) -> list[TorchPrior]:
     """A scene's keyframes as tensors, newest first."""
 
     def tensor(array: Any, kind: torch.dtype = torch.float32) -> Tensor:
@@ -74,7 +74,7 @@ class TorchDevice:
         self._field = TorchField(*tensors, *lattice)
         self._state = self._fresh_state()
 
-    def set_scene(self, scene: Scene) -> None:
+    def set_scene(self, scene: TrainingScene) -> None:
         grid, lattice = scene.occupancy, scene.lattice
         arrays = (grid.distance, grid.origin, lattice.cells_per_m, lattice.origin, scene.focus)
         # All that needs memory comes first: where there is none, the old scene stays whole.

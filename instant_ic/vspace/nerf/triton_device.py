@@ -22,8 +22,8 @@ from instant_ic.vspace.nerf.field import (
     FieldParameters,
     Floats,
     Rays,
-    Scene,
     StackedPriors,
+    TrainingScene,
     adam_step_size,
     level_rates,
     ray_sources,
@@ -68,7 +68,7 @@ class _GpuScene:
 
 
 @dataclass
-class _Step:
+class _StepBuffers:
     """Buffers of a training step: they stay where they are, as the graph has their addresses."""
 
     uniform: Tensor
@@ -128,7 +128,7 @@ class TritonDevice:
         self._p = self._uploaded(parameters)
         self._forget()
 
-    def set_scene(self, scene: Scene) -> None:
+    def set_scene(self, scene: TrainingScene) -> None:
         self._scene = self._uploaded_scene(scene)  # all that needs memory first: without it the old scene stays whole
         self._forget()
 
@@ -237,7 +237,7 @@ class TritonDevice:
         network = np.concatenate([array.reshape(-1) for array in parameters.network()])
         return _Parameters(master, master.half(), self._tensor(network))
 
-    def _uploaded_scene(self, scene: Scene) -> _GpuScene:
+    def _uploaded_scene(self, scene: TrainingScene) -> _GpuScene:
         stacked = StackedPriors.of(scene)
         keys = (
             *("rgb", "inverse_depth", "known", "depth_edge", "usable", "trust"),
@@ -256,14 +256,14 @@ class TritonDevice:
             keyframes=len(scene.priors),
         )
 
-    def _new_buffers(self) -> _Step:
+    def _new_buffers(self) -> _StepBuffers:
         rays = self._train.ray_columns * self._train.ray_rows
 
         def zeros(*shape: int, kind: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(shape, dtype=kind, device=self._device)
 
         table, network = len(self._p.master), len(self._p.network)
-        return _Step(
+        return _StepBuffers(
             uniform=zeros(rays, 3),
             sources=zeros(rays // TILE, kind=torch.int32),
             rates=zeros(self._shape["LEVELS"] + 1),
