@@ -271,7 +271,7 @@ class VirtualSpace(RayRenderer):
         self._store.keep(itertools.chain(*shown, self._held))
 
     def scene_of(self, prepared: KeyframeSet) -> PreparedScene:
-        """Build the scene to train on. May run in another thread, as ``prepare``, before the next keyframe is prepared."""
+        """Build the scene to train on; may run in the thread of ``prepare``, before the next keyframe."""
         priors, config = prepared.priors, self.config
         lattice, scene = Lattice.for_prior(priors[0], config.field), self._scene
         if scene is not None and scene.lattice.suits(lattice):
