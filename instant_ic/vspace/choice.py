@@ -37,7 +37,14 @@ class WarpTrial:
 
     @classmethod
     def of(cls, rays: Rays, truth: Floats, judged: NDArray[np.bool_], warped: Floats) -> WarpTrial:
-        """Of the warp's colours (P, 3); ``judged`` (P,): both sides have seen the place."""
+        """Compare the warp's colours with the truth.
+
+        Args:
+            rays: P rays of the view.
+            truth: true colours, 0 to 1, (P, 3).
+            judged: pixels that both the warp and the older keyframe have seen, (P,).
+            warped: the warp's colours, (P, 3).
+        """
         return cls(rays, truth, np.where(judged, _error(warped, truth), np.float32(np.nan)))
 
 

@@ -78,7 +78,7 @@ class SpaceStatus:
     """Distance from the keyframe up to which views may be shown."""
     converged: bool
     source: str
-    """What is shown: ``field``, ``warp`` or ``mesh``."""
+    """Source of the views: ``field``, ``warp`` or ``mesh``."""
     device: str
     warning: str = ""
     """Problem of the device; empty when there is none."""
