@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import perspective_directions, sample_equirect
+from instant_ic.slam.occupancy import OccupancyGrid
 
 Image: TypeAlias = NDArray[np.uint8]
 
@@ -63,21 +64,20 @@ def save_depth(path: Path, panorama: NDArray[np.uint8], depth_m: NDArray[np.floa
 
 def save_map(
     path: Path | io.BytesIO,
-    grid: NDArray[np.int8],
-    resolution_m: float,
-    origin_xy: tuple[float, float],
+    grid: OccupancyGrid,
     robot: tuple[float, float, float] | None = None,
     paths: dict[str, NDArray[np.float64]] | None = None,
 ) -> None:
-    """Save an occupancy grid (−1 unknown, 0..100) with the robot's pose (x, y, yaw) and named paths (N, ≥2)."""
+    """Save a map with the robot's pose (x, y, yaw) and named paths (N, ≥2)."""
     figure, axes = new_figure(1, 1, (7.0, 7.0))
     axis = axes[0, 0]
     # Three tones by the sign of the evidence, shaded slightly by its strength: a standing robot provides weak evidence
     # everywhere, which a linear scale would show as grey on grey.
-    shade = np.where(grid < 50, 1.0 - 0.15 * grid / 50.0, 0.35 * (100 - grid) / 50.0)
-    shade = np.where(grid < 0, 0.7, shade)
-    height, width = grid.shape
-    x0, y0 = origin_xy
+    values, resolution_m = grid.values, grid.resolution
+    shade = np.where(values < 50, 1.0 - 0.15 * values / 50.0, 0.35 * (100 - values) / 50.0)
+    shade = np.where(values < 0, 0.7, shade)
+    height, width = values.shape
+    x0, y0 = grid.origin
     extent = (x0, x0 + width * resolution_m, y0, y0 + height * resolution_m)
     axis.imshow(shade, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
     for name, points in (paths or {}).items():
@@ -86,7 +86,7 @@ def save_map(
         x, y, yaw = robot
         axis.plot(x, y, "o", color="tab:red", markersize=5, label="r-bot")
         axis.arrow(x, y, 0.5 * np.cos(yaw), 0.5 * np.sin(yaw), color="tab:red", width=0.03)
-    seen = np.argwhere(grid >= 0)
+    seen = np.argwhere(values >= 0)
     if len(seen):
         (r0, c0), (r1, c1) = seen.min(axis=0), seen.max(axis=0)
         axis.set_xlim(x0 + (c0 - 10) * resolution_m, x0 + (c1 + 10) * resolution_m)

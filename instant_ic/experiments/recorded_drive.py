@@ -17,6 +17,7 @@ from instant_ic.experiments.teleop_figures import STEP_S, TeleopDrive, judge
 from instant_ic.experiments.teleop_plot import draw_modes
 from instant_ic.experiments.teleop_stack import Log
 from instant_ic.geometry.poses import pose_matrix
+from instant_ic.slam.occupancy import OccupancyGrid
 
 STATE, MAP, CAMERA, KEYFRAME = "/ic/state", "/map", "/camera/image/compressed", "/keyframe"
 TYPES = {STATE: ("ControlState",), MAP: ("OccupancyGrid",), CAMERA: ("CompressedImage",), KEYFRAME: ("Keyframe",)}
@@ -184,14 +185,14 @@ def _plot(drive: TeleopDrive, grid: Any) -> bytes:
     }
     places = np.concatenate([track[:, :2] for track in tracks.values()])
     corner = places.min(axis=0) - 1.5
-    cells, resolution, origin = np.zeros((1, 1), np.int8), 1.0, (float(corner[0]), float(corner[1]))
     if grid is not None:
         cells, resolution, origin = grid_array(grid)
+        background = OccupancyGrid(cells, resolution, np.array(origin))
     else:
         columns, rows = np.ceil(places.max(axis=0) + 1.5 - corner).astype(int)
-        cells = np.zeros((rows, columns), np.int8)
+        background = OccupancyGrid(np.zeros((rows, columns), np.int8), 1.0, corner)
     out = io.BytesIO()
-    save_map(out, cells, resolution, origin, None, tracks)
+    save_map(out, background, None, tracks)
     return out.getvalue()
 
 

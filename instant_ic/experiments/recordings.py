@@ -30,6 +30,7 @@ from instant_ic.experiments.stack import Stack, StackError, free_ports
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import inverse, pose_matrix, yaw_of
 from instant_ic.msg import grid_array, image_array, matrix_from_pose, message_type, pose_message, stamp_ns, to_time
+from instant_ic.slam.occupancy import OccupancyGrid
 from instant_ic.util.pace import read as read_pace
 
 _YAWS_DEG = (0, 90, 180, -90)
@@ -173,7 +174,8 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     save_depth(out / "depth.png", photo, depth, f"depth: {keyframe.message}")
     grid, resolution, origin = grid_array(maps[-1])
     robot = matrix_from_pose(poses[-1])
-    save_map(out / "map.png", grid, resolution, origin, (robot[0, 3], robot[1, 3], yaw_of(robot)))
+    shown = OccupancyGrid(grid, resolution, np.array(origin))
+    save_map(out / "map.png", shown, (robot[0, 3], robot[1, 3], yaw_of(robot)))
     span_s = (stamp_ns(scans[-1]) - stamp_ns(scans[0])) / 1e9
     return {
         "scans": len(scans),

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import resource
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,10 +21,13 @@ from pathlib import Path
 import numpy as np
 
 from instant_ic.experiments.slam_logs import LogEntry, LogError, open_log
-from instant_ic.geometry.poses import compose2, relative2, wrap_angle
+from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, Scan, SlamConfig, SlamResult
 from instant_ic.slam.grid_slam import Anchor, warm_up
 from instant_ic.slam.scan import FloatArray
+
+MATCH_S = 0.006
+"""Largest difference of two times, in seconds, that count as the same."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +40,15 @@ class Relations:
     def __len__(self) -> int:
         return len(self.times_s)
 
-    def at_stamps(self, stamps_s: FloatArray, tolerance_s: float) -> Relations:
-        """Relations with both ends within ``tolerance_s`` of one of ``stamps_s`` (m,)."""
+    def at_stamps(self, stamps_s: FloatArray) -> Relations:
+        """Return the relations with both ends within ``MATCH_S`` of one of ``stamps_s`` (m,)."""
         stamps = np.sort(stamps_s)
         if len(stamps) == 0:
             return Relations(self.times_s[:0], self.poses[:0])
         after = np.clip(np.searchsorted(stamps, self.times_s), 0, len(stamps) - 1)
         before = np.maximum(after - 1, 0)
         gap = np.minimum(np.abs(stamps[after] - self.times_s), np.abs(stamps[before] - self.times_s))
-        keep = (gap <= tolerance_s).all(axis=1)
+        keep = (gap <= MATCH_S).all(axis=1)
         return Relations(self.times_s[keep], self.poses[keep])
 
 
@@ -71,19 +75,19 @@ def read_relations(path: str | Path) -> Relations:
     """Read a `.relations` file: ``t1 t2 x y z roll pitch yaw`` per line.
 
     Raises:
-        LogError: with the line number.
+        LogError: a line cannot be read; the message names it.
     """
-    rows = _read_columns(path, 8, "a relation")
+    rows = _read_columns(path, 8, "relation")
     return Relations(rows[:, :2], rows[:, [2, 3, 7]])
 
 
 def read_stamps(path: str | Path) -> FloatArray:
     """Read times in seconds, one per line, (n,)."""
-    return _read_columns(path, 1, "a stamp")[:, 0]
+    return _read_columns(path, 1, "stamp")[:, 0]
 
 
 def interpolate_trajectory(trajectory: FloatArray, times_s: FloatArray) -> FloatArray:
-    """Poses (m, 3) at ``times_s`` (m,) of a trajectory ``t x y yaw`` (n, 4), times ascending; clamped at its ends."""
+    """Interpolate a trajectory ``t x y yaw`` (n, 4) at times (m,), clamped at its ends; return poses (m, 3)."""
     yaw = np.interp(times_s, trajectory[:, 0], np.unwrap(trajectory[:, 3]))
     x = np.interp(times_s, trajectory[:, 0], trajectory[:, 1])
     y = np.interp(times_s, trajectory[:, 0], trajectory[:, 2])
@@ -91,14 +95,13 @@ def interpolate_trajectory(trajectory: FloatArray, times_s: FloatArray) -> Float
 
 
 def relation_error(trajectory: FloatArray, relations: Relations) -> dict[str, float | int]:
-    """Figures of the errors of a trajectory ``t x y yaw`` (n, 4) against the relations within its time range.
+    """Compare a trajectory ``t x y yaw`` (n, 4) with the relations within its time range; return figures.
 
     Raises:
         ValueError: no relation is within the trajectory's time range.
     """
-    inside = ((relations.times_s >= trajectory[0, 0] - 1e-3) & (relations.times_s <= trajectory[-1, 0] + 1e-3)).all(
-        axis=1
-    )
+    begin_s, end_s = trajectory[0, 0] - 1e-3, trajectory[-1, 0] + 1e-3
+    inside = ((relations.times_s >= begin_s) & (relations.times_s <= end_s)).all(axis=1)
     if not inside.any():
         raise ValueError(
             f"none of {len(relations)} relations lies within the trajectory's time: is it this log's file?"
@@ -106,11 +109,8 @@ def relation_error(trajectory: FloatArray, relations: Relations) -> dict[str, fl
     times, truth = relations.times_s[inside], relations.poses[inside]
     first = interpolate_trajectory(trajectory, times[:, 0])
     second = interpolate_trajectory(trajectory, times[:, 1])
-    errors = []
-    for a, b, relation in zip(first, second, truth, strict=True):
-        rest = relative2(relation, relative2(a, b))
-        errors.append((math.hypot(rest[0], rest[1]), math.degrees(abs(wrap_angle(float(rest[2]))))))
-    translation_m, rotation_deg = np.ascontiguousarray(np.array(errors).T)
+    found = np.array([relative2(a, b) for a, b in zip(first, second, strict=True)])
+    translation_m, rotation_deg = trajectory_errors(found, truth)
     return {
         "translation_mean_m": float(translation_m.mean()),
         "translation_std_m": float(translation_m.std()),
@@ -118,26 +118,19 @@ def relation_error(trajectory: FloatArray, relations: Relations) -> dict[str, fl
         "translation_max_m": float(translation_m.max()),
         "rotation_mean_deg": float(rotation_deg.mean()),
         "rotation_std_deg": float(rotation_deg.std()),
-        "relations": len(errors),
+        "relations": len(times),
     }
 
 
-def relation_times(entries: Sequence[LogEntry], relations: Relations, tolerance_s: float) -> FloatArray:
-    """Scan times (n,) in the clock that the relations use; the log may have two."""
-    own = np.array([entry.scan.stamp_ns * 1e-9 for entry in entries])
+def log_error(entries: Sequence[LogEntry], poses: FloatArray, relations: Relations) -> dict[str, float | int]:
+    """Return ``relation_error`` of the poses (n, 3) of a log's scans.
+
+    A log may have two clocks. The one that matches more relations counts.
+    """
+    times = np.array([entry.scan.stamp_ns * 1e-9 for entry in entries])
     logger = np.array([np.nan if entry.logger_s is None else entry.logger_s for entry in entries])
-    if np.isfinite(logger).all() and len(relations.at_stamps(logger, tolerance_s)) > len(
-        relations.at_stamps(own, tolerance_s)
-    ):
-        return logger
-    return own
-
-
-def log_error(
-    entries: Sequence[LogEntry], poses: FloatArray, relations: Relations, tolerance_s: float = 0.006
-) -> dict[str, float | int]:
-    """``relation_error`` of the poses (n, 3) of a log's scans."""
-    times = relation_times(entries, relations, tolerance_s)
+    if np.isfinite(logger).all() and len(relations.at_stamps(logger)) > len(relations.at_stamps(times)):
+        times = logger
     order = np.argsort(times, kind="stable")
     return relation_error(np.column_stack([times, poses])[order], relations)
 
@@ -165,7 +158,7 @@ class LogResult:
     slam: GridSlam
 
     def report(self) -> dict[str, object]:
-        """Figures for JSON; the mean counts all CPU time, the 99th percentile that of the scan thread."""
+        """Return figures for JSON; the mean counts all CPU time, the 99th percentile that of the scan thread."""
         return {
             "scans": len(self.trajectory),
             "cpu_ms_per_scan_mean": float((self.cpu_ms + self.background_ms).mean()),
@@ -193,7 +186,8 @@ def run_log(
     one millisecond after it; the trajectory keeps the original stamp.
 
     Args:
-        entries: of `instant_ic.experiments.slam_logs.read_log`, or compatible.
+        entries: scans with odometry, for example of ``slam_logs.read_log``.
+        config: configuration of the SLAM; None: its defaults.
         use_wheel_odom: False ignores the log's odometry.
         on_scan: called with the number of processed scans, for a progress bar.
 
@@ -208,7 +202,7 @@ def run_log(
     cpu_ms: list[float] = []
     background_ms: list[float] = []
     scores: list[float] = []
-    statuses: dict[str, int] = {}
+    statuses: Counter[str] = Counter()
     for entry, scan in ascending(entries):
         begin = time.thread_time()
         result = slam.process(scan, entry.odom_pose if use_wheel_odom else None, entry.base_from_laser)
@@ -224,7 +218,7 @@ def run_log(
         stamps.append(entry.scan.stamp_ns * 1e-9)
         online.append(result.map_from_base)
         scores.append(result.score)
-        statuses[result.status.value] = statuses.get(result.status.value, 0) + 1
+        statuses[result.status.value] += 1
         if on_scan is not None:
             on_scan(len(online))
     if not online:
@@ -236,13 +230,13 @@ def run_log(
         np.array(cpu_ms),
         np.array(background_ms),
         np.array(scores),
-        statuses,
+        dict(statuses),
         slam,
     )
 
 
 def ascending(entries: Iterable[LogEntry], last_ns: int | None = None) -> Iterator[tuple[LogEntry, Scan]]:
-    """Each entry with its scan; a scan that is not newer than the previous one is stamped a millisecond after it."""
+    """Yield each entry and its scan, stamped a millisecond after the previous one if it is not newer."""
     for entry in entries:
         scan = entry.scan
         if last_ns is not None and scan.stamp_ns <= last_ns:
@@ -252,14 +246,14 @@ def ascending(entries: Iterable[LogEntry], last_ns: int | None = None) -> Iterat
 
 
 def from_anchor(result: SlamResult) -> tuple[Anchor | None, FloatArray]:
-    """The pose (3,) relative to its keyframe; the pose itself without one."""
+    """Return the pose (3,) relative to its keyframe, or the pose itself if there is none."""
     if result.anchor is None:
         return None, result.map_from_base
     return result.anchor, relative2(result.anchor.pose(), result.map_from_base)
 
 
 def final_poses(anchored: Iterable[tuple[Anchor | None, FloatArray]]) -> FloatArray:
-    """Poses (n, 3) of ``from_anchor`` after the last optimisation."""
+    """Return the poses (n, 3) of ``from_anchor`` after the last optimisation."""
     return np.array([there if anchor is None else compose2(anchor.pose(), there) for anchor, there in anchored])
 
 
@@ -271,23 +265,18 @@ def perturb_odometry(entries: Iterable[LogEntry], seed: int) -> Iterator[LogEntr
     rng = np.random.default_rng(seed)
     signs = rng.choice([-1.0, 1.0], 2)
     factor = 1.0 + 0.02 * np.array([signs[0], signs[0], signs[1]])
-
-    def worse(step: FloatArray) -> FloatArray:
-        size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
-        return np.asarray(factor * step + 0.05 * size * rng.standard_normal(3))
-
-    return changed_odometry(entries, worse)
-
-
-def changed_odometry(entries: Iterable[LogEntry], change: Callable[[FloatArray], FloatArray]) -> Iterator[LogEntry]:
-    """The log with each step (3,) of its odometry changed."""
     last: FloatArray | None = None
     pose = np.zeros(3)
     for entry in entries:
         if entry.odom_pose is None:
             yield entry
             continue
-        pose = entry.odom_pose if last is None else compose2(pose, change(relative2(last, entry.odom_pose)))
+        if last is None:
+            pose = entry.odom_pose
+        else:
+            step = relative2(last, entry.odom_pose)
+            size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
+            pose = compose2(pose, factor * step + 0.05 * size * rng.standard_normal(3))
         last = entry.odom_pose
         yield replace(entry, odom_pose=pose)
 
@@ -298,28 +287,26 @@ def evaluate_log(
     config: SlamConfig | None = None,
     *,
     use_wheel_odom: bool = True,
-    tolerance_s: float = 0.006,
     on_scan: Callable[[int], None] | None = None,
 ) -> tuple[dict[str, object], LogResult]:
-    """Run SLAM on a log and evaluate it: figures for JSON, and the run itself.
+    """Run SLAM on a log and evaluate it; return figures for JSON, and the run itself.
 
     Figures of the final trajectory have plain names; ``online_translation_mean_m`` and ``online_rotation_mean_deg``
-    refer to the poses published online.
+    refer to the poses published online. Arguments as of ``run_log``.
     """
     entries = list(entries)
     result = run_log(entries, config, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
     report: dict[str, object] = {}
     if relations is not None:
-        final, online = (
-            log_error(entries, run[:, 1:], relations, tolerance_s) for run in (result.trajectory, result.online)
-        )
-        report.update(final)
+        online = log_error(entries, result.online[:, 1:], relations)
+        report.update(log_error(entries, result.trajectory[:, 1:], relations))
         report["online_translation_mean_m"] = online["translation_mean_m"]
         report["online_rotation_mean_deg"] = online["rotation_mean_deg"]
     report.update(result.report())
     return report, result
 
 
-def write_trajectory(path: Path, trajectory: FloatArray) -> None:
-    """Write ``t x y yaw`` per line, in seconds, metres and radians."""
-    np.savetxt(path, trajectory, fmt=("%.6f", "%.5f", "%.5f", "%.6f"))
+def trajectory_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return distance in metres and angle in degrees of each pose (n, 3) from its ground truth (n, 3)."""
+    rest = np.array([relative2(a, b) for a, b in zip(truth, estimate, strict=True)])
+    return np.hypot(rest[:, 0], rest[:, 1]), np.degrees(np.abs(rest[:, 2]))

@@ -15,15 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.slam import (
-    Relations,
-    ascending,
-    changed_odometry,
-    final_poses,
-    from_anchor,
-    log_error,
-    perturb_odometry,
-)  # fmt: skip
+from instant_ic.experiments.slam import ascending, final_poses, from_anchor
 from instant_ic.experiments.slam_logs import LogEntry, LogError
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
@@ -38,7 +30,6 @@ KIDNAP_M = 3.0
 GAP_S = 10.0
 """Duration of a gap in the scans, and of blindness."""
 HEADING_JUMP_RAD = math.radians(85.0)
-YAW_SCALE = 0.2
 HORIZON_S, LEAST_SCANS, MOST_SCANS = 60.0, 100, 400
 """How long a fault at a place is followed: in seconds, and at least and at most in scans."""
 WARM_UP_SCANS = 15
@@ -150,41 +141,6 @@ def _with_ranges(entry: LogEntry, ranges: FloatArray) -> LogEntry:
     return replace(entry, scan=replace(entry.scan, ranges=ranges))
 
 
-def _scaled_yaw(entries: Sequence[LogEntry], factor: float) -> list[LogEntry]:
-    """The log with each turn of the odometry ``factor`` times as large."""
-    return list(changed_odometry(entries, lambda step: np.array([step[0], step[1], factor * step[2]])))
-
-
-def _without_third(entries: Sequence[LogEntry], rng: np.random.Generator) -> list[LogEntry]:
-    """The log with a third of the beams, one sector, at zero."""
-    count = len(entries[0].scan.ranges)
-    first = int(rng.integers(count))
-    out = []
-    for entry in entries:
-        ranges = np.array(entry.scan.ranges, dtype=np.float64)
-        ranges[(first + np.arange(len(ranges) // 3)) % len(ranges)] = 0.0
-        out.append(_with_ranges(entry, ranges))
-    return out
-
-
-def whole_log_faults(entries: Sequence[LogEntry], rng: np.random.Generator) -> dict[str, Callable[[], Faulted]]:
-    """Faults that last from the first scan to the last, by name."""
-    everything = np.arange(len(entries))
-
-    def every(n: int) -> Faulted:
-        return Faulted(list(entries[::n]), everything[::n])
-
-    return {
-        "odometry_noise": lambda: Faulted(list(entries), everything),
-        "yaw_scale_plus": lambda: Faulted(_scaled_yaw(entries, 1 + YAW_SCALE), everything),
-        "yaw_scale_minus": lambda: Faulted(_scaled_yaw(entries, 1 - YAW_SCALE), everything),
-        "every_2nd_scan": lambda: every(2),
-        "every_5th_scan": lambda: every(5),
-        "no_odometry": lambda: Faulted([replace(entry, odom_pose=None) for entry in entries], everything),
-        "third_of_beams_zero": lambda: Faulted(_without_third(entries, rng), everything),
-    }
-
-
 PLACE_FAULTS: dict[str, Callable[[Sequence[LogEntry], int, int, np.random.Generator], Faulted]] = {
     "heading_jump_85deg": heading_jump,
     "gap_10s": gap,
@@ -192,8 +148,7 @@ PLACE_FAULTS: dict[str, Callable[[Sequence[LogEntry], int, int, np.random.Genera
 }
 KIDNAPPINGS = ("kidnapped_mapping", "kidnapped_localized")
 RELOCALIZATION = "relocalization"
-FAULTS = (*PLACE_FAULTS, *KIDNAPPINGS, "odometry_noise", "yaw_scale_plus", "yaw_scale_minus", "every_2nd_scan",
-          "every_5th_scan", "no_odometry", "third_of_beams_zero", RELOCALIZATION)  # fmt: skip
+FAULTS = (*PLACE_FAULTS, *KIDNAPPINGS, RELOCALIZATION)
 
 
 def _steps(slam: GridSlam, entries: Sequence[LogEntry], last_ns: int | None = None) -> Iterator[SlamResult]:
@@ -280,22 +235,18 @@ def evaluate_faults(
     *,
     places: int = 5,
     seed: int = 0,
-    noise_seeds: int = 1,
-    relations: Relations | None = None,
-    truth: FloatArray | None = None,
     faults: Sequence[str] = FAULTS,
-    on_step: Callable[[str], None] | None = None,
+    on_step: Callable[[str], None] = lambda name: None,
 ) -> dict[str, object]:
-    """Put each fault into the log and compare with the clean run; figures for JSON, by fault.
+    """Put each fault into the log and compare with the clean run; return figures for JSON, by fault.
 
     Args:
-        places: number of places for a fault at a place; chosen by ``seed``, the same for every fault.
-        seed: of the places and of all other choices.
-        noise_seeds: runs of each fault that lasts the whole log; the first has the log's own odometry, the others noise
-            (`perturb_odometry`).
-        relations: for the accuracy of the runs over the whole log.
-        truth: poses (n, 3) of a generated log in the frame of the first one, for the same; None: unknown.
-        on_step: called with the name of what runs next.
+        entries: scans of the log.
+        config: configuration of the SLAM; None: its defaults.
+        places: number of places for each fault; chosen by ``seed``, the same for every fault.
+        seed: seed of the places and of all other choices.
+        faults: names of ``FAULTS``.
+        on_step: called with the name of the run that begins.
 
     Raises:
         LogError: the log is too short.
@@ -310,11 +261,9 @@ def evaluate_faults(
     rng = np.random.default_rng(seed)
     first, last = max(WARM_UP_SCANS + 1, len(entries) // 5), len(entries) - LEAST_SCANS // 2
     at = np.sort(rng.choice(np.arange(first, last), size=min(places, last - first), replace=False))
-    announce = on_step or (lambda name: None)
-    at_places = [name for name in faults if name in (*PLACE_FAULTS, *KIDNAPPINGS)]
-    announce("clean")
+    on_step("clean")
     # A copy of the SLAM takes tens of megabytes.
-    clean, before = _clean_run(entries, config, [int(k) for k in at] if at_places else [])
+    clean, before = _clean_run(entries, config, [int(k) for k in at] if {*faults} - {RELOCALIZATION} else [])
     alarms = int((clean.trusted[:-1] & ~clean.trusted[1:]).sum())
     hours = max((entries[-1].scan.stamp_ns - entries[0].scan.stamp_ns) / 3.6e12, 1e-9)
     report: dict[str, object] = {
@@ -325,93 +274,35 @@ def evaluate_faults(
             "false_alarms_per_hour": alarms / hours,
         }
     }
-    saved = clean.slam.grid()
-    for name in at_places:
-        announce(name)
-        runs = []
-        for k, slam in before:
-            own = np.random.default_rng([seed, k])
-            end = _part(entries, k).stop
-            start_ns = entries[k - 1].scan.stamp_ns
-            if name in PLACE_FAULTS:
-                faulted = PLACE_FAULTS[name](entries, k, end, own)
-            else:
-                away = np.hypot(*(clean.final - clean.final[k - 1])[: len(entries) - LEAST_SCANS, :2].T)
-                far = np.flatnonzero(away > KIDNAP_M)
-                if len(far) == 0:
-                    continue
-                faulted = kidnap(entries, k, end, int(own.choice(far)), own)
-            if len(faulted.entries) == 0:
-                continue
-            if name == "kidnapped_localized":
-                slam = _localized(config, SavedMap(config or SlamConfig(), saved), entries, k, clean)
-                runs.append(_run(slam, faulted, clean, None, start_ns).figures())
-            else:
-                runs.append(_run(copy.deepcopy(slam), faulted, clean, k - 1, start_ns).figures())
-        report[name] = summary(runs)
-    makers = whole_log_faults(entries, rng)
-    for name in [name for name in faults if name in makers]:
-        announce(name)
-        accuracy = None if truth is None and relations is None else _Accuracy(truth, relations)
-        report[name] = _whole_log(makers[name](), config, clean, noise_seeds, accuracy)
-    if RELOCALIZATION in faults:
-        announce(RELOCALIZATION)
-        report[RELOCALIZATION] = relocalizations(entries, config, places, rng)
+    for name in faults:
+        on_step(name)
+        if name == RELOCALIZATION:
+            report[name] = relocalizations(entries, config, places, rng)
+        else:
+            runs = (_run_at(name, entries, k, slam, clean, np.random.default_rng([seed, k])) for k, slam in before)
+            report[name] = summary([run.figures() for run in runs if run is not None])
     return report
 
 
-@dataclass(frozen=True)
-class _Accuracy:
-    """What the accuracy of a run is measured against: ground truth (n, 3) of the clean log, or relations."""
-
-    truth: FloatArray | None
-    relations: Relations | None
-
-    def error_m(self, entries: Sequence[LogEntry], poses: FloatArray, source: NDArray[np.intp]) -> float | None:
-        """Mean error of ``poses`` (n, 3); None if no relation lies between them."""
-        if self.truth is not None:
-            origin = relative2(self.truth[source[0]], np.zeros(3))
-            there = np.array([compose2(poses[0], compose2(origin, pose)) for pose in self.truth[source]])
-            return float(np.hypot(*(poses - there)[:, :2].T).mean())
-        assert self.relations is not None
-        try:
-            return float(log_error(entries, poses, self.relations)["translation_mean_m"])
-        except ValueError:
+def _run_at(
+    name: str, entries: Sequence[LogEntry], at: int, slam: GridSlam, clean: CleanRun, rng: np.random.Generator
+) -> FaultRun | None:
+    """Run a fault from scan ``at`` on, after which ``slam`` is untouched; return None if the place is not suitable."""
+    end = _part(entries, at).stop
+    if name in PLACE_FAULTS:
+        faulted = PLACE_FAULTS[name](entries, at, end, rng)
+    else:
+        away = np.hypot(*(clean.final - clean.final[at - 1])[: len(entries) - LEAST_SCANS, :2].T)
+        far = np.flatnonzero(away > KIDNAP_M)
+        if len(far) == 0:
             return None
-
-
-def _whole_log(
-    faulted: Faulted, config: SlamConfig | None, clean: CleanRun, noise_seeds: int, accuracy: _Accuracy | None
-) -> dict[str, object]:
-    """Figures of a fault that lasts the whole log, over seeds of odometry noise."""
-    source = faulted.source
-    runs: list[dict[str, float | int]] = []
-    for noise in range(noise_seeds):
-        entries = faulted.entries if noise == 0 else list(perturb_odometry(faulted.entries, noise))
-        run, _ = _clean_run(entries, config, [])
-        online = clean.errors(run.online, source, None)
-        wrong = online > WRONG_M
-        figures: dict[str, float | int] = {
-            "final_error_mean_m": float(np.hypot(*(run.final - clean.final[source])[:, :2].T).mean()),
-            "online_error_mean_m": float(online.mean()),
-            "online_error_max_m": float(online.max()),
-            "wrong_scans": int(wrong.sum()),
-            "trusted_wrong_scans": int((wrong & run.trusted).sum()),
-        }
-        error = None if accuracy is None else accuracy.error_m(entries, run.final, source)
-        if error is not None:
-            figures["accuracy_m"] = error
-        runs.append(figures)
-    key = "accuracy_m" if all("accuracy_m" in run for run in runs) else "final_error_mean_m"
-    errors = np.array([run[key] for run in runs])
-    return {
-        "error": key,
-        "clean_m": None if accuracy is None else accuracy.error_m(faulted.entries, clean.final[source], source),
-        "median_m": float(np.median(errors)),
-        "max_m": float(errors.max()),
-        "over_twice_median": int((errors > 2 * np.median(errors)).sum()),
-        "runs": runs,
-    }
+        faulted = kidnap(entries, at, end, int(rng.choice(far)), rng)
+    if len(faulted.entries) == 0:
+        return None
+    start_ns = entries[at - 1].scan.stamp_ns
+    if name == "kidnapped_localized":
+        return _run(_localized(slam.config, entries, at, clean), faulted, clean, None, start_ns)
+    return _run(copy.deepcopy(slam), faulted, clean, at - 1, start_ns)
 
 
 def relocalizations(
@@ -479,11 +370,9 @@ def _clean_run(
     return CleanRun(np.array(online), final_poses(anchored), np.array(trusted), slam), before
 
 
-def _localized(
-    config: SlamConfig | None, saved: SavedMap, entries: Sequence[LogEntry], at: int, clean: CleanRun
-) -> GridSlam:
-    """A robot that localises in the clean run's map and has just seen scan ``at`` − 1."""
-    slam = GridSlam(config, saved)
+def _localized(config: SlamConfig, entries: Sequence[LogEntry], at: int, clean: CleanRun) -> GridSlam:
+    """Return a robot that localises in the clean run's map and has just seen scan ``at`` − 1."""
+    slam = GridSlam(config, SavedMap(config, clean.slam.grid()))
     for k in range(at - WARM_UP_SCANS, at):
         entry = entries[k]
         slam.process(entry.scan, entry.odom_pose, entry.base_from_laser)

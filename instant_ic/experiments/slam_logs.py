@@ -1,4 +1,4 @@
-"""Readers of 2D laser logs: CARMEN (`FLASER`, `ROBOTLASER1`) and the mines recordings of BreezySLAM.
+"""Readers of 2D laser logs: CARMEN (`FLASER`, `ROBOTLASER1`), the mines recordings of BreezySLAM, and bags.
 
 A log is an iterable of `LogEntry`. A line that cannot be read is an error with file and line: the reader raises it as
 `LogError`, or counts it in a `BadLines` and leaves the line out.
@@ -18,8 +18,12 @@ from typing import IO, Any
 
 import numpy as np
 
+from instant_ic.bag import BagError, BagReader
 from instant_ic.geometry.motion import along_arc
-from instant_ic.geometry.poses import relative2
+from instant_ic.geometry.poses import Pose2, pose2_from_matrix, relative2
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.msg import deserialize, pose2_from_message, stamp_ns, transform_matrix
+from instant_ic.slam.odometry import OdometryBuffer
 from instant_ic.slam.scan import FloatArray, Scan
 
 _MOST_LINE = 1 << 20
@@ -32,7 +36,7 @@ class LogError(ValueError):
 
 @dataclass
 class BadLines:
-    """What a reader left out of a log: the number of bad lines, and the errors of the first few."""
+    """Lines that a reader left out of a log: their number, and the errors of the first few."""
 
     count: int = 0
     errors: list[str] = field(default_factory=list)
@@ -105,15 +109,15 @@ def open_log(path: str | Path, bad: BadLines | None = None) -> IO[str]:
 
 
 def read_log(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
-    """Scans of a log of either format: a line of 24 or more bare numbers is the mines format.
+    """Read the scans of a text log; a line of 24 or more bare numbers is the mines format.
 
     Args:
-        path: the log, gzip or not.
-        bad: counts lines that cannot be read, which are left out; None: the first one raises.
+        path: log file, gzip or plain.
+        bad: counter of the lines that cannot be read and are left out; None: the first one raises.
 
     Raises:
         LogError: a line cannot be read, or the log has no scan.
-        OSError: no such file.
+        OSError: the file does not exist.
     """
     with open_log(path, BadLines()) as lines:  # what is damaged is reported when it is read
         first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
@@ -143,7 +147,7 @@ _SURVEYED_SCANS = 400
 
 
 def read_carmen(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
-    """Scans of a CARMEN log.
+    """Read the scans of a CARMEN log.
 
     ``FLASER n r0..rn-1 x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``, right to left, with
     the middle beam pointing forward. ``ROBOTLASER1`` lines hold their own angles and maximum range. Other messages are
@@ -151,7 +155,7 @@ def read_carmen(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEn
     lines. Otherwise the first pose is a corrected one, and the laser is assumed to be mounted at the robot's centre.
     The odometry is the second pose, the first if the second never changes, or none if neither changes. FLASER readings
     mean "no return" from the log's own ``PARAM`` on, or from the value at which readings pile up, or from 80 m on.
-    Arguments and errors as of `read_log`.
+    Arguments and errors are those of `read_log`.
     """
     survey = _survey(path)
     scans = 0
@@ -172,7 +176,7 @@ def read_carmen(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEn
 
 
 def _nothing(error: LogError, bad: BadLines | None) -> LogError:
-    """The error of a log without a scan: that of its first bad line, if it has any."""
+    """Return the error of a log without a scan: that of its first bad line, if it has any."""
     return LogError(f"{bad.errors[0]} (and no line can be read)") if bad and bad.errors else error
 
 
@@ -219,7 +223,7 @@ _MOUNT_WOBBLE = np.array([0.05, 0.05, 0.05])
 
 
 def _pile(readings: FloatArray) -> float:
-    """Range that means "no return": the value at which the largest readings pile up, or the SICK's 80 m.
+    """Return the range that means "no return": the value at which the largest readings pile up, or the SICK's 80 m.
 
     A laser may write its maximum range for a beam without return (8.183 m, 50 m, ...). Taken as hits, these readings
     would add arcs of wall to the map.
@@ -334,12 +338,12 @@ _MINES_RANGE_MAX_M = 4.0
 
 
 def read_mines(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
-    """Scans of a BreezySLAM `exp*.dat` recording (MinesRover: wheel ticks and a Hokuyo URG-04LX).
+    """Read the scans of a BreezySLAM `exp*.dat` recording (MinesRover: wheel ticks and a Hokuyo URG-04LX).
 
     Columns: 0 is the time in µs, 2 and 3 the left and right ticks, from 24 on 682 ranges in mm over 240°, right to
     left. The outer 70 on each side are unusable. 0 and the sensor's small error codes are erroneous (NaN). The odometry
-    is integrated from the ticks with differential drive kinematics and starts at the origin. Arguments and errors as of
-    `read_log`.
+    is integrated from the ticks with differential drive kinematics and starts at the origin. Arguments and errors are
+    those of `read_log`.
     """
     increment = _MINES_FIELD_OF_VIEW / (_MINES_RANGES - 1)
     angle_min = -_MINES_FIELD_OF_VIEW / 2 + _MINES_MARGIN * increment
@@ -381,3 +385,74 @@ def read_mines(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEnt
             yield LogEntry(scan, pose.copy(), np.array([_MINES_LASER_FORWARD_M, 0.0, 0.0]))
     if last_ticks is None:
         raise _nothing(LogError(f"{path}: contains no scan"), bad)
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path looks like a bag: a folder, or a file with a bag's extension."""
+    return path.is_dir() or path.suffix in (".mcap", ".db3")
+
+
+def read_bag(path: Path, scan_topic: str | None = None) -> Iterator[LogEntry]:
+    """Read the scans of a bag from ``scan_topic``, from ``/scan``, or from its only topic of type LaserScan.
+
+    Odometry comes from the bag's Odometry topic (``/wheel/odom`` before ``/odom`` before any other), interpolated to
+    the scan's stamp; the mount from ``/tf_static``. A scan outside the odometry's time range has none. Without a
+    transform to ``base_link``, the laser is assumed to be mounted at the robot's centre.
+
+    Raises:
+        LogError: the path is no bag, the topic does not exist, or a scan is malformed.
+    """
+    try:
+        with BagReader(path) as bag:
+            types = {summary.topic: summary.type_name for summary in bag.topics}
+            topic = _choose(path, types, "sensor_msgs/msg/LaserScan", scan_topic, ("/scan",))
+            if topic is None:
+                raise LogError(f"{path}: the bag has no topic of type LaserScan, only {', '.join(types) or 'none'}")
+            odometry = OdometryBuffer(keep_s=1e9)
+            wheels = _choose(path, types, "nav_msgs/msg/Odometry", None, ("/wheel/odom", "/odom"))
+            transforms = TransformBuffer()
+            for message in bag.messages([name for name in (wheels, "/tf_static") if name in types]):
+                value = deserialize(message.payload, message.type_name)
+                if message.topic == wheels:
+                    odometry.add(stamp_ns(value), pose2_from_message(value))
+                    continue
+                for one in value.transforms:
+                    transforms.set(one.header.frame_id, one.child_frame_id, 0, transform_matrix(one), True)
+            scans = 0
+            for message in bag.messages([topic]):
+                value = deserialize(message.payload, message.type_name)
+                stamp = stamp_ns(value)
+                try:
+                    scan = Scan(
+                        np.asarray(value.ranges), float(value.angle_min), float(value.angle_increment),
+                        float(value.range_min), float(value.range_max), stamp,
+                    )  # fmt: skip
+                except ValueError as error:
+                    raise LogError(f"{path}: scan {scans + 1} on {topic}: {error}") from None
+                scans += 1
+                yield LogEntry(scan, odometry.at(stamp), _mount(transforms, value.header.frame_id))
+            if scans == 0:
+                raise LogError(f"{path}: no scan on {topic}")
+    except BagError as error:
+        raise LogError(str(error)) from None
+
+
+def _choose(path: Path, types: dict[str, str], kind: str, wanted: str | None, usual: tuple[str, ...]) -> str | None:
+    found = sorted(topic for topic, type_name in types.items() if type_name == kind)
+    if wanted is not None:
+        if wanted not in found:
+            raise LogError(f"{path}: no LaserScan topic {wanted}; available: {', '.join(found) or 'none'}")
+        return wanted
+    for topic in usual:
+        if topic in found:
+            return topic
+    if len(found) > 1 and kind.endswith("LaserScan"):
+        raise LogError(f"{path}: several LaserScan topics ({', '.join(found)}): choose one with --scan-topic")
+    return found[0] if found else None
+
+
+def _mount(transforms: TransformBuffer, laser_frame: str) -> Pose2:
+    try:
+        return pose2_from_matrix(transforms.lookup("base_link", laser_frame))
+    except TransformError:
+        return np.zeros(3)

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.slam import LogResult, run_log
+from instant_ic.experiments.slam import LogResult, run_log, trajectory_errors
 from instant_ic.experiments.slam_logs import LogEntry
-from instant_ic.experiments.slam_worlds import trajectory_errors
 from instant_ic.geometry.motion import along_arc
 from instant_ic.geometry.poses import relative2, wrap_angle
 from instant_ic.sim.robot import RobotConfig, TrackedRobot

@@ -1,12 +1,10 @@
 """Generated buildings of plain walls, and logs of drives through them with ground-truth poses.
 
-They replace public logs that are not available. They have long loops, bare corridors, rooms that look alike, and the
-lasers of those logs (180° and 361 beams, 240° and 4 m, 8 m maxima).
+They have long loops, bare corridors, rooms that look alike, and the lasers of public logs.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ Wall = tuple[float, float, float, float]
 
 @njit(cache=True)
 def cast_rays(walls, x, y, angles):  # type: ignore[no-untyped-def]
-    """Distance to the first wall along each angle (n,), inf if there is none; ``walls`` (m, 4): x0 y0 x1 y1."""
+    """Return the distance to the first wall (m, 4: x0 y0 x1 y1) along each angle (n,); inf if there is none."""
     out = np.full(angles.shape[0], np.inf)
     for i in range(angles.shape[0]):
         dx, dy = math.cos(angles[i]), math.sin(angles[i])
@@ -73,7 +71,6 @@ LASERS = {
     "sick180": Laser(180, 179.0, 80.0, 0.01, (0.1, 0.0, 0.0)),
     "sick361": Laser(361, 180.0, 50.0, 0.01, (0.1, 0.0, 0.0)),
     "sick8m": Laser(181, 180.0, 8.183, 0.01),
-    "hokuyo": Laser(682, 240.0, 4.0, 0.01, (0.145, 0.0, 0.0)),
 }
 
 
@@ -95,31 +92,22 @@ def drive(
     step_rad: float = 0.1,
     noise: float = 0.05,
     scale: float = 0.03,
-    slip: float = 0.0,
 ) -> Drive:
-    """Drive between waypoints, at least two, turning on the spot, with a scan every ``step_m`` or ``step_rad``.
+    """Drive between waypoints, turning on the spot, with a scan every ``step_m`` or ``step_rad``.
 
     Args:
+        walls: walls of the building.
+        waypoints: at least two points (x, y) in metres.
+        laser: laser of the robot.
+        seed: seed of all noise.
+        step_m: metres between scans.
+        step_rad: radians between scans.
         noise: standard deviation (1σ) of each odometry step, relative to its size.
         scale: largest systematic odometry error, relative, for translation and rotation each.
-        slip: share of steps, 0..1, in which the tracks spin: the encoders count up to half as much again.
     """
     rng = np.random.default_rng(seed)
     world = np.array(walls, dtype=np.float64)
-    points = np.array(waypoints, dtype=np.float64)
-    start = np.array([*points[0], math.atan2(*(points[1] - points[0])[::-1])])
-    poses = [start]
-    for target in points[1:]:
-        way = target - poses[-1][:2]
-        heading = math.atan2(way[1], way[0])
-        turn = wrap_angle(heading - float(poses[-1][2]))
-        turns = math.ceil(abs(turn) / step_rad)
-        for _ in range(turns):
-            poses.append(compose2(poses[-1], [0.0, 0.0, turn / turns]))
-        length = math.hypot(way[0], way[1])
-        steps = max(1, math.ceil(length / step_m))
-        for _ in range(steps):
-            poses.append(compose2(poses[-1], [length / steps, 0.0, 0.0]))
+    poses = _poses_along(np.array(waypoints, dtype=np.float64), step_m, step_rad)
     factor = 1.0 + scale * rng.uniform(-1.0, 1.0, 3)
     odometry = np.zeros(3)
     mount = np.array(laser.mount)
@@ -128,8 +116,8 @@ def drive(
         if index:
             step = relative2(poses[index - 1], pose)
             size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2]) + 0.1 * abs(step[0])])
-            spun = 1.0 + (rng.uniform(0.0, 0.5, 3) if rng.random() < slip else 0.0)
-            odometry = compose2(odometry, factor * spun * step + noise * size * rng.standard_normal(3))
+            rng.random()  # keeps the noise of earlier versions
+            odometry = compose2(odometry, factor * step + noise * size * rng.standard_normal(3))
         at = compose2(pose, mount)
         ranges = cast_rays(world, at[0], at[1], laser.angles + at[2])
         ranges = ranges + laser.noise_m * rng.standard_normal(laser.beams)
@@ -137,11 +125,27 @@ def drive(
         increment = float(laser.angles[1] - laser.angles[0])
         scan = Scan(ranges, float(laser.angles[0]), increment, 0.02, laser.range_max, (index + 1) * 100_000_000)
         entries.append(LogEntry(scan, odometry, mount))
-    return Drive(entries, np.array([relative2(start, pose) for pose in poses]))
+    return Drive(entries, np.array([relative2(poses[0], pose) for pose in poses]))
+
+
+def _poses_along(points: FloatArray, step_m: float, step_rad: float) -> list[FloatArray]:
+    """Return poses (3,) along the lines between points (n, 2), with turns on the spot."""
+    poses = [np.array([*points[0], math.atan2(*(points[1] - points[0])[::-1])])]
+    for target in points[1:]:
+        way = target - poses[-1][:2]
+        turn = wrap_angle(math.atan2(way[1], way[0]) - float(poses[-1][2]))
+        turns = math.ceil(abs(turn) / step_rad)
+        for _ in range(turns):
+            poses.append(compose2(poses[-1], [0.0, 0.0, turn / turns]))
+        length = math.hypot(way[0], way[1])
+        steps = max(1, math.ceil(length / step_m))
+        for _ in range(steps):
+            poses.append(compose2(poses[-1], [length / steps, 0.0, 0.0]))
+    return poses
 
 
 def _line(x0: float, y0: float, x1: float, y1: float, doors: Sequence[tuple[float, float]] = ()) -> list[Wall]:
-    """A wall with openings, given as (distance from its start, width)."""
+    """Return the parts of a wall with openings, given as (distance from its start, width)."""
     length = math.hypot(x1 - x0, y1 - y0)
     ux, uy = (x1 - x0) / length, (y1 - y0) / length
     cuts = [0.0]
@@ -160,45 +164,52 @@ def _box(x: float, y: float, w: float, h: float) -> list[Wall]:
 
 
 def ring(seed: int = 0) -> tuple[list[Wall], list[tuple[float, float]]]:
-    """A ring of corridors with closed doors set back in niches and a few open rooms; driven twice, once in reverse.
+    """Return walls and waypoints of a ring of corridors with niches and a few open rooms.
 
-    The centre line is 210 m long; only the niches distinguish one stretch from the next.
+    The centre line is 210 m long; only the niches distinguish one stretch from the next. It is driven twice, then once
+    in reverse.
     """
     rng = np.random.default_rng(seed)
-    width, depth, half = 60.0, 45.0, 1.1
+    corners = [(0.0, 0.0), (60.0, 0.0), (60.0, 45.0), (0.0, 45.0)]
     walls: list[Wall] = []
-    corners = [(0.0, 0.0), (width, 0.0), (width, depth), (0.0, depth)]
     for k in range(4):
-        (ax, ay), (bx, by) = corners[k], corners[(k + 1) % 4]
-        length = math.hypot(bx - ax, by - ay)
-        ux, uy = (bx - ax) / length, (by - ay) / length
         for side in (-1.0, 1.0):  # right (outer) and left (inner) wall
-            extent = half if side < 0 else -half
-            at, doors = 1.0, []
-            while at < length - 3.0:
-                at += float(rng.uniform(1.5, 7.0))
-                if at > length - 2.5:
-                    break
-                doors.append((at + extent, 0.9))
-                at += 0.9
-            sx = ax - ux * extent - side * uy * half
-            sy = ay - uy * extent + side * ux * half
-            ex = bx + ux * extent - side * uy * half
-            ey = by + uy * extent + side * ux * half
-            walls += _line(sx, sy, ex, ey, doors)
-            for start, w in doors:
-                deep = float(rng.choice([0.12, 0.2, 0.3, 3.0], p=[0.4, 0.3, 0.2, 0.1]))
-                px, py = sx + ux * start, sy + uy * start
-                qx, qy = px + ux * w, py + uy * w
-                nx, ny = -side * uy * deep, side * ux * deep
-                walls += [(px, py, px + nx, py + ny), (px + nx, py + ny, qx + nx, qy + ny), (qx + nx, qy + ny, qx, qy)]
+            walls += _niche_wall(corners[k], corners[(k + 1) % 4], side, rng)
     loop = [(2.0, 0.0), *corners[1:], corners[0]]
     back = [(2.0, 0.0), corners[0], *corners[:0:-1], corners[0]]
     return walls, [*loop, *loop, (6.0, 0.0), *back, (6.0, 0.0)]
 
 
+def _niche_wall(
+    start: tuple[float, float], end: tuple[float, float], side: float, rng: np.random.Generator
+) -> list[Wall]:
+    """Return a corridor's wall on one side (1 left, −1 right) of its centre line, with niches of random depth."""
+    half, door_m = 1.1, 0.9
+    (ax, ay), (bx, by) = start, end
+    length = math.hypot(bx - ax, by - ay)
+    ux, uy = (bx - ax) / length, (by - ay) / length
+    extent = -side * half
+    at, doors = 1.0, []
+    while at < length - 3.0:
+        at += float(rng.uniform(1.5, 7.0))
+        if at > length - 2.5:
+            break
+        doors.append((at + extent, door_m))
+        at += door_m
+    sx, sy = ax - ux * extent - side * uy * half, ay - uy * extent + side * ux * half
+    ex, ey = bx + ux * extent - side * uy * half, by + uy * extent + side * ux * half
+    walls = _line(sx, sy, ex, ey, doors)
+    for begin, width in doors:
+        deep = float(rng.choice([0.12, 0.2, 0.3, 3.0], p=[0.4, 0.3, 0.2, 0.1]))
+        px, py = sx + ux * begin, sy + uy * begin
+        qx, qy = px + ux * width, py + uy * width
+        nx, ny = -side * uy * deep, side * ux * deep
+        walls += [(px, py, px + nx, py + ny), (px + nx, py + ny, qx + nx, qy + ny), (qx + nx, qy + ny, qx, qy)]
+    return walls
+
+
 def cells(rooms: int = 9) -> tuple[list[Wall], list[tuple[float, float]]]:
-    """A straight corridor with identical rooms on one side, identically furnished; some are visited."""
+    """Return walls and waypoints of a corridor with identical, identically furnished rooms, some of them visited."""
     room, hall = 4.0, 2.0
     length = rooms * room
     doors = [(k * room + 1.5, 1.0) for k in range(rooms)]
@@ -217,36 +228,3 @@ def cells(rooms: int = 9) -> tuple[list[Wall], list[tuple[float, float]]]:
         x = k * room + 2.0
         path += [(x, 0.0), (x, 3.0), (x, 0.0)]
     return walls, [*path, (1.0, 0.0)]
-
-
-def office(seed: int = 0) -> tuple[list[Wall], list[tuple[float, float]]]:
-    """Two corridors joined by crossings, offices with furniture on both sides, driven in figures of eight."""
-    rng = np.random.default_rng(seed)
-    walls: list[Wall] = [(-1.0, -1.0, -1.0, 13.0), (31.0, -1.0, 31.0, 13.0)]
-    crossings = [(0.0, 2.0), (14.0, 2.0), (30.0, 2.0)]
-    for y in (1.0, 11.0):
-        walls += _line(-1.0, y, 31.0, y, [(x, w) for x, w in crossings])
-    for x in (1.0, 13.0, 15.0, 29.0):
-        walls.append((x, 1.0, x, 11.0))
-    for side in (-1.0, 1.0):
-        wall_y, back_y = (-1.0, -5.5) if side < 0 else (13.0, 17.5)
-        xs = [-1.0]
-        while xs[-1] < 27.0:
-            xs.append(xs[-1] + float(rng.uniform(3.0, 5.0)))
-        xs[-1] = 31.0
-        walls += _line(-1.0, wall_y, 31.0, wall_y, [((a + b) / 2 - 0.5 + 1.0, 1.0) for a, b in itertools.pairwise(xs)])
-        walls += [(-1.0, back_y, 31.0, back_y)] + [(x, wall_y, x, back_y) for x in xs]
-        for a, b in itertools.pairwise(xs):
-            for _ in range(3):
-                w, h = rng.uniform(0.4, 1.4, 2)
-                x = float(rng.uniform(a + 0.1, b - 0.1 - w))
-                y = float(rng.uniform(1.6, 4.3 - h))
-                walls += _box(x, wall_y - y - h if side < 0 else wall_y + y, float(w), float(h))
-    eight = [(0.0, 0.0), (14.0, 0.0), (14.0, 12.0), (30.0, 12.0), (30.0, 0.0), (14.0, 0.0), (14.0, 12.0), (0.0, 12.0)]
-    return walls, [*eight, *eight, (0.0, 0.0), (14.0, 0.0), (14.0, 12.0), (0.0, 12.0), (0.0, 0.0), (2.0, 0.0)]
-
-
-def trajectory_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance in metres and angle in degrees of each pose (n, 3) from ground truth (n, 3)."""
-    rest = np.array([relative2(a, b) for a, b in zip(truth, estimate, strict=True)])
-    return np.hypot(rest[:, 0], rest[:, 1]), np.degrees(np.abs(rest[:, 2]))

@@ -14,8 +14,7 @@ from slam_planar_world import rectangle
 
 from instant_ic.bag import BagWriter
 from instant_ic.cli.main import main
-from instant_ic.experiments.slam_bag import read_bag
-from instant_ic.experiments.slam_logs import LogError
+from instant_ic.experiments.slam_logs import LogError, read_bag
 from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip
 from instant_ic.experiments.slam_worlds import Drive, Laser, drive
 from instant_ic.geometry.poses import compose2, matrix_from_pose2, pose_matrix, relative2
@@ -72,7 +71,7 @@ def test_figures_trajectory_and_plot(
     stamps = tmp_path / "stamps"
     stamps.write_text("\n".join(stamp(e) for e in journey.entries[: len(journey.entries) // 2]) + "\n")
     words = ["evaluate", "slam", str(log), "--relations", str(relations), "--stamps", str(stamps)]
-    assert main([*words, "--json", "out.json", "--plot", "map.png"]) == 0
+    assert main([*words, "--json", "out.json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report == json.loads((tmp_path / "out.json").read_text())
     assert set(report) >= NAMES
@@ -84,20 +83,19 @@ def test_figures_trajectory_and_plot(
     folder = Path(report["output"])
     assert report["bad_lines"] == 0 and sorted(file.name for file in tmp_path.iterdir() if file.is_dir()) == ["runs"]
     assert json.loads((folder / "figures.json").read_text()) == report
-    assert (folder / "map.png").read_bytes() == (tmp_path / "map.png").read_bytes()
     rows = np.loadtxt(folder / "trajectory.txt")
     assert rows.shape == (len(journey.entries), 4)
     assert [f"{t:.6f}" for t in rows[:, 0]] == [stamp(e) for e in journey.entries]
     rest = relative2(relative2(journey.truth[0], journey.truth[-1]), relative2(rows[0, 1:], rows[-1, 1:]))
     assert math.hypot(rest[0], rest[1]) < 0.05
-    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "map.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(
     ("text", "what"),
     [
         (
-            "FLASER 2 1.0 1.0 0 0 0 0 0 0 1.0 h 1\nFLASER 3 1.0 2.0\n",
+            "hello\nFLASER 3 1.0 2.0\n",
             "bad.log:2: FLASER: expected 3 readings, found 2",
         ),
         ("hello\n", "bad.log: no FLASER or ROBOTLASER1 line"),
@@ -108,7 +106,7 @@ def test_a_bad_log_is_told_by_its_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bad.log").write_text(text)
-    assert main(["evaluate", "slam", "bad.log", "--strict"]) == 1
+    assert main(["evaluate", "slam", "bad.log"]) == 1
     assert what in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["bad.log"]
 
@@ -129,8 +127,6 @@ def test_bad_lines_are_counted_and_left_out(
     assert good - 2 <= report["scans"] <= good
     assert report["bad_lines"] in (4, 5)  # three lines, the end of the file, and perhaps a line cut by it
     assert "cut.log.gz:4: " in said.err and "the gzip file is cut" in said.err
-    assert main(["evaluate", "slam", str(cut), "--strict"]) == 1
-    assert "cut.log.gz:4: " in capsys.readouterr().err
 
 
 def test_what_is_missing_is_told(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -138,7 +134,7 @@ def test_what_is_missing_is_told(log: Path, tmp_path: Path, capsys: pytest.Captu
     assert "none.log" in capsys.readouterr().err
     assert main(["evaluate", "slam", str(log), "--stamps", "x"]) == 2
     assert "--relations" in capsys.readouterr().err
-    assert main(["evaluate", "slam", str(log), "--plot", str(tmp_path / "no" / "x.png")]) == 2
+    assert main(["evaluate", "slam", str(log), "--json", str(tmp_path / "no" / "x.json")]) == 2
     assert "does not exist" in capsys.readouterr().err
     (tmp_path / "r").write_text("5 6 0 0 0 0 0 0\n")
     assert main(["evaluate", "slam", str(log), "--relations", str(tmp_path / "r"), "-o", str(tmp_path / "t")]) == 1

@@ -248,12 +248,8 @@ def test_a_heading_that_jumps_leaves_no_turned_map(log: list[LogEntry]) -> None:
     assert report["heading_jump_85deg"]["right_at_end"] == 2
 
 
-def test_noise_seeds_and_relocalizations_are_counted(log: list[LogEntry]) -> None:
-    report = evaluate_faults(log[:300], places=2, noise_seeds=2, faults=("odometry_noise", "relocalization"))
-    runs = report["odometry_noise"]["runs"]
-    assert runs[0]["final_error_mean_m"] == 0.0  # the log's own odometry: the clean run once more
-    assert 0.0 < runs[1]["final_error_mean_m"] < 0.1
-    assert report["odometry_noise"]["median_m"] == runs[1]["final_error_mean_m"] / 2
+def test_relocalizations_are_counted(log: list[LogEntry]) -> None:
+    report = evaluate_faults(log[:300], places=2, faults=("relocalization",))
     assert report["relocalization"]["starts"] == report["relocalization"]["found"] == 2
     assert report["relocalization"]["wrong"] == 0
 

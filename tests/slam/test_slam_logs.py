@@ -241,9 +241,9 @@ def test_relations_at_exact_stamps(tmp_path: Path) -> None:
     relations = read_relations(path)
     assert relations.poses[0].tolist() == [0.5, 0.0, 0.1]
     stamps = read_stamps(write(tmp_path / "s", "3.004\n1.0\n1.995\n"))
-    kept = relations.at_stamps(stamps, 0.006)
+    kept = relations.at_stamps(stamps)
     assert kept.times_s.tolist() == [[1.0, 2.0], [1.0, 3.0]]
-    assert len(relations.at_stamps(np.zeros(0), 0.006)) == 0
+    assert len(relations.at_stamps(np.zeros(0))) == 0
     with pytest.raises(LogError, match=r"t\.relations:2: "):
         read_relations(write(tmp_path / "t.relations", "1 2 3 4 5 6 7 8\n1 2 3\n"))
 
@@ -255,7 +255,7 @@ def test_intel_start_beats_its_odometry(mark: None) -> None:
         entries.append(entry)
         if len(entries) == 900:
             break
-    relations = read_relations(DATA / "intel.relations").at_stamps(read_stamps(DATA / "intel.exact_stamps"), 0.006)
+    relations = read_relations(DATA / "intel.relations").at_stamps(read_stamps(DATA / "intel.exact_stamps"))
     report, result = evaluate_log(entries, relations)
     odometry = np.array([[e.scan.stamp_ns * 1e-9, *e.odom_pose] for e in entries])
     assert report["relations"] > 50
