@@ -51,7 +51,6 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.on_record, self.on_snapshot = self.recording.record, self.recording.snapshot
         outputs = requests.publish, shown.publish
         self.feed = feed = PageFeed(config, self.server, self.tf, inputs, *outputs, self.clock, self.diagnose)
-        self.export_map = feed.grids.map_files
         self.subscribe("/camera/image/compressed", msg.CompressedImage, feed.take_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", msg.RenderedView, feed.take_view, qos=SENSOR)
         self.mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms: commands must not wait for it

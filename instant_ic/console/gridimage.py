@@ -73,14 +73,11 @@ class GridLayers:
 
     def __init__(self) -> None:
         self._newest: dict[FrameKind, OccupancyGrid] = {}
-        self._map: OccupancyGrid | None = None
         self._sent_digests: dict[FrameKind, int] = {}
 
     def take(self, kind: FrameKind, message: OccupancyGrid) -> None:
         """Store the newest grid of a kind."""
         self._newest[kind] = message
-        if kind is FrameKind.MAP:
-            self._map = message
 
     def changed(self) -> Iterator[tuple[FrameKind, GridImage]]:
         """Yield the grids that differ from the last ones yielded."""
@@ -90,14 +87,3 @@ class GridLayers:
             if image is not None and self._sent_digests.get(kind) != image.digest:
                 self._sent_digests[kind] = image.digest
                 yield kind, image
-
-    def map_files(self) -> dict[str, bytes]:
-        """Return the map in map_server's file format, name → content; empty without a map. Any thread may call it."""
-        from instant_ic.slam.map_files import ros_map  # imports numba
-
-        message = self._map
-        if message is None or message.info.width * message.info.height == 0:
-            return {}
-        grid, resolution, origin = grid_array(message)
-        image, text = ros_map(grid, round(resolution, 6), origin, "map.png")  # float32 in the message
-        return {"map.png": grey_png(image), "map.yaml": text.encode()}

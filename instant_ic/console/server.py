@@ -9,16 +9,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import html
-import io
 import json
 import logging
 import secrets
 import threading
 import time
-import zipfile
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 from urllib.parse import quote, unquote, urlsplit
@@ -104,9 +101,6 @@ class Backend(Protocol):
     def on_bookmark(self, name: str) -> None:
         """Give the present moment a name."""
 
-    def export_map(self) -> dict[str, bytes]:
-        """Return the map's files, name → content; empty without a map. Called on its own thread; may take time."""
-
 
 @dataclass(frozen=True)
 class ServerConfig(Checked):
@@ -182,7 +176,6 @@ class ConsoleServer:
         self._holder: str | None = None  # who has the robot's lease; empty: nobody; None: unknown
         self._gate_wake = asyncio.Event()
         self._finish = asyncio.Event()
-        self._exporting = asyncio.Lock()
         self._started: threading.Event = threading.Event()
         self._start_error: Exception | None = None
 
@@ -322,8 +315,6 @@ class ConsoleServer:
         app.on_response_prepare.append(_secure_headers)
         app.router.add_get("/", self._index)
         app.router.add_get("/health", self._health)
-        app.router.add_get("/export/panorama.jpg", self._export_panorama)
-        app.router.add_get("/export/map.zip", self._export_map)
         app.router.add_post("/sign-in", self._sign_in)
         app.router.add_post("/sign-out", self._sign_out)
         app.router.add_post("/estop", self._estop)
@@ -490,22 +481,6 @@ class ConsoleServer:
                 "commands": {verdict.name.lower(): count for verdict, count in self.gate.counts.items()},
             }
         )
-
-    async def _export_panorama(self, request: web.Request) -> web.StreamResponse:
-        frame = self._frames.get(FrameKind.PANORAMA)
-        if not isinstance(frame, PendingFrame):
-            raise web.HTTPNotFound(text="there is no camera image yet\n")
-        return _download(frame.payload, "panorama", "jpg", "image/jpeg")
-
-    async def _export_map(self, request: web.Request) -> web.StreamResponse:
-        # One at a time, and not on this thread: packing would delay the driver's commands.
-        async with self._exporting:
-            _end_if_left(request)
-            files = await asyncio.to_thread(self.backend.export_map)
-            if not files:
-                raise web.HTTPNotFound(text="there is no map yet\n")
-            packed = await asyncio.to_thread(zip_of, files)
-        return _download(packed, "map", "zip", "application/zip")
 
     async def _estop(self, request: web.Request) -> web.StreamResponse:
         """Set the emergency stop without the page's WebSocket, which may be stuck but alone can release it."""
@@ -920,15 +895,6 @@ class ConsoleServer:
             session.set_foreground(kinds, 1.0 / self.config.background_picture_hz)
 
 
-def zip_of(files: dict[str, bytes]) -> bytes:
-    """Return a ZIP archive of ``files``, name → content."""
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in files.items():
-            archive.writestr(name, content)
-    return packed.getvalue()
-
-
 def _bearer(authorization: str) -> str:
     """Return the token in an Authorization header; empty if there is none."""
     scheme, _, token = authorization.partition(" ")
@@ -939,12 +905,6 @@ def _end_if_left(request: web.Request) -> None:
     """End a request whose client has closed its connection: no limit counts it any more."""
     if request.transport is None:
         raise web.HTTPRequestTimeout
-
-
-def _download(content: bytes, stem: str, ending: str, content_type: str) -> web.Response:
-    name = f"{stem}_{datetime.now():%Y%m%d_%H%M%S}.{ending}"
-    headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "no-store"}
-    return web.Response(body=content, content_type=content_type, headers=headers)
 
 
 async def _secure_headers(request: web.Request, response: web.StreamResponse) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.console.access import AccessConfig
-from instant_ic.console.gridimage import GridImage, grey_png, grid_image
+from instant_ic.console.gridimage import GridImage, grid_image
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer, ServerConfig
@@ -144,10 +144,6 @@ class Demo:
     def on_bookmark(self, name: str) -> None:
         """See Backend."""
         self._desk.bookmark(name)
-
-    def export_map(self) -> dict[str, bytes]:
-        """See Backend."""
-        return {"map.png": grey_png(demo_world.occupancy()[0].view(np.uint8)), "map.yaml": b"image: map.png\n"}
 
     def start(self) -> None:
         """Start the server and the robot."""

@@ -1,10 +1,9 @@
-"""What the operator has besides driving, in Chromium: recording, export, overlay, a phone, no mouse, no colours."""
+"""What the operator has besides driving, in Chromium: recording, overlay, a phone, no mouse, no colours."""
 
 import io
 import itertools
 import json
 import re
-import zipfile
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ def text_of(page, selector):
     return page.locator(selector).inner_text()
 
 
-# ---- recording and export ---------------------------------------------------------------------------
+# ---- recording --------------------------------------------------------------------------------------
 
 
 def test_the_record_button_starts_tells_time_and_size_and_ends(driver, shared_demo):
@@ -116,7 +115,7 @@ def saved(page, act):
     return waiting.value.suggested_filename, waiting.value.path().read_bytes()
 
 
-def test_picture_panorama_and_map_are_saved(driver, shared_demo):
+def test_the_view_is_saved(driver, shared_demo):
     from PIL import Image
 
     shared_demo.place(-1.0, -0.5, 0.4)
@@ -130,23 +129,6 @@ def test_picture_panorama_and_map_are_saved(driver, shared_demo):
             break
     assert re.fullmatch(r"view_\d{8}_\d{6}\.png", name) and data[:4] == b"\x89PNG"
     assert shown.shape == (600, 960, 3) and found > 0.9  # of the panorama's few pixels
-    driver.locator("#more-open").click()
-    name, data = saved(driver, driver.get_by_role("button", name="Save the panorama").click)
-    assert re.fullmatch(r"panorama_\d{8}_\d{6}\.jpg", name)
-    assert Image.open(io.BytesIO(data)).size == (192, 96)  # as the camera sent it
-    driver.locator("#more-open").click()
-    name, data = saved(driver, driver.get_by_role("button", name="Save the map").click)
-    assert name.endswith(".zip")
-    assert sorted(zipfile.ZipFile(io.BytesIO(data)).namelist()) == ["map.png", "map.yaml"]
-
-
-def test_what_cannot_be_saved_is_told(driver, shared_demo, monkeypatch):
-    monkeypatch.setattr(shared_demo, "export_map", dict)
-    driver.locator("#more-open").click()
-    driver.get_by_role("button", name="Save the map").click()
-    driver.get_by_text("Not saved: there is no map yet").wait_for(state="attached")
-    assert any("404" in fault for fault in driver.faults)
-    driver.faults.clear()  # the browser reports the answer
 
 
 # ---- overlay ----------------------------------------------------------------------------------------

@@ -1,25 +1,18 @@
 """Record, snapshot, bookmark and export: what the recorder is asked, and what the page is told when it cannot."""
 
 import asyncio
-import io
 import queue
 import threading
 import time
-import zipfile
 
-import aiohttp
-import cv2
-import numpy as np
 import pytest
-import yaml
 
 from instant_ic.bus.control import ControlServer
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ServerConfig
+from instant_ic.console import ConsoleClient, ConsoleServer, ServerConfig
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.recording import MAX_BOOKMARKS, RecorderError, RecordingDesk
-from instant_ic.msg import grid_message
 from nodes.console import ConsoleNode
 
 WAIT_S = 20.0
@@ -159,29 +152,12 @@ def test_the_recorder_is_asked_over_its_control_channel(node, tmp_path, monkeypa
         server.close()
 
 
-def test_the_map_is_exported_as_map_server_reads_it(node, tmp_path):
-    from instant_ic.slam.map_files import load_grid
-
-    bus, console = node
-    assert console.export_map() == {}
-    grid = np.array([[0, 100, -1], [0, 0, 100]], np.int8)  # row 0: lowest y
-    bus.publish("/map", grid_message(grid, 0.05, (1.0, -2.0), "map", bus.clock.now_ns()), latched=True)
-    files = console.export_map()
-    picture = cv2.imdecode(np.frombuffer(files["map.png"], np.uint8), cv2.IMREAD_UNCHANGED)
-    assert picture.tolist() == [[254, 254, 0], [254, 0, 205]]  # largest y on top
-    text = yaml.safe_load(files["map.yaml"])
-    assert (text["image"], text["resolution"], text["origin"]) == ("map.png", 0.05, [1.0, -2.0, 0])
-    for name, content in files.items():
-        (tmp_path / name).write_bytes(content)
-    assert load_grid(tmp_path / "map.yaml").values.tolist() == grid.tolist()
-
-
 # ---- the server ------------------------------------------------------------------------------------
 
 
 class Backend:
     def __init__(self):
-        self.done, self.map = [], {}
+        self.done = []
         self._news = threading.Condition()
 
     def on_drive(self, linear, angular):
@@ -204,9 +180,6 @@ class Backend:
 
     def on_bookmark(self, name):
         self._add(("bookmark", name))
-
-    def export_map(self):
-        return self.map
 
     def _add(self, what):
         with self._news:
@@ -233,7 +206,7 @@ def served(tmp_path):
     server.stop()
 
 
-def test_drivers_record_and_watchers_may_not_but_both_export(served):
+def test_drivers_record_and_watchers_may_not(served):
     server, backend = served
 
     async def scenario():
@@ -256,21 +229,6 @@ def test_drivers_record_and_watchers_may_not_but_both_export(served):
             for name in ("", "  ", "x" * 61, "a\nb", 7):
                 await driver.send({"type": "bookmark", "name": name})
             await driver.wait_for(lambda c: len(c.errors) == 8, WAIT_S)
-        header = {"Authorization": "Bearer watch_token_file-0123456789"}
-        async with aiohttp.ClientSession(headers=header) as http:
-            for path in ("panorama.jpg", "map.zip"):
-                async with http.get(f"{server.url}export/{path}") as answer:
-                    assert answer.status == 404  # nothing there yet
-            server.send_frame(FrameKind.PANORAMA, {}, b"JPEG")
-            backend.map = {"map.png": b"PNG", "map.yaml": b"image: map.png\n"}
-            async with http.get(f"{server.url}export/panorama.jpg") as answer:
-                assert await answer.read() == b"JPEG" and answer.content_type == "image/jpeg"
-                assert answer.headers["Content-Disposition"].startswith('attachment; filename="panorama_')
-            async with http.get(f"{server.url}export/map.zip") as answer:
-                with zipfile.ZipFile(io.BytesIO(await answer.read())) as archive:
-                    assert {name: archive.read(name) for name in archive.namelist()} == backend.map
-        async with aiohttp.ClientSession() as http, http.get(f"{server.url}export/map.zip") as answer:
-            assert answer.status == 401
 
     asyncio.run(scenario())
 

@@ -369,40 +369,6 @@ def test_fault_requests_whose_clients_have_left_wait_for_ever(serve):
     run(scenario)
 
 
-def test_fault_maps_are_packed_for_clients_that_have_left(serve):
-    server = serve()
-    packing, go = threading.Semaphore(0), threading.Event()
-    waiting = Counter()
-
-    def export_map():
-        packing.release()
-        assert go.wait(WAIT_S)
-        return {}
-
-    server.backend.export_map = export_map
-
-    class Counted(asyncio.Lock):
-        async def acquire(self):
-            waiting["exports"] += 1
-            return await super().acquire()
-
-    server._exporting = Counted()
-
-    async def scenario():
-        for number in range(1, 11):
-            await ask_and_leave(server, "/export/map.zip", lambda number=number: waiting["exports"] >= number)
-        await until(lambda: not server.listener.admitted)
-        go.set()
-        async with aiohttp.ClientSession() as http, http.get(server.url + "export/map.zip") as response:
-            assert response.status == 404  # it waits until the others have had their turn
-
-    run(scenario)
-    packed = 0
-    while packing.acquire(blocking=False):
-        packed += 1
-    assert packed == 2  # the one that had begun, and the client that waited
-
-
 def test_fault_another_machines_reports_grow_the_consoles_memory():
     """Each under a new name: they come over the bridge, also from a host that does not drive."""
     faults, most = FaultList(), MOST_NAMES

@@ -12,7 +12,6 @@ import { Link, onDetail } from "./link.js";
 import { Look } from "./look.js";
 import { LAYERS, MAP, PANORAMA, VIEW } from "./messages.js";
 import { Recording } from "./record.js";
-import { saveFile } from "./save.js";
 import { Screen } from "./screen.js";
 import { settingsOf } from "./settings.js";
 import { GlViewer } from "./viewer.js";
@@ -197,8 +196,6 @@ const CLICKS = {
   "help-open": help,
   "help-more": help,
   "save-view": SHORTCUTS.KeyP,
-  "save-panorama": () => saveFile("panorama.jpg"),
-  "save-map": () => saveFile("map.zip"),
 };
 for (const [id, action] of Object.entries(CLICKS)) byId(id).addEventListener("click", action);
 byId("estop").addEventListener("pointerdown", stopNow);

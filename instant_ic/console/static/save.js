@@ -1,5 +1,5 @@
 // @ts-check
-// Saves the view, the panorama and the map as files on the operator's machine.
+// Saves the view as a file on the operator's machine.
 
 import { toast } from "./hud.js";
 
@@ -19,18 +19,6 @@ export function saveView(canvas, render) {
   canvas.width = width;
   canvas.height = height;
   render();
-}
-
-/** Saves a file of the server. @param {string} path under /export/ */
-export async function saveFile(path) {
-  try {
-    const answer = await fetch(`/export/${path}`, { cache: "no-store" });
-    if (!answer.ok) return toast(`Not saved: ${(await answer.text()).trim()}`);
-    const name = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1] ?? path;
-    download(await answer.blob(), name);
-  } catch (error) {
-    toast(`Not saved: ${error instanceof Error ? error.message : error}`);
-  }
 }
 
 /** @param {Blob} blob @param {string} name */
