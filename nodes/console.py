@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +137,8 @@ class ConsoleNode(Node[ConsoleConfig]):
     def on_look(self, look: Look) -> None:
         self.feed.requests.look = look
 
-    def on_bookmark(self, name: str) -> None:
+    def on_bookmark(self) -> None:
+        name = f"bookmark {datetime.now():%H:%M:%S}"
         self.bookmark_out.publish(msg.String(data=name))  # the topic puts it into every recording and snapshot
         self.recording.bookmark(name)
 

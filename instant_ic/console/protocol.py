@@ -137,16 +137,6 @@ def whole(message: dict[str, Any], key: str) -> int:
     return value
 
 
-def short_text(message: dict[str, Any], key: str, max_length: int) -> str:
-    """Return ``message[key]``, a text of 1 to ``max_length`` printable characters; raise ProtocolError otherwise."""
-    value = message.get(key)
-    if not isinstance(value, str) or not 1 <= len(value.strip()) <= max_length or not value.isprintable():
-        raise ProtocolError(
-            f"{message['type']}.{key} must be 1 to {max_length} printable characters (got {value!r:.80})"
-        )
-    return value.strip()
-
-
 def flag(message: dict[str, Any], key: str, default: bool | None = None) -> bool:
     """Return ``message[key]`` as a bool; raise ProtocolError for another type or a missing key without default."""
     value = message.get(key, default)

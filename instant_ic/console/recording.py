@@ -6,14 +6,10 @@ import logging
 import queue
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Mapping
-from datetime import datetime
+from collections.abc import Callable
 from pathlib import PurePath
 from typing import Any
 
-MAX_BOOKMARKS = 50
-MAX_SNAPSHOTS = 5
 _END_S = 5.0
 logger = logging.getLogger("instant_ic.console")
 
@@ -37,9 +33,7 @@ class RecordingDesk:
         self._report = report
         self._poll_s = poll_s
         self._wishes: queue.Queue[Callable[[], str] | None] = queue.Queue(maxsize=20)
-        self._bookmarks: deque[dict[str, Any]] = deque(maxlen=MAX_BOOKMARKS)
-        self._recording: Mapping[str, Any] = {}
-        self._asked_s = 0.0
+        self._recording = False
         self._notice: dict[str, Any] = {"number": 0, "text": "", "level": "ok"}
         self._thread = threading.Thread(target=self._run, name="recording desk", daemon=True)
 
@@ -64,15 +58,8 @@ class RecordingDesk:
         self._wish(self._snap)
 
     def bookmark(self, name: str) -> None:
-        """Add a published bookmark to the list."""
-        recording = self._recording
-        seconds: float | None = None
-        if recording.get("state") == "recording":
-            seconds = round(recording.get("seconds", 0.0) + time.monotonic() - self._asked_s, 1)
-        path = recording.get("path", "") if seconds is not None else ""
-        at = f"{datetime.now():%H:%M:%S}"
-        self._bookmarks.append({"name": name, "at": at, "seconds": seconds, "recording": _name(path)})
-        self._wish(lambda: f"Bookmark set: {name}" + ("" if path else " (not recording)"))
+        """Confirm a published bookmark to the operator."""
+        self._wish(lambda: f"Bookmark set: {name}" + ("" if self._recording else " (not recording)"))
 
     def _wish(self, wish: Callable[[], str] | None) -> None:
         try:
@@ -115,32 +102,26 @@ class RecordingDesk:
 
     def status(self) -> dict[str, Any]:
         """Ask the recorder for its state and return the page's ``recording`` message."""
-        message: dict[str, Any] = {"notice": self._notice, "bookmarks": list(self._bookmarks)}
+        message: dict[str, Any] = {"notice": self._notice}
         try:
             status = self._ask("status")
         except RecorderError as error:
-            self._recording = {}
+            self._recording = False
             return message | {"recorder": "missing", "text": str(error), "state": "none"}
         recording = status.get("recording")
         if recording is None:
             text = f"The recorder writes {_name(status.get('path', ''))} continuously. It cannot be started or stopped."
             return message | {"recorder": "missing", "text": text, "state": "none"}
-        self._recording, self._asked_s = recording, time.monotonic()
-        found = [
-            {"name": _name(made.get("path", "")), "state": made.get("state", ""), "text": made.get("words", "")}
-            for made in status.get("snapshots", [])[-MAX_SNAPSHOTS:]
-        ]
+        self._recording = recording.get("state") == "recording"
         return message | {
             "recorder": "ok",
             "text": recording.get("error", "") or status.get("error", ""),
             "state": recording.get("state", "idle"),
-            "name": _name(recording.get("path", "")),
             "path": recording.get("path", ""),
             "seconds": recording.get("seconds", 0.0),
             "bytes": recording.get("bytes", 0),
             "free_bytes": recording.get("free_bytes"),
             "cached_s": status.get("cached_s", 0.0),
-            "snapshots": found,
         }
 
 

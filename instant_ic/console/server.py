@@ -35,7 +35,7 @@ from instant_ic.console.connections import (
 from instant_ic.console.drive import LOOK_S, DriveConfig, DriveGate
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.log_rate import limit_logs
-from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, short_text, whole
+from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, whole
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
 from instant_ic.control.robot_lease import Verdict, sender_name
@@ -54,7 +54,6 @@ BURST_REQUESTS = 150.0
 SOCKETS_PER_S = 5.0  # WebSockets opened by one address; a new one is sent everything that is shown
 BURST_SOCKETS = 20.0
 RESERVED_FOR_DRIVERS = 2  # share of max_clients that pages that may only watch cannot take
-MAX_BOOKMARK = 60  # characters
 SILENT_CLIENT_S = 15.0
 SUPERSEDED_S = 5.0  # time for a page to load new layers; what it still renders from older ones does not count as a view
 START_TIMEOUT_S = 10.0
@@ -98,8 +97,8 @@ class Backend(Protocol):
     def on_snapshot(self) -> None:
         """Save the last minute."""
 
-    def on_bookmark(self, name: str) -> None:
-        """Give the present moment a name."""
+    def on_bookmark(self) -> None:
+        """Set a bookmark at the present moment."""
 
 
 @dataclass(frozen=True)
@@ -759,9 +758,8 @@ class ConsoleServer:
             self.backend.on_snapshot()
 
     def _on_bookmark(self, session: Session, message: dict[str, Any], now: float) -> None:
-        name = short_text(message, "name", MAX_BOOKMARK)
         if self._may_drive(session):
-            self.backend.on_bookmark(name)
+            self.backend.on_bookmark()
 
     def _on_ack(self, session: Session, message: dict[str, Any], now: float) -> None:
         try:

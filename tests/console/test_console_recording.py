@@ -2,6 +2,7 @@
 
 import asyncio
 import queue
+import re
 import threading
 import time
 
@@ -12,7 +13,7 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.console import ConsoleClient, ConsoleServer, ServerConfig
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.config import ConsoleConfig
-from instant_ic.console.recording import MAX_BOOKMARKS, RecorderError, RecordingDesk
+from instant_ic.console.recording import RecorderError, RecordingDesk
 from nodes.console import ConsoleNode
 
 WAIT_S = 20.0
@@ -30,8 +31,7 @@ class FakeRecorder:
                 "state": self.state, "path": "/d/rec_1", "seconds": 12.5, "bytes": 3_000_000, "messages": 9,
                 "error": self.error, "free_bytes": 10**9,
             }  # fmt: skip
-            made = [{"path": f"/d/s{n}", "state": "done", "words": "9 messages"} for n in range(7)]
-            return {"path": "/d", "error": "", "cached_s": 60.0, "snapshots": made, "recording": recording}
+            return {"path": "/d", "error": "", "cached_s": 60.0, "recording": recording}
         self.asked.append((command, arguments))
         if command == "record":
             self.state = "recording"
@@ -61,14 +61,13 @@ def test_a_recording_is_begun_told_and_ended(desk):
     assert wait_for(lambda m: m["state"] == "idle")["recorder"] == "ok"
     made.record(True)
     told = wait_for(lambda m: m["state"] == "recording")
-    assert (told["name"], told["seconds"], told["bytes"], told["free_bytes"]) == ("rec_1", 12.5, 3_000_000, 10**9)
+    assert (told["path"], told["seconds"], told["bytes"], told["free_bytes"]) == ("/d/rec_1", 12.5, 3_000_000, 10**9)
     assert told["notice"] == {"number": 1, "text": "Recording to rec_1", "level": "ok"}
     made.record(False)
     made.snapshot()
     told = wait_for(lambda m: m["notice"]["number"] == 3)
     assert recorder.asked == [("record", {}), ("stop", {}), ("snapshot", {"reason": "operator"})]
     assert told["notice"]["text"] == "Saving the last minute: rec_1"
-    assert [made["name"] for made in told["snapshots"]] == ["s2", "s3", "s4", "s5", "s6"]  # the newest five
 
 
 def test_a_missing_recorder_and_a_refusal_are_told_in_words_and_the_next_wish_counts(desk):
@@ -89,21 +88,6 @@ def test_a_full_disk_is_told(desk):
     assert wait_for(lambda m: m["state"] == "disk full")["text"] == "only 90 MB are free where /d is"
 
 
-def test_bookmarks_are_listed_with_their_place_in_the_recording(desk):
-    made, recorder, wait_for = desk
-    made.bookmark("before")
-    statuses = wait_for(lambda m: m["bookmarks"])
-    assert statuses["bookmarks"][0]["seconds"] is None and "not recording" in statuses["notice"]["text"]
-    recorder.state = "recording"
-    wait_for(lambda m: m["state"] == "recording")
-    for n in range(MAX_BOOKMARKS):
-        made.bookmark(f"door {n}")
-    statuses = wait_for(lambda m: m["bookmarks"][-1]["name"] == f"door {MAX_BOOKMARKS - 1}")
-    assert len(statuses["bookmarks"]) == MAX_BOOKMARKS and statuses["bookmarks"][0]["name"] == "door 0"
-    assert statuses["bookmarks"][-1]["recording"] == "rec_1"
-    assert 12.5 <= statuses["bookmarks"][-1]["seconds"] < 12.5 + WAIT_S  # and what has passed since it was asked
-
-
 def test_a_recorder_that_records_all_the_time_is_no_recorder_for_the_button():
     statuses = []
     made = RecordingDesk(lambda command, **arguments: {"path": "/d/drive"}, statuses.append)
@@ -122,8 +106,8 @@ def node():
 
 def test_a_bookmark_goes_to_the_bus_so_that_every_bag_has_it(node):
     bus, console = node
-    console.on_bookmark("door stuck")
-    assert bus.last("/operator/bookmark").data == "door stuck"
+    console.on_bookmark()
+    assert re.fullmatch(r"bookmark \d\d:\d\d:\d\d", bus.last("/operator/bookmark").data)
 
 
 def test_the_recorder_is_asked_over_its_control_channel(node, tmp_path, monkeypatch):
@@ -178,8 +162,8 @@ class Backend:
     def on_snapshot(self):
         self._add(("snapshot",))
 
-    def on_bookmark(self, name):
-        self._add(("bookmark", name))
+    def on_bookmark(self):
+        self._add(("bookmark",))
 
     def _add(self, what):
         with self._news:
@@ -214,21 +198,19 @@ def test_drivers_record_and_watchers_may_not(served):
             ConsoleClient(server.url, token="token_file-0123456789") as driver,
             ConsoleClient(server.url, token="watch_token_file-0123456789") as watcher,
         ):
-            for message in ({"type": "record", "on": True}, {"type": "snapshot"}, {"type": "bookmark", "name": "x"}):
+            for message in ({"type": "record", "on": True}, {"type": "snapshot"}, {"type": "bookmark"}):
                 await watcher.send(message)
             await watcher.wait_for(lambda c: c.refused == ["watch_only"] * 3, WAIT_S)
             assert backend.done == []
             await driver.send({"type": "record", "on": True})
             await driver.send({"type": "snapshot"})
-            await driver.send({"type": "bookmark", "name": " door stuck "})
+            await driver.send({"type": "bookmark"})
             await driver.send({"type": "record", "on": False})
             await asyncio.to_thread(backend.wait, 4)
-            assert backend.done == [("record", True), ("snapshot",), ("bookmark", "door stuck"), ("record", False)]
-            for bad in ({"type": "record"}, {"type": "record", "on": 1}, {"type": "bookmark"}):
+            assert backend.done == [("record", True), ("snapshot",), ("bookmark",), ("record", False)]
+            for bad in ({"type": "record"}, {"type": "record", "on": 1}):
                 await driver.send(bad)
-            for name in ("", "  ", "x" * 61, "a\nb", 7):
-                await driver.send({"type": "bookmark", "name": name})
-            await driver.wait_for(lambda c: len(c.errors) == 8, WAIT_S)
+            await driver.wait_for(lambda c: len(c.errors) == 2, WAIT_S)
 
     asyncio.run(scenario())
 

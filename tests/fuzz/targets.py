@@ -344,7 +344,7 @@ _MESSAGES: tuple[dict[str, Any], ...] = (
     {"type": "look", "yaw": 0.1, "pitch": 0.2, "hfov": 1.5, "vfov": 1.0},
     {"type": "record", "on": True},
     {"type": "snapshot"},
-    {"type": "bookmark", "name": "here"},
+    {"type": "bookmark"},
     {"type": "ack", "kind": 1, "seq": 5},
 )
 _JSON_WORDS = tuple(

@@ -3,7 +3,7 @@
 
 /** @import { Frame, GridFrame, Message } from "./messages.js" */
 import { byId, elementOf, mark } from "./dom.js";
-import { attachStick, Drive, isDriveKey, isTyping } from "./drive.js";
+import { attachStick, Drive, isDriveKey } from "./drive.js";
 import { Gamepads } from "./gamepad.js";
 import * as hud from "./hud.js";
 import { Images } from "./images.js";
@@ -25,7 +25,7 @@ const drive = new Drive(link);
 const look = new Look(canvas);
 const images = new Images(viewer, link);
 const screen = new Screen(viewer, images, look, link, lease);
-const recording = new Recording(link, drive);
+const recording = new Recording(link);
 const pads = new Gamepads(drive, look);
 const wake = () => screen.wake();
 
@@ -167,7 +167,6 @@ const SHORTCUTS = {
 };
 
 window.addEventListener("keydown", (event) => {
-  if (isTyping(event)) return; // typing a name in a dialog; the robot is stopped while it is open
   if (event.code === "Space") {
     // The space bar always stops, so no focused button may receive it.
     event.preventDefault();
@@ -180,7 +179,7 @@ window.addEventListener("keydown", (event) => {
   if (isDriveKey(event)) askForTheLease();
 }, { capture: true });
 window.addEventListener("keyup", (event) => {
-  if (event.code === "Space" && !isTyping(event)) event.preventDefault();
+  if (event.code === "Space") event.preventDefault();
 }, { capture: true });
 
 /** @type {Record<string, () => void>} */

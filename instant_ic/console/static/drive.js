@@ -13,14 +13,8 @@ const KEYS = {
   KeyD: [0, -1], ArrowRight: [0, -1],
 };
 
-/** Whether a key event goes to a text field. @param {Event} event */
-export function isTyping(event) {
-  return event.target instanceof HTMLInputElement && event.target.type === "text";
-}
-
 /** Whether a key event drives; keys of a focused slider belong to the slider. @param {KeyboardEvent} event */
 export function isDriveKey(event) {
-  if (isTyping(event)) return false;
   const slider = event.target instanceof HTMLInputElement && event.code.startsWith("Arrow");
   return event.code in KEYS && !slider;
 }
@@ -102,10 +96,6 @@ export class Drive extends EventTarget {
   }
 
   _update() {
-    if (this.link.away()) {
-      this._held.clear();
-      this._stick = [0, 0];
-    }
     let [forward, left] = this._stick;
     for (const code of this._held) {
       forward += KEYS[code][0];

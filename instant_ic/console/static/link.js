@@ -22,8 +22,6 @@ export class Link extends EventTarget {
     /** @type {number | null} Delay of the last drive command. */
     this.commandAgeMs = null;
     this.commandHz = 0; // drive commands accepted in the last second
-    /** Whether the operator does something else, such as typing. @type {() => boolean} */
-    this.away = () => false;
     this.connected = false;
     this.everConnected = false;
     /** @type {WebSocket | null} */
@@ -129,7 +127,7 @@ export class Link extends EventTarget {
   }
 
   _ping(leaving = false) {
-    this.send({ type: "ping", client_ms: performance.now(), away: leaving || document.hidden || this.away() });
+    this.send({ type: "ping", client_ms: performance.now(), away: leaving || document.hidden });
   }
 
   /** @param {string | ArrayBuffer} data */

@@ -1,7 +1,6 @@
 // @ts-check
 // Look direction relative to the robot's heading: mouse or finger drag, wheel, keys.
 
-import { isTyping } from "./drive.js";
 import { clamp, radians, wrapAngle } from "./math.js";
 
 const MAX_PITCH = radians(80);
@@ -42,7 +41,7 @@ export class Look {
     }, { passive: false });
     element.addEventListener("dblclick", () => this.centre());
     window.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || isTyping(event)) return;
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
       if (event.code in KEYS) this._held.add(event.code);
       if (event.code === "KeyC") this.centre();
     });

@@ -117,8 +117,6 @@ const recording = object({
   bytes: optional(number),
   free_bytes: optional(number),
   cached_s: optional(number),
-  snapshots: optional(list(object({ name: text, state: text, text }))),
-  bookmarks: list(object({ name: text, at: text, seconds: optional(number), recording: text })),
   notice: object({ number, text, level: text }),
 });
 const refused = object({

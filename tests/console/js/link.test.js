@@ -96,15 +96,11 @@ test("a refused WebSocket asks why; 401 shows the sign-in", async () => {
   assert.deepEqual(events, ["signed-out"]);
 });
 
-test("pings say whether the operator is away: typing, hidden or leaving", () => {
+test("pings say whether the operator is away: hidden or leaving", () => {
   connect();
   const last = () => socket().sent.at(-1);
-  link.away = () => true;
   time.advance(50);
-  assert.deepEqual([last().type, last().away], ["ping", true]);
-  link.away = () => false;
-  time.advance(50);
-  assert.equal(last().away, false);
+  assert.deepEqual([last().type, last().away], ["ping", false]);
   document.hidden = true;
   fire(document, "visibilitychange"); // at once
   assert.equal(last().away, true);
