@@ -6,15 +6,17 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
+from instant_ic.depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES
+from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.depth.sources import DepthSource, SourceConfig, complete
-from instant_ic.experiments.depth_lidar import Errors, measure
+from instant_ic.experiments.depth_lidar import RangeErrors, measure
 from instant_ic.geometry.projections import equirect_directions, sample_equirect
 
 if TYPE_CHECKING:
@@ -27,12 +29,16 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 class DepthEvaluationError(ValueError):
-    """An image cannot be scored, or the settings contradict each other."""
+    """An image cannot be scored, a file has no partner, or the settings contradict each other."""
 
 
 @dataclass(frozen=True)
-class LidarSettings(Errors):
-    """The simulated VLP-16 above or below the camera, with its errors; see ``depth_lidar``."""
+class LidarSettings(RangeErrors):
+    """The simulated VLP-16 above or below the camera, with its errors.
+
+    Attributes:
+        height_m: height above the floor.
+    """
 
     height_m: float = 0.6
 
@@ -44,27 +50,21 @@ class LidarSettings(Errors):
 
 @dataclass(frozen=True)
 class DepthSettings:
-    """Evaluation settings.
+    """Settings of an evaluation.
 
     Attributes:
         source: ``network``, ``lidar``, ``fused`` or ``completed``.
         lidar: simulated LiDAR that measures the ground truth; None: the network's metres are scored unscaled.
-        camera_height_m: above the floor.
-        method: of the scaler; empty for its default.
+        camera_height_m: height above the floor.
     """
 
     source: str = "fused"
     lidar: LidarSettings | None = None
     camera_height_m: float = 1.2
-    method: str = ""
 
     def __post_init__(self) -> None:
         if self.source != "network" and self.lidar is None:
-            raise DepthEvaluationError(f"source {self.source} needs LiDAR points: add --lidar (and --depth)")
-        if self.method and self.lidar is None:
-            raise DepthEvaluationError("a scaling method needs LiDAR points: add --lidar (and --depth)")
-        if self.method and self.source == "lidar":
-            raise DepthEvaluationError("source lidar does not scale a network: omit the method")
+            raise DepthEvaluationError(f"source {self.source} needs LiDAR points: give --depth and --lidar too")
         if not self.camera_height_m > 0:
             raise DepthEvaluationError(f"the camera's height must be above 0 (got {self.camera_height_m})")
 
@@ -75,71 +75,55 @@ class Scored:
 
     Attributes:
         name: label for the report.
-        rgb: (H, W, 3) uint8 image.
-        depth_m: (h, w) float32 result, metres (the model's unit if it was not scaled), 0 = unknown.
-        truth_m: (H', W') float32, 0 = unknown; None without ground truth.
-        points: (N, 3) LiDAR points in the camera's frame; None without LiDAR.
-        before: metrics of the network's metres before scaling; None if the network outputs none, or without ground
-            truth.
-        after: metrics of the result; None without ground truth. ``weighted`` counts pixels by solid angle; ``shape``
-            divides the result by its median ratio to the truth first, which shows the error that no scale can remove.
-        sigma_shares: shares of pixels whose error is within one, two and three sigma; None without LiDAR or ground
-            truth.
-        seconds_model, seconds_source: wall time of the network, and of scaling and fusion; ``cpu_source_s``: CPU time
-            of scaling and fusion.
-        fit: ``ok``, ``message``, ``scale``, ``shift``, ``quality``, ``relative_sigma``, ``points``; None without LiDAR.
+        rgb: image, (H, W, 3) uint8.
+        depth_m: result in metres (the model's unit if it was not scaled), (h, w) float32; 0 is unknown.
+        truth_m: true depth, (H', W') float32; 0 is unknown; None without ground truth.
+        before: metrics of the network's metres before scaling; None if it estimates none, or without ground truth.
+        after: metrics of the result; None without ground truth.
+        shape: metrics of the result after division by its median ratio to the truth, which show the error that no
+            scale can remove; None without ground truth.
+        within_sigma: shares of pixels with an error within one, two and three sigma; None without LiDAR or truth.
+        seconds_model: wall time of the network.
+        seconds_source: wall time of scaling and fusion.
+        fit: ``ok``, ``message``, ``scale``, ``shift``, ``quality``, ``relative_sigma`` and ``points`` of the scaling;
+            None without LiDAR.
     """
 
     name: str
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     truth_m: NDArray[np.float32] | None
-    points: NDArray[np.float32] | None
     before: DepthMetrics | None
     after: DepthMetrics | None
-    weighted: DepthMetrics | None
     shape: DepthMetrics | None
-    sigma_shares: tuple[float, float, float] | None
+    within_sigma: tuple[float, float, float] | None
     seconds_model: float
     seconds_source: float
-    cpu_source_s: float
     fit: dict[str, Any] | None
 
-    @property
-    def seconds(self) -> float:
-        """Time from image (and points) to depth."""
-        return self.seconds_model + self.seconds_source
-
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; the metrics after scaling are repeated at the top level."""
-        row: dict[str, Any] = {"name": self.name}
-        if self.after is not None:
-            row |= self.after.as_dict()
-        row |= {
-            "seconds": round(self.seconds, 4),
-            "seconds_model": round(self.seconds_model, 4),
-            "seconds_source": round(self.seconds_source, 4),
-            "cpu_source_s": round(self.cpu_source_s, 4),
-        }
-        for key in ("before", "after", "weighted", "shape"):
-            metrics: DepthMetrics | None = getattr(self, key)
-            row[_KEYS[key]] = metrics.as_dict() if metrics is not None else None
-        for index, name in enumerate(("one", "two", "three")):
-            row[f"within_{name}_sigma"] = _rounded(self.sigma_shares[index]) if self.sigma_shares else None
+        """Return plain values; the metrics after scaling are repeated at the top level."""
+        row: dict[str, Any] = {"name": self.name, **(self.after.as_dict() if self.after else {})}
+        row["seconds"] = round(self.seconds_model + self.seconds_source, 4)
+        row["seconds_model"], row["seconds_source"] = round(self.seconds_model, 4), round(self.seconds_source, 4)
+        for name, metrics in zip(_METRICS, (self.before, self.after, self.shape), strict=True):
+            row[name] = metrics.as_dict() if metrics is not None else None
+        for number, name in enumerate(("one", "two", "three")):
+            row[f"within_{name}_sigma"] = _rounded(self.within_sigma[number]) if self.within_sigma else None
         row["fit"] = self.fit
         return row
 
 
-_KEYS = {"before": "before", "after": "after", "weighted": "after_by_solid_angle", "shape": "after_best_scale"}
+_METRICS = ("before", "after", "after_best_scale")
 
 
 class Evaluator:
-    """Scores panoramas one by one with the same settings.
+    """Depth source that is scored on panoramas one by one.
 
     Args:
-        settings: of the evaluation.
-        model: the network that sees the image alone; None for ``lidar``.
-        completion: of ``completed``.
+        settings: settings of the evaluation.
+        model: network that sees the image alone; None for source ``lidar``.
+        completion: network of source ``completed``.
 
     Raises:
         DepthEvaluationError: the settings need a model, or a different one.
@@ -158,75 +142,80 @@ class Evaluator:
         if kind != "metric" and settings.lidar is None:
             raise DepthEvaluationError(f"the model's depth is {kind}: metres come only from LiDAR, add --lidar")
         scaler = replace(ScalerConfig(), output_kind=kind)
-        if settings.method:
-            scaler = replace(scaler, method=settings.method)
         self.source = DepthSource(SourceConfig(source=settings.source, scaler=scaler))
         self._warm = False
 
-    def score(self, name: str, rgb: NDArray[np.uint8], truth_m: Floats | None, points: Floats | None = None) -> Scored:
-        """Score the depth of a level panorama against ground truth.
+    def score(self, name: str, rgb: NDArray[np.uint8], truth_m: Floats | None) -> Scored:
+        """Score the depth of a level panorama.
 
-        ``rgb`` is (H, W, 3) uint8; ``truth_m`` is the radial depth (H', W') in metres, 0 = unknown. Scores are computed
-        at the ground truth's pixels. A result of another size is interpolated there, bilinear in inverse depth and with
-        the nearest pixel at edges. ``points`` (N, 3) in the camera's frame replace the simulated LiDAR measurement.
+        Metrics are computed at the pixels of the ground truth. A result of another size is interpolated there.
+
+        Args:
+            name: label for the report.
+            rgb: panorama, (H, 2 H, 3).
+            truth_m: true radial depth in metres, (H', 2 H'); 0 is unknown; None: no comparison.
 
         Raises:
             DepthEvaluationError: not a panorama, nothing to compare, or LiDAR without ground truth to measure.
         """
-        settings = self.settings
-        for what, array in (("picture", rgb), ("true depth", truth_m)):
-            if array is not None and abs(array.shape[1] - 2 * array.shape[0]) > 0.02 * array.shape[1]:
-                raise DepthEvaluationError(
-                    f"{name}: the {what} is {array.shape[1]} x {array.shape[0]}, a 360° panorama is 2:1"
-                )
-        truth = None
-        if truth_m is not None:
-            known = np.isfinite(truth_m) & (truth_m > 0)
-            truth = np.where(known, truth_m, 0).astype(np.float32)
-            if not known.any():
-                raise DepthEvaluationError(f"{name}: the ground truth has no valid pixel")
-        if settings.lidar is not None and points is None:
+        _check_panorama(name, "picture", rgb)
+        truth = None if truth_m is None else _known_depth(name, truth_m)
+        settings, points = self.settings, None
+        if settings.lidar is not None:
             if truth is None:
                 raise DepthEvaluationError(f"{name}: the simulated LiDAR needs ground-truth depth")
             points = measure(truth, settings.lidar.height_m, settings.camera_height_m, settings.lidar)
         if self.model is not None and not self._warm:
-            self.model.estimate(rgb)  # warm-up: the first run allocates memory
+            self.model.estimate(rgb)  # the first run allocates memory
             self._warm = True
         begin = time.perf_counter()
         raw = self.model.estimate(rgb) if self.model is not None else None
-        between, cpu_s = time.perf_counter(), time.process_time()
-        sigma = fit = None
-        if settings.lidar is None:
-            assert raw is not None  # ensured by __init__ and DepthSettings: only the network works without LiDAR
-            depth = raw
-        else:
-            assert points is not None
-            result = self.source.estimate(raw, points, _UP, settings.camera_height_m)
-            if self.completion is not None:
-                result = complete(result, partial(self.completion.complete, rgb))
-            depth, sigma = result.depth_m, result.sigma
-            keys = ("ok", "message", "scale", "shift", "quality", "relative_sigma", "points")
-            fit = {key: _rounded(getattr(result, key)) for key in keys}
-        end, cpu_s = time.perf_counter(), time.process_time() - cpu_s
-        before = after = weighted = shape = shares = None
+        between = time.perf_counter()
+        depth, sigma, fit = self._depth(rgb, raw, points)
+        end = time.perf_counter()
+        before = after = shape = shares = None
         if truth is not None:
-            at_truth = look_up(depth, truth.shape)
+            known, at_truth = truth > 0, look_up(depth, truth.shape)
             after = depth_metrics(at_truth, truth, known)
-            weighted = depth_metrics(at_truth, truth, known, solid_angle_weights(len(truth))[:, None])
             ratio = at_truth[known & (at_truth > 0)] / truth[known & (at_truth > 0)]
             shape = depth_metrics(at_truth / np.median(ratio) if len(ratio) else at_truth, truth, known)
             if raw is not None and self.model is not None and self.model.manifest.output_kind == "metric":
                 before = depth_metrics(look_up(raw, truth.shape), truth, known)
             if sigma is not None:
                 shares = _within_sigma(depth, sigma, nearest(truth, depth.shape))
-        return Scored(
-            name, rgb, depth, truth, None if points is None else points.astype(np.float32), before, after, weighted,
-            shape, shares, between - begin, end - between, cpu_s, fit,
-        )  # fmt: skip
+        return Scored(name, rgb, depth, truth, before, after, shape, shares, between - begin, end - between, fit)
+
+    def _depth(
+        self, rgb: NDArray[np.uint8], raw: NDArray[np.float32] | None, points: Floats | None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32] | None, dict[str, Any] | None]:
+        """Return depth, sigma and fit of the source, from the network's depth and the LiDAR's points."""
+        if points is None:
+            assert raw is not None  # ensured by DepthSettings: only the network works without LiDAR
+            return raw, None, None
+        result = self.source.estimate(raw, points, _UP, self.settings.camera_height_m)
+        if self.completion is not None:
+            result = complete(result, partial(self.completion.complete, rgb))
+        keys = ("ok", "message", "scale", "shift", "quality", "relative_sigma", "points")
+        return result.depth_m, result.sigma, {key: _rounded(getattr(result, key)) for key in keys}
+
+
+def _check_panorama(name: str, what: str, array: NDArray[Any]) -> None:
+    height, width = array.shape[:2]
+    if abs(width - 2 * height) > 0.02 * width:
+        raise DepthEvaluationError(f"{name}: the {what} is {width} x {height}, a 360° panorama is 2:1")
+
+
+def _known_depth(name: str, truth_m: Floats) -> NDArray[np.float32]:
+    """Return true depth with 0 for unknown pixels."""
+    _check_panorama(name, "true depth", truth_m)
+    truth = np.where(np.isfinite(truth_m) & (truth_m > 0), truth_m, 0).astype(np.float32)
+    if not truth.any():
+        raise DepthEvaluationError(f"{name}: the ground truth has no valid pixel")
+    return truth
 
 
 def look_up(depth: Floats, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Resample equirect depth to (H, W): planes stay planes, and edges stay sharp."""
+    """Resample equirect depth to (H, W): bilinear in inverse depth, nearest pixel at depth edges."""
     if depth.shape == size:
         return depth.astype(np.float32)
     inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0)
@@ -256,31 +245,26 @@ def _within_sigma(depth: Floats, sigma: Floats, truth: Floats) -> tuple[float, f
 
 
 def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: DepthModel | None) -> dict[str, Any]:
-    """``Scored.as_dict`` of panoramas with their means: ``mean`` (after scaling), ``before`` and ``after``."""
-    means = {key: _mean([row[key] for row in scored if row.get(key)]) for key in _KEYS.values()}
+    """Summarise ``Scored.as_dict`` of panoramas: means before and after scaling, and each image."""
+    means = {key: _mean([row[key] for row in scored if row.get(key)]) for key in _METRICS}
     mean: dict[str, Any] = dict(means["after"] or {})
     for key in ("seconds", "seconds_model", "seconds_source"):
         if scored:
             mean[key] = round(float(np.mean([row[key] for row in scored])), 4)
-    errors = [row["scale_error_median"] for row in scored if "scale_error_median" in row]
     shares = [row["within_one_sigma"] for row in scored if row["within_one_sigma"] is not None]
     return {
         "model": model.manifest.name if model else None,
         "provider": model.provider if model else None,
         "source": settings.source,
-        "method": settings.method or (ScalerConfig().method if settings.lidar and model else None),
         "lidar": asdict(settings.lidar) if settings.lidar else None,
         "camera_height_m": settings.camera_height_m,
         "count": len(scored),
         "fits_ok": sum(bool(row["fit"]["ok"]) for row in scored) if settings.lidar else None,
         "mean": mean,
         **means,
-        "scale_error": {
-            "median": _rounded(float(np.median(errors))), "p95": _rounded(float(np.quantile(errors, 0.95)))
-        } if errors else None,
         "within_one_sigma": _rounded(float(np.mean(shares))) if shares else None,
         "images": list(scored),
-    }  # fmt: skip
+    }
 
 
 def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, float] | None:
@@ -288,7 +272,45 @@ def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, float] | None:
 
 
 def _rounded(value: Any) -> Any:
-    """Round numbers for JSON to five decimals, and replace infinity."""
+    """Round numbers for JSON to five decimals, and replace infinity by None."""
     if isinstance(value, float | np.floating):
         return round(float(value), 5) if np.isfinite(value) else None
     return value
+
+
+def pair(images: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, Path | None]]:
+    """Pair each image with the depth file of the same stem (``room.jpg``, ``room.npy``), or with None.
+
+    Paths are files or folders. A single image and a single depth file are paired whatever their names. A stem may end
+    in ``_rgb`` or ``_depth``; a folder's files that end in ``_depth`` are no images.
+
+    Raises:
+        DepthEvaluationError: a path is missing, a folder holds no image, or no image has a depth file.
+    """
+    found = [path for path in _files(images, PICTURE_SUFFIXES) if not path.stem.endswith("_depth") or path in images]
+    if not found:
+        raise DepthEvaluationError(f"{images[0]}: no picture in this folder ({', '.join(PICTURE_SUFFIXES)})")
+    depth = [path for path in _files(truths, DEPTH_SUFFIXES) if path not in found]
+    if len(found) == len(depth) == 1:
+        return [(found[0], depth[0])]
+    by_stem = {_stem(path): path for path in depth}
+    pairs = [(image, by_stem.get(_stem(image))) for image in found]
+    if truths and not any(truth for _, truth in pairs):
+        raise DepthEvaluationError(f"no depth file has the stem of an image ({found[0].name}, ...)")
+    return pairs
+
+
+def _files(paths: Sequence[Path], suffixes: tuple[str, ...]) -> list[Path]:
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            found += sorted(file for file in path.iterdir() if file.suffix.lower() in suffixes)
+        elif path.is_file():
+            found.append(path)
+        else:
+            raise DepthEvaluationError(f"{path}: no such file or folder")
+    return found
+
+
+def _stem(path: Path) -> str:
+    return path.stem.removesuffix("_rgb").removesuffix("_depth")

@@ -19,14 +19,14 @@ MIN_RANGE_M, MAX_RANGE_M = 0.4, 100.0
 
 
 @dataclass(frozen=True)
-class Errors:
+class RangeErrors:
     """Errors of measured ranges.
 
     Attributes:
         noise_m: standard deviation of a range, metres.
         outliers: share of the points, 0..1, at a wrong range on their ray: half nearer than the surface (dust, rain,
             mixed pixels), half up to three times as far (glass, mirrors).
-        seed: of both.
+        seed: seed of noise and outliers.
     """
 
     noise_m: float = 0.02
@@ -54,7 +54,7 @@ def measure(
     depth_m: Floats,
     lidar_height_m: float,
     camera_height_m: float,
-    errors: Errors | None = None,
+    errors: RangeErrors | None = None,
 ) -> NDArray[np.float32]:
     """Simulate one revolution of a VLP-16 on the camera's vertical, from a level depth image.
 
@@ -63,12 +63,13 @@ def measure(
     visible surface (through a depth discontinuity) or through unknown pixels, because its end is unknown.
 
     Args:
-        depth_m: (H, W) radial depth of a level panorama, metres; 0 or not finite is unknown.
-        lidar_height_m, camera_height_m: above the same floor.
-        errors: of the ranges; the default ones by default.
+        depth_m: radial depth of a level panorama in metres, (H, W); 0 or not finite is unknown.
+        lidar_height_m: height of the LiDAR above the floor.
+        camera_height_m: height of the camera above the same floor.
+        errors: errors of the ranges; None: the default ones.
 
     Returns:
-        (N, 3) points in the camera's frame, metres.
+        Points in the camera's frame in metres, (N, 3).
 
     Raises:
         ValueError: not a depth image, or a value out of bounds.
@@ -84,7 +85,7 @@ def measure(
     azimuth = math.pi - (np.arange(AZIMUTHS) + 0.5) * (2 * math.pi / AZIMUTHS)
     profile = _profiles(inverse, azimuth)
     elevation = math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height)
-    depth_edge = _torn(profile, math.pi / height)[:-1] | ((profile[1:] > 0) ^ (profile[:-1] > 0))
+    depth_edge = _depth_edges(profile, math.pi / height)[:-1] | ((profile[1:] > 0) ^ (profile[:-1] > 0))
     profile, depth_edge = _bridge_unknown(profile, depth_edge)
     radius = np.where(profile > 0, 1.0 / np.where(profile > 0, profile, 1.0), np.nan)
     across, up = radius * np.cos(elevation)[:, None], radius * np.sin(elevation)[:, None] - below_m
@@ -95,7 +96,7 @@ def measure(
         hit = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
         points.append(_on_rays(omega, azimuth[hit], range_m[hit]))
     true = np.concatenate(points)
-    return _measured(true, errors or Errors(), np.array([0.0, 0.0, below_m]))
+    return _measured(true, errors or RangeErrors(), np.array([0.0, 0.0, below_m]))
 
 
 def measure_world(
@@ -103,12 +104,21 @@ def measure_world(
     map_from_camera: Floats,
     lidar_height_m: float,
     camera_height_m: float,
-    errors: Errors | None = None,
+    errors: RangeErrors | None = None,
     through_glass: bool = False,
 ) -> NDArray[np.float32]:
-    """Simulate a revolution by ray casting, also behind visible surfaces; (N, 3) in the camera's frame, metres.
+    """Simulate one revolution of a VLP-16 by ray casting, also behind visible surfaces.
 
-    With ``through_glass``, windows (what shines and is upright) give no points.
+    Args:
+        renderer: renderer of the world.
+        map_from_camera: pose of the camera, (4, 4).
+        lidar_height_m: height of the LiDAR above the floor.
+        camera_height_m: height of the camera above the floor.
+        errors: errors of the ranges; None: the default ones.
+        through_glass: windows (upright surfaces that shine) return no points.
+
+    Returns:
+        Points in the camera's frame in metres, (N, 3).
     """
     omega, azimuth = np.meshgrid(np.radians(np.linspace(-15, 15, 16)), np.arange(AZIMUTHS) * (2 * math.pi / AZIMUTHS))
     rays = _on_rays(omega.ravel(), azimuth.ravel(), np.ones(omega.size))
@@ -121,26 +131,26 @@ def measure_world(
     if through_glass:
         surface = renderer.world.face_surface[np.maximum(face, 0)]
         hit &= (renderer.world.emission[surface] == 0) | (np.abs(renderer.world.normal[surface, 2]) > 0.5)
-    return _measured(rays[hit] * range_m[hit, None].astype(np.float64), errors or Errors(), mount)
+    return _measured(rays[hit] * range_m[hit, None].astype(np.float64), errors or RangeErrors(), mount)
 
 
 def _on_rays(omega: float | Floats, azimuth: Floats, range_m: Floats) -> NDArray[np.float64]:
-    """(N, 3) points at ranges (N,) on rays of elevation ``omega`` and azimuths (N,), from the LiDAR."""
+    """Return points (N, 3) at ranges (N,) on rays of elevation ``omega`` and azimuths (N,), from the LiDAR."""
     flat = np.cos(omega) * range_m
     return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(omega) * range_m], axis=-1)
 
 
-def _measured(points: Floats, errors: Errors, mount: Floats) -> NDArray[np.float32]:
+def _measured(points: Floats, errors: RangeErrors, mount: Floats) -> NDArray[np.float32]:
     """Apply errors along the rays to points (N, 3) from the LiDAR at ``mount`` (3,)."""
     range_m = np.linalg.norm(points, axis=1)
     return (points * (errors.apply(range_m) / range_m)[:, None] + mount).astype(np.float32)
 
 
-def _torn(inverse: Floats, step_rad: float) -> NDArray[np.bool_]:
-    """Whether there is a depth discontinuity between each row of (H, W) inverse depth and the next; last row to first.
+def _depth_edges(inverse: Floats, step_rad: float) -> NDArray[np.bool_]:
+    """Mark depth discontinuities between each row of inverse depth (H, W) and the next, and between last and first row.
 
-    True if the surface is seen at less than 8 degrees and the inverse depth, which is smooth over any plane, jumps; or
-    if it is seen at less than 1 degree.
+    An edge is marked where the surface is seen at less than 1 degree, or at less than 8 degrees while the inverse
+    depth, which is smooth over any plane, jumps.
     """
     following = np.roll(inverse, -1, axis=0)
     jump = np.abs(following - inverse)
@@ -151,12 +161,12 @@ def _torn(inverse: Floats, step_rad: float) -> NDArray[np.bool_]:
 
 
 def _profiles(inverse: Floats, azimuth: Floats) -> NDArray[np.float64]:
-    """Columns (H, N) of inverse depth (H, W) at azimuths (N,): interpolated on a surface, else the nearer neighbour."""
+    """Return columns (H, N) of inverse depth (H, W) at azimuths (N,), interpolated only on a surface."""
     width = inverse.shape[1]
     u = (math.pi - azimuth) * (width / (2 * math.pi)) - 0.5
     left = np.floor(u).astype(np.intp)
     share = u - left
-    depth_edge = _torn(np.ascontiguousarray(inverse.T), 2 * math.pi / width).T
+    depth_edge = _depth_edges(np.ascontiguousarray(inverse.T), 2 * math.pi / width).T
     a, b = inverse[:, left % width], inverse[:, (left + 1) % width]
     apart = depth_edge[:, left % width] | (a == 0) | (b == 0)
     return np.where(apart, np.where(share < 0.5, a, b), (1 - share) * a + share * b)
@@ -176,7 +186,10 @@ def _bridge_unknown(
 
 
 def _first_crossing(across: Floats, up: Floats, depth_edge: NDArray[np.bool_], omega: float) -> NDArray[np.float64]:
-    """Ranges (N,) where beams of elevation ``omega`` first meet profiles (H, N); inf for none or at a discontinuity."""
+    """Return the ranges (N,) at which beams of elevation ``omega`` first meet profiles (H, N).
+
+    The range is inf where a beam meets none, or meets it at a discontinuity.
+    """
     side = across * math.sin(omega) - up * math.cos(omega)
     along = across * math.cos(omega) + up * math.sin(omega)
     s0, s1 = side[:-1], side[1:]

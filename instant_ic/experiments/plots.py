@@ -5,13 +5,18 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.depth.colour import depth_picture
 from instant_ic.geometry.projections import perspective_directions, sample_equirect
 from instant_ic.slam.occupancy import OccupancyGrid
+
+if TYPE_CHECKING:
+    from instant_ic.experiments.depth import Scored
 
 Image: TypeAlias = NDArray[np.uint8]
 
@@ -59,6 +64,32 @@ def save_depth(path: Path, panorama: NDArray[np.uint8], depth_m: NDArray[np.floa
     axes[1, 0].set_axis_off()
     axes[1, 0].set_title(title, fontsize=9)
     figure.colorbar(drawn, ax=axes[1, 0], orientation="horizontal", label="m", fraction=0.05, pad=0.03)
+    save_figure(figure, path)
+
+
+def save_depth_sheet(path: Path, rows: Sequence[Scored]) -> None:
+    """Save a row for each panorama: image and depth, with true depth and relative error if there is ground truth."""
+    columns = 4 if any(row.truth_m is not None for row in rows) else 2
+    figure, axes = new_figure(len(rows), columns, (4.5 * columns, 2.6 * len(rows)))
+    for row, line in zip(rows, axes, strict=True):
+        reference = row.depth_m if row.truth_m is None else row.truth_m
+        known = reference[reference > 0]
+        near, far = np.percentile(known, (1, 99)) if len(known) else (1.0, 2.0)
+        line[0].imshow(row.rgb)
+        line[0].set_title(row.name, fontsize=9)
+        line[1].imshow(depth_picture(row.depth_m, near, far))
+        line[1].set_title(f"depth, {near:.1f} (red) to {far:.1f} m", fontsize=9)
+        if row.truth_m is not None and row.after is not None:
+            line[2].imshow(depth_picture(row.truth_m, near, far))
+            line[2].set_title("truth", fontsize=9)
+            size = row.depth_m.shape[1], row.depth_m.shape[0]
+            truth = cv2.resize(row.truth_m, size, interpolation=cv2.INTER_NEAREST)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                error = np.where((truth > 0) & (row.depth_m > 0), row.depth_m / truth - 1, np.nan)
+            line[3].imshow(error, cmap="RdBu", vmin=-0.5, vmax=0.5)
+            line[3].set_title(f"error, -50 % (red) to 50 %: MRE {row.after.mre:.3f}", fontsize=9)
+        for axis in line:
+            axis.set_axis_off()
     save_figure(figure, path)
 
 
@@ -184,8 +215,6 @@ def image_strip(columns: Sequence[str], rows: Sequence[tuple[str, Sequence[NDArr
 
     ``tile`` is the width of an image in pixels.
     """
-    import cv2
-
     label_px, head_px = 64, 24
     height, width = rows[0][1][0].shape[:2]
     size = (tile, max(round(tile * height / width), 1))
@@ -206,6 +235,4 @@ def image_strip(columns: Sequence[str], rows: Sequence[tuple[str, Sequence[NDArr
 
 def jpeg(image: NDArray[np.uint8], quality: int = 88) -> bytes:
     """Encode an RGB image."""
-    import cv2
-
     return bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1])

@@ -115,13 +115,13 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
     """Take a panorama from a pose with its depth: the model's, and the depth scaled by a simulated VLP-16."""
     from instant_ic.depth.scaler import ScalerConfig
     from instant_ic.depth.sources import DepthSource, SourceConfig, complete
-    from instant_ic.experiments.depth_lidar import Errors, measure_world
+    from instant_ic.experiments.depth_lidar import RangeErrors, measure_world
 
     width = settings.panorama_width
     rgb = renderer.render(pose, width, width // 2, supersample=2).rgb
     true = renderer.render(pose, min(width, 1024), min(width, 1024) // 2).depth_m
     raw = model.estimate(rgb)
-    points = measure_world(renderer, pose, LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, Errors(seed=settings.seed), True)
+    points = measure_world(renderer, pose, LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, RangeErrors(seed=settings.seed), True)
     scaler = ScalerConfig(output_kind=model.manifest.output_kind)
     source = DepthSource(SourceConfig("completed", scaler))
     fused = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M)

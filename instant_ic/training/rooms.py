@@ -13,7 +13,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.training.dataset import save_sample
 
 FIRST_HELD_OUT = 900_000
-"""Worlds from this seed on are reserved for the evaluations (``instant_ic.experiments.depth_worlds``)."""
+"""Worlds from this seed on are reserved for evaluations."""
 CAMERA_HEIGHT_M, CLEARANCE_M = (0.5, 1.7), (0.3, 0.7)
 """Lowest and highest camera above the floor; distance from objects, minimum and maximum."""
 TILT_DEG = 1.5

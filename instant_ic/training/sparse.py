@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.sources import DepthSource, SourceConfig
-from instant_ic.experiments.depth_lidar import Errors, measure, measure_world
+from instant_ic.experiments.depth_lidar import RangeErrors, measure, measure_world
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.mapping.local_model import LocalModel
 from instant_ic.mapping.mapper import LocalView
@@ -58,8 +58,8 @@ def prior_of_image(rgb: NDArray[np.uint8], depth_m: Floats, rng: np.random.Gener
     return _prior(rgb, depth_m, points, mount, faulty, _UP, None, None, rng)
 
 
-def _errors(rng: np.random.Generator, outliers: float) -> Errors:
-    return Errors(rng.uniform(0.01, 0.03), rng.uniform(0, outliers), int(rng.integers(1 << 31)))
+def _errors(rng: np.random.Generator, outliers: float) -> RangeErrors:
+    return RangeErrors(rng.uniform(0.01, 0.03), rng.uniform(0, outliers), int(rng.integers(1 << 31)))
 
 
 def _prior(
@@ -118,7 +118,7 @@ def drive(renderer: EquirectRenderer, map_from_camera: Floats, lidar_m: float, r
     for place in np.linspace(max(length, 0.0), 0.0, count):
         at = end + place * back
         pose = pose_matrix(at[0], at[1], lidar_m, yaw=heading)
-        points = measure_world(renderer, pose, lidar_m, lidar_m, Errors(0.02, 0.0, int(rng.integers(1 << 31))))
+        points = measure_world(renderer, pose, lidar_m, lidar_m, RangeErrors(0.02, 0.0, int(rng.integers(1 << 31))))
         x, y = at[:2] + rng.normal(0, 0.008, 2)
         drift = pose_matrix(x, y, lidar_m, yaw=heading + rng.normal(0, 0.002))
         model.add(points @ drift[:3, :3].T + drift[:3, 3], drift[:3, 3], max(length, 0.0) / count)

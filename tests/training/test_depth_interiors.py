@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from instant_ic.experiments import depth_worlds
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.training.dataset import DatasetError, save_sample
@@ -82,7 +81,6 @@ def test_a_rendered_folder_says_what_is_wrong(tmp_path: Path) -> None:
 
 
 def test_worlds_of_the_evaluations_are_never_trained_on() -> None:
-    assert FIRST_HELD_OUT == depth_worlds.FIRST_SEED
     recipe = RoomsConfig(first_world=FIRST_HELD_OUT - 400)
     with pytest.raises(ValueError, match="for evaluation"):
         replace(recipe, worlds=401)
