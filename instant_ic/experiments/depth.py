@@ -158,7 +158,7 @@ class Evaluator:
         Raises:
             DepthEvaluationError: not a panorama, nothing to compare, or LiDAR without ground truth to measure.
         """
-        _check_panorama(name, "picture", rgb)
+        _check_panorama(name, "image", rgb)
         truth = None if truth_m is None else _known_depth(name, truth_m)
         settings, points = self.settings, None
         if settings.lidar is not None:
@@ -289,7 +289,7 @@ def pair(images: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, Pat
     """
     found = [path for path in _files(images, PICTURE_SUFFIXES) if not path.stem.endswith("_depth") or path in images]
     if not found:
-        raise DepthEvaluationError(f"{images[0]}: no picture in this folder ({', '.join(PICTURE_SUFFIXES)})")
+        raise DepthEvaluationError(f"{images[0]}: no image in this folder ({', '.join(PICTURE_SUFFIXES)})")
     depth = [path for path in _files(truths, DEPTH_SUFFIXES) if path not in found]
     if len(found) == len(depth) == 1:
         return [(found[0], depth[0])]

@@ -224,7 +224,7 @@ def test_what_cannot_be_scored_says_why():
     with pytest.raises(DepthEvaluationError, match="relative"):
         Evaluator(DepthSettings("network"), KnownModel(box_room(), "relative"))
     evaluator = Evaluator(DepthSettings("network", LidarSettings()), model)
-    with pytest.raises(DepthEvaluationError, match=r"room: the picture is 100 x 100"):
+    with pytest.raises(DepthEvaluationError, match=r"room: the image is 100 x 100"):
         evaluator.score("room", np.zeros((100, 100, 3), np.uint8), box_room())
     with pytest.raises(DepthEvaluationError, match=r"room: the true depth is 64 x 64"):
         evaluator.score("room", RGB, np.ones((64, 64)))
@@ -259,7 +259,7 @@ def test_pictures_and_depth_are_paired_by_stem(tmp_path):
     for images, truths, words in (
         ([rgb / "c.jpg", rgb / "a.jpg"], [gt / "b_depth.png"], "no depth file has the stem"),
         ([tmp_path / "none"], [], "no such file"),
-        ([tmp_path], [], "no picture in this folder"),
+        ([tmp_path], [], "no image in this folder"),
     ):
         with pytest.raises(DepthEvaluationError, match=words):
             pair(images, truths)
