@@ -22,7 +22,6 @@ from instant_ic.msg import (
 from instant_ic.vspace import SpaceState
 from instant_ic.vspace.config import NerfConfig
 from instant_ic.vspace.jobs import IncomingKeyframe, JobOutcome, SpaceWorker, ViewOrder, load_robot_mask
-from instant_ic.vspace.layers import Layers
 from instant_ic.vspace.schedule import JobSchedule, Turns
 
 _STATUS_S = 0.5
@@ -30,7 +29,7 @@ _LOCKSTEP_S, _LOCKSTEP_ITERATIONS = 0.1, 5  # in tests and replay training runs 
 
 
 class NerfNode(Node[NerfConfig]):
-    """One thread renders and trains in turns, another prepares a new keyframe; ``JobSchedule`` decides what is next."""
+    """One thread takes keyframes, renders and trains in turn; ``JobSchedule`` decides what is next."""
 
     name = "nerf"
     worker_class: type[SpaceWorker] = SpaceWorker
@@ -47,14 +46,13 @@ class NerfNode(Node[NerfConfig]):
         self.status_out = self.publisher("/vspace/status", VspaceStatus, qos=LATCHED)
         self.layers_out = self.publisher("/vspace/layers", VspaceLayers, qos=LATCHED)
         self.work = self.worker_class(config.space, robot, warm=not self.lockstep)
-        renderer = self.background(self.work.run, self.on_rendered)
-        preparer = self.background(self.work.run, self.on_prepared)
+        worker = self.background(self.work.run, self.on_outcome)
         turns = Turns(config.render_fps, config.train_ms_per_frame)
-        self.schedule = JobSchedule(config.space, turns, renderer.submit, preparer.submit, self.lockstep)
+        self.schedule = JobSchedule(config.space, turns, worker.submit, self.lockstep)
         self.schedule.start()
         self.subscribe("/keyframe", Keyframe, self.on_keyframe, qos=LATCHED)
         self.subscribe("/view/request", ViewRequest, self.on_request, qos=SENSOR)
-        self.timer(_STATUS_S, self.on_timer)
+        self.timer(_STATUS_S, self.publish_status)
         if self.lockstep:
             self.timer(_LOCKSTEP_S, lambda: self.schedule.train(_LOCKSTEP_ITERATIONS))
         self.publish_status()
@@ -81,21 +79,11 @@ class NerfNode(Node[NerfConfig]):
             size = request.width, request.height, request.fov_rad
             self.schedule.request_view(ViewOrder(request.id, request, pose, *size, self.config.jpeg_quality))
 
-    def on_prepared(self, outcome: JobOutcome) -> None:
-        self.schedule.take_prepared(outcome)
-        self.report(outcome)
-        if isinstance(outcome.made, Layers):
-            self.layers_out.publish(layers_message(outcome.made, self.clock.now_ns()))
-        self.schedule.next()
-
-    def on_timer(self) -> None:
-        self.schedule.wants_layers = self.layers_out.subscriber_count > 0
-        self.schedule.next()
-        self.publish_status()
-
-    def on_rendered(self, outcome: JobOutcome) -> None:
+    def on_outcome(self, outcome: JobOutcome) -> None:
         changed = self.schedule.take(outcome, self.clock.now_ns())
         self.report(outcome)
+        if outcome.layers is not None:
+            self.layers_out.publish(layers_message(outcome.layers, self.clock.now_ns()))
         if outcome.encoded is not None:
             self.publish_view(outcome)
         if changed:

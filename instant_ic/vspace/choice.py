@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from instant_ic.vspace.agreement import exposure_gains
 from instant_ic.vspace.composition import Rendering, compose
+from instant_ic.vspace.keyframes import KeyframeSet, spread
 from instant_ic.vspace.nerf.field import Floats, Rays
-from instant_ic.vspace.store import KeyframeSet, spread
 from instant_ic.vspace.view import perspective_rays
 
 TRIALS = 2

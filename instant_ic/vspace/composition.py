@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.vspace.keyframes import Keyframe
 from instant_ic.vspace.nerf.field import Floats, Rays
-from instant_ic.vspace.store import Keyframe
 from instant_ic.vspace.view import continue_unseen
 
 Rendering = tuple[Floats, Floats, Floats]
@@ -50,7 +50,7 @@ def compose(rays: Rays, keyframe: Keyframe | None, field: Rendering | None) -> C
     colour, depth, confidence = field
     background = np.zeros(len(depth), np.float32)
     unseen = confidence == 0
-    if keyframe is not None and keyframe.background is not None and unseen.any():
+    if keyframe is not None and unseen.any():
         background = keyframe.background.draw(rays, unseen, field)
     return ComposedView(colour, depth, confidence, background)
 

@@ -1,4 +1,4 @@
-"""The work on a virtual space as jobs: what one thread renders and trains, and what another one prepares meanwhile."""
+"""Jobs on a virtual space, which one thread does in turn."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from instant_ic.util.limits import decode_image, load_image
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_device_fault
-from instant_ic.vspace.layers import encode
+from instant_ic.vspace.layers import Layers, encode
 from instant_ic.vspace.mesh_file import MeshError
 from instant_ic.vspace.mesh_space import Space, make_space
 from instant_ic.vspace.prior import KeyframeError
@@ -32,34 +32,36 @@ KeyframeArrays = tuple[NDArray[np.uint8], NDArray[np.floating], NDArray[np.float
 
 
 class JobKind(enum.Enum):
-    """What a job does. ``PREPARE``, ``LAYERS`` and ``SCENE`` belong to the preparing thread, the others to the
-    rendering thread.
-    """
+    """Kinds of jobs."""
 
     WARM_UP = "warm_up"
-    PREPARE = "keyframe"
-    SHOW = "show"
+    KEYFRAME = "keyframe"
     LAYERS = "layers"
-    SCENE = "scene"
     LEARN = "learn"
     RENDER = "view"
     TRAIN = "train"
 
 
-_NICE = 5
-"""Of the threads that train, render and prepare: robot control comes first."""
-_SAME_POSE = 2e-3
-"""Metres and radians within which poses are the same: a third of a view's pixel. A standing robot's pose jitters."""
-_CHANGES = (JobKind.SHOW, JobKind.LEARN, JobKind.TRAIN)
+NICE = 5
+"""Scheduling priority of the worker's thread: robot control comes first."""
+SAME_POSE = 2e-3
+"""Largest difference of two poses that count as equal, in metres and radians: a third of a view's pixel."""
+_CHANGES = (JobKind.KEYFRAME, JobKind.LEARN, JobKind.TRAIN)
 """Jobs after which the same request gives another view."""
-_INPUT_JOBS = (JobKind.PREPARE, JobKind.SHOW, JobKind.RENDER)
-"""A ValueError in one of these is the sender's fault: the keyframe or the request is refused."""
+_INPUT_JOBS = (JobKind.KEYFRAME, JobKind.RENDER)
+"""Jobs in which a ValueError is the sender's fault: the keyframe or the request is refused."""
 
 
 @dataclass(frozen=True)
 class IncomingKeyframe:
-    """A keyframe and its arrival time; ``decode`` runs on the preparing thread and may raise ``KeyframeError``;
-    ``image``: the camera's encoded panorama, None where there is none.
+    """A keyframe as it arrived.
+
+    Attributes:
+        id: its number.
+        message: the message.
+        arrival_ns: time of its arrival.
+        decode: decodes it on the worker's thread; may raise ``KeyframeError``.
+        image: the camera's encoded panorama; None to encode it here.
     """
 
     id: int
@@ -82,10 +84,10 @@ class ViewOrder:
     jpeg_quality: int
 
     def same_view(self, other: ViewOrder) -> bool:
-        """Whether both ask for the same view."""
+        """Return whether both ask for the same view."""
         keys = ("width", "height", "fov_rad", "jpeg_quality")
         alike = all(getattr(self, key) == getattr(other, key) for key in keys)
-        return alike and np.allclose(self.pose(), other.pose(), rtol=0, atol=_SAME_POSE)
+        return alike and np.allclose(self.pose(), other.pose(), rtol=0, atol=SAME_POSE)
 
 
 @dataclass(frozen=True)
@@ -93,16 +95,16 @@ class Job:
     """One piece of work.
 
     Attributes:
-        keyframe: of all kinds but ``RENDER`` and ``TRAIN``.
-        view: of ``RENDER``.
-        made: result of the keyframe's previous job.
-        iterations, budget_ms: limits of ``TRAIN``.
+        kind: what to do.
+        keyframe: keyframe of ``KEYFRAME``, ``LAYERS`` and ``LEARN``.
+        view: requested view of ``RENDER``.
+        iterations: limit of ``TRAIN``; None for no limit.
+        budget_ms: time limit of ``TRAIN``.
     """
 
     kind: JobKind
     keyframe: IncomingKeyframe | None = None
     view: ViewOrder | None = None
-    made: Any = None
     iterations: int | None = None
     budget_ms: float = float("inf")
 
@@ -122,14 +124,17 @@ class JobOutcome:
     """Result of a job.
 
     Attributes:
-        status: of the space after the job; None while there is no space.
-        refused: why the job's input was refused; empty otherwise.
+        job: the job.
+        layers: the keyframe's layers, of ``LAYERS``.
+        encoded: the view of ``RENDER``.
+        status: status of the space after the job; None while there is no space.
+        refused: reason why the job's input was refused; empty otherwise.
         error: a fault that is not the input's.
-        is_bug: whether the error is neither a missing device, nor too little memory, nor an unusable mesh.
+        is_bug: the error is neither a missing device, nor too little memory, nor an unusable mesh.
     """
 
     job: Job
-    made: Any = None
+    layers: Layers | None = None
     encoded: EncodedView | None = None
     status: SpaceStatus | None = None
     refused: str = ""
@@ -138,12 +143,12 @@ class JobOutcome:
 
 
 class SpaceWorker:
-    """Runs jobs on one space. ``run`` is called by two threads, each with its own kinds of jobs.
+    """Runs jobs on one space, one at a time.
 
     Args:
-        config: the space's parameters.
-        robot: the robot's mask, as ``VirtualSpace`` takes it.
-        warm: whether ``WARM_UP`` compiles the kernels.
+        config: parameters of the space.
+        robot: mask of the robot, as ``VirtualSpace`` takes it.
+        warm: compile the kernels in ``WARM_UP``.
     """
 
     def __init__(self, config: VirtualSpaceConfig, robot: NDArray[np.bool_] | None, warm: bool) -> None:
@@ -152,7 +157,6 @@ class SpaceWorker:
         self._robot, self._warm = robot, warm
         self._newest: EncodedView | None = None  # view of the space as it is
         self._version = 0  # of the layers
-        self._sources: dict[int, IncomingKeyframe] = {}  # of the keyframes by their place in the store
 
     def run(self, job: Job) -> JobOutcome:
         """Do a job; errors are part of the outcome."""
@@ -171,45 +175,30 @@ class SpaceWorker:
         """Do a job; errors are raised."""
         if job.kind is JobKind.WARM_UP:
             if self._warm:
-                self._yield_to_others()
+                _yield_to_others()
                 warm_up(self.config)
             self.space = make_space(self.config, self._robot)
             return JobOutcome(job)
-        space = self.space
+        space, keyframe = self.space, job.keyframe
         assert space is not None
         if job.kind in _CHANGES:
             self._newest = None
-        if job.kind is JobKind.PREPARE:
-            assert job.keyframe is not None
-            if self._warm:
-                self._yield_to_others()
-            arrays = job.keyframe.decode()
-            if not isinstance(space, VirtualSpace):
-                return JobOutcome(job, arrays)
-            prepared = space.prepare(*arrays)
-            self._sources[prepared.keyframes[0].place] = job.keyframe
-            return JobOutcome(job, prepared)
-        if job.kind is JobKind.LAYERS:
-            source = self._sources[job.made.newest.place]
-            self._version += 1
-            return JobOutcome(job, encode(job.made.newest, source.id, source.image, self._version))
-        if job.kind is JobKind.SCENE and isinstance(space, VirtualSpace):
-            return JobOutcome(job, space.scene_of(job.made))
-        if job.kind is JobKind.SHOW and isinstance(space, VirtualSpace):
-            space.show(job.made, dissolve=True)
-        elif job.kind is JobKind.SHOW:
-            space.set_keyframe(*job.made)
-        elif job.kind is JobKind.LEARN and isinstance(space, VirtualSpace):
-            space.learn(job.made)
-        elif job.kind is JobKind.TRAIN:
-            space.train(job.budget_ms, job.iterations)
-        elif job.kind is JobKind.RENDER:
-            assert job.view is not None
+        if job.view is not None:
             return JobOutcome(job, encoded=self._rendered(space, job.view))
+        if job.kind is JobKind.TRAIN:
+            space.train(job.budget_ms, job.iterations)
+        elif keyframe is not None and job.kind is JobKind.KEYFRAME:
+            space.take_keyframe(*keyframe.decode())
+        elif keyframe is not None and isinstance(space, VirtualSpace) and space.shown is not None:
+            if job.kind is JobKind.LEARN:
+                space.learn(space.shown)
+                return JobOutcome(job)
+            self._version += 1
+            return JobOutcome(job, encode(space.shown.newest, keyframe.id, keyframe.image, self._version))
         return JobOutcome(job)
 
     def _rendered(self, space: Space, order: ViewOrder) -> EncodedView:
-        """The view of an order; the newest one again where it would be the same: a standing robot costs nothing."""
+        """Render a view, or return the newest one if it would be the same: a standing robot costs nothing."""
         if self._newest is not None and self._newest.order.same_view(order):
             return self._newest
         changes, start = space.dissolving, time.perf_counter()
@@ -219,15 +208,22 @@ class SpaceWorker:
         self._newest = None if changes else encoded
         return encoded
 
-    def _yield_to_others(self) -> None:
-        """Lower this thread's priority (Linux has one per thread); never raise it, which only root may."""
-        if sys.platform == "linux":
-            thread = threading.get_native_id()
-            os.setpriority(os.PRIO_PROCESS, thread, max(_NICE, os.getpriority(os.PRIO_PROCESS, thread)))
+
+def _yield_to_others() -> None:
+    """Lower this thread's priority (Linux has one per thread); never raise it, which only root may."""
+    if sys.platform == "linux":
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, max(NICE, os.getpriority(os.PRIO_PROCESS, thread)))
 
 
 def decode_panorama(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """RGB image (H, W, 3) of a keyframe's JPEG or PNG.
+    """Decode a keyframe's panorama.
+
+    Args:
+        data: JPEG or PNG.
+
+    Returns:
+        RGB image, (H, W, 3).
 
     Raises:
         KeyframeError: it cannot be decoded.
@@ -239,7 +235,13 @@ def decode_panorama(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def load_robot_mask(path: str | Path) -> NDArray[np.bool_]:
-    """Load the mask of the robot in its panoramas, (H, 2 H), true where the image file is bright.
+    """Load the mask of the robot in its panoramas.
+
+    Args:
+        path: image file, bright where a panorama shows the robot.
+
+    Returns:
+        The mask, (H, 2 H).
 
     Raises:
         ValueError: not an image, or not twice as wide as high.

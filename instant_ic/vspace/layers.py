@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.util.limits import decode_image
+from instant_ic.vspace.keyframes import Keyframe
 from instant_ic.vspace.nerf.field import Floats
-from instant_ic.vspace.store import Keyframe
 
 _CODES = 65535
 _QUALITY = 90
@@ -84,11 +84,10 @@ def encode(keyframe: Keyframe, number: int, image: bytes | None, version: int) -
     prior, background = keyframe.prior, keyframe.background
     seen = _encoded_geometry(prior.inverse_depth, _marks(keyframe))
     parts = [(Kind.SEEN, image or _jpeg(prior.rgb), seen)]
-    if background is not None:
-        marks = np.rint(background.sure * np.float32(_SURE / 255)).astype(np.uint8) << 3
-        for quads, content in ((background.guessed, Content.SURFACE), (background.sky, Content.SKY)):
-            marks[tuple(quads.T)] |= np.uint8(content)
-        parts.append((Kind.BEHIND, _jpeg(background.rgb), _encoded_geometry(background.inverse, marks)))
+    marks = np.rint(background.sure * np.float32(_SURE / 255)).astype(np.uint8) << 3
+    for quads, content in ((background.guessed, Content.SURFACE), (background.sky, Content.SKY)):
+        marks[tuple(quads.T)] |= np.uint8(content)
+    parts.append((Kind.BEHIND, _jpeg(background.rgb), _encoded_geometry(background.inverse, marks)))
     layers = [
         Layer(
             kind,

@@ -110,6 +110,8 @@ class MeshSpace(RayRenderer):
         aside = np.abs(rays.directions @ pose[:3, 2].astype(np.float32)) < _ASIDE
         self._check_place(depth_m, range_m, aside, width)
 
+    take_keyframe = set_keyframe
+
     def _fit_colours(self, theirs: Floats, ours: Floats) -> None:
         """Factors of the mesh's colours from medians, as between keyframes; later keyframes go half the way."""
         usable = np.all((theirs > 0.05) & (theirs < 0.95) & (ours > 0.05) & (ours < 0.95), axis=1)

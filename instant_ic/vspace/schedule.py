@@ -1,4 +1,4 @@
-"""What the two threads of a virtual space do next: rendering and training in turns, preparing a new keyframe."""
+"""Schedule of a virtual space's worker: it takes keyframes, renders requested views, and trains in idle time."""
 
 from __future__ import annotations
 
@@ -35,76 +35,58 @@ class Turns:
         self._rendered_last = False
         self._render_ms = 0.0
 
-    def renders_next(self, requested: bool, trains: bool) -> bool:
-        """Whether a requested view is next; while the space ``trains``, training has a turn after each view."""
-        return requested and not (trains and self._rendered_last)
+    def renders_next(self, requested: bool, works: bool) -> bool:
+        """Return whether a view is next: each view is followed by a turn of other work, if there is any.
+
+        Args:
+            requested: a view is requested.
+            works: the space has to train or to take a keyframe.
+        """
+        return requested and not (works and self._rendered_last)
 
     def rendered(self, render_ms: float) -> None:
         """Note the rendering time of a view."""
         self._rendered_last, self._render_ms = True, render_ms
 
+    def worked(self) -> None:
+        """Note other work than rendering."""
+        self._rendered_last = False
+
     def budget_ms(self) -> float:
-        """Length of training's next turn, which starts now: the rest of the view's period, within the limits."""
+        """Return the length of training's turn, which starts now: the rest of the view's period, within the limits."""
         left = 1e3 / self.render_fps - self._render_ms if self._rendered_last else self.train_ms_per_frame
         self._rendered_last = False
         return min(self.train_ms_per_frame, max(left, LEAST_SHARE * self._render_ms))
 
 
-class FrameRate:
-    """Frame rate over the last 20 views."""
-
-    def __init__(self) -> None:
-        self._rendered_ns: deque[int] = deque(maxlen=20)
-
-    def note(self, now_ns: int) -> None:
-        """Count a view."""
-        self._rendered_ns.append(now_ns)
-
-    def per_second(self, now_ns: int) -> float:
-        """Views per second; 0 when none was rendered for 2 s."""
-        if len(self._rendered_ns) < 2 or now_ns - self._rendered_ns[-1] > 2_000_000_000:
-            return 0.0
-        span = self._rendered_ns[-1] - self._rendered_ns[0]
-        return (len(self._rendered_ns) - 1) * 1e9 / span if span > 0 else 0.0
-
-
 class JobSchedule:
     """Decides which job is next; knows neither threads nor messages. All calls come from one thread.
 
+    A keyframe is shown first, then its layers are encoded, then the field learns from it. Of waiting keyframes and of
+    waiting views only the newest is kept.
+
     Args:
-        config: the space's parameters.
-        turns: shares of rendering and training.
-        render: starts a job on the thread that renders and trains; ``take`` gets its outcome.
-        prepare: starts a job on the thread that prepares keyframes; ``take_prepared`` gets its outcome.
+        config: parameters of the space.
+        turns: shares of rendering and other work.
+        start: starts a job on the worker; ``take`` gets its outcome.
         lockstep: no measured time counts, and training runs in ``train`` only; otherwise it fills idle time.
     """
 
-    def __init__(
-        self,
-        config: VirtualSpaceConfig,
-        turns: Turns,
-        render: Callable[[Job], None],
-        prepare: Callable[[Job], None],
-        lockstep: bool,
-    ) -> None:
+    def __init__(self, config: VirtualSpaceConfig, turns: Turns, start: Callable[[Job], None], lockstep: bool) -> None:
         self.config, self.turns = config, turns
         self.keyframe: IncomingKeyframe | None = None  # newest one that views show
         self.status: SpaceStatus | None = None
         self.failure = ""
-        self.preparing = False
-        self.wants_layers = False  # somebody receives them
-        self._render, self._prepare, self._lockstep = render, prepare, lockstep
+        self._start_job, self._lockstep = start, lockstep
         self._waiting_keyframe: IncomingKeyframe | None = None
         self._waiting_view: ViewOrder | None = None
-        self._busy = False  # the rendering thread
-        self._todo: deque[Job] = deque()  # the rendering thread's jobs for the keyframe in preparation
+        self._busy = False
+        self._todo: deque[Job] = deque()  # what the shown keyframe still needs
         self._learns = False  # the field has something to learn
-        self._shown: Job | None = None  # the newest one that has shown a keyframe
-        self._layers_due = self._scene_due = False  # of that
         self._is_ready, self._ready_seconds = False, 0.0
         self._warned = False  # about the device
-        self._frame_rate = FrameRate()
-        # Of the last rendered view; 0 = unknown.
+        self._rendered_ns: deque[int] = deque(maxlen=20)
+        # Figures of the last rendered view; 0 = unknown.
         self._render_ms = self._expected_psnr_db = self._unseen_share = 0.0
 
     def start(self) -> None:
@@ -122,35 +104,23 @@ class JobSchedule:
         self.next()
 
     def next(self) -> None:
-        """Give idle threads their next jobs; they stay idle when there is nothing to prepare, render or train."""
-        if self.status is not None and not self.preparing:
-            self._prepare_next()
+        """Start the next job, unless one runs or there is nothing to do."""
         if self._busy or self.status is None:
             return
         trains = self._trains and not self._lockstep
-        if self._todo:
-            self._start(self._todo.popleft())
-        elif self._waiting_view is not None and self.turns.renders_next(True, trains):
+        works = trains or bool(self._todo) or self._waiting_keyframe is not None
+        if self._waiting_view is not None and self.turns.renders_next(True, works):
             order, self._waiting_view = self._waiting_view, None
             self._start(Job(JobKind.RENDER, view=order))
+        elif self._todo:
+            self.turns.worked()
+            self._start(self._todo.popleft())
+        elif self._waiting_keyframe is not None:
+            self.turns.worked()
+            keyframe, self._waiting_keyframe = self._waiting_keyframe, None
+            self._start(Job(JobKind.KEYFRAME, keyframe))
         elif trains:
             self._start(Job(JobKind.TRAIN, budget_ms=self.turns.budget_ms()))
-
-    def _prepare_next(self) -> None:
-        """The preparing thread's next job: what the shown keyframe still needs, then the next keyframe."""
-        shown = self._shown
-        if shown is not None and self._layers_due and self.wants_layers:
-            self._layers_due = False
-            job = Job(JobKind.LAYERS, shown.keyframe, made=shown.made)
-        elif shown is not None and self._scene_due:
-            self._scene_due = False
-            job = Job(JobKind.SCENE, shown.keyframe, made=shown.made)
-        elif self._waiting_keyframe is not None:
-            job, self._waiting_keyframe = Job(JobKind.PREPARE, self._waiting_keyframe), None
-        else:
-            return
-        self.preparing = True
-        self._prepare(job)
 
     def train(self, iterations: int) -> None:
         """Train now, unless a job runs or nothing is left to train."""
@@ -159,57 +129,48 @@ class JobSchedule:
 
     def _start(self, job: Job) -> None:
         self._busy = True
-        self._render(job)
+        self._start_job(job)
 
     @property
     def _trains(self) -> bool:
-        """Whether anything is left to train."""
+        """True while something is left to train."""
         return self._learns and not self.failure and self.status is not None and not self.status.converged
 
-    def take_prepared(self, outcome: JobOutcome) -> None:
-        """Pass the preparing thread's result to the rendering thread."""
-        job = outcome.job
-        if outcome.error is not None or outcome.refused or job.kind is JobKind.LAYERS:
-            self.preparing = False
-        else:
-            kind = JobKind.SHOW if job.kind is JobKind.PREPARE else JobKind.LEARN
-            self._todo.append(Job(kind, job.keyframe, made=outcome.made))
-
     def take(self, outcome: JobOutcome, now_ns: int) -> bool:
-        """Take the rendering thread's result; returns whether the state, the text or the keyframe has changed."""
+        """Take the result of a job; return whether the state, the text or the keyframe has changed."""
         self._busy = False
         job, self.status = outcome.job, outcome.status
         failed = outcome.error is not None
-        changed = False
-        if job.kind is JobKind.LEARN:
-            self.preparing = False
-            self._learns = self._learns or not failed
-        elif job.kind is JobKind.SHOW and (failed or outcome.refused):
-            self.preparing = False
-        elif job.kind is JobKind.SHOW:
-            self.keyframe, self.failure, self._is_ready = job.keyframe, "", False
+        changed = failed and job.kind in _LASTING
+        if changed:
+            self.failure = f"{job.kind.value}: {type(outcome.error).__name__}: {outcome.error}"
+        elif job.kind is JobKind.LEARN:
+            self._learns = True
+        elif job.kind is JobKind.KEYFRAME and not failed and not outcome.refused:
+            self._shown(job.keyframe)
             changed = True
-            self.preparing, self._shown = False, job
-            self._layers_due = self.status is not None and self.status.source != "mesh"
-            self._scene_due = self.status is not None and self.status.source == "field"
         elif outcome.encoded is not None:
             view = outcome.encoded.view
             self._render_ms = 0.0 if self._lockstep else outcome.encoded.render_ms
             self._expected_psnr_db = 0.0 if math.isnan(view.expected_psnr_db) else view.expected_psnr_db
             self._unseen_share = view.unseen_share
             self.turns.rendered(self._render_ms)
-            self._frame_rate.note(now_ns)
-        if failed and job.kind in _LASTING:
-            self.failure = f"{job.kind.value}: {type(outcome.error).__name__}: {outcome.error}"
-            changed = True
+            self._rendered_ns.append(now_ns)
         if self.keyframe is not None and not self._is_ready and self.state == SpaceState.READY:
             self._is_ready = changed = True
             self._ready_seconds = (now_ns - self.keyframe.arrival_ns) / 1e9
         return changed
 
+    def _shown(self, keyframe: IncomingKeyframe | None) -> None:
+        """Note that a keyframe is shown, and what it still needs."""
+        self.keyframe, self.failure, self._is_ready = keyframe, "", False
+        source = "" if self.status is None else self.status.source
+        kinds = {"warp": (JobKind.LAYERS,), "field": (JobKind.LAYERS, JobKind.LEARN)}.get(source, ())
+        self._todo = deque(Job(kind, keyframe) for kind in kinds)
+
     @property
     def state(self) -> SpaceState:
-        """What the space can show."""
+        """State of the space."""
         if self.failure:
             return SpaceState.FAILED
         if self.status is None or (self.keyframe is None and self.config.source != "mesh"):
@@ -217,7 +178,7 @@ class JobSchedule:
         return self.status.state
 
     def text(self) -> str:
-        """The state in a sentence for people."""
+        """Describe the state for an operator."""
         status = self.status
         if self.failure:
             return self.failure
@@ -241,7 +202,7 @@ class JobSchedule:
         return text
 
     def findings(self, outcome: JobOutcome) -> list[Diagnosis]:
-        """Diagnoses that follow from a job's outcome, after it was taken."""
+        """Return the diagnoses that follow from a job's outcome, after it was taken."""
         kind, status, keyframe, view = outcome.job.kind, outcome.status, outcome.job.keyframe, outcome.job.view
         found = []
         if status is not None and (status.warning or self._warned):
@@ -252,27 +213,33 @@ class JobSchedule:
             text = f"{kind.value}: {type(outcome.error).__name__}: {outcome.error}"
             found.append(Diagnosis(name, Level.ERROR, text))
         elif keyframe is not None and outcome.refused:
-            text = f"keyframe {keyframe.id} refused: {outcome.refused}"
+            text = f"Keyframe {keyframe.id} refused: {outcome.refused}"
             found.append(Diagnosis("keyframe", Level.ERROR, text, {"id": keyframe.id}))
-        elif keyframe is not None and kind is JobKind.SHOW:
+        elif keyframe is not None and kind is JobKind.KEYFRAME:
             found.append(Diagnosis("keyframe", Level.OK, f"keyframe {keyframe.id} in use", {"id": keyframe.id}))
-        elif view is not None and outcome.refused:
-            found.append(
-                Diagnosis("view", Level.WARN, f"request {view.id} refused: {outcome.refused}", {"id": view.id})
-            )
         elif view is not None:
-            text = f"{view.width} x {view.height} in {self._render_ms:.0f} ms"
-            if self._unseen_share > _NOTHING_SEEN:
-                text += ": no keyframe shows anything from that pose; is it far away?"
-            found.append(
-                Diagnosis("view", Level.WARN if self._unseen_share > _NOTHING_SEEN else Level.OK, text, {"id": view.id})
-            )
+            found.append(self._view_finding(view, outcome.refused))
         elif kind is JobKind.TRAIN:
             found.append(Diagnosis("vspace", Level.OK, self.text()))
         return found
 
+    def _view_finding(self, view: ViewOrder, refused: str) -> Diagnosis:
+        if refused:
+            return Diagnosis("view", Level.WARN, f"Request {view.id} refused: {refused}", {"id": view.id})
+        text, empty = f"{view.width} x {view.height} in {self._render_ms:.0f} ms", self._unseen_share > _NOTHING_SEEN
+        if empty:
+            text += ": no keyframe shows anything from that pose. Is it far away?"
+        return Diagnosis("view", Level.WARN if empty else Level.OK, text, {"id": view.id})
+
+    def _render_fps(self, now_ns: int) -> float:
+        """Return the views per second over the last 20; 0 if none was rendered for 2 s."""
+        rendered = self._rendered_ns
+        if len(rendered) < 2 or now_ns - rendered[-1] > 2_000_000_000 or rendered[-1] == rendered[0]:
+            return 0.0
+        return (len(rendered) - 1) * 1e9 / (rendered[-1] - rendered[0])
+
     def figures(self, now_ns: int) -> dict[str, Any]:
-        """The present status: fields of VspaceStatus.msg, 0 or empty where unknown."""
+        """Return the fields of VspaceStatus.msg, 0 or empty where unknown."""
         status, keyframe, state = self.status, self.keyframe, self.state
         shown = status if keyframe is not None or self.config.source == "mesh" else None
         of_keyframe = status if keyframe is not None else None
@@ -288,7 +255,7 @@ class JobSchedule:
             "iterations": 0 if of_keyframe is None else of_keyframe.iterations,
             "ms_per_iteration": 0.0 if of_keyframe is None or self._lockstep else of_keyframe.ms_per_iteration,
             "render_ms": self._render_ms,
-            "render_fps": self._frame_rate.per_second(now_ns),
+            "render_fps": self._render_fps(now_ns),
             "device": "" if status is None else status.device,
             "message": self.text(),
         }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import enum
 import functools
-import itertools
 import math
 import time
 from collections import deque
@@ -23,12 +22,12 @@ from instant_ic.vspace.choice import Choice, WarpTrial, gain_db, trials
 from instant_ic.vspace.composition import ComposedView, Rendering, compose, dissolve, filled_image, to_8bit
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_out_of_memory, make_device
+from instant_ic.vspace.keyframes import Keyframe, KeyframeSet, recent, spread
 from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, Schedule, TrainingScene
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import PanoramaPrior, prepare
 from instant_ic.vspace.readiness import Texture, error_terms, expected_psnr_db
 from instant_ic.vspace.saved import SavedSpace, TrainingProgress, read, write
-from instant_ic.vspace.store import RECENT, Keyframe, KeyframeSet, KeyframeStore, ready, recent, spread
 from instant_ic.vspace.view import RayRenderer, View, checked_pose, perspective_rays
 
 T = TypeVar("T")
@@ -91,20 +90,11 @@ class NotReadyError(RuntimeError):
     """Training or a view was requested before the first keyframe."""
 
 
-@dataclass(frozen=True)
-class PreparedScene:
-    """A scene to train on, its keyframes, and the older ones that field and warp are compared by."""
-
-    scene: TrainingScene
-    keyframes: KeyframeSet
-    trials: tuple[WarpTrial, ...] = ()
-
-
 class VirtualSpace(RayRenderer):
     """The newest keyframes, shown at once by warping, and one hash-grid field trained on all of them.
 
     A new keyframe is shown from the moment it is taken; the field goes on from what it has learnt. One thread at a
-    time, but for ``prepare`` and ``scene_of``, which another may call meanwhile. The same calls with the same seed give
+    time. The same calls with the same seed give
     the same bits on the CPU, as long as training is asked for by iterations and not by time.
 
     Example:
@@ -133,13 +123,10 @@ class VirtualSpace(RayRenderer):
         if self.config.source == "auto":
             source = "field" if self._device.on_gpu else "warp"
             self.config = dataclasses.replace(self.config, source=source)
-        # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
-        self._store = KeyframeStore(self.config.keyframes + 2 + (RECENT - 1 if self.config.older else 0))
         self._shown: KeyframeSet | None = None
         self._before: KeyframeSet | None = None  # shown before, until the newest has taken over
         self._pictures = 0  # rendered since then
         self._scene: TrainingScene | None = None  # what the field learns
-        self._held: tuple[Keyframe, ...] = ()  # whose arrays the scene looks at
         self._trials: tuple[WarpTrial, ...] = ()
         self._choice = Choice(self.config.picture.field_gain_db)
         self._texture: tuple[PanoramaPrior, Texture] | None = None
@@ -192,7 +179,7 @@ class VirtualSpace(RayRenderer):
         map_from_camera: NDArray[np.floating],
         relative_sigma: float | NDArray[np.floating],
     ) -> None:
-        """Use a new keyframe: ``prepare``, ``scene_of`` and ``learn`` where a field is trained, and ``show``.
+        """Use a new keyframe: ``prepare``, ``learn`` if a field is trained, and ``show``.
 
         Args: as ``prior.prepare``.
 
@@ -201,8 +188,24 @@ class VirtualSpace(RayRenderer):
         """
         prepared = self.prepare(rgb, depth_m, map_from_camera, relative_sigma)
         if self.config.source == "field":
-            self.learn(self.scene_of(prepared))
+            self.learn(prepared)
         self.show(prepared)
+
+    def take_keyframe(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        relative_sigma: float | NDArray[np.floating],
+    ) -> None:
+        """Show a new keyframe, into which views dissolve; ``learn`` may follow.
+
+        Args: as ``prior.prepare``.
+
+        Raises:
+            KeyframeError: the keyframe is no good; the old space stays as it was.
+        """
+        self.show(self.prepare(rgb, depth_m, map_from_camera, relative_sigma), dissolve=True)
 
     def prepare(
         self,
@@ -215,8 +218,7 @@ class VirtualSpace(RayRenderer):
 
         The field learns from ``config.keyframes`` − 1 earlier keyframes too, in the new one's exposure and without
         moved objects. ``config.older`` keyframes give their pixels of what is hidden from the new one. Keyframes of
-        another size are dropped. This may run in another thread beside all other calls; each keyframe must be shown
-        before the next is prepared.
+        another size are dropped.
 
         Args: as ``prior.prepare``.
 
@@ -227,16 +229,15 @@ class VirtualSpace(RayRenderer):
         prior = prepare(
             rgb, depth_m, map_from_camera, relative_sigma, config.geometry, config.panorama_width, self._robot
         )
-        newest = self._store.put(prior)
         before = () if self._shown is None else (*self._shown.keyframes, *self._shown.kept)
-        size = (newest.prior.rgb.shape, newest.prior.inverse_depth.shape)
+        size = (prior.rgb.shape, prior.inverse_depth.shape)
         before = tuple(one for one in before if (one.prior.rgb.shape, one.prior.inverse_depth.shape) == size)
-        shown = self._together((newest, *before[: config.keyframes - 1]))
+        older = config.keyframes - 1
+        shown = self._together((Keyframe.build(prior), *before[:older]))
         first = shown.newest
-        kept = tuple(one for one in before if all(one.place != other.place for other in shown.keyframes))
-        if first.background is None or not config.older:
+        if not config.older:
             return shown
-        kept = recent((first, *kept))[1:]
+        kept = recent((first, *before[older:]))[1:]
         others = [
             (one.prior, exposure_gains([first.prior, one.prior])[1]) for one in spread((first, *kept), config.older)
         ]
@@ -244,12 +245,10 @@ class VirtualSpace(RayRenderer):
         return KeyframeSet((first, *shown.keyframes[1:]), shown.gains, kept)
 
     def _together(self, keyframes: tuple[Keyframe, ...]) -> KeyframeSet:
-        """Keyframes in one exposure, without moved objects."""
-        if len(keyframes) == 1:
-            alone = keyframes[0].prior.without(np.zeros_like(keyframes[0].prior.content, bool))
-            return KeyframeSet((_renewed(keyframes[0], alone),), np.ones((1, 3), np.float32))
-        gone = moved([keyframe.prior for keyframe in keyframes])
-        keyframes = tuple(_renewed(one, one.prior.without(mask)) for one, mask in zip(keyframes, gone, strict=True))
+        """Bring keyframes to one exposure and leave out moved objects."""
+        if len(keyframes) > 1:
+            gone = moved([keyframe.prior for keyframe in keyframes])
+            keyframes = tuple(one.without(mask) for one, mask in zip(keyframes, gone, strict=True))
         return KeyframeSet(keyframes, exposure_gains([keyframe.prior for keyframe in keyframes]))
 
     def show(self, prepared: KeyframeSet, dissolve: bool = False) -> None:
@@ -261,41 +260,37 @@ class VirtualSpace(RayRenderer):
         self._shown = prepared
         if self.config.source == "warp":
             self._ready, self._ready_iterations = True, 1  # a warp is ready at once
-        self._let_go()
+        self._end_dissolve()
 
-    def _let_go(self) -> None:
-        """Free keyframes that are neither shown nor trained on."""
+    def _end_dissolve(self) -> None:
         if self._pictures >= self.config.picture.refresh_pictures - 1:
             self._before = None
-        shown = [(*one.keyframes, *one.kept) for one in (self._shown, self._before) if one is not None]
-        self._store.keep(itertools.chain(*shown, self._held))
 
-    def scene_of(self, prepared: KeyframeSet) -> PreparedScene:
-        """Build the scene to train on; may run in the thread of ``prepare``, before the next keyframe."""
-        priors, config = prepared.priors, self.config
-        lattice, scene = Lattice.for_prior(priors[0], config.field), self._scene
-        if scene is not None and scene.lattice.suits(lattice):
-            lattice = scene.lattice
-        scene = TrainingScene(priors, lattice, build_occupancy(priors, config.geometry), prepared.gains)
-        return PreparedScene(scene, prepared, () if config.picture.field_alone else trials(prepared))
-
-    def learn(self, prepared: PreparedScene) -> None:
+    def learn(self, shown: KeyframeSet) -> None:
         """Train on these keyframes from now on, starting from the present parameters.
 
         Where the scale has changed by more than a factor of 2 it starts again. A failing device leaves the old space.
         """
-        scene, old = prepared.scene, self._scene
+        priors, old = shown.priors, self._scene
+        lattice = Lattice.for_prior(priors[0], self.config.field)
+        if old is not None and old.lattice.suits(lattice):
+            lattice = old.lattice
+        occupancy = build_occupancy(priors, self.config.geometry)
+        self._learn(TrainingScene(priors, lattice, occupancy, shown.gains))
+        self._trials = () if self.config.picture.field_alone else trials(shown)
+        self._choose()
+
+    def _learn(self, scene: TrainingScene) -> None:
+        old = self._scene
         refresh = old is not None and scene.lattice is old.lattice
         if refresh or old is None:
             self._on_device(lambda device: device.set_scene(scene))
         else:
             self._start_anew(scene, old)
-        self._scene, self._held = scene, prepared.keyframes.keyframes
+        self._scene, self._trials = scene, ()
         self._ready = self._ready and (refresh or not self.config.picture.field_alone)
         self._reset_run(refresh)
-        self._trials = prepared.trials
         self._choice.gain_db = math.nan  # on other images
-        self._choose()
 
     def _start_anew(self, scene: TrainingScene, old: TrainingScene) -> None:
         learnt = self._device.parameters()
@@ -320,7 +315,7 @@ class VirtualSpace(RayRenderer):
         if self._shown is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
         if self._scene is None:
-            self.learn(self.scene_of(self._shown))
+            self.learn(self._shown)
         start = time.perf_counter()
         done = 0
         limit = self.config.train.iterations if iterations is None else iterations
@@ -423,7 +418,7 @@ class VirtualSpace(RayRenderer):
         view, image = self._on_device(lambda device: self._dissolved(device, rays, projection == "equirect"))
         if self._before is not None:
             self._pictures += 1
-            self._let_go()
+            self._end_dissolve()
         expected = self._judge(rays, view.depth, view.confidence)
         depth, confidence = view.depth.reshape(rays.shape), view.confidence.reshape(rays.shape)
         return View(to_8bit(image), depth, confidence, projection, expected)
@@ -432,7 +427,7 @@ class VirtualSpace(RayRenderer):
         """Train on the shown keyframes if the field is rendered too and has no scene yet."""
         if self._scene is None and (self._panorama_share < 1 or around):
             assert self._shown is not None
-            self.learn(self.scene_of(self._shown))
+            self.learn(self._shown)
 
     def _dissolved(self, device: Device, rays: Rays, around: bool) -> tuple[ComposedView, Floats]:
         """Render the newest keyframe, and its image (H, W, 3) blended with that of the keyframe shown before.
@@ -504,7 +499,7 @@ class VirtualSpace(RayRenderer):
         if self._shown is None:
             raise NotReadyError("no keyframe yet: there is nothing to save")
         if self._scene is None:
-            self.learn(self.scene_of(self._shown))
+            self.learn(self._shown)
         assert self._scene is not None
         return write(
             path,
@@ -527,10 +522,10 @@ class VirtualSpace(RayRenderer):
         """
         saved = read(path)
         space = cls(saved.config if device is None else dataclasses.replace(saved.config, device=device))
-        shown = KeyframeSet(tuple(space._store.put(prior) for prior in saved.priors), saved.gains)
+        shown = KeyframeSet(tuple(Keyframe.build(prior) for prior in saved.priors), saved.gains)
         occupancy = build_occupancy(saved.priors, saved.config.geometry)
         space._device.load(saved.parameters)
-        space.learn(PreparedScene(TrainingScene(shown.priors, saved.lattice, occupancy, saved.gains), shown))
+        space._learn(TrainingScene(shown.priors, saved.lattice, occupancy, saved.gains))
         space.show(shown)
         progress = saved.progress
         space._schedule = Schedule(saved.config.train, progress.refresh, progress.iteration)
@@ -541,13 +536,6 @@ class VirtualSpace(RayRenderer):
         # Rays that were not sampled before, the same at each loading.
         space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
         return space
-
-
-def _renewed(keyframe: Keyframe, prior: PanoramaPrior) -> Keyframe:
-    """The keyframe with another prior of the same panorama."""
-    if prior is keyframe.prior:
-        return keyframe
-    return ready(keyframe.place, prior, keyframe.warp.pyramid)
 
 
 def _field_alone(rays: Rays, device: Device) -> Rendering:

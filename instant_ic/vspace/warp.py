@@ -39,18 +39,15 @@ class Pyramid:
     sizes: NDArray[np.int64]
 
     @classmethod
-    def of(cls, rgb: NDArray[np.uint8], texels: NDArray[np.uint8] | None = None) -> Pyramid:
-        """Of a panorama (H, 2 H, 3); levels as long as both sides can be halved, down to 8 rows.
-
-        ``texels``: where they go, if there is a place for them already.
-        """
+    def of(cls, rgb: NDArray[np.uint8]) -> Pyramid:
+        """Build the pyramid of a panorama (H, 2 H, 3), halving it until a side is odd or 8 rows remain."""
         levels = [rgb]
         while levels[-1].shape[0] >= 16 and levels[-1].shape[0] % 2 == 0:
             rows = levels[-1][::2].astype(np.uint16) + levels[-1][1::2]
             levels.append(((rows[:, ::2] + rows[:, 1::2] + 2) >> 2).astype(np.uint8))
         sizes = np.array([level.shape[:2] for level in levels], np.int64)
         start = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]).astype(np.int64)
-        return cls(np.concatenate([level.reshape(-1, 3) for level in levels], out=texels), start, sizes)
+        return cls(np.concatenate([level.reshape(-1, 3) for level in levels]), start, sizes)
 
     def look_up(
         self, camera_from_map: Floats, rays: Rays, depth: Floats, wanted: Floats, share: float, colour: Floats
@@ -93,7 +90,12 @@ class PanoramaWarp:
     """
 
     def __init__(self, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> None:
-        """Of a keyframe; ``pyramid``: of its panorama, where that is there already."""
+        """Build the mesh of a keyframe.
+
+        Args:
+            prior: the keyframe.
+            pyramid: image pyramid of its panorama; built here if None.
+        """
         self.prior = prior
         self.pyramid = pyramid or Pyramid.of(prior.rgb)
         self._camera_from_map = np.linalg.inv(prior.map_from_camera).astype(np.float32)

@@ -13,8 +13,8 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, ReadinessConfig, SpaceState, TrainConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.agreement import exposure_gain, exposure_gains, moved
 from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.keyframes import Keyframe, recent, spread
 from instant_ic.vspace.prior import MOVED, ROOM, prepare
-from instant_ic.vspace.store import Keyframe, recent, spread
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",
@@ -56,19 +56,6 @@ def test_the_newest_so_many_are_kept(keyframes):
     assert [prior.map_from_camera[0, 3] for prior in space.keyframes] == [-1.5, 0.5, 0.0][:keyframes]
     space.train()
     assert not space.status.refreshing
-
-
-def test_nothing_large_is_allocated_for_a_keyframe_after_the_first():
-    space = VirtualSpace(dataclasses.replace(CONFIG, keyframes=2))
-    seen = set()
-    for number in range(9):
-        learn(space, pose_matrix(x=-1.0 + 0.2 * number))
-        space.render(VIEW, 32, 32, 1.0)
-        seen.add(space.keyframe.rgb.__array_interface__["data"][0])
-        # What is shown is what was taken, although others have lain in its place before.
-        assert np.array_equal(space.keyframe.rgb, box_room.panorama(space.keyframe.map_from_camera, 96).rgb)
-    assert len(seen) <= 4  # two shown, one that is left, one that is made ready
-    assert len(space._store._arrays) == 4
 
 
 def test_keyframes_of_another_size_replace_all():
@@ -115,7 +102,7 @@ def test_a_gain_without_strong_evidence_is_1():
 
 def test_which_older_keyframes_are_chosen_and_kept():
     def at(x):
-        return Keyframe(0, types.SimpleNamespace(map_from_camera=pose_matrix(x=x)), None, None)
+        return Keyframe(types.SimpleNamespace(map_from_camera=pose_matrix(x=x)), None, None)
 
     def places(keyframes):
         return [float(keyframe.prior.map_from_camera[0, 3]) for keyframe in keyframes]

@@ -1,13 +1,11 @@
 """The node in lockstep: keyframe in, status and views out, bad keyframes refused."""
 
 import dataclasses
-import threading
 
 import cv2
 import numpy as np
 import pytest
 
-from instant_ic.adapters.nerf import decode_keyframe
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
@@ -20,8 +18,9 @@ from instant_ic.msg import (
     image_message,
     pose_message,
 )
-from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
-from instant_ic.vspace.jobs import IncomingKeyframe, Job, JobKind, load_robot_mask
+from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.jobs import IncomingKeyframe, JobKind, JobOutcome, ViewOrder, load_robot_mask
+from instant_ic.vspace.schedule import JobSchedule, Turns
 from nodes.nerf import NerfConfig, NerfNode
 
 EMPTY, TRAINING, READY = 0, 1, 2
@@ -253,16 +252,21 @@ def test_a_new_keyframe_is_shown_at_once_and_learnt_behind(bus):
     assert bus.last("/vspace/view").keyframe_id == 2
 
 
-def test_the_newest_of_those_that_wait_is_taken(bus):
-    node = bus.node
-    node.schedule.preparing = True  # as while a thread prepares one
+def test_of_waiting_keyframes_and_views_the_newest_is_taken():
+    jobs = []
+    schedule = JobSchedule(SPACE, Turns(10, 50), jobs.append, lockstep=True)
+    schedule.start()
     for number in (1, 2, 3):
-        bus.publish("/keyframe", keyframe_message(number), latched=True)
-    node.schedule.preparing = False
-    node.schedule.next()
-    bus.publish("/keyframe", keyframe_message(4, fit=False), latched=True)
-    assert next(s.keyframe_id for s in bus.messages("/vspace/status") if s.keyframe_id) == 3
-    assert bus.last("/vspace/status").keyframe_id == 3
+        schedule.offer_keyframe(IncomingKeyframe(number, None, 0, tuple))
+        schedule.request_view(ViewOrder(number, None, tuple, 64, 36, 1.0, 90))
+    status = VirtualSpace(SPACE).status
+    schedule.take(JobOutcome(jobs.pop(), status=status), 0)  # the warm-up has ended
+    schedule.next()
+    view = jobs.pop()
+    assert (view.kind, view.view.id) == (JobKind.RENDER, 3)
+    schedule.take(JobOutcome(view, status=status, refused="no keyframe"), 0)
+    schedule.next()
+    assert [(job.kind, job.keyframe.id) for job in jobs] == [(JobKind.KEYFRAME, 3)]
 
 
 def test_a_pose_far_off_is_drawn_without_confidence_and_told(bus):
@@ -314,36 +318,6 @@ def test_the_robots_mask(tmp_path):
             cv2.imwrite(str(path), content)
         with pytest.raises(ValueError, match=words):
             load_robot_mask(str(path))
-
-
-def test_pictures_go_on_while_a_keyframe_is_prepared():
-    """In real threads: a keyframe whose preparation is stuck holds up no picture."""
-    with LockstepBus(start_ns=10 * S) as bus:
-        node = bus.add(NerfNode, NerfConfig(space=SPACE))
-        bus.publish("/keyframe", keyframe_message(1), latched=True)
-        go_on, results = threading.Event(), []
-        whole = node.work.space.prepare
-
-        def slow(*arguments):
-            assert go_on.wait(30)
-            return whole(*arguments)
-
-        node.work.space.prepare = slow
-        second = keyframe_message(2)
-        job = Job(JobKind.PREPARE, IncomingKeyframe(2, second, 0, lambda: decode_keyframe(second)))
-        thread = threading.Thread(target=lambda: results.append(node.work.run(job)))
-        thread.start()
-        for number in (1, 2, 3):
-            bus.publish("/view/request", request_message(number))
-        bus.advance(0.5)  # and training goes on
-        assert [view.request_id for view in bus.messages("/vspace/view")] == [1, 2, 3]
-        assert bus.last("/vspace/status").iterations > 0
-        go_on.set()
-        thread.join(30)
-        assert results[0].error is None
-        node.work.space.show(results[0].made)
-        bus.publish("/view/request", request_message(4))
-        assert bus.last("/vspace/view").request_id == 4
 
 
 @pytest.mark.parametrize(

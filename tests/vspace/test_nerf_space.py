@@ -179,7 +179,7 @@ def test_what_is_shown_passes_into_a_new_keyframe():
         assert picture == pytest.approx(expected, abs=2)
     # The field has not learnt it yet, and can at any time.
     assert len(space._scene.priors) == 1 and np.array_equal(space._scene.prior.map_from_camera, CAMERA)
-    space.learn(space.scene_of(prepared))
+    space.learn(prepared)
     assert space.train(iterations=2).iterations == 2
     assert np.array_equal(space._scene.prior.map_from_camera, NEXT)
 

@@ -1,0 +1,110 @@
+"""Keyframes prepared for rendering, and the choice of older ones that are kept with the newest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace.background import Background
+from instant_ic.vspace.nerf.field import Floats
+from instant_ic.vspace.prior import PanoramaPrior
+from instant_ic.vspace.warp import PanoramaWarp, Pyramid
+
+REACH_M = 3.0
+"""Largest distance of an older keyframe whose pixels are used, in metres."""
+APART_M = 0.25
+"""Smallest distance between two keyframes that are kept, in metres."""
+RECENT = 7
+"""Number of keyframes kept: the last 3.6 m of a drive with one each 0.6 m."""
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A keyframe prepared for rendering: its prior, its warp, and its background."""
+
+    prior: PanoramaPrior
+    warp: PanoramaWarp
+    background: Background
+
+    @classmethod
+    def build(cls, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> Keyframe:
+        """Build the warp and the background of a keyframe.
+
+        Args:
+            prior: the keyframe.
+            pyramid: image pyramid of its panorama; built here if None.
+        """
+        return cls(prior, PanoramaWarp(prior, pyramid), Background.of(prior))
+
+    @property
+    def position(self) -> NDArray[np.float64]:
+        """Position of the camera in the map, (3,) metres."""
+        return self.prior.map_from_camera[:3, 3]
+
+    def without(self, moved: NDArray[np.bool_]) -> Keyframe:
+        """Return the keyframe without moved objects.
+
+        Args:
+            moved: pixels that show them, (h, w); pixels left out before and not among them count again.
+        """
+        prior = self.prior.without(moved)
+        return self if prior is self.prior else Keyframe.build(prior, self.warp.pyramid)
+
+
+@dataclass(frozen=True)
+class KeyframeSet:
+    """The newest keyframe, which views show, and the older ones used with it.
+
+    Attributes:
+        keyframes: keyframes that the field learns from together, newest first.
+        gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3).
+        kept: older keyframes, newest first, whose pixels show what is hidden from the newest.
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    gains: Floats
+    kept: tuple[Keyframe, ...] = ()
+
+    @property
+    def newest(self) -> Keyframe:
+        """The keyframe that views show."""
+        return self.keyframes[0]
+
+    @property
+    def priors(self) -> tuple[PanoramaPrior, ...]:
+        """Priors of ``keyframes``, newest first."""
+        return tuple(keyframe.prior for keyframe in self.keyframes)
+
+
+def spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:
+    """Choose the older keyframes that show most of what the newest does not see.
+
+    The farthest within ``REACH_M`` comes first, then those farthest from all chosen before, ``APART_M`` at least.
+
+    Args:
+        keyframes: the newest, then older ones from new to old.
+        count: number of older keyframes to choose.
+    """
+    places = np.array([keyframe.position for keyframe in keyframes])
+    gaps = np.linalg.norm(places - places[0], axis=1)
+    within = gaps <= REACH_M
+    chosen: list[Keyframe] = []
+    while len(chosen) < count:
+        best = int(np.where(within, gaps, 0).argmax())
+        if gaps[best] < APART_M or not within[best]:
+            break
+        chosen.append(keyframes[best])
+        gaps = np.minimum(gaps, np.linalg.norm(places - places[best], axis=1))
+    return chosen
+
+
+def recent(keyframes: Iterable[Keyframe]) -> tuple[Keyframe, ...]:
+    """Return the newest ``RECENT`` keyframes that lie ``APART_M`` from each other, newest first."""
+    kept: list[Keyframe] = []
+    for keyframe in keyframes:
+        if all(np.linalg.norm(other.position - keyframe.position) >= APART_M for other in kept):
+            kept.append(keyframe)
+    return tuple(kept[:RECENT])
