@@ -124,7 +124,7 @@ def test_the_bag_commands_of_the_page_that_need_no_stack_run_in_the_order_given(
     for folder in ("drive", "again", "broken"):  # of `ic bag record`, of `ic replay`, and of a machine that failed
         shutil.copytree(ROOT / "tests/data/corridor_drive", tmp_path / folder)
     (tmp_path / "broken" / "metadata.yaml").unlink()
-    (tmp_path / "old.bag").symlink_to(tmp_path / "drive")
+    (tmp_path / "old").symlink_to(tmp_path / "drive")
     ran = []
     for command in commands("docs/bags.md"):
         words = shlex.split(command)[1:]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -32,7 +31,7 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
 
     Args:
         data: compressed bytes.
-        compression: ``zstd``, ``lz4`` or ``bz2``; empty for none.
+        compression: ``zstd`` or ``lz4``; empty for none.
         declared_bytes: decompressed size that the frame declares; `MOST_CHUNK_BYTES` is the limit in any case.
 
     Raises:
@@ -54,30 +53,29 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
             if size > most_bytes:
                 raise ValueError(f"it decompresses to more than {most_bytes} bytes, its declared or maximum size")
             out.append(piece)
-    except (RuntimeError, OSError, EOFError) as error:  # raised by lz4 and bz2
+    except (RuntimeError, EOFError) as error:  # raised by lz4
         raise ValueError(str(error)) from None
     return b"".join(out)
 
 
 def guard_rosbags() -> None:
-    """Add size limits to `rosbags`, which has none: ROS 1 chunks, messages, whole files, SQLite values, YAML.
+    """Add size limits to `rosbags`, which has none: MCAP chunks, messages, whole files, SQLite values, YAML.
 
     This replaces the decompressor tables and YAML readers of `rosbags`; a test checks that `rosbags` uses the
-    replacements. ``files.py`` replaces its reader of MCAP files.
+    replacements.
     """
     import apsw
-    from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader as ros2
-    from rosbags.rosbag2 import storage_sqlite3
+    from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 
     from instant_ic.bag.metadata import profiles_of
 
     ros2.YAML = _BoundedYaml  # type: ignore[assignment,misc]
-    for module in (ros2, storage_sqlite3):
+    for module in (ros2, storage_mcap, storage_sqlite3):
         module.parse_qos = profiles_of  # type: ignore[attr-defined]
 
-    ros1.decompressors["bz2"] = lambda data: decompress(data, "bz2")
-    ros1.decompressors["lz4"] = lambda data: decompress(data, "lz4")
+    storage_mcap.DECOMPRESSORS["lz4"] = lambda data, size: decompress(data, "lz4", size)
+    storage_mcap.DECOMPRESSORS["zstd"] = lambda data, size: decompress(data, "zstd", size)
     ros2.zstd = SimpleNamespace(  # type: ignore[assignment]
         decompress=lambda data: decompress(data, "zstd"), open=_open_zstd
     )
@@ -162,14 +160,7 @@ def _zstd(data: bytes) -> Iterator[bytes]:
 def _lz4(data: bytes) -> Iterator[bytes]:
     import lz4.frame
 
-    return _pieces(lz4.frame.LZ4FrameDecompressor(), data)
-
-
-def _bz2(data: bytes) -> Iterator[bytes]:
-    return _pieces(bz2.BZ2Decompressor(), data)
-
-
-def _pieces(decompressor: bz2.BZ2Decompressor, data: bytes) -> Iterator[bytes]:
+    decompressor = lz4.frame.LZ4FrameDecompressor()
     piece = decompressor.decompress(data, _PIECE)
     while piece:
         yield piece
@@ -178,4 +169,4 @@ def _pieces(decompressor: bz2.BZ2Decompressor, data: bytes) -> Iterator[bytes]:
         piece = decompressor.decompress(b"", _PIECE)
 
 
-_PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}
+_PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {"zstd": _zstd, "lz4": _lz4}

@@ -1,4 +1,4 @@
-"""Reads bags as bytes: rosbag2 folders (MCAP and SQLite), bare ``.mcap`` and ``.db3`` files, ROS 1 ``.bag`` files."""
+"""Reads bags as bytes, by `rosbags`: rosbag2 folders (MCAP and SQLite), bare ``.mcap`` and ``.db3`` files."""
 
 from __future__ import annotations
 
@@ -13,11 +13,9 @@ from typing import Any
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
-from rosbags.rosbag2.reader import DirectoryReader
 
 from instant_ic.bag.bounded import guard_rosbags
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.mcap_source import McapSource
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
@@ -27,8 +25,6 @@ from instant_ic.msg import deserialize
 from instant_ic.util.closing import Closing
 
 guard_rosbags()
-DirectoryReader.STORAGE_PLUGINS["mcap"] = McapSource  # type: ignore[index]
-Reader.STORAGE_PLUGINS[".mcap"] = McapSource  # type: ignore[index]
 
 
 @dataclass(frozen=True)
@@ -58,7 +54,7 @@ class BagReader(Closing):
     Latched values that a recorder repeats at the start of each file are counted once and returned once.
 
     Args:
-        path: rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
+        path: rosbag2 folder, ``.mcap`` or ``.db3`` file.
 
     Raises:
         BagError: there is no bag at the path, or the bag is truncated.
@@ -68,15 +64,11 @@ class BagReader(Closing):
         self.path = path
         if not path.exists():
             raise BagError(f"bag {path} does not exist")
+        if path.suffix == ".bag":
+            raise BagError(f"{path} is a ROS 1 bag; convert it first: rosbags-convert --src {path} --dst {path.stem}")
         self._reader: Any
-        self._ros1: Any = None
         try:
-            if path.suffix == ".bag" and path.is_file():
-                from instant_ic.bag.ros1 import Ros1Source
-
-                self._ros1 = self._reader = Ros1Source(path)
-            else:
-                self._reader = Reader(path)
+            self._reader = Reader(path)
             self._reader.open()
         except FileNotFoundError:
             raise BagError(self._why_no_metadata()) from None
@@ -172,9 +164,8 @@ class BagReader(Closing):
     @property
     def compression(self) -> str:
         """Compression of the messages: ``zstd``, ``lz4`` or empty."""
-        kinds = {str(self._reader.compression_format or "")} if self._ros1 is None else {""}
-        if self._ros1 is None:
-            kinds |= {chunk.compression for storage in self._storages for chunk in getattr(storage, "chunks", ())}
+        kinds = {str(self._reader.compression_format or "")}
+        kinds |= {chunk.compression for storage in self._storages for chunk in getattr(storage, "chunks", ())}
         return ", ".join(sorted(kinds - {""}))
 
     @property
@@ -276,7 +267,7 @@ class BagReader(Closing):
     def _raw(
         self, connections: list[Connection], start_ns: int | None, stop_ns: int | None
     ) -> Generator[tuple[Connection, int, bytes], None, None]:
-        if self._ros1 is not None or self._reader.compression_mode == "message":
+        if self._reader.compression_mode == "message":
             yield from self._reader.messages(connections, start_ns, stop_ns)
             return
         # Merge by stamp: files are not in stamp order where a clock was set back or files overlap.

@@ -34,16 +34,19 @@ from instant_ic.util.diagnosis import Diagnosis, Level, RecentCount
 FOREIGN_CLOCK_NS = 10_000_000_000
 """A stamp farther than this from the simulated clock comes from another clock."""
 
+FLUSH_S = 1.0
+"""Longest time of the recording that a killed recorder loses."""
+
 SYNC_S = 5.0
 """Longest time of the recording that a power failure loses, beside what the disk itself holds back."""
+
+SPACE_S = 1.0
+"""Seconds between two looks at the free space of the disk."""
 
 RECORDING, PAUSED, DISK_FULL, FAILED, ENDED = "recording", "paused", "disk full", "failed", "ended"
 
 _MB = 1_000_000
-_LEVEL = 1  # of zstd: it must keep pace
-_FLUSH_S = 1.0
 _KEEP_CUSTOM_S = 10.0
-_SPACE_S = 1.0
 _RECENT_S = 10.0  # losses longer ago are no warning
 _ROOM_AGAIN = 64_000_000  # free space above the reserve before recording restarts
 
@@ -217,7 +220,7 @@ class Recorder:
             self._cache = SnapshotCache(self.options.snapshot_seconds, self.options.max_cache_mb * _MB)
         else:
             self._writer = BagWriter(
-                path, self.options.compressed, self.options.max_bag_size, self.options.max_bag_duration, _LEVEL
+                path, self.options.compressed, self.options.max_bag_size, self.options.max_bag_duration
             )
         self._queue = _Queue(self.options.queue_mb * _MB)
         self._counting = threading.Lock()
@@ -463,7 +466,7 @@ class Recorder:
         next_flush = next_space = 0.0
         next_custom, next_sync = time.monotonic() + _KEEP_CUSTOM_S, time.monotonic() + SYNC_S
         while True:
-            item = self._queue.take(0.0 if self._ending.is_set() else _SPACE_S)
+            item = self._queue.take(0.0 if self._ending.is_set() else SPACE_S)
             if item is None and self._ending.is_set():
                 break
             try:
@@ -473,12 +476,12 @@ class Recorder:
                     item()
                 now = time.monotonic()
                 if now >= next_space:
-                    next_space = now + _SPACE_S
+                    next_space = now + SPACE_S
                     self._look_for_space()
                 if self._writer is None or self._state != RECORDING:
                     continue
                 if now >= next_flush:
-                    next_flush = now + _FLUSH_S
+                    next_flush = now + FLUSH_S
                     self._writer.flush()
                 if now >= next_custom:
                     next_custom = now + _KEEP_CUSTOM_S
@@ -547,7 +550,7 @@ class Recorder:
         try:
             if not content:
                 raise BagError(f"snapshot {snapshot.path}: no message has been received yet")
-            with BagWriter(snapshot.path, self.options.compressed, level=_LEVEL) as writer:
+            with BagWriter(snapshot.path, self.options.compressed) as writer:
                 for entry in content:
                     writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
                 self._set_custom(writer)

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_scan import McapScan
-from instant_ic.bag.mcap_source import McapSource
 from instant_ic.bag.mcap_writer import Schema
-from instant_ic.bag.metadata import PartInfo, Topic, preset_of, preset_of_text, schema_of, with_hash, write_metadata
+from instant_ic.bag.metadata import PartInfo, Topic, preset_of_text, with_hash, write_metadata
 from instant_ic.bag.writer import CUSTOM_RECORD, BagWriter
 from instant_ic.bus.qos import QoS
 
@@ -90,7 +89,7 @@ def reindex(folder: Path) -> tuple[int, int]:
     for file in mcap_files(folder):
         try:
             parts.append(_part(file, topics, custom))
-        except Exception as error:  # noqa: BLE001 - a parser may raise anything on bytes that are not a bag
+        except ValueError as error:
             raise BagError(f"{file} is incomplete: {error}; ic bag recover {folder}") from None
     try:
         write_metadata(folder, parts, topics, custom)
@@ -100,26 +99,29 @@ def reindex(folder: Path) -> tuple[int, int]:
 
 
 def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str, str]) -> PartInfo:
-    """Summarise one file; its topics and custom data are added to ``topics`` and ``custom``."""
-    part = PartInfo(file.name)
-    reader = McapSource(file)
-    reader.open()
-    try:
-        for connection in reader.connections:
-            key = (connection.topic, connection.msgtype)
-            part.counts[key] = part.counts.get(key, 0) + connection.msgcount
-            qos = preset_of(connection.ext.offered_qos_profiles)  # type: ignore[union-attr]
-            topics.setdefault(key, (qos, schema_of(connection)))
-        if reader.metadata.message_count:
-            part.start_ns, part.end_ns = reader.metadata.start_time, reader.metadata.end_time - 1
-        custom.update(reader.definitions.metadata.get(CUSTOM_RECORD, {}))
-    finally:
-        reader.close()
-    for message in McapScan(file).messages():
-        if not message.repeated:  # repeated messages come first
-            break
-        part.repeated[message.topic] = part.repeated.get(message.topic, 0) + 1
-        part.repeated_ns = message.stamp_ns
+    """Summarise one file; its topics and custom data are added to ``topics`` and ``custom``.
+
+    Raises:
+        ValueError: it is truncated or damaged.
+    """
+    part, scan = PartInfo(file.name), McapScan(file)
+    stamps: list[int] = []
+    for message in scan.messages():
+        topic = (message.topic, message.schema.name)
+        part.counts[topic] = part.counts.get(topic, 0) + 1
+        stamps.append(message.stamp_ns)
+        if message.repeated:
+            part.repeated[message.topic] = part.repeated.get(message.topic, 0) + 1
+            part.repeated_ns = message.stamp_ns
+    if problem := scan.stopped_by or "; ".join(scan.damaged):
+        raise ValueError(problem)
+    for channel in scan.channels.values():
+        schema = with_hash(scan.schema_of(channel))
+        qos = preset_of_text(channel.metadata.get("offered_qos_profiles", ""))
+        topics.setdefault((channel.topic, schema.name), (qos, schema))
+    if stamps:
+        part.start_ns, part.end_ns = min(stamps), max(stamps)
+    custom.update(scan.metadata.get(CUSTOM_RECORD, {}))
     return part
 
 

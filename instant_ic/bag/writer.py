@@ -44,7 +44,6 @@ class BagWriter(Closing):
     Args:
         path: the folder, which must not exist; only its owner can read it.
         compressed: compress chunks with zstd, for archiving or sending; halves the size of point packets.
-        level: zstd level; 1 keeps pace with raw images, 3 is smaller.
         max_bytes: file size at which a new file starts; 0 sets no limit.
         max_duration_s: duration by message stamps after which a new file starts; 0 sets no limit.
 
@@ -58,11 +57,9 @@ class BagWriter(Closing):
         compressed: bool = False,
         max_bytes: int = 0,
         max_duration_s: float = 0.0,
-        level: int = 3,
     ) -> None:
         self.path = path
         self.compressed = compressed
-        self._level = level
         self.max_bytes = max_bytes
         self.max_duration_ns = int(max_duration_s * 1e9)
         self.bytes = 0
@@ -114,14 +111,17 @@ class BagWriter(Closing):
         """Append one message.
 
         Args:
-            payload: CDR bytes, which must not change until they are on the disk.
+            topic: name of the topic.
+            type_name: type of the topic.
+            payload: CDR bytes; copied.
             stamp_ns: nanoseconds since the epoch.
             qos: QoS of the topic; used the first time that the topic appears.
             schema: definition of the type; default ours. Without one, the bytes are still recorded.
             publisher: name of the publisher; each publisher of a latched topic has its own current value.
 
         Raises:
-            DiskFullError: lost messages are in ``lost``; the bag can be closed, or continued once there is room.
+            DiskFullError: lost messages are in ``lost``; the file has no index. The bag can be closed, or continued
+                in another file once there is room.
             BagError: the file cannot be written; lost messages are in ``lost``.
         """
         if self._closed:
@@ -204,7 +204,7 @@ class BagWriter(Closing):
         part, self._part = self._part, None
         if part is not None:
             try:
-                with suppress(OSError):  # no room: finish() makes some, and metadata.yaml holds the same values
+                with suppress(OSError):  # no room; metadata.yaml holds the same values
                     part.file.add_metadata(CUSTOM_RECORD, self._custom)
                 full = part.file.finish()
             except OSError as error:
@@ -218,7 +218,7 @@ class BagWriter(Closing):
             self._note(part)
             if full is not None:
                 self._write_metadata()
-                raise DiskFullError(f"bag {self.path}: {full.strerror}; it is complete up to here")
+                raise self._full_or_failed(full, f"bag {self.path}")
         self._write_metadata()
 
     def close(self) -> None:
@@ -260,7 +260,7 @@ class BagWriter(Closing):
         numbered = number > 0 or self.max_bytes > 0 or self.max_duration_ns > 0
         name = f"{self.path.name}_{number}.mcap" if numbered else f"{self.path.name}.mcap"
         try:
-            file = McapWriter(self.path / name, self.compressed, self._level)
+            file = McapWriter(self.path / name, self.compressed)
         except OSError as error:
             if error.errno in _FULL:
                 raise DiskFullError(f"bag {self.path}: {error.strerror}") from error
@@ -296,16 +296,18 @@ class BagWriter(Closing):
 
     def _failed(self, error: OSError, what: str) -> BagError:
         """End the file at its last complete chunk and return the error to raise."""
-        words = f"bag {self.path}, {what}: {error.strerror}"
+        words = f"bag {self.path}, {what}"
         try:
             self.end_part()
         except DiskFullError:
             pass
         except BagError as worse:
-            words = str(worse)
-        if error.errno in _FULL:
-            return DiskFullError(f"{words}: the disk is full; the bag is complete up to here")
-        return BagError(words)
+            return worse
+        return self._full_or_failed(error, words)
+
+    def _full_or_failed(self, error: OSError, words: str) -> BagError:
+        text = f"{words}: {error.strerror}; run ic bag recover {self.path}"
+        return DiskFullError(text) if error.errno in _FULL else BagError(text)
 
     def _note(self, part: _Part) -> None:
         part.info.counts = self._count_lost(part)

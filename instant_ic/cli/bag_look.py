@@ -180,23 +180,13 @@ def _plain(topic: TopicDifference) -> dict[str, Any]:
 
 
 def convert(args: argparse.Namespace) -> int:
-    options = ConvertOptions(
-        choice=TopicChoice(tuple(topic_names(args.topics)), tuple(topic_names(args.exclude))),
-        start_s=args.start,
-        end_s=args.end,
-        remap=pairs(args.remap, ":=", "--remap"),
-        skip_unknown=args.skip_unknown,
-        compressed=args.compression,
-        max_bytes=args.max_bag_size,
-        max_duration_s=args.max_bag_duration,
-    )
+    choice = TopicChoice(tuple(topic_names(args.topics)), tuple(topic_names(args.exclude)))
+    options = ConvertOptions(choice, args.start, args.end, args.compression)
     with progress(f"converting {', '.join(args.bags)}") as step:
-        result = convert_bags([Path(bag) for bag in args.bags], Path(args.output), options, step)
-    print(f"{args.output}: {result.counts.total()} messages in {result.files} files")
-    for topic, count in sorted(result.counts.items()):
+        counts = convert_bags([Path(bag) for bag in args.bags], Path(args.output), options, step)
+    print(f"{args.output}: {counts.total()} messages")
+    for topic, count in sorted(counts.items()):
         print(f"  {topic}: {count}")
-    for type_name, topics in sorted(result.skipped.items()):
-        print(f"left out: unknown type {type_name} ({', '.join(topics)})")
     return 0
 
 

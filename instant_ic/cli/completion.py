@@ -80,4 +80,4 @@ def launch_arguments(args: Any) -> Iterable[str]:
 @_quiet
 def bags(args: Any) -> Iterable[str]:
     found = [path.parent for pattern in ("*/metadata.yaml", "*/*/metadata.yaml") for path in Path().glob(pattern)]
-    return sorted(str(path) for path in [*found, *Path().glob("*.mcap"), *Path().glob("*.bag")])
+    return sorted(str(path) for path in [*found, *Path().glob("*.mcap")])

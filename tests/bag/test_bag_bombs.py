@@ -14,8 +14,6 @@ import pytest
 import yaml
 import zstandard
 from mcap.opcode import Opcode
-from rosbags.interfaces import ConnectionExtRosbag1
-from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from instant_ic.bag import BagError, BagReader, bounded
@@ -105,31 +103,14 @@ def ros2_bag(mode: CompressionMode, storage: StoragePlugin) -> Callable[[Path], 
     return write
 
 
-def ros1_bag(compression: Ros1Writer.CompressionFormat) -> Callable[[Path], Path]:
-    def write(folder: Path) -> Path:
-        writer = Ros1Writer(folder / "bag.bag")
-        writer.set_compression(compression)
-        with writer:
-            connection = writer.add_connection(
-                "/text", TEXT, msgdef="string data", md5sum="992ce8a1687cec8c8bd883ec73ca41d1"
-            )
-            assert isinstance(connection.ext, ConnectionExtRosbag1)
-            writer.write(connection, 1, struct.pack("<I", BOMB) + bytes(BOMB))
-        return folder / "bag.bag"
-
-    return write
-
-
 @pytest.mark.parametrize(
     "write",
     [
         ros2_bag(CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
         ros2_bag(CompressionMode.FILE, StoragePlugin.SQLITE3),
         ros2_bag(CompressionMode.STORAGE, StoragePlugin.MCAP),
-        ros1_bag(Ros1Writer.CompressionFormat.BZ2),
-        ros1_bag(Ros1Writer.CompressionFormat.LZ4),
     ],
-    ids=["sqlite-message", "sqlite-file", "mcap", "ros1-bz2", "ros1-lz4"],
+    ids=["sqlite-message", "sqlite-file", "mcap"],
 )
 def test_every_kind_of_bag_is_limited(
     tmp_path: Path, write: Callable[[Path], Path], small_limits: None, monkeypatch: pytest.MonkeyPatch
@@ -199,13 +180,12 @@ def test_sqlite_topic_without_a_type_is_an_error_with_the_bag(tmp_path: Path) ->
         BagReader(file)
 
 
-@pytest.mark.parametrize("compression", ["zstd", "lz4", "bz2"])
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_whole_frames_come_whole_and_cut_ones_as_far_as_they_go(compression: str) -> None:
-    import bz2
     import random
 
     content = random.Random(3).randbytes(3 * MB) + bytes(MB)
-    pack = {"zstd": zstandard.compress, "lz4": lz4.frame.compress, "bz2": bz2.compress}[compression]
+    pack = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}[compression]
     data = pack(content)
     assert bounded.decompress(data, compression, len(content)) == content
     cut = bounded.decompress(data[: 2 * MB], compression, len(content))

@@ -112,20 +112,20 @@ def test_wrong_tolerances_are_told(
 
 def test_convert_recover_reindex(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     bag = make(tmp_path / "bag")
-    words = ("-t", "scan", "--start", "2", "--end", "7", "--remap", "/scan:=/front", "-d", "2", "--compression")
+    words = ("-t", "scan", "--start", "2", "--end", "7", "--compression")
     status, out, _ = ic(capsys, "bag", "convert", bag, "-o", tmp_path / "new", *words)
-    assert status == 0 and "5 messages in 3 files" in out and "/front: 5" in out
+    assert status == 0 and "5 messages" in out and "/scan: 5" in out
     (tmp_path / "new" / "metadata.yaml").unlink()
     status, _, error = ic(capsys, "bag", "info", tmp_path / "new")
     assert status == 1 and "ic bag reindex" in error
     status, out, _ = ic(capsys, "bag", "reindex", tmp_path / "new")
-    assert status == 0 and "5 messages in 3 files" in out
-    file = tmp_path / "new" / "new_2.mcap"
+    assert status == 0 and "5 messages in 1 files" in out
+    file = tmp_path / "new" / "new.mcap"
     file.write_bytes(file.read_bytes()[:-100])
     status, _, error = ic(capsys, "bag", "reindex", tmp_path / "new")
-    assert status == 1 and "new_2.mcap is incomplete" in error
+    assert status == 1 and "new.mcap is incomplete" in error
     status, out, _ = ic(capsys, "bag", "recover", tmp_path / "new", "-o", tmp_path / "saved")
-    assert status == 0 and "5 messages" in out and "new_2.mcap" in out
+    assert status == 0 and "5 messages" in out and "new.mcap" in out
     with BagReader(tmp_path / "saved") as reader:
         assert [m.stamp_ns // S for m in reader.messages()] == [3, 4, 5, 6, 7]
 

@@ -191,8 +191,8 @@ def test_dora_3518_a_recorder_that_cannot_follow_says_so(tmp_path: Path, monkeyp
 
     made = recorder(tmp_path / "bag", {"/scan": SENSOR}, queue_mb=1)
     made.take("/scan", BOOL, b"x", S)
-    slow, writev = threading.Event(), os.writev
-    monkeypatch.setattr(os, "writev", lambda fd, parts: (slow.wait(60), writev(fd, parts))[1])
+    slow, write = threading.Event(), os.write
+    monkeypatch.setattr(os, "write", lambda fd, data: (slow.wait(60), write(fd, data))[1])
     for index in range(30):
         made.take("/scan", BOOL, b"x" * 100_000, 2 * S + index)
     told = made.status()["overflow"]["/scan"]
@@ -209,8 +209,8 @@ def test_rerun_recording_does_not_block_the_control_loop(tmp_path: Path, monkeyp
 
     made = recorder(tmp_path / "bag", {"/image": SENSOR})
     made.take("/image", BOOL, b"x", S)
-    slow, writev = threading.Event(), os.writev
-    monkeypatch.setattr(os, "writev", lambda fd, parts: (slow.wait(60), writev(fd, parts))[1])
+    slow, write = threading.Event(), os.write
+    monkeypatch.setattr(os, "write", lambda fd, data: (slow.wait(60), write(fd, data))[1])
     picture = bytes(5_500_000)
     began_s = time.monotonic()
     for index in range(20):  # 110 MB while the disk takes nothing at all

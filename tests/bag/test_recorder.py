@@ -29,6 +29,12 @@ S = 1_000_000_000
 YES, NO = bytes(serialize(Bool(data=True))), bytes(serialize(Bool(data=False)))
 
 
+@pytest.fixture(autouse=True)
+def quick_recorder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recording, "FLUSH_S", 0.1)
+    monkeypatch.setattr(recording, "SPACE_S", 0.1)
+
+
 class Losses:
     def __init__(self) -> None:
         self.lost = 0
@@ -75,13 +81,13 @@ class SlowDisk:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.go = threading.Event()
-        writev = os.writev
+        write = os.write
 
-        def wait_and_write(fd: int, parts: list[memoryview]) -> int:
+        def wait_and_write(fd: int, data: memoryview) -> int:
             assert self.go.wait(60)
-            return writev(fd, parts)
+            return write(fd, data)
 
-        self._begin = lambda: monkeypatch.setattr(os, "writev", wait_and_write)
+        self._begin = lambda: monkeypatch.setattr(os, "write", wait_and_write)
 
     def hang(self) -> None:
         self._begin()
@@ -172,14 +178,14 @@ def test_full_disk_leaves_a_valid_bag_and_a_recorder_that_lives(
 ) -> None:
     recorder = make(tmp_path / "bag")
     full = threading.Event()
-    writev = os.writev
+    write = os.write
 
-    def write(fd: int, parts: list[memoryview]) -> int:
-        if full.is_set() and sum(len(part) for part in parts) > 50_000:  # the index still finds room
+    def refuse(fd: int, data: memoryview) -> int:
+        if full.is_set() and len(data) > 50_000:  # the end still finds room
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return writev(fd, parts)
+        return write(fd, data)
 
-    monkeypatch.setattr(os, "writev", write)
+    monkeypatch.setattr(os, "write", refuse)
     recorder.take("/estop", BOOL, NO, 1 * S)
     recorder.take("/scan", BOOL, b"1" * 100_000, 1 * S)
     wait_for(lambda: (tmp_path / "bag" / "bag.mcap").stat().st_size > 100_000, "the flush")
@@ -187,7 +193,7 @@ def test_full_disk_leaves_a_valid_bag_and_a_recorder_that_lives(
     recorder.take("/estop", BOOL, YES, 2 * S)
     recorder.take("/scan", BOOL, b"2" * 2_000_000, 2 * S)
     wait_for(lambda: recorder.error, "the full disk")
-    assert "No space left on device" in recorder.error and "complete up to here" in recorder.error
+    assert "No space left on device; run ic bag recover" in recorder.error
     full.clear()
     wait_for(lambda: recorder.state == RECORDING, "room")
     recorder.tick()
@@ -380,24 +386,23 @@ def on_the_disk(path: Path) -> list[bytes]:
     return [message.payload for file in path.glob("*.mcap") for message in McapScan(file).messages()]
 
 
-@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EIO, errno.EFBIG])
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EIO])
 @pytest.mark.parametrize("size", [100, 300_000])
-@pytest.mark.parametrize("index_fits", [True, False])
+@pytest.mark.parametrize("end_fits", [True, False])
 def test_every_message_is_recorded_or_counted_whatever_the_disk_refuses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, size: int, index_fits: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, size: int, end_fits: bool
 ) -> None:
     """On a full disk the messages of the chunk that was being written were neither."""
     recorder = make(tmp_path / "bag")
     refused = threading.Event()
-    writev = os.writev
+    write = os.write
 
-    def write(fd: int, parts: list[memoryview]) -> int:
-        length = sum(len(part) for part in parts)
-        if refused.is_set() and (length > 2_000 or not index_fits):
+    def refuse(fd: int, data: memoryview) -> int:
+        if refused.is_set() and (len(data) > 2_000 or not end_fits):
             raise OSError(error, os.strerror(error))
-        return writev(fd, parts)
+        return write(fd, data)
 
-    monkeypatch.setattr(os, "writev", write)
+    monkeypatch.setattr(os, "write", refuse)
     sent = [index.to_bytes(2) * (size // 2) for index in range(120)]
     for index in range(40):
         recorder.take("/scan", BOOL, sent[index], index + S)

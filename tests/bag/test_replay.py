@@ -6,7 +6,6 @@ import pytest
 
 from instant_ic.bag import BagError, BagReader, BagWriter, Schema
 from instant_ic.bag.compare import compare
-from instant_ic.bag.convert import ConvertOptions, convert
 from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.replay import ReplayError, ReplayNode, make_node, replay
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node
@@ -203,7 +202,9 @@ def test_type_of_another_definition_is_refused(tmp_path: Path) -> None:
 
 
 def test_bare_file_split_bag_and_compressed_bag_replay_alike(bag: Path, tmp_path: Path) -> None:
-    convert([bag], tmp_path / "split", ConvertOptions(max_duration_s=0.3, compressed=True))
+    with BagReader(bag) as reader, BagWriter(tmp_path / "split", True, max_duration_s=0.3) as writer:
+        for m in reader.messages():
+            writer.write(m.topic, m.type_name, m.payload, m.stamp_ns, m.qos)
     for number, source in enumerate((bag, bag / "bag.mcap", tmp_path / "split")):
         result = replay(source, [mean_node()], tmp_path / f"{number}" / "out", compressed=number == 2)
         assert all(topic.same for topic in compare(tmp_path / "0" / "out", tmp_path / f"{number}" / "out"))

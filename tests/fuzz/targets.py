@@ -702,29 +702,6 @@ def _parse_reindex() -> Callable[[bytes], object]:
     return _by_file("bag.mcap", parse)
 
 
-def _ros1_bags() -> list[bytes]:
-    from rosbags.rosbag1 import Writer
-
-    samples = []
-    for compression in (None, Writer.CompressionFormat.BZ2, Writer.CompressionFormat.LZ4):
-        path = _folder() / "bag.bag"
-        writer = Writer(path)
-        if compression is not None:
-            writer.set_compression(compression)
-        with writer:
-            connection = writer.add_connection(
-                "/text", "std_msgs/msg/String", msgdef="string data", md5sum="992ce8a1687cec8c8bd883ec73ca41d1"
-            )
-            for stamp in range(3):
-                writer.write(connection, stamp, b"\5\0\0\0hello")
-        samples.append(path.read_bytes())
-    return samples
-
-
-def _parse_ros1() -> Callable[[bytes], object]:
-    return _by_file("bag.bag", _read_bag)
-
-
 def _sqlite_bags() -> list[bytes]:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -1074,7 +1051,6 @@ TARGETS = {
         Target("mcap-read", _mcaps, _parse_bag, _bag_errors(), fix=fix_chunk, share=150),
         Target("mcap-reindex", _mcaps, _parse_reindex, _bag_errors(), fix=fix_chunk, share=100),
         Target("bag-metadata", _metadata_files, _parse_metadata, _bag_errors(), _YAML_WORDS, share=20),
-        Target("ros1-bag", _ros1_bags, _parse_ros1, _bag_errors(), share=6),
         Target("sqlite-bag", _sqlite_bags, _parse_sqlite, _bag_errors(), share=100),
         Target("parameters", _parameter_samples, _parse_parameters, _parameter_errors(), _YAML_WORDS, share=100),
         Target(

@@ -10,10 +10,10 @@ from pathlib import Path
 import cv2
 import pytest
 
-from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import preset_of_text, schema_or_unknown, with_hash
-from instant_ic.bag.recover import recover, reindex
+from instant_ic.bag.recover import recover
 from instant_ic.bus.qos import RELIABLE, SENSOR
 from instant_ic.camera.http import Session
 from instant_ic.config.params import ParameterError, load_file
@@ -72,17 +72,6 @@ def test_recover_takes_messages_whose_definition_is_damaged(bag: Path, tmp_path:
     recover(file, tmp_path / "new")
     with BagReader(tmp_path / "new") as found:
         assert found.count == 3
-
-
-def test_reindex_of_a_damaged_summary_says_what_to_do(bag: Path) -> None:
-    file = next(bag.glob("*.mcap"))
-    content = bytearray(file.read_bytes())
-    (start,) = struct.unpack_from("<Q", content, len(content) - 28)
-    for at in range(start, len(content) - 37):
-        content[at] ^= 0x80
-    file.write_bytes(content)
-    with pytest.raises(BagError, match="ic bag recover"):
-        reindex(bag)
 
 
 def test_parameter_file_that_is_no_utf8_is_an_error_with_its_name(tmp_path: Path) -> None:

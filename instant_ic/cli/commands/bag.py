@@ -44,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
     text, example = "play a bag with /clock; space pauses, → steps, ↑ ↓ change the rate", "ic bag play drive --rate 2"
     playing = verb(verbs, "play", text, "bag_run.play", f"{example} --start 10")
     add = playing.add_argument
-    add("bag", metavar="BAG", help="folder, .mcap, .db3 or ROS 1 .bag file", completer=completion.bags)
+    add("bag", metavar="BAG", help="folder, .mcap or .db3 file", completer=completion.bags)
     _topics(playing)
     add("-r", "--rate", type=float, default=1.0, help="speed factor (default: %(default)s)")
     add("--start", **span, default=0.0, help="start at this offset")
@@ -72,7 +72,7 @@ def add_parser(subparsers: Any) -> None:
     tolerances(comparing)
     comparing.add_argument("--json", action="store_true", help="print JSON")
 
-    text = "convert ROS 1 bags, SQLite bags and bare files to a bag; filter, merge, split, compress"
+    text = "convert SQLite bags and bare files to a bag; filter, cut, merge, compress"
     converting = verb(verbs, "convert", text, "bag_look.convert", "ic bag convert old.bag -o drive")
     add = converting.add_argument
     add("bags", nargs="+", metavar="BAG", help="several bags are merged by stamp")
@@ -82,9 +82,7 @@ def add_parser(subparsers: Any) -> None:
     add("-x", "--exclude", **many, metavar="TOPIC", help="topics to leave out")
     add("--start", **span, default=0.0, help="start at this offset")
     add("--end", **span, default=0.0, help="end at this offset")
-    add("--remap", **many, metavar="FROM:=TO", help="rename a topic; repeatable")
-    add("--skip-unknown", action="store_true", help="leave out topics of unknown types")
-    _files(converting)
+    add("--compression", action="store_true", help="compress with zstd")
 
     text, example = "recover a readable bag from one that was cut short or damaged", "ic bag recover broken -o saved"
     rescuing = verb(verbs, "recover", text, "bag_look.recover", example)
