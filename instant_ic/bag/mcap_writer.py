@@ -98,7 +98,7 @@ class McapWriter:
         self._open: list[tuple[int, int]] = []  # channel and stamp of each message in the open chunk
         self._open_bytes = 0
         compression = CompressionType.ZSTD if compressed else CompressionType.NONE
-        self._writer = Writer(self._file, CHUNK_BYTES, compression)  # type: ignore[arg-type]
+        self._writer = Writer(self._file, CHUNK_BYTES, compression)
         try:
             self._put(self._writer.start, "ros2", LIBRARY)
         except OSError:
