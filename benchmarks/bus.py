@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reporting import parser_of, report
+from reporting import parser_for, report
 
 PEER = Path(__file__).with_name("bus_peer.py")
 SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_500_000}
@@ -289,7 +289,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    parser = parser_of(__doc__)
+    parser = parser_for(__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer messages")
     parser.add_argument(
         "--only",

@@ -23,7 +23,7 @@ from typing import Any
 
 import aiohttp
 import numpy as np
-from reporting import parser_of, report
+from reporting import parser_for, report
 
 from instant_ic.console import ConsoleClient, ConsoleServer, ServerConfig
 from instant_ic.console.access import AccessConfig
@@ -212,7 +212,7 @@ def measure(kind: str | None, clients: int, seconds: float, address: str, post: 
 
 
 def main() -> None:
-    parser = parser_of(__doc__)
+    parser = parser_for(__doc__)
     parser.add_argument("--flood", choices=("pings", "limit", "http", "connect"), default="pings")
     parser.add_argument("--clients", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=20.0)

@@ -44,7 +44,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from reporting import parser_of, report
+from reporting import parser_for, report
 
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.console.view import PROBE
@@ -397,7 +397,7 @@ def draws_hz(row: dict[str, Any]) -> float:
 
 
 def main() -> int:
-    parser = parser_of(__doc__)
+    parser = parser_for(__doc__)
     parser.add_argument("--presses", type=int, default=30, help="for each figure (default 30)")
     parser.add_argument("--width", type=int, default=960)
     parser.add_argument("--height", type=int, default=600)

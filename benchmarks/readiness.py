@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from reporting import parser_of, report
+from reporting import parser_for, report
 
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments.illusion import TeleopSettings
@@ -97,7 +97,7 @@ def save_plot(path: Path, frames: dict[str, list[dict[str, Any]]]) -> None:
 
 
 def main() -> None:
-    parser = parser_of(__doc__)
+    parser = parser_for(__doc__)
     parser.add_argument("--world", default="corridors", help="worlds, by comma (default corridors)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the courses (default 0)")
     parser.add_argument("--episodes", type=int, default=4, help="courses in each world (default 4)")

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from reporting import note, parser_of, report
+from reporting import note, parser_for, report
 
 from instant_ic.experiments.slam import (
     Relations,
@@ -151,7 +151,7 @@ def named_log(name: str, data: Path) -> tuple[list[LogEntry], Relations | None]:
 
 def main() -> None:
     parts = ("box", "long", "intel", "intel_seeds", "worlds", "sim")
-    parser = parser_of(__doc__)
+    parser = parser_for(__doc__)
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"
     parser.add_argument("--data", type=Path, default=default)
     parser.add_argument("--only", nargs="+", choices=(*parts, "faults"), default=parts)

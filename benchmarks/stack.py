@@ -27,7 +27,7 @@ from typing import Any
 
 import psutil
 from cpu_usage import Usage, cpu_percent, reference_loop, usage
-from reporting import note, parser_of, report
+from reporting import note, parser_for, report
 
 from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.experiments.drive import DriveRecorder
@@ -98,7 +98,7 @@ class Watch:
 
 
 def main() -> int:
-    parser = parser_of(__doc__)
+    parser = parser_for(__doc__)
     parser.add_argument("--repeat", type=int, default=1, help="number of drives, each with a new stack (default 1)")
     parser.add_argument("--pace", type=float, default=None, help="fixed pace (default: what the machine can do)")
     parser.add_argument("--screenshots", type=Path, metavar="DIR", help="screenshots of the page in each mode")

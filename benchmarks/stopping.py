@@ -49,7 +49,7 @@ from typing import Any, NamedTuple
 
 import aiohttp
 import numpy as np
-from reporting import parser_of, report
+from reporting import parser_for, report
 
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.protocol import ESTOP_BITS, Command, encode_reply, read_request, write_frame
@@ -646,7 +646,7 @@ def summary(drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def main() -> int:
-    parser = parser_of(__doc__)
+    parser = parser_for(__doc__)
     parser.add_argument("--only", action="append", default=[], help="faults whose name begins so; may be repeated")
     parser.add_argument("--repeat", type=int, default=2, help="drives for each fault (default 2)")
     parser.add_argument(
