@@ -107,7 +107,12 @@ class SimulatedPlace:
         self.start = pose_matrix(x, y, 1.2, yaw=math.pi - (int(np.argmax(ways)) + 0.5) * (2 * math.pi / 64))
 
     def keyframe(self, x: float, depth_error: float = 0.0) -> tuple[Any, ...]:
-        """Return the arguments of ``VirtualSpace.set_keyframe``; the depth has smooth errors of this share (1 sigma)."""
+        """Return the arguments of ``VirtualSpace.set_keyframe``.
+
+        Args:
+            x: place of the camera along the way, in metres.
+            depth_error: standard deviation of smooth errors of the depth, as a share of it.
+        """
         pose = self.start @ pose_matrix(x)
         panorama = self._renderer.render(pose, PANORAMA, PANORAMA // 2, supersample=2)
         coarse = np.random.default_rng(round(100 * x) + 1000).normal(size=(9, 16)).astype(np.float32)

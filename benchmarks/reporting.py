@@ -14,7 +14,7 @@ import numpy as np
 
 
 def parser_for(doc: str | None, with_json: bool = True) -> argparse.ArgumentParser:
-    """Return a parser with a module's docstring as its help, and the option ``--json`` unless ``with_json`` is False."""
+    """Return a parser with a module's docstring as its help, and the option ``--json``."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     if with_json:
         parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
