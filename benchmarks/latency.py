@@ -118,7 +118,7 @@ addEventListener("rendered", ({detail}) => {
 
 
 class SimulatedInput:
-    """Input of the nodes from a robot that stands in the simulator's corridor while its virtual robot drives."""
+    """Input of the nodes from a robot at rest in the simulator's corridor while its virtual robot drives."""
 
     def __init__(self, stack: Stack) -> None:
         self.stack = stack
