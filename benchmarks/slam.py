@@ -31,7 +31,7 @@ from instant_ic.experiments.slam_logs import LogEntry, read_log
 from instant_ic.experiments.slam_worlds import LASERS, cells, drive, ring
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam import GridSlam, Scan
-from instant_ic.slam.grid_slam import warm_up
+from instant_ic.slam.start import warm_up
 
 KEPT = (
     "translation_mean_m", "translation_median_m", "translation_max_m", "rotation_mean_deg", "relations",

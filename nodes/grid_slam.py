@@ -10,12 +10,12 @@ from instant_ic.adapters import slam as slam_messages
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, WARN, Node, NodeError, QoS, main
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.slam.config import GridSlamConfig
-from instant_ic.slam.grid_slam import JobResult, make_slam, run_job, save_answer, transforms, warm_up
 from instant_ic.slam.map_updates import MapUpdates
 from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.report import diagnoses
 from instant_ic.slam.scan import FloatArray
 from instant_ic.slam.scan_queue import QueuedScan, ScanError, ScanQueue
+from instant_ic.slam.start import make_slam, warm_up
 
 ODOMETRY_QUEUE = QoS("sensor", depth=100)
 """Deep, because scans are placed between two odometry messages."""
@@ -29,7 +29,7 @@ class GridSlamNode(Node[GridSlamConfig]):
     def setup(self) -> None:
         warm_up(self.config)
         self.poll: Any = None  # timer while scans wait for odometry, which may have gone silent
-        self.worker = self.background(run_job, self.take_over)
+        self.worker = self.background(slam_messages.run_job, self.take_over)
         self.queue = ScanQueue(self.config)
         self.limiter = CorrectionLimiter()
         self.map_out = self.publisher("/map", msg.OccupancyGrid, qos=LATCHED)
@@ -104,7 +104,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.diagnose_all(*diagnoses(slam, result, odometry is not None, config.use_wheel_odom))
         self.placed_ns = stamp
         self.integrity_out.publish(slam_messages.integrity_message(slam, result, config.map_frame, stamp))
-        for parent, child, matrix in transforms(slam, self.limiter, config, stamp, odometry is not None):
+        for parent, child, matrix in slam_messages.transforms(slam, self.limiter, config, stamp, odometry is not None):
             self.tf_broadcast(parent, child, matrix, stamp)
         if slam.in_map_frame:
             self.pose_out.publish(slam_messages.pose_message(result, config.map_frame, stamp))
@@ -114,7 +114,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         if job is not None:
             self.worker.submit((slam, job))
 
-    def take_over(self, result: JobResult) -> None:
+    def take_over(self, result: slam_messages.JobResult) -> None:
         """Apply the worker's result, unless its map has been discarded since."""
         self.diagnose_all(result.diagnosis)
         if result.slam is self.slam:
@@ -130,7 +130,7 @@ class GridSlamNode(Node[GridSlamConfig]):
 
     def on_save(self, message: Any) -> None:
         """Write the map to the path in the message; the answer goes to /slam/saved."""
-        answer = save_answer(self.slam, Path(message.data))
+        answer = slam_messages.save_answer(self.slam, Path(message.data))
         self.log.info("%s", answer)
         self.saved_out.publish(msg.String(data=answer))
 

@@ -1,12 +1,14 @@
-"""Messages of the node ``grid_slam`` from the plain values of ``instant_ic.slam``, and back."""
+"""Messages, transforms and background jobs of the node ``grid_slam``."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from instant_ic.geometry.poses import matrix_from_pose2, planar_covariance
+from instant_ic.geometry.poses import Matrix, matrix_from_pose2, planar_covariance
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import (
     LaserScan,
@@ -23,10 +25,15 @@ from instant_ic.msg import (
 )
 from instant_ic.msg import pose_message as _pose
 from instant_ic.slam import GridSlam, Scan
+from instant_ic.slam.config import GridSlamConfig
 from instant_ic.slam.grid_slam import SlamResult
+from instant_ic.slam.localization import FoundPlace
+from instant_ic.slam.loop_closure import LoopOutcome
 from instant_ic.slam.map_updates import MapUpdates
+from instant_ic.slam.odometry import CorrectionLimiter
 from instant_ic.slam.scan import FloatArray
 from instant_ic.slam.scan_queue import ScanError, level_mount
+from instant_ic.util.diagnosis import Diagnosis, Level
 
 
 def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> tuple[Scan, FloatArray]:
@@ -98,3 +105,43 @@ def map_messages(updates: MapUpdates, slam: GridSlam, map_frame: str, stamp: int
         origin = (float(whole.origin[0]), float(whole.origin[1]))
         grid = grid_message(whole.values, whole.resolution, origin, map_frame, stamp)
     return update, grid
+
+
+def save_answer(slam: GridSlam, stem: Path) -> str:
+    """Save the map; return which files were written, or the error."""
+    try:
+        return "saved: " + ", ".join(str(file) for file in slam.save(stem))
+    except ValueError as error:
+        return f"error: {error}"
+
+
+def transforms(
+    slam: GridSlam, limiter: CorrectionLimiter, config: GridSlamConfig, stamp_ns: int, with_odometry: bool
+) -> Iterator[tuple[str, str, Matrix]]:
+    """Yield the transforms to broadcast after a scan: parent, child and parent_from_child (4, 4)."""
+    if not with_odometry:
+        yield config.odom_frame, config.base_frame, matrix_from_pose2(slam.odom_from_base)
+    # A robot that is lost keeps the frames that it had: it may drive on, slowly, until its place is recognized.
+    if slam.in_map_frame:
+        map_from_odom = limiter.follow(slam.map_from_odom, slam.odom_from_base, stamp_ns)
+        yield config.map_frame, config.odom_frame, matrix_from_pose2(map_from_odom)
+    else:
+        limiter.reset()
+
+
+class JobResult(NamedTuple):
+    """Outcome of a background job of one SLAM; None with a diagnosis if it failed."""
+
+    slam: GridSlam
+    outcome: FoundPlace | LoopOutcome | None
+    diagnosis: Diagnosis | None = None
+
+
+def run_job(item: tuple[GridSlam, Callable[[], FoundPlace | LoopOutcome]]) -> JobResult:
+    """Run a ``background_job``, on any thread."""
+    slam, job = item
+    try:
+        return JobResult(slam, job())
+    except Exception as error:  # noqa: BLE001 - scans go on
+        text = f"loop closure failed and is off until the node restarts: {type(error).__name__}: {error}"
+        return JobResult(slam, None, Diagnosis("loops", Level.ERROR, text))

@@ -23,8 +23,9 @@ import numpy as np
 from instant_ic.experiments.slam_logs import LogEntry, LogError, open_log
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, Scan, SlamConfig, SlamResult
-from instant_ic.slam.grid_slam import Anchor, warm_up
+from instant_ic.slam.keyframes import ScanKeyframe
 from instant_ic.slam.scan import FloatArray
+from instant_ic.slam.start import warm_up
 
 MATCH_S = 0.006
 """Largest difference of two times, in seconds, that count as the same."""
@@ -198,7 +199,7 @@ def run_log(
     warm_up(config)
     stamps: list[float] = []
     online: list[FloatArray] = []
-    anchored: list[tuple[Anchor | None, FloatArray]] = []
+    anchored: list[tuple[ScanKeyframe | None, FloatArray]] = []
     cpu_ms: list[float] = []
     background_ms: list[float] = []
     scores: list[float] = []
@@ -245,14 +246,14 @@ def ascending(entries: Iterable[LogEntry], last_ns: int | None = None) -> Iterat
         yield entry, scan
 
 
-def from_anchor(result: SlamResult) -> tuple[Anchor | None, FloatArray]:
+def from_anchor(result: SlamResult) -> tuple[ScanKeyframe | None, FloatArray]:
     """Return the pose (3,) relative to its keyframe, or the pose itself if there is none."""
     if result.anchor is None:
         return None, result.map_from_base
     return result.anchor, relative2(result.anchor.pose(), result.map_from_base)
 
 
-def final_poses(anchored: Iterable[tuple[Anchor | None, FloatArray]]) -> FloatArray:
+def final_poses(anchored: Iterable[tuple[ScanKeyframe | None, FloatArray]]) -> FloatArray:
     """Return the poses (n, 3) of ``from_anchor`` after the last optimisation."""
     return np.array([there if anchor is None else compose2(anchor.pose(), there) for anchor, there in anchored])
 

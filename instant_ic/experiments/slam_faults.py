@@ -19,9 +19,9 @@ from instant_ic.experiments.slam import ascending, final_poses, from_anchor
 from instant_ic.experiments.slam_logs import LogEntry, LogError
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
-from instant_ic.slam.grid_slam import warm_up
 from instant_ic.slam.localization import SavedMap
 from instant_ic.slam.scan import FloatArray
+from instant_ic.slam.start import warm_up
 
 WRONG_M = 0.5
 """A pose farther from the reference is wrong."""

@@ -15,7 +15,6 @@ from slam_planar_world import rectangle
 from instant_ic.experiments.slam_worlds import Drive, Laser, drive
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, OccupancyGrid, Scan, SlamConfig, SlamResult, SlamStatus
-from instant_ic.slam.grid_slam import make_slam
 from instant_ic.slam.localization import bound_nodes
 from instant_ic.slam.loop_search import pool
 from instant_ic.slam.map_files import (
@@ -27,6 +26,7 @@ from instant_ic.slam.map_files import (
     save_graph,
     save_grid,
 )
+from instant_ic.slam.start import make_slam
 
 LASER = Laser(240, 360.0, 12.0, 0.01)
 # Two rooms and a door; nothing in it looks like anything else.
