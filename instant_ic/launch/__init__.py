@@ -1,20 +1,15 @@
 """Read, check, start, supervise and stop launch files (docs/launch.md)."""
 
-from instant_ic.launch.description import (
-    LaunchArgument,
-    LaunchDescription,
-    NodeSpec,
-    find_launch_file,
-)
+from instant_ic.launch.description import LaunchArgument, LaunchDescription, NodeSpec, find_launch_file
 from instant_ic.launch.reader import read_arguments, read_launch_file
-from instant_ic.launch.source import LaunchFileError, Problem
+from instant_ic.launch.source import LaunchFileError, LaunchProblem
 
 __all__ = [
     "LaunchArgument",
     "LaunchDescription",
     "LaunchFileError",
+    "LaunchProblem",
     "NodeSpec",
-    "Problem",
     "find_launch_file",
     "read_arguments",
     "read_launch_file",

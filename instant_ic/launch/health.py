@@ -5,21 +5,25 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from instant_ic.bus import RELIABLE, SENSOR, registry
 from instant_ic.bus.heartbeat import EVERY_NODES, TYPE, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import ERROR, OK, WARN
-from instant_ic.bus.qos import QoS
-from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.topics import nominal_rate
 from instant_ic.msg import MessageError, deserialize, header, message_type, serialize
 from instant_ic.util.paths import sign_in_file
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from instant_ic.bus.qos import QoS
+    from instant_ic.bus.transport import RawSubscription
+    from instant_ic.launch.description import NodeSpec
 
 FAULT_HOLDS_S = 3.0
 """A wrong rate is reported once it has lasted this long."""
@@ -42,12 +46,17 @@ MILESTONES: tuple[tuple[str, str, str], ...] = (
 
 @dataclass(frozen=True)
 class TopicFault:
-    """A topic that has stopped or is too slow."""
+    """A topic that has stopped or is too slow.
+
+    Attributes:
+        label: node that publishes it.
+        text: what is wrong, with the numbers.
+        stopped: whether it has stopped.
+    """
 
     label: str
-    """Node that publishes it."""
     topic: str
-    words: str
+    text: str
     stopped: bool
 
 
@@ -55,35 +64,35 @@ class HealthMonitor:
     """Subscribes to ``/heartbeat`` (and ``/vspace/status`` if the stack has a ``nerf``) without a node of its own.
 
     Args:
+        nodes: the stack's nodes.
         run_dir: prepared run directory; those of groups lie in it, also prepared.
     """
 
     def __init__(self, nodes: Sequence[NodeSpec], run_dir: Path) -> None:
         self.nodes: dict[str, Heartbeat] = {}
-        """By label."""
-        self._specs = [spec for spec in nodes if spec.heartbeat]
-        self._run_dir = run_dir
-        groups = {spec.group: spec.run_dir or run_dir for spec in nodes} | {"": run_dir}
+        """Newest heartbeat of each node, by label."""
+        self._specs = list(nodes)
+        self._folders = {spec.group: spec.run_dir or run_dir for spec in nodes} | {"": run_dir}
         name = f"launch_{os.getpid()}"
-        self._transports = {group: LocalTransport(folder, name, time.time_ns) for group, folder in groups.items()}
+        self._transports = {group: LocalTransport(path, name, time.time_ns) for group, path in self._folders.items()}
         for transport in self._transports.values():
             transport.patient = True
-        self._folders = groups
         spaces = {(spec.group, spec.namespace.strip("/")): spec for spec in self._specs}
         self._beats = [(spec.group, self._subscribe(spec, "/heartbeat", TYPE, RELIABLE)) for spec in spaces.values()]
         status = "instant_ic_msgs/msg/VspaceStatus"
         self._vspace = [
             (_labelled(spec, "virtual space"), self._subscribe(spec, "/vspace/status", status, RELIABLE))
-            for spec in self._of("nerf")
+            for spec in self._running("nerf")
             if not spec.namespace
         ]
         array = "diagnostic_msgs/msg/DiagnosticArray"
         self._diagnostics = {
             group: transport.advertise("/diagnostics", array, RELIABLE) for group, transport in self._transports.items()
         }
-        self._late = [self._subscribe(spec, LATE, "std_msgs/msg/Float32") for spec in self._of("simulator")]
+        self._late = [self._subscribe(spec, LATE, "std_msgs/msg/Float32") for spec in self._running("simulator")]
         control = "instant_ic_msgs/msg/ControlState"
-        self._control = [self._subscribe(spec, "/ic/state", control) for spec in self._of("arbiter") if self._late]
+        arbiters = self._running("arbiter") if self._late else []
+        self._control = [self._subscribe(spec, "/ic/state", control) for spec in arbiters]
         self._vspace_text: dict[str, str] = {}
         self._next_diagnostics_s = 0.0
         self._addresses: dict[str, str] = {}
@@ -91,10 +100,10 @@ class HealthMonitor:
         self._flowed: set[tuple[str, str]] = set()
         self._wrong_since: dict[tuple[str, str], float] = {}
 
-    def _of(self, program: str) -> list[NodeSpec]:
+    def _running(self, program: str) -> list[NodeSpec]:
         return [spec for spec in self._specs if spec.exec == program]
 
-    def _subscribe(self, spec: NodeSpec, topic: str, type_name: str, qos: QoS = SENSOR) -> Any:
+    def _subscribe(self, spec: NodeSpec, topic: str, type_name: str, qos: QoS = SENSOR) -> RawSubscription:
         namespace = spec.namespace.strip("/")
         name = f"/{namespace}{topic}" if namespace else topic
         return self._transports[spec.group].subscribe(name, type_name, qos, lambda: None)
@@ -104,21 +113,28 @@ class HealthMonitor:
         for transport in self._transports.values():
             transport.wait(0.0)
         for group, subscription in self._beats:
-            for publisher, message in _published([subscription]):
+            for publisher, message in _arrived(subscription):
                 beat = from_message(message)
                 if beat.node == publisher:  # a bridge's may come from a node of this name on another machine
                     self.nodes[f"{group}/{beat.node}" if group else beat.node] = beat
         for label, subscription in self._vspace:
-            for status in _taken([subscription]):
+            for _, status in _arrived(subscription):
                 self._vspace_text[label] = status.message
                 if status.state == _VSPACE_READY:
                     self._reached.add(label)
-        for word, program, topic in MILESTONES:
-            for spec in self._specs:
-                health = self.nodes.get(spec.label)
-                flow = health.outputs.get(topic) if health is not None and spec.exec == program else None
-                if flow is not None and flow.age_s < math.inf:
-                    self._reached.add(_labelled(spec, word))
+        for milestone, spec, topic in self._milestones():
+            health = self.nodes.get(spec.label)
+            flow = health.outputs.get(topic) if health is not None else None
+            if flow is not None and flow.age_s < math.inf:
+                self._reached.add(milestone)
+
+    def _milestones(self) -> list[tuple[str, NodeSpec, str]]:
+        """Return label, node and topic of each milestone of this stack."""
+        return [
+            (_labelled(spec, text), spec, topic)
+            for text, program, topic in MILESTONES
+            for spec in self._running(program)
+        ]
 
     @property
     def cpu_cores(self) -> float:
@@ -126,16 +142,17 @@ class HealthMonitor:
         return sum(health.cpu_percent for health in self.nodes.values()) / 100.0
 
     def take_late(self) -> tuple[float | None, bool]:
-        """Largest delay of the simulated devices since the last call, and whether the arbiter reported a stale source.
+        """Return the largest delay of the simulated devices since the last call, and whether a source is stale.
 
-        The delay is a share of the acceptable one; None without a report. Both only with a simulator in the stack.
+        The delay is a share of the acceptable one; None without a report. The arbiter reports stale sources. Both are
+        known only with a simulator in the stack.
         """
-        late = max((float(message.data) for message in _taken(self._late)), default=None)
-        reasons = [message.reason_code for message in _taken(self._control)]
+        late = max((float(message.data) for sub in self._late for _, message in _arrived(sub)), default=None)
+        reasons = [message.reason_code for sub in self._control for _, message in _arrived(sub)]
         return late, any(reason >= message_type("ControlState").REASON_SCAN_STALE for reason in reasons)
 
     def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
-        """Monotonic time of the newest heartbeat in which this process reported that it runs; None before the first."""
+        """Return the monotonic time of the newest heartbeat of a running process; None before the first."""
         health = self.nodes.get(spec.label)
         return health.seen_s if health is not None and health.pid == pid and health.up else None
 
@@ -145,15 +162,12 @@ class HealthMonitor:
         return len(self._reached) + sum(health.up for health in self.nodes.values())
 
     def nodes_missing(self) -> list[str]:
-        """Nodes that have not reported yet that they run."""
+        """Return the nodes that have not reported yet that they run."""
         return [s.label for s in self._specs if s.label not in self.nodes or not self.nodes[s.label].up]
 
     def waiting_for(self) -> list[str]:
-        """``MILESTONES`` (and the v-space) of this stack's nodes that have not been reached yet."""
-        wanted = [
-            _labelled(spec, word) for word, program, _ in MILESTONES for spec in self._specs if spec.exec == program
-        ]
-        left = [label for label in wanted if label not in self._reached]
+        """Return the ``MILESTONES`` (and the v-space) of this stack's nodes that have not been reached yet."""
+        left = [label for label, _, _ in self._milestones() if label not in self._reached]
         for label, _ in self._vspace:
             if label not in self._reached:
                 text = self._vspace_text.get(label)
@@ -161,7 +175,7 @@ class HealthMonitor:
         return left
 
     def topic_faults(self) -> list[TopicFault]:
-        """Topics that have stopped or become too slow (config/topics.yaml), once the fault has lasted a while.
+        """Return topics that have stopped or become too slow (config/topics.yaml), once the fault has lasted a while.
 
         Topics that never had a message are left to :meth:`waiting_for` and to the node's own diagnoses.
         """
@@ -175,16 +189,16 @@ class HealthMonitor:
                 expected = nominal_rate(topic, spec.namespace)
                 if expected is None or topic.endswith(EVERY_NODES):
                     continue
-                key, age_s = (spec.label, topic), flow.age_s
-                words = expected.fault(flow.rate_hz, age_s)
-                if not words:
+                key = spec.label, topic
+                text = expected.fault(flow.rate_hz, flow.age_s)
+                if not text:
                     self._flowed.add(key)
                     self._wrong_since.pop(key, None)
                 elif key in self._flowed and now_s - self._wrong_since.setdefault(key, now_s) > FAULT_HOLDS_S:
-                    faults.append(TopicFault(spec.label, topic, words, not expected.alive(age_s)))
+                    faults.append(TopicFault(spec.label, topic, text, not expected.alive(flow.age_s)))
         return faults
 
-    def publish(self, down: dict[str, str], faults: Sequence[TopicFault]) -> None:
+    def publish(self, down: Mapping[str, str], faults: Sequence[TopicFault]) -> None:
         """Publish ``/diagnostics`` once a second.
 
         Args:
@@ -195,18 +209,22 @@ class HealthMonitor:
         if now_s < self._next_diagnostics_s:
             return
         self._next_diagnostics_s = now_s + _DIAGNOSTICS_S
+        status = message_type("DiagnosticStatus")
         for group, publisher in self._diagnostics.items():
-            labels = {spec.label: spec.name for spec in self._specs if spec.group == group}
-            entries = [(ERROR, labels[label], words) for label, words in down.items() if label in labels]
+            names = {spec.label: spec.name for spec in self._specs if spec.group == group}
+            entries = [(ERROR, names[label], text) for label, text in down.items() if label in names]
             entries += [
-                (WARN if f.stopped else OK, f"{labels[f.label]} {f.topic}", f.words)
-                for f in faults
-                if f.label in labels
+                (WARN if f.stopped else OK, f"{names[f.label]} {f.topic}", f.text) for f in faults if f.label in names
             ]
-            publisher.send(serialize(_diagnostic_array(entries)))
+            statuses = [
+                status(level=level, name=f"launch: {name}", message=text, hardware_id="", values=[])
+                for level, name, text in entries
+            ]
+            array = message_type("DiagnosticArray")(header=header("", time.time_ns()), status=statuses)
+            publisher.send(serialize(array))
 
     def addresses(self, *, with_token: bool) -> dict[str, str]:
-        """Addresses of the operator's page and, if it needs a token, of the Foxglove bridge, once their nodes run.
+        """Return the addresses of the operator's page and, if it needs a token, of the Foxglove bridge, once they run.
 
         Args:
             with_token: for a terminal: include the token, which is a new one after a restart; else name its file.
@@ -217,10 +235,11 @@ class HealthMonitor:
                 continue
             folder = self._folders[spec.group]
             file = sign_in_file(folder, spec.name)
-            if with_token and (address := _line_of(file)):
-                self._addresses[spec.label] = address
+            if with_token and file.is_file():
+                with suppress(OSError):  # its node has just ended
+                    self._addresses[spec.label] = file.read_text(encoding="utf-8").strip()
             elif spec.label not in self._addresses:
-                address = find_console(registry.list_nodes(folder), [spec.name]) or ""
+                address = next((console_address(n) for n in registry.list_nodes(folder) if n.name == spec.name), "")
                 if file.is_file():
                     address = f"{address or spec.exec}, sign in as {file} says"
                 if address:
@@ -228,52 +247,27 @@ class HealthMonitor:
         return self._addresses
 
     def close(self) -> None:
+        """End the subscriptions."""
         for transport in self._transports.values():
             transport.close()
 
 
-def _line_of(file: Path) -> str:
-    """A file's text; empty if there is none, because its node has just ended."""
-    with suppress(OSError):
-        return file.read_text(encoding="utf-8").strip()
-    return ""
+def _arrived(subscription: RawSubscription) -> Iterator[tuple[str, Any]]:
+    """Yield publisher and message of what has arrived. A message that cannot be read must not end the stack."""
+    for received in subscription.take():
+        with suppress(MessageError):  # its node counts as silent
+            yield received.publisher, deserialize(received.payload, received.type_name)
 
 
-def _published(subscriptions: Iterable[Any]) -> Iterable[tuple[str, Any]]:
-    """Publishers and messages that have arrived. A message that cannot be read must not end the stack."""
-    for subscription in subscriptions:
-        for received in subscription.take():
-            with suppress(MessageError):  # its node counts as silent
-                yield received.publisher, deserialize(received.payload, received.type_name)
+def _labelled(spec: NodeSpec, text: str) -> str:
+    return f"{spec.group}/{text}" if spec.group else text
 
 
-def _taken(subscriptions: Iterable[Any]) -> Iterable[Any]:
-    """The messages that have arrived."""
-    return (message for _, message in _published(subscriptions))
-
-
-def _labelled(spec: NodeSpec, word: str) -> str:
-    return f"{spec.group}/{word}" if spec.group else word
-
-
-def _diagnostic_array(entries: Sequence[tuple[int, str, str]]) -> Any:
-    status = message_type("DiagnosticStatus")
-    return message_type("DiagnosticArray")(
-        header=header("", time.time_ns()),
-        status=[
-            status(level=level, name=f"launch: {name}", message=words, hardware_id="", values=[])
-            for level, name, words in entries
-        ],
-    )
-
-
-def find_console(infos: Iterable[registry.NodeInfo], names: Iterable[str]) -> str | None:
-    """Address of a console according to the registry, from its parameters ``server.host`` and ``server.port``."""
-    wanted = set(names)
-    for info in infos:
-        server = info.params.get("server", {})
-        if info.name in wanted and server.get("port"):
-            host = str(server.get("host") or "127.0.0.1")
-            scheme = "https" if server.get("access", {}).get("tls_certificate") else "http"
-            return f"{scheme}://{'127.0.0.1' if host == '0.0.0.0' else host}:{server['port']}"
-    return None
+def console_address(node: registry.NodeInfo) -> str:
+    """Return the address of a console by its parameters ``server.host`` and ``server.port``; empty if it has none."""
+    server = node.params.get("server", {})
+    if not server.get("port"):  # any free port: the console's log has it
+        return ""
+    host = str(server.get("host") or "127.0.0.1")
+    scheme = "https" if server.get("access", {}).get("tls_certificate") else "http"
+    return f"{scheme}://{'127.0.0.1' if host == '0.0.0.0' else host}:{server['port']}"

@@ -1,239 +1,214 @@
-"""Read ``node`` and ``executable`` entries of launch files."""
+"""Read the ``node`` entries of launch files."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
-import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from instant_ic.config.yaml_text import one_line
+import yaml
+
+from instant_ic.config.scalars import Scalar, is_null
+from instant_ic.config.yaml_text import one_line, read_spelled
 from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
-from instant_ic.launch.source import Value, load
-from instant_ic.launch.substitutions import Context
-from instant_ic.launch.values import (
-    CONDITION,
-    flag_of,
-    holds,
-    integer_of,
-    pairs_of,
-    parameter_value,
-    plain_text,
-    seconds_of,
-    text_of,
-    words_of,
-)
+from instant_ic.launch.source import YamlPlace, load
+from instant_ic.launch.substitutions import MOST_TEXT, LaunchContext, SubstitutionError, substitute, truth
 from instant_ic.util import paths
 
 NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 """Node names that the bus accepts."""
 
+_NAMESPACE = re.compile(r"/?\w+(/\w+)*/?")
 NODE_MAIN = Path(__file__).with_name("node_main.py")
-_PROCESS_KEYS = (
-    *("env", "args", "output", "cwd", "launch-prefix", "emulate_tty", "shell", "required"),
-    *("respawn", "respawn_delay", "respawn_max_retries", "sigterm_timeout", "sigkill_timeout", *CONDITION),
+CONDITION = ("if", "unless")
+"""Keys of entries that may be left out."""
+_NODE_KEYS = (
+    *("exec", "name", "namespace", "param", "remap", "env", *CONDITION),
+    *("respawn", "respawn_delay", "required", "hang_timeout"),
 )
-_NODE_KEYS = ("pkg", "exec", "exec_name", "name", "namespace", "param", "remap", "ros_args", "hang_timeout")
-_OUTPUTS = ("both", "screen", "log")
 
 
 @dataclass
 class Scope:
-    """Settings that apply to the actions of one group or file.
+    """Settings of one file or group.
 
     Attributes:
-        context: variables, environment, files.
-        namespace: prefix of its nodes' topics.
+        context: variables and files of substitutions.
         group: name of its run directory within the stack's; empty: the stack's own.
-        env: variables from ``set_env`` and ``unset_env`` (None).
-        options: ``-p``, ``--params-file`` and ``-r`` arguments for each node.
-        delay_s: wait after the start of the stack.
+        options: ``--params-file`` arguments for each node.
     """
 
-    context: Context
-    namespace: str = ""
+    context: LaunchContext
     group: str = ""
-    env: dict[str, str | None] = field(default_factory=dict)
     options: list[str] = field(default_factory=list)
-    delay_s: float = 0.0
 
     def child(self) -> Scope:
-        """A copy that can change independently."""
-        return dataclasses.replace(self, context=self.context.child(), env=dict(self.env), options=list(self.options))
+        """Return a copy that can change independently."""
+        context = dataclasses.replace(self.context, variables=dict(self.context.variables))
+        return dataclasses.replace(self, context=context, options=list(self.options))
 
-    @property
-    def run_dir(self) -> Path | None:
-        """Run directory of its nodes; None: the stack's own."""
-        return self.context.run_dir if self.group else None
+    def text(self, value: YamlPlace | None) -> str:
+        """Return a value's text after substitution; empty if there is none."""
+        return "" if value is None else self.substituted(value.text(), value)
+
+    def substituted(self, text: str, value: YamlPlace) -> str:
+        """Return a text of this place after substitution."""
+        try:
+            return substitute(text, self.context)
+        except SubstitutionError as error:
+            raise value.problem(str(error)) from None
+
+    def flag(self, value: YamlPlace | None) -> bool:
+        """Return a truth value; false if there is none."""
+        try:
+            return truth(self.text(value))
+        except SubstitutionError as error:
+            assert value is not None
+            raise value.problem(str(error)) from None
+
+    def holds(self, fields: Mapping[str, YamlPlace]) -> bool:
+        """Return whether ``if`` and ``unless`` let an entry count."""
+        return ("if" not in fields or self.flag(fields["if"])) and not self.flag(fields.get("unless"))
+
+    def seconds(self, value: YamlPlace | None, default: float) -> float:
+        """Return a number of seconds >= 0."""
+        if value is None:
+            return default
+        text = self.text(value)
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if not 0 <= number < math.inf:
+            raise value.problem(f"expected a number of seconds >= 0, got {text!r}")
+        return number
+
+    def pairs(self, value: YamlPlace | None, first: str, second: str) -> list[tuple[str, str]]:
+        """Return the two texts of each entry of a list."""
+        found = [] if value is None else [entry.fields((first, second), (first, second)) for entry in value.items()]
+        return [(self.text(fields[first]), self.text(fields[second])) for fields in found]
 
 
-def join_namespace(namespace: str, name: str) -> str:
-    """Resolve a namespace inside another; one that begins with ``/`` is absolute."""
-    if name.startswith("/") or not namespace:
-        return name
-    return f"{namespace.rstrip('/')}/{name}"
+def read_node(body: YamlPlace, scope: Scope) -> NodeSpec | None:
+    """Read a ``node``; None if its conditions do not hold.
 
-
-def read_node(body: Value, scope: Scope) -> NodeSpec | None:
-    """Read a ``node``; None if it is wrong or its conditions do not hold."""
-    context = scope.context
-    fields = body.fields(known=(*_NODE_KEYS, *_PROCESS_KEYS), required=("exec",))
-    executable = text_of(fields.get("exec"), context)
-    name = text_of(fields.get("name"), context) or Path(executable or "").stem
-    namespace = scope.namespace
-    if own := text_of(fields.get("namespace"), context):
-        namespace = join_namespace(namespace, own)
-    if executable and not NODE_NAME.fullmatch(name):
-        body.problem(f"node name {name!r} is not legal: letters, digits and underscores only")
-    if (package := text_of(fields.get("pkg"), context)) not in (None, "instant_ic"):
-        fields["pkg"].problem(f"pkg {package!r}: nodes are those of instant_ic; start another program by executable")
-    if flag_of(fields.get("shell"), context):
-        fields["shell"].problem("a node is not started by a shell: use executable")
-    start = _program(fields["exec"], executable, context) if executable else None
+    Raises:
+        LaunchProblem: the first mistake in it.
+    """
+    fields = body.fields(_NODE_KEYS, required=("exec",))
+    executable = scope.text(fields["exec"])
+    name = scope.text(fields.get("name")) or Path(executable).stem
+    namespace = scope.text(fields.get("namespace"))
+    start = _program(fields["exec"], executable, scope.context)
+    if not NODE_NAME.fullmatch(name):
+        raise body.problem(f"node name {name!r} is not legal: letters, digits and underscores only")
+    if namespace and not _NAMESPACE.fullmatch(namespace):
+        raise fields["namespace"].problem(f"namespace {namespace!r} is not legal: names separated by / only")
     options = ["--name", name, *(["--namespace", namespace] if namespace else []), *scope.options]
     places: dict[str, str] = {}
     for entry in fields["param"].items() if "param" in fields else []:
-        options += _parameter(entry, context, places, prefix="")
-    for source, target in pairs_of(fields.get("remap"), "from", "to", context):
+        options += _parameter(entry, scope, places)
+    for source, target in scope.pairs(fields.get("remap"), "from", "to"):
         options += ["-r", f"{source}:={target}"]
-    options += words_of(fields.get("args"), context)
-    # ROS 2 separates its own arguments from the program's; here all of them are the node's.
-    options += [word for word in words_of(fields.get("ros_args"), context) if word not in ("--ros-args", "--")]
-    hang_timeout_s = seconds_of(fields.get("hang_timeout"), context)
-    process = _process(fields, scope, body)
-    if not holds(fields, context) or start is None or not executable:
-        return None
-    return NodeSpec(
+    spec = NodeSpec(
         name=name,
         namespace=namespace,
         exec=executable,
-        command=(*process.pop("prefix"), *start, *options),
-        hang_timeout_s=HANG_TIMEOUT_S if hang_timeout_s is None else hang_timeout_s,
+        command=(*start, *options),
+        env=dict(scope.pairs(fields.get("env"), "name", "value")),
+        respawn=scope.flag(fields.get("respawn")),
+        respawn_delay_s=scope.seconds(fields.get("respawn_delay"), 1.0),
+        required=scope.flag(fields.get("required")),
+        file=body.file,
+        line=body.line,
+        run_dir=scope.context.run_dir if scope.group else None,
+        group=scope.group,
+        hang_timeout_s=scope.seconds(fields.get("hang_timeout"), HANG_TIMEOUT_S),
         places=places,
-        **process,
     )
+    return spec if scope.holds(fields) else None
 
 
-def read_executable(body: Value, scope: Scope, taken: set[str]) -> NodeSpec | None:
-    """Read an ``executable`` (any program); None if it is wrong or its conditions do not hold.
-
-    Args:
-        taken: names of the processes before it.
-    """
-    context = scope.context
-    fields = body.fields(known=("cmd", "name", *_PROCESS_KEYS), required=("cmd",))
-    if flag_of(fields.get("shell"), context):
-        words = ["/bin/sh", "-c", text_of(fields.get("cmd"), context) or ""]
-        program = words[2].split()[0] if words[2].split() else ""
-    else:
-        words = words_of(fields.get("cmd"), context)
-        program = words[0] if words else ""
-    words += words_of(fields.get("args"), context)
-    if "cmd" in fields and not program:
-        fields["cmd"].problem("cmd is empty")
-    name = text_of(fields.get("name"), context)
-    if name is None:
-        stem = re.sub(r"\W", "_", Path(program).name) or "program"
-        name = next(n for i in range(1, len(taken) + 2) if (n := stem if i == 1 else f"{stem}_{i}") not in taken)
-    process = _process(fields, scope, body)
-    if not holds(fields, context) or not program:
-        return None
-    if not NODE_NAME.fullmatch(name.lstrip("0123456789")):
-        body.problem(f"name {name!r} is not legal: letters, digits and underscores only")
-    if shutil.which(words[0], path=context.environment.get("PATH")) is None and not (process["prefix"]):
-        fields["cmd"].problem(f"program {words[0]!r} does not exist")
-        return None
-    return NodeSpec(name=name, exec=program, command=(*process.pop("prefix"), *words), heartbeat=False, **process)
+def parameter_file(value: YamlPlace, scope: Scope) -> list[str]:
+    """Return the command-line arguments that pass a parameter file to a node."""
+    path = scope.context.launch_file.parent / scope.text(value)  # an absolute path replaces the folder
+    if not paths.is_file(path):
+        raise value.problem(f"parameter file {path} does not exist")
+    for node_name, section in load(path).fields().items():
+        if "ros__parameters" not in section.fields():
+            raise section.problem(f"section {node_name!r} has no ros__parameters: key")
+    return ["--params-file", str(path)]
 
 
-def _process(fields: Mapping[str, Value], scope: Scope, body: Value) -> dict[str, Any]:
-    """Common part of ``node`` and ``executable``: arguments of :class:`NodeSpec`, and also ``prefix``."""
-    context = scope.context
-    output = text_of(fields.get("output"), context) or "both"
-    if output not in _OUTPUTS:
-        fields["output"].problem(f"output must be one of {', '.join(_OUTPUTS)} (got {output!r})")
-    flag_of(fields.get("emulate_tty"), context)  # nodes write line by line anyway
-    prefix = words_of(fields.get("launch-prefix"), context)
-    if prefix and shutil.which(prefix[0]) is None:
-        fields["launch-prefix"].problem(f"program {prefix[0]!r} does not exist")
-    cwd = text_of(fields.get("cwd"), context)
-    if cwd and not Path(cwd).is_dir():
-        fields["cwd"].problem(f"folder {cwd} does not exist")
-    env: dict[str, str | None] = dict(scope.env)
-    env.update(pairs_of(fields.get("env"), "name", "value", context))
-    for variable in env:
-        if "=" in variable:
-            body.problem(f"environment variable {variable!r}: a name has no =")
-    delay_s = seconds_of(fields.get("respawn_delay"), context)
-    return {
-        "prefix": prefix,
-        "env": env,
-        "respawn": flag_of(fields.get("respawn"), context),
-        "respawn_delay_s": 1.0 if delay_s is None else delay_s,
-        "respawn_max_retries": integer_of(fields.get("respawn_max_retries"), context, -1),
-        "required": flag_of(fields.get("required"), context),
-        "sigterm_timeout_s": seconds_of(fields.get("sigterm_timeout"), context),
-        "sigkill_timeout_s": seconds_of(fields.get("sigkill_timeout"), context),
-        "to_terminal": output != "log",
-        "cwd": Path(cwd) if cwd else None,
-        "file": body.file,
-        "line": body.line,
-        "run_dir": scope.run_dir,
-        "group": scope.group,
-        "start_delay_s": scope.delay_s,
-    }
-
-
-def _program(value: Value, executable: str, context: Context) -> tuple[str, ...] | None:
+def _program(value: YamlPlace, executable: str, context: LaunchContext) -> tuple[str, ...]:
     if executable.endswith(".py"):
         file = context.launch_file.parent / executable
-        if paths.is_file(file):
-            return (sys.executable, str(file.resolve()))
-        value.problem(f"program {executable} does not exist beside the launch file")
-        return None
-    if executable in paths.node_names():
-        return (sys.executable, str(NODE_MAIN), str(paths.node_file(executable)))
-    value.problem(f"unknown exec {executable!r} (nodes: {', '.join(paths.node_names())})")
-    return None
+        if not paths.is_file(file):
+            raise value.problem(f"program {executable} does not exist beside the launch file")
+        return (sys.executable, str(file.resolve()))
+    if executable not in paths.node_names():
+        raise value.problem(f"unknown exec {executable!r} (nodes: {', '.join(paths.node_names())})")
+    return (sys.executable, str(NODE_MAIN), str(paths.node_file(executable)))
 
 
-def _parameter(entry: Value, context: Context, places: dict[str, str], prefix: str) -> list[str]:
-    fields = entry.fields(known=("name", "value", "type", "from", "param", "allow_substs", *CONDITION))
-    if not entry.is_mapping or not holds(fields, context):
+def _parameter(entry: YamlPlace, scope: Scope, places: dict[str, str]) -> list[str]:
+    """Return the arguments for one entry of ``param``; note in ``places`` where a single parameter is set."""
+    fields = entry.fields(("name", "value", "type", "from", *CONDITION))
+    if not scope.holds(fields):
         return []
     if "from" in fields:
-        words = parameter_file(fields["from"], context)
-        if words and flag_of(fields.get("allow_substs"), context) and "$(" in Path(words[1]).read_text():
-            fields["allow_substs"].problem("a parameter file cannot contain substitutions: give name and value")
-        return words
-    name = plain_text(fields.get("name"))
-    if name and "param" in fields:  # nested parameters, as in ROS 2
-        inner = [_parameter(part, context, places, f"{prefix}{name}.") for part in fields["param"].items()]
-        return [word for words in inner for word in words]
-    if not name or "value" not in fields:
-        entry.problem("a parameter needs name and value, or from: FILE")
-        return []
-    value = parameter_value(fields["value"], plain_text(fields.get("type")) or "", context)
-    word = f"{prefix}{name}:={one_line(value)}"
+        return parameter_file(fields["from"], scope)
+    if "name" not in fields or "value" not in fields:
+        raise entry.problem("a parameter needs name and value, or from: FILE")
+    kind = fields["type"].text() if "type" in fields else ""
+    word = f"{fields['name'].text()}:={one_line(_parameter_value(fields['value'], kind, scope))}"
     places[word] = entry.place
     return ["-p", word]
 
 
-def parameter_file(value: Value, context: Context) -> list[str]:
-    """Command-line arguments that pass a parameter file to a node; empty, with the problem noted, if it is invalid."""
-    name = text_of(value, context)
-    if name is None:
-        return []
-    path = context.launch_file.parent / name  # an absolute path replaces the folder
-    if not paths.is_file(path):
-        value.problem(f"parameter file {path} does not exist")
-        return []
-    root = load(path, value.problems)
-    for node_name, section in root.fields().items() if root is not None else ():
-        if not section.is_mapping or "ros__parameters" not in section.fields():
-            section.problem(f"section {node_name!r} has no ros__parameters: key")
-    return ["--params-file", str(path)]
+_READERS: dict[str, Callable[[str], object]] = {
+    "str": str,
+    "int": int,
+    "float": float,
+    "bool": truth,
+    "": read_spelled,
+}
+
+
+def _parameter_value(value: YamlPlace, kind: str, scope: Scope) -> object:
+    """Return a parameter's value of the given type, or with the spelling of its unquoted scalars."""
+    if not value.is_single:
+        return _texts_replaced(value, scope)
+    text = scope.text(value)
+    if kind not in _READERS:
+        raise value.problem(f"unknown type {kind!r} (types: str, int, float, bool)")
+    # Quoted and empty text stays text; everything else is read as YAML.
+    if kind == "" and ((value.is_quoted and "$(" not in value.text()) or not text):
+        return text
+    try:
+        return _READERS[kind](text)
+    except (ValueError, yaml.YAMLError):
+        raise value.problem(f"{text!r} is not of type {kind or 'YAML'}") from None
+
+
+def _texts_replaced(value: YamlPlace, scope: Scope) -> object:
+    """Return a list or mapping with its texts after substitution."""
+    length = 0
+
+    def read(plain: object) -> object:
+        nonlocal length
+        if isinstance(plain, (str, Scalar)) and not is_null(plain):
+            text = scope.substituted(str(plain), value)
+            length += len(text)
+            if length > MOST_TEXT:  # 300 bytes of aliases can stand for 100 000 uses of a long text
+                raise value.problem(f"its texts have more than {MOST_TEXT} characters, counting every alias")
+            return Scalar(text) if text and isinstance(plain, Scalar) else text
+        if isinstance(plain, list):
+            return [read(entry) for entry in plain]
+        return {key: read(entry) for key, entry in plain.items()} if isinstance(plain, dict) else plain
+
+    return read(value.spelled())

@@ -24,6 +24,7 @@ class Outlet:
     """Runs calls one after another on a thread of its own.
 
     Args:
+        name: of the thread.
         limit: how much may wait, in the unit of ``put``'s ``size``.
     """
 
@@ -39,10 +40,12 @@ class Outlet:
         self._thread.start()
 
     def put(self, function: Callable[..., None], *args: Any, size: int = 1, always: bool = False) -> bool:
-        """Queue a call; False if too much is waiting already.
+        """Queue a call; return False if too much is waiting already.
 
         Args:
             function: runs on the outlet's thread.
+            *args: its arguments.
+            size: how much it adds to what waits.
             always: queue it even then; for the few calls that matter.
         """
         with self._condition:
@@ -54,7 +57,7 @@ class Outlet:
             return True
 
     def close(self, timeout_s: float = 2.0) -> bool:
-        """Wait up to ``timeout_s`` until all calls have run; returns whether the thread has ended."""
+        """Wait up to ``timeout_s`` until all calls have run; return whether the thread has ended."""
         with self._condition:
             self._closed = True
             self._condition.notify()
@@ -64,10 +67,9 @@ class Outlet:
     def _run(self) -> None:
         while True:
             with self._condition:
-                while not self._calls:
-                    if self._closed:
-                        return
-                    self._condition.wait()
+                self._condition.wait_for(lambda: self._calls or self._closed)
+                if not self._calls:
+                    return
                 size, function, args = self._calls.popleft()
             try:
                 function(*args)
@@ -81,47 +83,49 @@ class Outlet:
                     self._waiting -= size
 
 
-class LogFile:
+class NodeLog:
     """A node's log file, mode 0600; the previous run's file is kept. Errors are reported once and never raised.
 
     Args:
-        tell: called with a text when writing fails and when it works again; runs on the writing thread.
+        path: the log file.
+        report: called with a text when writing fails and when it works again; runs on the writing thread.
         max_bytes: a larger file is renamed to ``.log.1``, and a new one is started.
+        retry_s: wait after a failed write before the next attempt.
     """
 
-    RETRY_S = 5.0
-    """Wait after a failed write before the next attempt."""
-
-    def __init__(self, path: Path, tell: Callable[[str], None], max_bytes: int = 64 << 20) -> None:
+    def __init__(
+        self, path: Path, report: Callable[[str], None], max_bytes: int = 64 << 20, retry_s: float = 5.0
+    ) -> None:
         self.path = path
-        self._tell = tell
-        self._max_bytes = max_bytes
+        self._report = report
+        self._max_bytes, self._retry_s = max_bytes, retry_s
         self._file: FileIO | None = None
         self._size = 0
-        self._lost = 0
+        self._lost_bytes = 0
         self._next_try_s = 0.0
         self._rotate()
 
     def write(self, data: bytes) -> None:
+        """Append to the file."""
         try:
             if self._size + len(data) > self._max_bytes:
                 self.close()
                 self._rotate()
             if self._file is None:
                 if time.monotonic() < self._next_try_s:
-                    self._lost += len(data)
+                    self._lost_bytes += len(data)
                     return
                 self._open()
-            if self._lost:
-                self._put(f"[launch: {self._lost} bytes are missing here: writing failed]\n".encode())
-                self._tell(f"{self.path} can be written again; {self._lost} bytes are missing in it")
-                self._lost = 0
+            if self._lost_bytes:
+                self._put(f"[launch: {self._lost_bytes} bytes are missing here: writing failed]\n".encode())
+                self._report(f"{self.path} can be written again; {self._lost_bytes} bytes are missing in it")
+                self._lost_bytes = 0
             self._put(data)
         except OSError as error:
-            if not self._lost:
-                self._tell(f"{self.path} cannot be written ({error.strerror}); its lines are lost until there is space")
-            self._lost += len(data)
-            self._next_try_s = time.monotonic() + self.RETRY_S
+            if not self._lost_bytes:
+                self._report(f"{self.path} cannot be written ({error.strerror}). Free some space; its lines are lost.")
+            self._lost_bytes += len(data)
+            self._next_try_s = time.monotonic() + self._retry_s
             self.close()
 
     def close(self) -> None:
@@ -150,4 +154,4 @@ class LogFile:
         except FileNotFoundError:
             pass
         except OSError as error:
-            self._tell(f"{self.path} cannot be renamed ({error.strerror}); new output is appended to it")
+            self._report(f"{self.path} cannot be renamed ({error.strerror}); new output is appended to it")

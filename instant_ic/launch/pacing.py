@@ -22,7 +22,7 @@ _PERIOD_S = 0.25
 
 
 @dataclass(frozen=True)
-class Sample:
+class PaceSample:
     """State of a stack and its machine at one time.
 
     Attributes:
@@ -77,7 +77,7 @@ class PaceChooser:
         self._available_cores = math.inf  # at the last fall
         self._fresh_s = -math.inf  # when no source was stale last
 
-    def step(self, sample: Sample) -> float:
+    def step(self, sample: PaceSample) -> float:
         now_s = sample.now_s
         if not sample.stale:
             self._fresh_s = now_s
@@ -95,7 +95,7 @@ class PaceChooser:
             self._rise(sample, self._punctual_s)
         return self.pace
 
-    def _fall(self, sample: Sample, late: float) -> None:
+    def _fall(self, sample: PaceSample, late: float) -> None:
         now_s = sample.now_s
         # The effect of a fall shows in the next images, which come later the slower the pace is.
         if self.pace <= SLOWEST or now_s - self._fell_s < 0.25 + 0.4 / self.pace:
@@ -107,7 +107,7 @@ class PaceChooser:
         self._available_cores = sample.idle_cores + sample.stack_cores
         self.pace = max(SLOWEST, self.pace * min(0.9, max(0.6, 1.0 / late)))
 
-    def _rise(self, sample: Sample, punctual_s: float) -> None:
+    def _rise(self, sample: PaceSample, punctual_s: float) -> None:
         now_s = sample.now_s
         if sample.idle_cores + sample.stack_cores > self._available_cores + self.OTHERS_CORES:
             self._hold_s = min(self._hold_s, self.HOLD_S)
@@ -190,7 +190,7 @@ class Pacing:
         if now_s - self._sample_s < _PERIOD_S:
             return
         self._sample_s = now_s
-        pace = self._chooser.step(Sample(now_s, *stack.take_late(), self._load.idle_cores(), stack.cpu_cores))
+        pace = self._chooser.step(PaceSample(now_s, *stack.take_late(), self._load.idle_cores(), stack.cpu_cores))
         if pace != self._files.factor:
             self._files.change(pace)
         self._tell(now_s)

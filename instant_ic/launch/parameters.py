@@ -1,8 +1,8 @@
 """Check the parameters of a launch description's nodes without starting them.
 
-The check imports the nodes' modules, which takes two seconds of CPU for the whole stack. So valid nodes are cached,
-keyed by everything the result depends on (the package's files, the parameter files, the command line). All others are
-checked in a separate process, which frees the memory when it ends.
+The check imports the nodes' modules, which takes two seconds of CPU for the whole stack. So a valid stack is remembered
+by everything the result depends on (the package's files, the parameter files, the command lines). Others are checked in
+a separate process, which frees the memory when it ends.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,10 +28,9 @@ from instant_ic.util import paths
 if TYPE_CHECKING:
     from instant_ic.config.params import Values
 
-_CHECK_TIMEOUT_S = 120.0
-_MOST_REMEMBERED = 500
-_TOGETHER = ""
-"""Label of problems that several nodes have together."""
+CHECK_TIMEOUT_S = 120.0
+"""Longest time that the check may take."""
+_MOST_REMEMBERED = 50
 
 
 class ParameterCheckError(RuntimeError):
@@ -39,8 +38,18 @@ class ParameterCheckError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class _Node:
-    """Input of the check of one node."""
+class CheckedNode:
+    """Input of the check of one node.
+
+    Attributes:
+        label: its name for users.
+        words: its arguments.
+        at: ``file:line`` of its entry.
+        places: ``file:line`` of each ``-p`` argument.
+        shared: value as YAML, place and file of each parameter that a ``/**`` section sets for this run directory.
+        own_programs: whether the stack has nodes that are not checked.
+        group: run directory within the stack's: the robot of a fleet.
+    """
 
     label: str
     exec: str
@@ -48,27 +57,23 @@ class _Node:
     at: str
     places: Mapping[str, str]
     shared: Mapping[str, tuple[str, str, str]]
-    """Value as YAML, place and file of each parameter that a ``/**`` section sets for this run directory."""
     own_programs: bool
-    """Whether the stack has nodes that are not checked."""
-    group: str = ""
-    """Run directory within the stack's: the robot of a fleet."""
+    group: str
 
 
-def _checkable(nodes: Sequence[NodeSpec]) -> list[_Node]:
-    """The shipped nodes; programs given by path and executables are not checked."""
+def _checkable(nodes: Sequence[NodeSpec]) -> list[CheckedNode]:
+    """Return the shipped nodes; programs given by path are not checked."""
     shipped = [spec for spec in nodes if str(paths.node_file(spec.exec)) in spec.command]
     shared = _shared(shipped)
-    own_programs = any(spec.heartbeat for spec in nodes if spec not in shipped)
     return [
-        _Node(
+        CheckedNode(
             label=spec.label,
             exec=spec.exec,
             words=_words(spec),
             at=f"{spec.file}:{spec.line}",
             places=dict(spec.places),
             shared=shared[spec.group],
-            own_programs=own_programs,
+            own_programs=len(shipped) < len(nodes),
             group=spec.group,
         )
         for spec in shipped
@@ -76,7 +81,7 @@ def _checkable(nodes: Sequence[NodeSpec]) -> list[_Node]:
 
 
 def given_values(spec: NodeSpec) -> tuple[type[Any], Values]:
-    """Configuration class of a shipped node, and the values that its launch file gives it, with their origins.
+    """Return the configuration class of a shipped node, and the values that its launch file gives it.
 
     Raises:
         ParameterError: a file or an argument cannot be read.
@@ -91,7 +96,7 @@ def given_values(spec: NodeSpec) -> tuple[type[Any], Values]:
 
 
 def check_parameter_file(file: Path) -> list[str]:
-    """All mistakes in a parameter file: its sections against the shipped nodes, ``/**`` against all of them.
+    """Return all mistakes in a parameter file: its sections against the shipped nodes, ``/**`` against all of them.
 
     What depends on other values of the node (a missing one, for example) is left to the check of a launch file.
     """
@@ -125,7 +130,7 @@ def _files(words: Sequence[str]) -> list[Path]:
 
 
 def _shared(specs: Sequence[NodeSpec]) -> dict[str, dict[str, tuple[str, str, str]]]:
-    """The ``/**`` values of each run directory; the first node with a value decides, so that others can differ."""
+    """Return the ``/**`` values of each run directory; the first node with a value decides."""
     from instant_ic.config.params import PROCESS_KEYS, SHARED, ParameterError, load_sections
     from instant_ic.config.yaml_text import one_line
 
@@ -143,70 +148,55 @@ def _shared(specs: Sequence[NodeSpec]) -> dict[str, dict[str, tuple[str, str, st
 
 
 def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
-    """Check all nodes for unknown parameters, wrong types and values out of range, and against each other.
+    """Return all unknown parameters, wrong types, values out of range, and values that contradict each other."""
+    return _checked(_checkable(nodes))
 
-    Returns:
-        One text per problem.
-    """
-    checkable = _checkable(nodes)
-    found = [problem for node in checkable for problem in _problems(node)]
-    return list(dict.fromkeys(found + _disagreements([node for node in checkable if node.exec in RELATED])))
+
+def _checked(nodes: Sequence[CheckedNode]) -> list[str]:
+    problems = [problem for node in nodes for problem in _problems(node)]
+    return list(dict.fromkeys([*problems, *_disagreements(nodes)]))
 
 
 def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = None) -> list[str]:
-    """Like :func:`check_parameters`, but in a separate process, and only for nodes not cached as valid.
+    """Check parameters like :func:`check_parameters`, but in a separate process, and a valid stack only once.
 
     Args:
-        cache: file of valid nodes; default ``$XDG_CACHE_HOME/instant_ic/launch_check.json``. If it cannot be read or
+        nodes: nodes of the stack.
+        cache: file of valid stacks; default ``$XDG_CACHE_HOME/instant_ic/launch_check.json``. If it cannot be read or
             written, the check only takes longer.
 
     Raises:
         ParameterCheckError: the check did not finish.
     """
     cache = cache or paths.cache_dir() / "launch_check.json"
-    package = _package_state()
-    keys = {node: _key(node, package) for node in map(_frozen, _checkable(nodes))}
-    known = _remembered(cache)
-    unknown = [json.loads(node) for node, key in keys.items() if key not in known]
-    related = {node: key for node, key in keys.items() if json.loads(node)["exec"] in RELATED}
-    together = hashlib.sha256("".join(related.values()).encode()).hexdigest()
-    compared = [json.loads(node) for node in related] if len(related) > 1 and together not in known else []
-    if not unknown and not compared:
+    request = json.dumps([asdict(node) for node in _checkable(nodes)], sort_keys=True)
+    digest = hashlib.sha256(f"{_package_state()}\n{request}".encode())
+    for file in sorted({file for spec in nodes for file in _files(spec.command)}):
+        with suppress(OSError):  # missing: the check itself reports it
+            digest.update(file.read_bytes())
+    key, valid = digest.hexdigest(), _remembered(cache)
+    if key in valid:
         return []
-    problems = _check_apart(unknown, compared)
-    bad = {label for label, _ in problems}
-    good = [key for node, key in keys.items() if json.loads(node)["label"] not in bad]
-    good += [together] if compared and not bad else []
-    _remember(cache, [*(key for key in known if key not in good), *good])
-    return list(dict.fromkeys(text for _, text in problems))
+    problems = _check_apart(request)
+    if not problems:
+        _remember(cache, [*valid, key])
+    return problems
 
 
 def existing_bags(nodes: Sequence[NodeSpec]) -> list[str]:
-    """A text for each recorder whose bag's folder exists already: it would refuse, and the stack run unrecorded."""
+    """Return a text for each recorder whose bag's folder exists already: it would refuse, and nothing be recorded."""
     problems = []
     for spec in nodes:
         given = dict(word.split(":=", 1) for word in spec.command if ":=" in word)
         if spec.exec == "bag_recorder" and given.get("path") and given.get("snapshot") != "true":
-            path = Path(spec.cwd or ".") / Path(given["path"]).expanduser()
+            path = Path(given["path"]).expanduser()
             if path.exists():
                 problems.append(f"{path} exists: record into a new folder (node {spec.label})")
     return problems
 
 
-def _frozen(node: _Node) -> str:
-    return json.dumps(vars(node), sort_keys=True, default=str)
-
-
-def _key(node: str, package: str) -> str:
-    digest = hashlib.sha256(f"{package}\n{node}".encode())
-    for file in _files(json.loads(node)["words"]):
-        with suppress(OSError):  # missing: the check itself reports it
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
 def _package_state() -> str:
-    """Text that changes whenever a module of the package does."""
+    """Return a text that changes whenever a module of the package does."""
     root = Path(__file__).resolve().parents[1]
     newest, count = 0, 0
     for folder, _, names in os.walk(root):
@@ -232,25 +222,24 @@ def _remember(cache: Path, keys: Sequence[str]) -> None:
         scratch.replace(cache)
 
 
-def _check_apart(nodes: Sequence[dict[str, Any]], related: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Label and text of each problem of some nodes, and of some together."""
+def _check_apart(request: str) -> list[str]:
+    """Return the problems of some nodes, given as JSON; a separate process finds them."""
     command = [sys.executable, "-m", "instant_ic.launch.parameters"]
     try:
-        done = subprocess.run(
-            command, input=json.dumps([nodes, related]), capture_output=True, text=True, timeout=_CHECK_TIMEOUT_S
-        )
+        done = subprocess.run(command, input=request, capture_output=True, text=True, timeout=CHECK_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         raise ParameterCheckError(
-            f"the nodes' parameters could not be checked within {_CHECK_TIMEOUT_S:.0f} s: is a module waiting for "
+            f"the nodes' parameters could not be checked within {CHECK_TIMEOUT_S:.0f} s: is a module waiting for "
             "something while it is imported? ic launch FILE --no-check starts without"
         ) from None
     if done.returncode != 0:
         raise ParameterCheckError(f"the nodes' parameters could not be checked:\n{done.stderr.strip()}")
-    return [(label, text) for label, text in json.loads(done.stdout)]
+    problems: list[str] = json.loads(done.stdout)
+    return problems
 
 
-def _problems(node: _Node) -> list[str]:
-    """All problems of one node's command line."""
+def _problems(node: CheckedNode) -> list[str]:
+    """Return all problems of one node's command line."""
     from instant_ic.bus.node_files import NodeFileError, node_class
     from instant_ic.bus.process import argument_parser, parse_remaps
     from instant_ic.config.params import ParameterError, configure, gather
@@ -262,12 +251,10 @@ def _problems(node: _Node) -> list[str]:
         return [f"{where}: {error}"]
     except Exception as error:  # noqa: BLE001 - whatever a module raises on import, the node would raise too
         return [f"{where}: cannot be loaded: {type(error).__name__}: {error}"]
-    parser = argument_parser(found)
-    told: list[str] = []
-    parser.error = told.append  # type: ignore[method-assign,assignment]
-    args, unknown = parser.parse_known_args(node.words)
-    if told or unknown:
-        return [f"{where}: {text}" for text in told or [f"unknown arguments: {' '.join(unknown)}"]]
+    try:
+        args = argument_parser(found).parse_args(node.words)
+    except SystemExit:  # such as a remap of a name that begins with a dash
+        return [f"{where}: its arguments cannot be read: {' '.join(node.words)}"]
     problems: list[str] = []
     try:
         parse_remaps(args.remap)
@@ -277,7 +264,10 @@ def _problems(node: _Node) -> list[str]:
         values = gather(args.name, args.params_file, args.param, node.places)
     except ParameterError as error:
         return problems + [str(problem) if problem.where else f"{where}: {problem}" for problem in error.problems]
-    problems += _undeclared(node, values)
+    if not node.own_programs:
+        # A shared value that no node has is a typing error, unless it is for a program that is not checked.
+        shared = {key: value for key, value in values.items() if value.shared}
+        problems += _declared_by_none(shared, (node.exec, *paths.node_names()))
     try:
         config, _ = configure(found.config_class(), values)
     except ParameterError as error:
@@ -288,8 +278,8 @@ def _problems(node: _Node) -> list[str]:
     return problems + _contradictions(node, values, config)
 
 
-def _contradictions(node: _Node, values: Values, config: Any) -> list[str]:
-    """Values that differ from the one shared by the nodes, unless stated beside it or on the node's own entry."""
+def _contradictions(node: CheckedNode, values: Values, config: Any) -> list[str]:
+    """Return values that differ from the shared one, unless stated beside it or on the node's own entry."""
     from instant_ic.config.parameter_info import plain
     from instant_ic.config.params import flatten, to_dict, typed_value, yaml_value
 
@@ -316,14 +306,14 @@ def _contradictions(node: _Node, values: Values, config: Any) -> list[str]:
     return problems
 
 
-def _disagreements(nodes: Sequence[_Node]) -> list[str]:
-    """Values of nodes that drive one robot and do not fit together; nodes with problems of their own are left out."""
+def _disagreements(nodes: Sequence[CheckedNode]) -> Iterator[str]:
+    """Yield values of one robot's nodes that do not fit together; nodes with problems of their own are left out."""
     from instant_ic.bus.node_files import NodeFileError, node_class
     from instant_ic.bus.process import argument_parser
     from instant_ic.config.params import ParameterError, configure, gather
 
     robots: dict[str, dict[str, list[Driving]]] = {}
-    for node in nodes:
+    for node in (node for node in nodes if node.exec in RELATED):
         with suppress(ParameterError, NodeFileError, SystemExit):  # the check of the node reports it
             found = node_class(node.exec)
             args = argument_parser(found).parse_args(node.words)
@@ -332,13 +322,8 @@ def _disagreements(nodes: Sequence[_Node]) -> list[str]:
             meant = {key for key, value in values.items() if value.file is None}
             alike = robots.setdefault(node.group, {}).setdefault(node.exec, [])
             alike.append(Driving(node.at, config, meant | node.shared.keys()))
-    return [text for robot in robots.values() for text in disagreements(robot)]
-
-
-def _undeclared(node: _Node, values: Values) -> list[str]:
-    """Shared values that no node has a parameter for: a typing error, or of a program that is not checked."""
-    left = {key: value for key, value in values.items() if value.shared}
-    return [] if node.own_programs else _declared_by_none(left, (node.exec, *paths.node_names()))
+    for robot in robots.values():
+        yield from disagreements(robot)
 
 
 def _declared_by_none(values: Values, nodes: Sequence[str]) -> list[str]:
@@ -356,13 +341,9 @@ def _declared_by_none(values: Values, nodes: Sequence[str]) -> list[str]:
 
 
 def main() -> None:
-    """Entry point of the separate process: nodes on standard input, problems on standard output."""
-    nodes, related = (
-        [_Node(**{**entry, "words": tuple(entry["words"])}) for entry in entries] for entries in json.load(sys.stdin)
-    )
-    report = [(node.label, problem) for node in nodes for problem in _problems(node)]
-    report += [(_TOGETHER, problem) for problem in _disagreements(related)]
-    json.dump(report, sys.stdout)
+    """Check the nodes on standard input, in a separate process; write the problems to standard output."""
+    nodes = [CheckedNode(**{**entry, "words": tuple(entry["words"])}) for entry in json.load(sys.stdin)]
+    json.dump(_checked(nodes), sys.stdout)
 
 
 if __name__ == "__main__":

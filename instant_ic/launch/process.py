@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from instant_ic.launch.description import NodeSpec
-from instant_ic.launch.outlet import LogFile, Outlet
+from instant_ic.launch.outlet import NodeLog, Outlet
 from instant_ic.launch.reaper import VARIABLE
 
 MAX_LINE_BYTES = 1 << 16
@@ -32,16 +32,17 @@ Schedule = Sequence[tuple[signal.Signals, float]]
 """Signals that end a process, with the wait after each."""
 
 _CHILD = Path(__file__).with_name("child.py")
-_BURST_BYTES = 4.0 * OUTPUT_BYTES_PER_S
+_BURST_S = 4.0
 _PIPE_BYTES = 1 << 20  # a short delay of the launcher must not block the nodes
+_CHUNKS_A_CALL = 4
 
 
 def dies_with_us() -> tuple[str, ...]:
-    """Command prefix that makes the kernel kill the process when this thread dies, for whatever reason."""
+    """Return the command prefix that makes the kernel kill the process when this thread dies, for whatever reason."""
     return sys.executable, "-I", "-S", str(_CHILD), str(os.getpid())
 
 
-class State(enum.Enum):
+class ProcessState(enum.Enum):
     """State of a supervised process."""
 
     RUNNING = "running"
@@ -55,7 +56,6 @@ class RespawnLimit:
 
     Args:
         delay_s: wait before the first restart.
-        max_retries: the process is given up after more restarts than this in total; -1: no limit.
     """
 
     MAX_DELAY_S = 15.0
@@ -63,8 +63,8 @@ class RespawnLimit:
     MAX_STARTS = 5
     """The process is given up after more restarts than this within the window."""
 
-    def __init__(self, delay_s: float, max_retries: int = -1) -> None:
-        self.delay_s, self.max_retries = delay_s, max_retries
+    def __init__(self, delay_s: float) -> None:
+        self.delay_s = delay_s
         self.retries = 0
         """Total number of restarts."""
         self._starts: deque[float] = deque()
@@ -75,10 +75,10 @@ class RespawnLimit:
         return len(self._starts)
 
     def next_delay_s(self, now_s: float) -> float | None:
-        """Count one more restart; returns the seconds to wait before it, or None if there were too many."""
+        """Count one more restart; return the seconds to wait before it, or None if there were too many."""
         while self._starts and now_s - self._starts[0] > self.WINDOW_S:
             self._starts.popleft()
-        if len(self._starts) >= self.MAX_STARTS or 0 <= self.max_retries <= self.retries:
+        if len(self._starts) >= self.MAX_STARTS:
             return None
         delay_s = min(self.delay_s * 2 ** len(self._starts), self.MAX_DELAY_S)
         self._starts.append(now_s)
@@ -86,9 +86,7 @@ class RespawnLimit:
         return delay_s
 
     def __str__(self) -> str:
-        """Text for the limit that was reached."""
-        if 0 <= self.max_retries <= self.retries:
-            return f"{self.max_retries} restarts"
+        """Return the limit as text."""
         return f"{self.MAX_STARTS} restarts within {self.WINDOW_S:.0f} s"
 
 
@@ -96,8 +94,11 @@ class ManagedProcess:
     """A process in a session of its own, with its log file.
 
     Args:
+        spec: the node to run.
+        run_dir: run directory of the stack.
         mark: text that the process and everything it starts carry in their environment.
-        tell: called with texts about the log.
+        disk: thread that writes the log.
+        report: called with texts about the log.
     """
 
     def __init__(
@@ -106,12 +107,12 @@ class ManagedProcess:
         run_dir: Path,
         mark: str,
         disk: Outlet,
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
         self.spec = spec
-        self.limit = RespawnLimit(spec.respawn_delay_s, spec.respawn_max_retries)
+        self.limit = RespawnLimit(spec.respawn_delay_s)
         self.mark = f"{mark}/{spec.label}."  # ends with a dot, so that no mark is a prefix of another
-        self.state = State.WAITING
+        self.state = ProcessState.WAITING
         self.exit_status: int | None = None
         self.reason = ""
         """Why the launcher ends it; empty when it ends by itself or with the stack."""
@@ -120,17 +121,17 @@ class ManagedProcess:
         self.started_s = 0.0
         """Monotonic time of its last start."""
         self.output_closed = False
-        self.log_path = (spec.run_dir or run_dir) / "log" / f"{spec.name}.log"
         self._run_dir = spec.run_dir or run_dir
+        self.log_path = self._run_dir / "log" / f"{spec.name}.log"
         self._popen: subprocess.Popen[bytes] | None = None
         self._partial = b""
         self._ending: deque[tuple[signal.Signals, float]] | None = None
         self._next_signal_s = 0.0
         self._disk = disk
-        self._log = LogFile(self.log_path, tell)
-        self._budget = _BURST_BYTES
+        self._log = NodeLog(self.log_path, report)
+        self._budget = _BURST_S * OUTPUT_BYTES_PER_S
         self._budget_s = time.monotonic()
-        self._left_out = 0
+        self._dropped_bytes = 0
 
     @property
     def pid(self) -> int | None:
@@ -145,10 +146,11 @@ class ManagedProcess:
     @property
     def flooding(self) -> bool:
         """Whether some of its output is being dropped."""
-        return self._left_out > 0
+        return self._dropped_bytes > 0
 
     @property
     def ending(self) -> bool:
+        """Whether it is being ended."""
         return self._ending is not None
 
     def start(self) -> None:
@@ -156,11 +158,11 @@ class ManagedProcess:
 
         Raises:
             OSError: the kernel refuses it.
+            ValueError: an argument contains a zero byte.
         """
-        guard = dies_with_us()
         # A stack started by a node of another stack carries both marks, so that it ends with the outer one.
         marks = [mark for mark in (os.environ.get(VARIABLE), self.mark) if mark]
-        environment: dict[str, str | None] = {
+        environment = {
             **os.environ,
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",  # a crash, or the SIGABRT sent to a hung node, prints the stack of every thread
@@ -170,19 +172,18 @@ class ManagedProcess:
         }
         self.exit_status, self.reason, self._ending = None, "", None
         self._popen = subprocess.Popen(
-            (*guard, *self.spec.command),
+            (*dies_with_us(), *self.spec.command),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env={key: value for key, value in environment.items() if value is not None},
-            cwd=self.spec.cwd,
+            env=environment,
             start_new_session=True,
         )
         assert self._popen.stdout is not None
         os.set_blocking(self._popen.stdout.fileno(), False)
         with suppress(OSError):  # the user's pipe memory is used up: keep the usual 64 kB
             fcntl.fcntl(self._popen.stdout.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        self.state, self.output_closed = State.RUNNING, False
+        self.state, self.output_closed = ProcessState.RUNNING, False
         self.started_s = time.monotonic()
 
     def send(self, signum: signal.Signals) -> None:
@@ -203,7 +204,7 @@ class ManagedProcess:
         self.reason = self.reason or reason
 
     def press_on(self, now_s: float) -> signal.Signals | None:
-        """Send the next ending signal when it is due; returns the signal sent."""
+        """Send the next ending signal when it is due; return the signal sent."""
         if self._ending is None or now_s < self._next_signal_s or not self._ending:
             return None
         signum, wait_s = self._ending.popleft()
@@ -212,46 +213,49 @@ class ManagedProcess:
         return signum
 
     def out_of_means(self, now_s: float) -> bool:
-        """Whether all signals have been sent and their waits are over."""
+        """Return whether all signals have been sent and their waits are over."""
         return self._ending is not None and not self._ending and now_s >= self._next_signal_s
 
     def read_lines(self, now_s: float) -> Iterator[str]:
-        """New lines of its output; all of it goes into the log file.
+        """Yield new lines of its output; all of it goes into the log file.
 
-        Reads at most four chunks per call, so that endless output cannot keep the launcher from the other processes,
-        and at most ``OUTPUT_BYTES_PER_S``.
+        Reads few chunks per call, so that endless output cannot keep the launcher from the other processes, and at most
+        the output limit.
         """
-        self._budget = min(self._budget + (now_s - self._budget_s) * OUTPUT_BYTES_PER_S, _BURST_BYTES)
+        self._budget += (now_s - self._budget_s) * OUTPUT_BYTES_PER_S
+        self._budget = min(self._budget, _BURST_S * OUTPUT_BYTES_PER_S)
         self._budget_s = now_s
-        for _ in range(4):
-            if self._popen is None or self._popen.stdout is None:
+        for _ in range(_CHUNKS_A_CALL):
+            if self.output is None:
                 return
             try:
-                data = os.read(self._popen.stdout.fileno(), MAX_LINE_BYTES)
+                data = os.read(self.output.fileno(), MAX_LINE_BYTES)
             except BlockingIOError:
                 return
             if not data:
                 self.output_closed = True
                 return
             # Once output is dropped, the budget must first recover by one second: one note per second, not per chunk.
-            if self._budget < (OUTPUT_BYTES_PER_S if self._left_out else 0):
-                self._left_out += len(data)
+            if self._budget < (OUTPUT_BYTES_PER_S if self._dropped_bytes else 0):
+                self._dropped_bytes += len(data)
                 continue
             self._budget -= len(data)
-            if self._left_out:
-                data, self._left_out = self._note() + data, 0
+            data = self._note() + data
             if not self._disk.put(self._log.write, data, size=len(data)):
-                self._left_out += len(data)  # the disk is too slow
+                self._dropped_bytes += len(data)  # the disk is too slow
             *lines, self._partial = (self._partial + data).split(b"\n")
             if len(self._partial) >= MAX_LINE_BYTES:
                 lines, self._partial = [*lines, self._partial], b""
             yield from (line.decode(errors="replace").rstrip("\r") for line in lines)
 
     def _note(self) -> bytes:
-        return f"\n[launch: {self._left_out} bytes dropped: more than {OUTPUT_BYTES_PER_S} a second]\n".encode()
+        """Return a line about dropped output, if there is some, and forget it."""
+        dropped, self._dropped_bytes = self._dropped_bytes, 0
+        text = f"\n[launch: {dropped} bytes dropped: more than {OUTPUT_BYTES_PER_S} a second]\n"
+        return text.encode() if dropped else b""
 
     def has_ended(self) -> bool:
-        """Whether its own process has ended. It stays unreaped, so that its group id cannot be reused."""
+        """Return whether its own process has ended. It stays unreaped, so that its group id cannot be reused."""
         if self._popen is None:
             return False
         return os.waitid(os.P_PID, self._popen.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
@@ -263,9 +267,8 @@ class ManagedProcess:
         now_s = time.monotonic()
         for _ in range(8):
             yield from self.read_lines(now_s)
-        if self._left_out:
+        if self._dropped_bytes:
             self._disk.put(self._log.write, self._note())
-            self._left_out = 0
         if self._partial:
             yield self._partial.decode(errors="replace")
             self._partial = b""
@@ -273,7 +276,7 @@ class ManagedProcess:
         if self._popen.stdout is not None:
             self._popen.stdout.close()
         self._popen, self._ending = None, None
-        self.state = State.ENDED if self.exit_status == 0 and not self.reason else State.FAILED
+        self.state = ProcessState.ENDED if self.exit_status == 0 and not self.reason else ProcessState.FAILED
 
     def close(self) -> None:
         """Close the log file once everything waiting has been written."""
@@ -281,7 +284,7 @@ class ManagedProcess:
 
 
 def describe_exit(status: int) -> str:
-    """``exit status 1``, or ``killed by SIGSEGV``."""
+    """Return ``exit status 1``, or ``killed by SIGSEGV``."""
     if status >= 0:
         return f"exit status {status}"
     try:

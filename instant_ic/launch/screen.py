@@ -35,7 +35,7 @@ _HOLDS_BACK_S = 30.0
 
 
 @dataclass(frozen=True)
-class Row:
+class ScreenRow:
     """A node in the table.
 
     Attributes:
@@ -57,7 +57,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class View:
+class StackView:
     """State of a stack at one time.
 
     Attributes:
@@ -71,7 +71,7 @@ class View:
         pace: of the simulation, as text; empty in real time.
     """
 
-    rows: tuple[Row, ...] = ()
+    rows: tuple[ScreenRow, ...] = ()
     missing: tuple[str, ...] = ()
     waiting: tuple[str, ...] = ()
     addresses: Mapping[str, str] = field(default_factory=dict)
@@ -81,7 +81,7 @@ class View:
     pace: str = ""
 
 
-class Screen:
+class StackScreen:
     """Prints lines and events, what the stack waits for, and the console's address.
 
     Args:
@@ -156,7 +156,7 @@ class Screen:
     def event(self, text: str, bad: bool = False) -> None:
         self._console.print(Text(f"{'launch':>{self._width}} │ {visible(text)}", style="bold red" if bad else "bold"))
 
-    def refresh(self, view: View) -> None:
+    def refresh(self, view: StackView) -> None:
         """Print what has changed since the last view, and render the table again."""
         now = time.monotonic()
         if view.looked and not view.ending:
@@ -164,7 +164,7 @@ class Screen:
         if self._live is not None:
             self._live.update(self.table(view), refresh=True)
 
-    def _tell_progress(self, view: View, now: float) -> None:
+    def _tell_progress(self, view: StackView, now: float) -> None:
         if not view.missing and not self._told_nodes:
             self._told_nodes = True
             count = sum(row.state not in ("failed", "ended") for row in view.rows) or len(self._colours)
@@ -211,7 +211,7 @@ class Screen:
             self.event(f"back to the right rate: {', '.join(over)}")
         self._told_faults = faults
 
-    def table(self, view: View) -> RenderableType:
+    def table(self, view: StackView) -> RenderableType:
         """The table of nodes with a status line below."""
         table = Table(box=None, pad_edge=False, expand=False, header_style="dim")
         # Minimum widths, or a long message in the last column would squeeze the others.
@@ -227,7 +227,7 @@ class Screen:
             table.add_row(*self._cells(row))
         return Group(Rule(style="dim"), table, self._footer(view))
 
-    def _cells(self, row: Row) -> tuple[Text, ...]:
+    def _cells(self, row: ScreenRow) -> tuple[Text, ...]:
         sign, style = _STATE_STYLES.get(row.state, _BAD_STYLE)
         state = Text(f"{sign} {row.state}", style=style)
         if row.starts:
@@ -247,7 +247,7 @@ class Screen:
             last,
         )
 
-    def _footer(self, view: View) -> Text:
+    def _footer(self, view: StackView) -> Text:
         words = Text(overflow="ellipsis", no_wrap=True)
         if view.ending:
             return words.append("stopping", style="bold yellow")

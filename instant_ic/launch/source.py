@@ -1,50 +1,40 @@
-"""YAML with line numbers, and a list of everything that is wrong with it."""
+"""YAML files whose values know their file and line."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 
 from instant_ic.config.yaml_text import compose_yaml, spelled
 
-_NO_VALUE = "tag:yaml.org,2002:null"
+_KINDS = {yaml.ScalarNode: "single value", yaml.SequenceNode: "list", yaml.MappingNode: "mapping"}
 
 
-@dataclass(frozen=True)
-class Problem:
-    """One mistake: file, line (from 1) and text."""
+class LaunchProblem(ValueError):
+    """One mistake in a file; printed as ``file:line: text``, which editors and terminals understand."""
 
-    file: Path
-    line: int
-    text: str
-
-    def __str__(self) -> str:
-        """``file:line: text``, the format that editors and terminals understand."""
-        return f"{_shorten(self.file)}:{self.line}: {self.text}"
+    def __init__(self, file: Path, line: int, text: str) -> None:
+        super().__init__(f"{_shortened(file)}:{line}: {text}")
+        self.file, self.line, self.text = file, line, text
 
 
 class LaunchFileError(ValueError):
-    """A launch file or its includes have mistakes; ``problems`` lists all of them."""
+    """A launch file or its includes have mistakes; ``problems`` lists them."""
 
-    def __init__(self, problems: list[Problem]) -> None:
-        super().__init__("\n".join(str(problem) for problem in problems))
-        self.problems = problems
+    def __init__(self, problems: Sequence[LaunchProblem]) -> None:
+        super().__init__("\n".join(map(str, problems)))
+        self.problems = list(problems)
 
 
-@dataclass
-class Value:
-    """A place in a YAML file (scalar, mapping or list), with accessors that note problems instead of raising.
-
-    Attributes:
-        problems: list where mistakes are noted; shared by the whole launch description.
-    """
+@dataclass(frozen=True)
+class YamlPlace:
+    """A scalar, mapping or list in a YAML file. Reading it as another kind raises :class:`LaunchProblem`."""
 
     file: Path
     node: yaml.Node
-    problems: list[Problem] = field(repr=False)
 
     @property
     def line(self) -> int:
@@ -53,105 +43,83 @@ class Value:
 
     @property
     def place(self) -> str:
-        """``file:line``."""
-        return f"{_shorten(self.file)}:{self.line}"
-
-    def problem(self, text: str) -> None:
-        self.problems.append(Problem(self.file, self.line, text))
+        """File and line, ``file:line``."""
+        return f"{_shortened(self.file)}:{self.line}"
 
     @property
-    def is_null(self) -> bool:
-        return isinstance(self.node, yaml.ScalarNode) and self.node.tag == _NO_VALUE
-
-    @property
-    def is_list(self) -> bool:
-        return isinstance(self.node, yaml.SequenceNode)
-
-    @property
-    def is_mapping(self) -> bool:
-        return isinstance(self.node, yaml.MappingNode)
+    def is_single(self) -> bool:
+        """Whether it is neither a list nor a mapping."""
+        return isinstance(self.node, yaml.ScalarNode)
 
     @property
     def is_quoted(self) -> bool:
-        """Whether it is quoted (or block) text, and so never a number or a boolean."""
+        """Whether it is quoted or block text, which is never a number or a boolean."""
         return isinstance(self.node, yaml.ScalarNode) and bool(self.node.style)
 
-    def text(self) -> str | None:
-        """The scalar as written; None, with a problem noted, for lists and mappings."""
-        if isinstance(self.node, yaml.ScalarNode):
-            return "" if self.is_null else str(self.node.value)
-        self.problem(f"expected a single value, got a {_kind(self.node)}")
-        return None
+    def problem(self, text: str) -> LaunchProblem:
+        """Return the error for a mistake at this place."""
+        return LaunchProblem(self.file, self.line, text)
 
-    def items(self) -> list[Value]:
-        """The entries of a list; empty, with a problem noted, for anything else."""
-        if isinstance(self.node, yaml.SequenceNode):
-            return [Value(self.file, entry, self.problems) for entry in self.node.value]
-        self.problem(f"expected a list, got a {_kind(self.node)}")
-        return []
+    def text(self) -> str:
+        """Return the scalar as it is written; empty for null."""
+        if not self.is_single:
+            raise self._unexpected("a single value")
+        return "" if self.node.tag == "tag:yaml.org,2002:null" else str(self.node.value)
 
-    def fields(self, known: Collection[str] = (), required: Collection[str] = ()) -> dict[str, Value]:
-        """Entries of a mapping; unknown (if ``known`` is given), duplicate and missing keys are noted as problems."""
+    def items(self) -> list[YamlPlace]:
+        """Return the entries of a list."""
+        if not isinstance(self.node, yaml.SequenceNode):
+            raise self._unexpected("a list")
+        return [YamlPlace(self.file, entry) for entry in self.node.value]
+
+    def fields(self, known: Collection[str] = (), required: Collection[str] = ()) -> dict[str, YamlPlace]:
+        """Return the entries of a mapping; a missing, a repeated or, with ``known``, an unknown key is a mistake."""
         if not isinstance(self.node, yaml.MappingNode):
-            self.problem(f"expected keys and values, got a {_kind(self.node)}")
-            return {}
-        found: dict[str, Value] = {}
+            raise self._unexpected("keys and values")
+        found: dict[str, YamlPlace] = {}
         for key_node, value_node in self.node.value:
-            key = Value(self.file, key_node, self.problems)
+            key = YamlPlace(self.file, key_node)
             name = key.text()
-            if name is None:
-                continue
             if name in found:
-                key.problem(f"{name!r} is given twice (first in line {found[name].line})")
-            elif known and name not in known:
-                key.problem(f"unknown key {name!r} (known: {', '.join(sorted(known))})")
-            else:
-                found[name] = Value(self.file, value_node, self.problems)
-        for name in required:
-            if name not in found:
-                self.problem(f"{name!r} is missing")
+                raise key.problem(f"{name!r} is given twice (first in line {found[name].line})")
+            if known and name not in known:
+                raise key.problem(f"unknown key {name!r} (supported: {', '.join(sorted(known))})")
+            found[name] = YamlPlace(self.file, value_node)
+        if missing := [name for name in required if name not in found]:
+            raise self.problem(f"{missing[0]!r} is missing")
         return found
 
     def spelled(self) -> object:
-        """The value with the spelling of its scalars; None, with the problem noted, if it does not fit its tag."""
+        """Return the value with the spelling of its scalars."""
         try:
             return spelled(self.node)
         except yaml.YAMLError as error:
-            self.problem(f"not YAML: {error}")
-            return None
+            raise self.problem(f"not YAML: {error}") from None
+
+    def _unexpected(self, wanted: str) -> LaunchProblem:
+        return self.problem(f"expected {wanted}, got a {_KINDS.get(type(self.node), 'value of another kind')}")
 
 
-def load(file: Path, problems: list[Problem]) -> Value | None:
-    """Read a YAML file; None, with the problem noted, if it cannot be read."""
+def load(file: Path) -> YamlPlace:
+    """Read a YAML file.
+
+    Raises:
+        LaunchProblem: it cannot be read, is not YAML or is empty.
+    """
     try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        problems.append(Problem(file, 1, f"cannot be read: {reason}"))
-        return None
-    try:
-        node = compose_yaml(text)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        problems.append(Problem(file, mark.line + 1 if mark else 1, f"not YAML: {error.problem}"))
-        return None
+        node = compose_yaml(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise LaunchProblem(file, 1, f"cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise LaunchProblem(file, 1, f"cannot be read: {error}") from None
     except yaml.YAMLError as error:
-        problems.append(Problem(file, 1, f"not YAML: {error}"))
-        return None
+        mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+        line = mark.line + 1 if mark else 1
+        raise LaunchProblem(file, line, f"not YAML: {getattr(error, 'problem', None) or error}") from None
     if node is None:
-        problems.append(Problem(file, 1, "the file is empty"))
-        return None
-    return Value(file, node, problems)
+        raise LaunchProblem(file, 1, "the file is empty")
+    return YamlPlace(file, node)
 
 
-def _kind(node: yaml.Node) -> str:
-    return {yaml.ScalarNode: "single value", yaml.SequenceNode: "list", yaml.MappingNode: "mapping"}.get(
-        type(node), "something else"
-    )
-
-
-def _shorten(file: Path) -> str:
-    try:
-        return str(file.relative_to(Path.cwd()))
-    except ValueError:
-        return str(file)
+def _shortened(file: Path) -> Path:
+    return file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file

@@ -14,10 +14,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol
 
-from instant_ic.launch.description import Announcement, NodeSpec, Shutdown
+from instant_ic.launch.description import NodeSpec
+from instant_ic.launch.hang import BUSY_FACTOR, HeartbeatSilence, is_traced
 from instant_ic.launch.health import HealthMonitor
 from instant_ic.launch.outlet import Outlet
-from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, Schedule, State, describe_exit
+from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, ProcessState, Schedule, describe_exit
 from instant_ic.launch.reaper import kill_marked
 from instant_ic.util.closing import on_end_signal
 
@@ -31,16 +32,13 @@ STOP_SCHEDULE: Schedule = (
 HANG_SCHEDULE: Schedule = ((signal.SIGABRT, 2.0), (signal.SIGKILL, 1.0))
 """Signals to a hung node: the first makes it write the stack of every thread, the second ends it."""
 
-BUSY_FACTOR = 6.0
-"""Factor on the hang time-out for a node that computes (a compiler at its first image)."""
-
-_BUSY_SHARE = 0.5
+_HURRIED_SCHEDULE: Schedule = ((signal.SIGKILL, 1.0),)
 _ROUND_S = 0.25  # also the time to react to Ctrl-C; output of a node, and its end, come at once
 _LOG_BYTES = 32 << 20  # how much may wait for the disk
 _REAPER = Path(__file__).with_name("reaper.py")
 
 
-class Output(Protocol):
+class SupervisorOutput(Protocol):
     """Destination of the supervisor's output."""
 
     def node_line(self, node: str, text: str) -> None:
@@ -50,32 +48,10 @@ class Output(Protocol):
         """Show an event reported by the supervisor."""
 
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
-        """Called several times a second."""
+        """Show the present state; called several times a second."""
 
     def stopping(self) -> None:
-        """Called once, when the end begins."""
-
-
-class _Silence:
-    """Time that a process has gone without a heartbeat, as observed by the launcher."""
-
-    def __init__(self) -> None:
-        self.beat_s: float | None = None
-        self.lasts_s = 0.0
-        self.told = False
-        self._active_s = 0.0
-
-    def look(self, beat_s: float | None, pid: int, since_last_look_s: float) -> None:
-        if beat_s is None or beat_s != self.beat_s:
-            self.beat_s, self.lasts_s, self.told = beat_s, 0.0, False
-            self._active_s = _active_s(pid)
-            return
-        # If the launcher itself was held up (stopped, swapped out), the nodes are not to blame.
-        self.lasts_s += min(since_last_look_s, 0.5)
-
-    def busy(self, pid: int) -> bool:
-        """Whether the process has computed, or waited for a CPU, for most of the silence."""
-        return _is_runnable(pid) or _active_s(pid) - self._active_s > _BUSY_SHARE * self.lasts_s
+        """Note that the end begins."""
 
 
 class Supervisor:
@@ -86,6 +62,9 @@ class Supervisor:
     nodes.
 
     Args:
+        nodes: the nodes to run.
+        run_dir: run directory of the stack.
+        output: destination of lines and events.
         stop_schedule: signals at shutdown, with the wait after each.
         make_health: called once all processes are started; None: heartbeats are not watched.
     """
@@ -94,29 +73,24 @@ class Supervisor:
         self,
         nodes: Sequence[NodeSpec],
         run_dir: Path,
-        output: Output,
+        output: SupervisorOutput,
         stop_schedule: Schedule = STOP_SCHEDULE,
         make_health: Callable[[], HealthMonitor] | None = None,
-        announcements: Sequence[Announcement] = (),
-        shutdown: Shutdown | None = None,
     ) -> None:
         self._stop_schedule = tuple(stop_schedule)
         self._output = output
         self._mark = uuid.uuid4().hex
         self._disk = Outlet("log files", _LOG_BYTES)
-        self._told: deque[str] = deque()
+        self._log_events: deque[str] = deque()
         """Texts from the thread that writes the logs."""
-        self.processes = [ManagedProcess(node, run_dir, self._mark, self._disk, self._told.append) for node in nodes]
+        self.processes = [ManagedProcess(n, run_dir, self._mark, self._disk, self._log_events.append) for n in nodes]
         self._make_health = make_health
         self._health: HealthMonitor | None = None
-        self._silences = {process: _Silence() for process in self.processes}
-        self._announcements = sorted(announcements, key=lambda announcement: announcement.delay_s)
-        self._shutdown = shutdown
+        self._silences = {process: HeartbeatSilence() for process in self.processes}
         self._selector = selectors.DefaultSelector()
         self._stop = False
         self._hurry = False
         self._status = 0
-        self._start_s = 0.0
         self._last_look_s = 0.0
 
     def request_stop(self, hurry: bool = False) -> None:
@@ -134,15 +108,13 @@ class Supervisor:
         try:
             # A second signal hurries the end.
             with self._reaper(), on_end_signal(lambda *_: self.request_stop(hurry=self._stop)):
-                self._start_s = self._last_look_s = time.monotonic()
-                for process in self.processes:
-                    process.start_s = self._start_s + process.spec.start_delay_s
+                self._last_look_s = time.monotonic()
                 try:
                     while not self._stop:
                         self._step(_ROUND_S)
-                        if all(process.state in (State.ENDED, State.FAILED) for process in self.processes):
-                            failed = [p for p in self.processes if p.state is State.FAILED]
-                            self._status = 1 if failed else self._status
+                        states = {process.state for process in self.processes}
+                        if states <= {ProcessState.ENDED, ProcessState.FAILED}:
+                            self._status = 1 if ProcessState.FAILED in states else self._status
                             break
                 finally:
                     self._stop_all()
@@ -152,7 +124,7 @@ class Supervisor:
                 process.close()
             if not self._disk.close():
                 self._output.event("the rest of the logs could not be written", bad=True)
-            self._tell()
+            self._forward_log_events()
             if self._health is not None:
                 self._health.close()
         return self._status
@@ -187,13 +159,13 @@ class Supervisor:
         """Forward the nodes' output, then move every process towards its wanted state."""
         flooded = False
         for key, _ in self._selector.select(wait_s):
-            flooded |= self._pass_on(key.data)
+            flooded |= self._forward_output(key.data)
         if self._health is not None:
             self._health.poll()
         self._reconcile(time.monotonic())
         if self._health is None and self._make_health is not None and not self._stop:
             self._health = self._make_health()  # after the starts, so that no process waits for it
-        self._tell()
+        self._forward_log_events()
         self._output.refresh(self.processes)
         if flooded:
             time.sleep(0.005)  # a process writes without end: leave the CPU to the others
@@ -204,51 +176,34 @@ class Supervisor:
         for process in self.processes:
             if process.has_ended():
                 self._reap(process)
-            wanted = not self._stop and process.state in (State.WAITING, State.RUNNING) and now_s >= process.start_s
-            runs = process.state is State.RUNNING
+            runs = process.state is ProcessState.RUNNING
+            wanted = (runs or process.state is ProcessState.WAITING) and not self._stop and now_s >= process.start_s
             if wanted and not runs:
                 self._start(process)
             elif wanted and not process.ending:
-                self._judge(process, since_s)
+                self._check_heartbeat(process, since_s)
             elif not wanted and runs and not process.ending:
-                process.begin_end(self._schedule(process))
+                process.begin_end(_HURRIED_SCHEDULE if self._hurry else self._stop_schedule)
             if runs and (signum := process.press_on(now_s)) is not None:
                 sent.setdefault(signum, []).append(process.spec.label)
         for signum, names in sent.items():
             if signum is not signal.SIGINT:
                 self._output.event(f"{signum.name} to {', '.join(names)}", bad=True)
-        self._keep_time(now_s - self._start_s)
 
-    def _keep_time(self, since_start_s: float) -> None:
-        """Print the launch file's texts when they are due, or end the stack at its ``shutdown``."""
-        while self._announcements and self._announcements[0].delay_s <= since_start_s:
-            self._output.event(self._announcements.pop(0).text)
-        if self._shutdown is not None and since_start_s >= self._shutdown.delay_s and not self._stop:
-            self._output.event(f"stopping the stack: {self._shutdown.reason}")
-            self._stop = True
-
-    def _schedule(self, process: ManagedProcess) -> Schedule:
-        if self._hurry:
-            return ((signal.SIGKILL, 1.0),)
-        own = {signal.SIGINT: process.spec.sigterm_timeout_s, signal.SIGTERM: process.spec.sigkill_timeout_s}
-        return [(signum, wait_s if (w := own.get(signum)) is None else w) for signum, wait_s in self._stop_schedule]
-
-    def _judge(self, process: ManagedProcess, since_s: float) -> None:
+    def _check_heartbeat(self, process: ManagedProcess, since_s: float) -> None:
         """End a process that has stopped sending heartbeats."""
-        if self._health is None or process.pid is None or not process.spec.heartbeat:
+        if self._health is None or process.pid is None:
             return
         limit_s, silence = process.spec.hang_timeout_s, self._silences[process]
         silence.look(self._health.beat_s(process.spec, process.pid), process.pid, since_s)
-        if silence.beat_s is None or limit_s <= 0 or silence.lasts_s < limit_s:
+        if silence.beat_s is None or limit_s <= 0 or silence.lasts_s < limit_s or is_traced(process.pid):
             return
-        if _is_traced(process.pid):
-            return  # a debugger holds it
         if silence.lasts_s < BUSY_FACTOR * limit_s and silence.busy(process.pid):
-            if not silence.told:
-                silence.told = True
-                words = f"no heartbeat for {silence.lasts_s:.0f} s, but it is computing"
+            if not silence.reported:
+                silence.reported = True
+                text = f"no heartbeat for {silence.lasts_s:.0f} s, but it is computing"
                 self._output.event(
-                    f"{process.spec.label}: {words}; it will be killed after {BUSY_FACTOR * limit_s:.0f} s", bad=True
+                    f"{process.spec.label}: {text}; it will be killed after {BUSY_FACTOR * limit_s:.0f} s", bad=True
                 )
             return
         reason = f"hangs: no heartbeat for {silence.lasts_s:.0f} s"
@@ -256,26 +211,25 @@ class Supervisor:
         process.begin_end(HANG_SCHEDULE, reason)
 
     def _start(self, process: ManagedProcess) -> None:
-        self._silences[process] = _Silence()
+        self._silences[process] = HeartbeatSilence()
         try:
             process.start()
         except (OSError, ValueError) as error:  # ValueError: an argument contains a zero byte
-            process.state, process.exit_status = State.FAILED, 127
+            process.state, process.exit_status = ProcessState.FAILED, 127
             self._output.event(f"{process.spec.label} cannot be started: {error}", bad=True)
             self._after_end(process)
             return
         assert process.output is not None
         self._selector.register(process.output, selectors.EVENT_READ, process)
 
-    def _tell(self) -> None:
-        while self._told:
-            self._output.event(self._told.popleft(), bad=True)
+    def _forward_log_events(self) -> None:
+        while self._log_events:
+            self._output.event(self._log_events.popleft(), bad=True)
 
-    def _pass_on(self, process: ManagedProcess) -> bool:
-        """Forward a process's output; returns whether most of it was dropped."""
+    def _forward_output(self, process: ManagedProcess) -> bool:
+        """Forward a process's output; return whether some of it was dropped."""
         for line in process.read_lines(time.monotonic()):
-            if process.spec.to_terminal:
-                self._output.node_line(process.spec.label, line)
+            self._output.node_line(process.spec.label, line)
         if process.output_closed:
             self._forget_output(process)
         return process.flooding
@@ -288,8 +242,7 @@ class Supervisor:
     def _reap(self, process: ManagedProcess) -> None:
         self._forget_output(process)
         for line in process.reap():
-            if process.spec.to_terminal:
-                self._output.node_line(process.spec.label, line)
+            self._output.node_line(process.spec.label, line)
         if self._stop:
             return
         # Children in a session of their own, outside the process group, would keep its devices and ports open.
@@ -303,7 +256,7 @@ class Supervisor:
         what = f"{spec.label} ended ({process.reason or describe_exit(status)})"
         status = status or (1 if process.reason else 0)
         hint = f", see {process.log_path}" if status else ""
-        if status == USAGE_STATUS and spec.heartbeat:
+        if status == USAGE_STATUS:
             self._status = 1
             self._output.event(f"{what}: its parameters are wrong, so the stack ends{hint}", bad=True)
             self._stop = True
@@ -311,11 +264,11 @@ class Supervisor:
         if spec.respawn:
             delay_s = process.limit.next_delay_s(time.monotonic())
             if delay_s is not None:
-                process.state, process.start_s = State.WAITING, time.monotonic() + delay_s
+                process.state, process.start_s = ProcessState.WAITING, time.monotonic() + delay_s
                 used, most = process.limit.used, process.limit.MAX_STARTS
                 self._output.event(f"{what}; restarts in {delay_s:.1f} s ({used} of {most})", bad=True)
                 return
-            process.state = State.FAILED
+            process.state = ProcessState.FAILED
             self._output.event(f"{what}; given up after {process.limit}{hint}", bad=True)
             status = status or 1
         if spec.required:
@@ -328,44 +281,19 @@ class Supervisor:
     def _stop_all(self) -> None:
         self._stop = True
         self._output.stopping()
-        running = [process for process in self.processes if process.state is State.RUNNING]
+        running = [process for process in self.processes if process.state is ProcessState.RUNNING]
         if running:
             self._output.event(f"stopping {len(running)} node{'s' if len(running) > 1 else ''}")
         hurried = self._hurry
-        while left := [process for process in self.processes if process.state is State.RUNNING]:
+        while left := [process for process in self.processes if process.state is ProcessState.RUNNING]:
             if self._hurry and not hurried:
                 hurried = True
                 for process in left:
-                    process.begin_end(self._schedule(process))
+                    process.begin_end(_HURRIED_SCHEDULE)
             self._step(0.02)
-            if all(process.state is not State.RUNNING or process.out_of_means(time.monotonic()) for process in left):
-                stuck = [f"{p.spec.label} (pid {p.pid})" for p in left if p.state is State.RUNNING]
+            now_s = time.monotonic()
+            if all(process.state is not ProcessState.RUNNING or process.out_of_means(now_s) for process in left):
+                stuck = [f"{p.spec.label} (pid {p.pid})" for p in left if p.state is ProcessState.RUNNING]
                 if stuck:
                     self._output.event(f"{', '.join(stuck)} cannot be killed: blocked in the kernel", bad=True)
                 return
-
-
-def _active_s(pid: int) -> float:
-    """Seconds that a process's first thread (the node's own) has computed or waited for a CPU; 0 if it is gone."""
-    try:
-        computed, waited, _ = Path(f"/proc/{pid}/schedstat").read_text().split()
-    except OSError:
-        return 0.0
-    return (int(computed) + int(waited)) / 1e9
-
-
-def _is_runnable(pid: int) -> bool:
-    """Whether a process's first thread computes or waits for a CPU now; the kernel counts a wait only at its end."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].startswith("R")
-    except OSError:
-        return False
-
-
-def _is_traced(pid: int) -> bool:
-    """Whether a debugger is attached to a process."""
-    try:
-        status = Path(f"/proc/{pid}/status").read_text()
-    except OSError:
-        return False
-    return any(line.startswith("TracerPid:") and line.split()[1] != "0" for line in status.splitlines())

@@ -8,6 +8,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from instant_ic.config.scalars import to_float
+from instant_ic.launch.source import LaunchProblem, YamlPlace, load
 from instant_ic.util import paths
 
 ALIVE_PERIODS = 10.0
@@ -60,30 +62,25 @@ def read_topic_rates(file: Path) -> dict[str, TopicRate]:
     """Read a table of rates: topic → expected rate.
 
     Raises:
-        TopicTableError: all mistakes: an unreadable file, an unknown key, or a rate that is not a number > 0.
+        TopicTableError: the first mistake: an unreadable file, an unknown key, or a rate that is not a number > 0.
     """
-    from instant_ic.config.scalars import to_float
-    from instant_ic.launch.source import Problem, load
+    try:
+        return {topic: _topic_rate(topic, entry) for topic, entry in load(file).fields().items()}
+    except LaunchProblem as problem:
+        raise TopicTableError(str(problem)) from None
 
-    problems: list[Problem] = []
-    rates: dict[str, TopicRate] = {}
-    root = load(file, problems)
-    for topic, entry in root.fields().items() if root is not None else ():
-        fields = entry.fields(known=("rate_hz", "when"), required=("rate_hz",))
-        rate, when = fields.get("rate_hz"), fields.get("when")
-        given = rate.spelled() if rate is not None else 1
-        number = 0.0
-        with suppress(ValueError):
-            number = to_float(given)
-        if number <= 0:
-            entry.problem(f"{topic}: rate_hz must be a number > 0 (got {given!r})")
-        elif not topic.startswith("/"):
-            entry.problem(f"topic {topic!r} must begin with /")
-        else:
-            rates[topic] = TopicRate(number, (when.text() if when is not None else "") or "")
-    if problems:
-        raise TopicTableError("\n".join(map(str, problems)))
-    return rates
+
+def _topic_rate(topic: str, entry: YamlPlace) -> TopicRate:
+    fields = entry.fields(("rate_hz", "when"), required=("rate_hz",))
+    given = fields["rate_hz"].spelled()
+    number = 0.0
+    with suppress(ValueError):
+        number = to_float(given)
+    if number <= 0:
+        raise entry.problem(f"{topic}: rate_hz must be a number > 0 (got {given!r})")
+    if not topic.startswith("/"):
+        raise entry.problem(f"topic {topic!r} must begin with /")
+    return TopicRate(number, fields["when"].text() if "when" in fields else "")
 
 
 @functools.cache

@@ -15,7 +15,7 @@ from instant_ic.cli.logs import LogLine, show
 from instant_ic.cli.main import main
 from instant_ic.cli.top import NodeRow
 from instant_ic.cli.top_screen import table
-from instant_ic.launch.screen import Row, Screen, View
+from instant_ic.launch.screen import ScreenRow, StackScreen, StackView
 from instant_ic.msg import Bool, message_type, serialize
 
 EVIL = "\x1b]0;owned\x07\x1b[2J\x1bc\x9b31m\rgone"
@@ -75,10 +75,10 @@ def test_a_log_line_shows_escapes_and_hides_passwords():
 def test_the_launchers_screen_and_top_show_escapes_of_nodes():
     out = io.StringIO()
     console = Console(file=out, width=400, force_terminal=False)
-    screen = Screen(["slam"], live=False, console=console, verbose=True)
+    screen = StackScreen(["slam"], live=False, console=console, verbose=True)
     screen.node_line("slam", f"{EVIL} rtsp://me:secret@h/")
     screen.event(EVIL)
-    console.print(screen.table(View((Row("slam", "running", text=EVIL, sends=((EVIL, 1.0, True),)),))))
+    console.print(screen.table(StackView((ScreenRow("slam", "running", text=EVIL, sends=((EVIL, 1.0, True),)),))))
     console.print(table([NodeRow("slam", 1, "running", EVIL)], "cpu"))
     assert RAW.findall(out.getvalue()) == [] and "secret" not in out.getvalue()
     assert out.getvalue().count("owned") == 5

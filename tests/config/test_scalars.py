@@ -154,10 +154,10 @@ def test_plain_values_are_what_they_were(value: Any) -> None:
 LAUNCH = """launch:
 - arg: {name: name, default: "0123"}
 - arg: {name: third, default: 2e-1}
-- set_parameter: {name: frame, value: 0017}
 - node:
     exec: vlp16_driver
     param:
+    - {name: frame, value: 0017}
     - {name: sensor, value: $(var name)}
     - {name: silence_s, value: 5e-1}
     - {name: lidar_mount.xyz, value: [1e-1, $(var third), .5]}

@@ -102,11 +102,11 @@ def test_manifest(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("- set_parameter: {name: a, value: " + BOMB + "}", MANY),
-        ("- set_parameter: {name: a, value: &a [*a]}", "contains itself"),
+        ("- node: {exec: arbiter, param: [{name: a, value: " + BOMB + "}]}", MANY),
+        ("- node: {exec: arbiter, param: [{name: a, value: &a [*a]}]}", "contains itself"),
         ("- " + "{group: [" * 300 + "]}" * 300, "nested too deeply"),
-        ("- let: {name: a, value: $(eval " + "(" * 400 + "1" + ")" * 400 + ")}", "2: .* nested too deeply"),
-        ("- let: {name: a, value: " + "$(if 1 " * 600 + "1" + ")" * 600 + "}", "2: .* nested too deeply"),
+        ("- let: {name: a, value: $(eval " + "(" * 400 + "1" + ")" * 400 + ")}", "2: .* too many nested parentheses"),
+        ("- let: {name: a, value: " + "$(var " * 600 + "1" + ")" * 600 + "}", "2: unknown variable"),
         (
             "- let: {name: v0, value: xx}\n"
             + "\n".join(f"- let: {{name: v{n + 1}, value: $(var v{n})$(var v{n})}}" for n in range(40)),

@@ -774,11 +774,10 @@ def _parameter_errors() -> tuple[type[BaseException], ...]:
 
 
 _LAUNCH = b"""launch:
-- arg: {name: world, default: corridor, description: "a world", choice: [{value: corridor}, {value: room}]}
+- arg: {name: world, default: corridor, description: "a world"}
 - arg: {name: port, type: int, default: "8089"}
 - let: {name: other, value: "$(var world)-x"}
-- set_env: {name: A, value: "1"}
-- append_env: {name: PATH, value: /x}
+- set_parameters_from_file: {filename: $(config robot.yaml)}
 - node:
     exec: theta_camera
     param:
@@ -788,16 +787,13 @@ _LAUNCH = b"""launch:
     env: [{name: OMP_NUM_THREADS, value: 1}]
     respawn: true
 - group:
-  - push_ros_namespace: {namespace: robot1}
-  - set_parameter: {name: silence_s, value: 3.0}
-  - node: {exec: vlp16_driver}
+    run_dir: robot1
+    launch:
+    - node: {exec: vlp16_driver}
 - include: {file: small.yaml, arg: [{name: a, value: $(var world)}]}
-- log: {message: "starting $(var world)"}
-- timer: {period: 2.0, children: [{node: {exec: navigator}}]}
-- shutdown: {reason: over}
 """
-_BOMB_LAUNCH = b"launch:\n- set_parameter:\n    name: p\n    value:\n" + b"".join(
-    b"      " + line + b"\n" for line in _BOMB.splitlines()
+_BOMB_LAUNCH = b"launch:\n- node:\n    exec: arbiter\n    param:\n    - name: p\n      value:\n" + b"".join(
+    b"        " + line + b"\n" for line in _BOMB.splitlines()
 )
 _SMALL_LAUNCH = b"launch:\n- arg: {name: a, default: b}\n- node: {exec: arbiter, name: $(var a)}\n"
 

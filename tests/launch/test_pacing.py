@@ -12,7 +12,7 @@ from instant_ic.bus.registry import prepare
 from instant_ic.launch import pacing
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.health import HealthMonitor
-from instant_ic.launch.pacing import SLOWEST, CoreLoad, PaceChooser, Pacing, Sample, pace_of
+from instant_ic.launch.pacing import SLOWEST, CoreLoad, PaceChooser, PaceSample, Pacing, pace_of
 from instant_ic.msg import ControlState, Float32, header, pose_message, serialize, twist_message
 from instant_ic.util import pace
 
@@ -41,7 +41,7 @@ class Machine:
             used = available * min(1.0, factor / feasible)
             idle = available - used + self.cores - 2 if self.idle else 0.0
             late = 0.2 if factor <= feasible else 1.0 + 5.0 * (factor / feasible - 1.0)
-            self.paces.append(self.chooser.step(Sample(self.now_s, late, False, idle, used)))
+            self.paces.append(self.chooser.step(PaceSample(self.now_s, late, False, idle, used)))
         return self.paces[-1]
 
 
@@ -95,19 +95,19 @@ def test_steps_are_small_and_within_bounds():
 
 def test_no_rise_without_a_report():
     chooser = PaceChooser(0.5)
-    assert {chooser.step(Sample(t / 4, None, False, 2.0)) for t in range(400)} == {0.5}
+    assert {chooser.step(PaceSample(t / 4, None, False, 2.0)) for t in range(400)} == {0.5}
 
 
 @pytest.mark.parametrize(("idle", "falls"), [(0.0, True), (1.0, False)])
 def test_a_stale_source_is_the_machines_fault_only_while_the_machine_is_busy(idle, falls):
     chooser = PaceChooser(1.0)
-    chooser.step(Sample(0.0, 0.1))
-    assert (chooser.step(Sample(0.25, 0.1, True, idle)) < 1.0) == falls
+    chooser.step(PaceSample(0.0, 0.1))
+    assert (chooser.step(PaceSample(0.25, 0.1, True, idle)) < 1.0) == falls
 
 
 def test_a_source_that_stays_stale_has_a_fault_of_its_own():
     chooser = PaceChooser(1.0)
-    paces = [chooser.step(Sample(t / 4, 0.1, t > 4)) for t in range(800)]
+    paces = [chooser.step(PaceSample(t / 4, 0.1, t > 4)) for t in range(800)]
     assert min(paces) > SLOWEST and paces[-1] > min(paces)
 
 

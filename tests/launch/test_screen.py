@@ -15,10 +15,10 @@ from instant_ic.bus.heartbeat import Flow, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.launch import NodeSpec
-from instant_ic.launch.app import _Output, _row
-from instant_ic.launch.health import HealthMonitor, TopicFault, find_console
-from instant_ic.launch.process import State
-from instant_ic.launch.screen import Row, Screen, View
+from instant_ic.launch.app import StackOutput, screen_row
+from instant_ic.launch.health import HealthMonitor, TopicFault, console_address
+from instant_ic.launch.process import ProcessState
+from instant_ic.launch.screen import ScreenRow, StackScreen, StackView
 from instant_ic.msg import NodeStatus, header, serialize
 
 
@@ -28,9 +28,9 @@ def out() -> io.StringIO:
 
 
 @contextmanager
-def screen_on(out: io.StringIO, live: bool, period_s: float = 0.0, verbose: bool = False) -> Iterator[Screen]:
+def screen_on(out: io.StringIO, live: bool, period_s: float = 0.0, verbose: bool = False) -> Iterator[StackScreen]:
     console = Console(file=out, width=120, force_terminal=live, color_system=None)
-    screen = Screen(["slam", "page"], live, period_s, console, verbose)
+    screen = StackScreen(["slam", "page"], live, period_s, console, verbose)
     screen.start()
     try:
         yield screen
@@ -41,12 +41,12 @@ def screen_on(out: io.StringIO, live: bool, period_s: float = 0.0, verbose: bool
 def test_plain_lines_tell_what_is_waited_for(out: io.StringIO) -> None:
     with screen_on(out, live=False) as screen:
         screen.node_line("slam", "hello \x1b[31mred\x1b[0m")
-        screen.refresh(View(looked=False, missing=("slam",)))  # nobody has listened yet: nothing to tell
-        screen.refresh(View(missing=("slam", "page"), waiting=("map",)))
-        screen.refresh(View(waiting=("map",)))
-        screen.refresh(View(addresses={"console": "http://127.0.0.1:8080"}))
-        screen.refresh(View(addresses={"console": "http://127.0.0.1:8080"}))
-        screen.refresh(View(waiting=("map",), ending=True))
+        screen.refresh(StackView(looked=False, missing=("slam",)))  # nobody has listened yet: nothing to tell
+        screen.refresh(StackView(missing=("slam", "page"), waiting=("map",)))
+        screen.refresh(StackView(waiting=("map",)))
+        screen.refresh(StackView(addresses={"console": "http://127.0.0.1:8080"}))
+        screen.refresh(StackView(addresses={"console": "http://127.0.0.1:8080"}))
+        screen.refresh(StackView(waiting=("map",), ending=True))
     lines = out.getvalue().splitlines()
     assert lines[0] == "  slam │ hello red"
     assert lines[1] == "launch │ 0 of 2 nodes are up, waiting for slam, page"
@@ -59,11 +59,11 @@ def test_plain_lines_tell_what_is_waited_for(out: io.StringIO) -> None:
 
 def test_plain_lines_tell_a_degraded_topic_once_and_its_recovery(out: io.StringIO) -> None:
     with screen_on(out, live=False) as screen:
-        screen.refresh(View())
-        screen.refresh(View(faults=("/pose of slam: 7.2 of 10 Hz", "/scan of lidar: stopped 3.0 s ago")))
-        screen.refresh(View(faults=("/pose of slam: 7.9 of 10 Hz", "/scan of lidar: stopped 4.0 s ago")))
-        screen.refresh(View(faults=("/pose of slam: 7.9 of 10 Hz",)))
-        screen.refresh(View())
+        screen.refresh(StackView())
+        screen.refresh(StackView(faults=("/pose of slam: 7.2 of 10 Hz", "/scan of lidar: stopped 3.0 s ago")))
+        screen.refresh(StackView(faults=("/pose of slam: 7.9 of 10 Hz", "/scan of lidar: stopped 4.0 s ago")))
+        screen.refresh(StackView(faults=("/pose of slam: 7.9 of 10 Hz",)))
+        screen.refresh(StackView())
     assert out.getvalue().splitlines()[2:] == [
         "launch │ too slow: /pose of slam: 7.2 of 10 Hz, /scan of lidar: stopped 3.0 s ago",
         "launch │ back to the right rate: /scan of lidar",
@@ -78,7 +78,7 @@ def test_a_nodes_warnings_are_shown_once_and_after_the_start_only(out: io.String
     with screen_on(out, live=False, period_s=60.0) as screen:
         screen.node_line("slam", "12:00:00.000 INFO    slam: running")
         screen.node_line("slam", "12:00:00.000 ERROR   slam: scan: none yet")
-        screen.refresh(View((Row("page", "degraded", text="no camera"), Row("slam", "running"))))
+        screen.refresh(StackView((ScreenRow("page", "degraded", text="no camera"), ScreenRow("slam", "running"))))
         screen.node_line("slam", WARNED)
         screen.node_line("slam", "  a line that belongs to it")
         screen.node_line("slam", WARNED.replace("3", "4").replace("12:", "13:"))
@@ -98,10 +98,10 @@ def test_a_nodes_warnings_are_shown_once_and_after_the_start_only(out: io.String
 def test_warnings_of_a_start_that_does_not_end_are_shown(out: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
     with screen_on(out, live=False, period_s=60.0) as screen:
         screen.node_line("slam", WARNED)
-        screen.refresh(View(missing=("page",)))
+        screen.refresh(StackView(missing=("page",)))
         assert out.getvalue() == ""
         monkeypatch.setattr(time, "monotonic", lambda: screen._started_s + 31.0)
-        screen.refresh(View(missing=("page",)))
+        screen.refresh(StackView(missing=("page",)))
     assert out.getvalue().splitlines()[0] == f"  slam │ {WARNED}"
 
 
@@ -113,13 +113,13 @@ def test_verbose_shows_every_line(out: io.StringIO) -> None:
 
 def test_table_of_nodes(out: io.StringIO) -> None:
     rows = (
-        Row("slam", "running", 12.3, 99.6, sends=(("/pose", 9.96, True),)),
-        Row("page", "silent", 1.0, 10.0, starts=2),
-        Row("gone", "failed", text="hangs: no heartbeat for 10 s"),
-        Row("new", "starting"),
+        ScreenRow("slam", "running", 12.3, 99.6, sends=(("/pose", 9.96, True),)),
+        ScreenRow("page", "silent", 1.0, 10.0, starts=2),
+        ScreenRow("gone", "failed", text="hangs: no heartbeat for 10 s"),
+        ScreenRow("new", "starting"),
     )
     with screen_on(out, live=True) as screen:
-        screen.refresh(View(rows, missing=("new",), pace="simulation at 0.6 of real time"))
+        screen.refresh(StackView(rows, missing=("new",), pace="simulation at 0.6 of real time"))
     text = out.getvalue()
     assert " · simulation at 0.6 of real time · " in text
     found = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line and line[0].isalpha()}
@@ -253,7 +253,7 @@ def test_a_topic_that_flowed_and_slows_down_or_stops_is_a_fault_after_a_while(
     def faults_after(seconds: float, rate_hz: float, age_s: float) -> list[str]:
         now[0] += seconds
         monitor.nodes["my_slam"] = from_message(beat("my_slam", rate_hz=rate_hz, age_s=age_s))
-        return [fault.words for fault in monitor.topic_faults()]
+        return [fault.text for fault in monitor.topic_faults()]
 
     try:
         assert faults_after(0, 0.0, float("inf")) == []  # never came: that is what waiting_for() tells
@@ -297,19 +297,17 @@ def test_each_group_is_heard_in_its_own_run_directory(tmp_path: Path) -> None:
         ({"host": "127.0.0.1", "port": 8081}, "http://127.0.0.1:8081"),
         ({"host": "0.0.0.0", "port": 80}, "http://127.0.0.1:80"),
         ({"host": "10.1.1.1", "port": 80}, "http://10.1.1.1:80"),
-        ({"host": "127.0.0.1", "port": 0}, None),  # any free port: the console's log tells it
+        ({"host": "127.0.0.1", "port": 0}, ""),  # any free port: the console's log has it
     ],
 )
-def test_console_address(server: dict[str, object], address: str | None) -> None:
-    info = NodeInfo("page", "m", 1, 0, {"server": server})
-    assert find_console([info], ["page"]) == address
-    assert find_console([info], ["another"]) is None
+def test_console_address(server: dict[str, object], address: str) -> None:
+    assert console_address(NodeInfo("page", "m", 1, 0, {"server": server})) == address
 
 
 def test_row_of_a_node_from_its_process_its_heartbeat_and_its_topics() -> None:
     process: Any = SimpleNamespace(
         spec=NodeSpec("lidar", "vlp16_driver", ()),
-        state=State.RUNNING,
+        state=ProcessState.RUNNING,
         limit=SimpleNamespace(retries=1),
         reason="",
         ending=False,
@@ -321,22 +319,25 @@ def test_row_of_a_node_from_its_process_its_heartbeat_and_its_topics() -> None:
     health = Heartbeat("lidar", 1, "running", "", 7.0, 180.0, outputs=outputs, seen_s=now_s)
     monitor: Any = SimpleNamespace(nodes={"lidar": health})
     slow = TopicFault("lidar", "/scan", "5.0 of 10 Hz", stopped=False)
-    row = _row(process, monitor, [slow, TopicFault("other", "/pose", "stopped 3.0 s ago", stopped=True)])
+    row = screen_row(process, monitor, [slow, TopicFault("other", "/pose", "stopped 3.0 s ago", stopped=True)])
     assert (row.state, row.starts, row.text) == ("slow", 1, "")
     # Wrong ones first, then those whose rate is known.
     assert row.sends == (("/scan", 5.0, False), ("/lidar/points", 10.0, True), ("/unknown", 3.0, True))
-    stopped = _row(process, monitor, [TopicFault("lidar", "/scan", "stopped 3.0 s ago", stopped=True)])
+    stopped = screen_row(process, monitor, [TopicFault("lidar", "/scan", "stopped 3.0 s ago", stopped=True)])
     assert (stopped.state, stopped.text) == ("slow", "scan stopped 3.0 s ago")
     process.started_s = now_s + 1.0  # started again: what its predecessor said counts no more
-    assert _row(process, monitor, []).state == "starting"
+    assert screen_row(process, monitor, []).state == "starting"
     process.ending, process.reason = True, "hangs: no heartbeat for 10 s"
-    assert (_row(process, monitor, []).state, _row(process, monitor, []).text) == ("stopping", process.reason)
+    assert (screen_row(process, monitor, []).state, screen_row(process, monitor, []).text) == (
+        "stopping",
+        process.reason,
+    )
 
 
 def test_an_optional_node_that_has_ended_is_not_waited_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recorder, slam = NodeSpec("recorder", "bag_recorder", ()), NodeSpec("slam", "grid_slam", (), respawn=True)
     description: Any = SimpleNamespace(nodes=[recorder, slam])
-    output = _Output(description, tmp_path, live=False, verbose=False)
+    output = StackOutput(description, tmp_path, live=False, verbose=False)
     monitor: Any = SimpleNamespace(
         nodes={},
         topic_faults=list,
@@ -345,10 +346,10 @@ def test_an_optional_node_that_has_ended_is_not_waited_for(tmp_path: Path, capsy
         addresses=lambda with_token: {},
         publish=lambda down, faults: None,
     )
-    output._health = monitor
+    output.health = monitor
     processes: Any = [
-        SimpleNamespace(spec=spec, state=State.FAILED, limit=SimpleNamespace(retries=0), reason="")
+        SimpleNamespace(spec=spec, state=ProcessState.FAILED, limit=SimpleNamespace(retries=0), reason="")
         for spec in (recorder, slam)
     ]
-    assert output._view(processes).missing == ("slam",)
+    assert output.view(processes).missing == ("slam",)
     output.close(0)

@@ -44,14 +44,21 @@ def test_namespace_of_the_sender_is_left_out() -> None:
     assert nominal_rate("/left/scan") is None and nominal_rate("/leftscan", "left") is None
 
 
-def test_mistakes_are_told_with_their_lines(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("/a: {rate_hz: 0}", "rate_hz must be a number > 0 (got 0)"),
+        ("/b: {rate: 3}", "unknown key 'rate'"),
+        ("c: {rate_hz: 1}", "topic 'c' must begin with /"),
+        ("/d: {rate_hz: yes}", "rate_hz must be a number > 0 (got 'yes')"),
+    ],
+)
+def test_a_mistake_is_reported_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "topics.yaml"
-    file.write_text("/a: {rate_hz: 0}\n/b: {rate: 3}\nc: {rate_hz: 1}\n/d: {rate_hz: yes}\n")
+    file.write_text(f"/fine: {{rate_hz: 1}}\n{text}\n")
     with pytest.raises(TopicTableError) as caught:
         read_topic_rates(file)
-    lines = str(caught.value).splitlines()
-    assert [int(line.split(":")[1]) for line in lines] == [1, 2, 2, 3, 4]
-    assert "rate_hz must be a number > 0 (got 0)" in lines[0] and "unknown key 'rate'" in lines[1]
+    assert f"{file}:2: " in str(caught.value) and message in str(caught.value)
 
 
 def test_commands_of_an_operator_who_commands_nothing_are_not_too_slow() -> None:

@@ -15,7 +15,7 @@ from instant_ic.bag.recorder import BagRecorderConfig, Recorder
 from instant_ic.bag.recover import recover, reindex
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bridge.host_keys import KeyStore
-from instant_ic.launch.outlet import LogFile
+from instant_ic.launch.outlet import NodeLog
 from instant_ic.msg import Bool, serialize
 from instant_ic.util import private
 
@@ -106,10 +106,10 @@ def test_an_existing_folder_keeps_its_mode_and_the_files_in_it_are_private(tmp_p
 
 def test_log_files_of_the_launcher_are_private_and_so_are_those_of_an_older_version(tmp_path):
     folder = tmp_path / "log"
-    LogFile(folder / "early.log", pytest.fail).write(b"line\n")
+    NodeLog(folder / "early.log", pytest.fail).write(b"line\n")
     old = folder / "old.log"
     old.write_text("before\n")
-    log = LogFile(old, pytest.fail)  # becomes old.log.1
+    log = NodeLog(old, pytest.fail)  # becomes old.log.1
     log.write(b"line\n")
     log.close()
     old.chmod(0o644)

@@ -6,10 +6,13 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
 from instant_ic.cli.arguments import launch_values, verb
+
+if TYPE_CHECKING:
+    from instant_ic.launch import LaunchArgument
 
 
 def add_parser(subparsers: Any) -> None:
@@ -51,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
     file = find_launch_file(args.file)
     if args.show_args:
-        _show(file.name, read_arguments(file), read_arguments(file, included=True))
+        _show(file.name, read_arguments(file))
         return 0
     values = launch_values(args.arguments)
     run_dir = (args.run_dir or paths.run_dir()).absolute()
@@ -89,17 +92,12 @@ def _pace(word: str) -> float | None:
         raise argparse.ArgumentTypeError(f"must be a number or auto (got {word!r})") from None
 
 
-def _show(name: str, arguments: Sequence[Any], included: Sequence[Any]) -> None:
+def _show(name: str, arguments: Sequence[LaunchArgument]) -> None:
     print(f"arguments of {name}:")
     if not arguments:
         print("  none")
     for argument in arguments:
-        kind = " | ".join(argument.choices) if argument.choices else argument.type
         default = "required" if argument.default is None else f"default: {argument.default!r}"
-        print(f"  {argument.name}: {kind} ({default})")
+        print(f"  {argument.name}: {argument.type} ({default})")
         if argument.description:
             print(f"      {argument.description}")
-    for file in dict.fromkeys(argument.file for argument in included):
-        left = ", ".join(f"{a.name} {a.default!r}" for a in included if a.file == file and a.default is not None)
-        if left:
-            print(f"the included {file.name} keeps its own defaults of: {left}")
