@@ -81,7 +81,7 @@ class LaunchDescription:
 
     @property
     def simulated(self) -> bool:
-        """Whether the devices are simulated, so that the stack's time need not be the machine's."""
+        """True if the devices are simulated, so that the stack's time need not be the machine's."""
         return any(node.exec == "simulator" for node in self.nodes)
 
     def run_dirs(self, run_dir: Path) -> list[Path]:

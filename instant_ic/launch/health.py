@@ -41,7 +41,7 @@ MILESTONES: tuple[tuple[str, str, str], ...] = (
     ("map", "grid_slam", "/pose"),  # the map itself is published only when it changes
     ("first depth image", "depth_scaler", "/depth/scaled"),
 )
-"""What an operator waits for at start-up: label, node, and the topic whose messages show that it works."""
+"""Steps of the start that an operator waits for: label, node, and the topic whose messages show that it works."""
 
 
 @dataclass(frozen=True)

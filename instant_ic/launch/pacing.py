@@ -1,4 +1,4 @@
-"""Chooses the pace of a simulated stack (:mod:`instant_ic.util.pace`) by what the machine can do."""
+"""Choice of the pace of a simulated stack (:mod:`instant_ic.util.pace`) by what the machine can do."""
 
 from __future__ import annotations
 

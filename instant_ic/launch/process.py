@@ -145,12 +145,12 @@ class ManagedProcess:
 
     @property
     def flooding(self) -> bool:
-        """Whether some of its output is being dropped."""
+        """True while some of its output is being dropped."""
         return self._dropped_bytes > 0
 
     @property
     def ending(self) -> bool:
-        """Whether it is being ended."""
+        """True while it is being ended."""
         return self._ending is not None
 
     def start(self) -> None:

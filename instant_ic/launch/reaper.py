@@ -18,7 +18,7 @@ _LONGEST_S = 3.0
 
 
 def marked(mark: str) -> "list[int]":
-    """Processes that carry a mark. Other users' processes are not readable, and cannot belong to this stack."""
+    """Return the processes that carry a mark; other users' are not readable, and cannot belong to this stack."""
     wanted = mark.encode()
     found = []
     for name in os.listdir("/proc"):  # noqa: PTH208 - pathlib would stat each of them

@@ -20,6 +20,7 @@ def stack_lock(run_dir: Path, label: str) -> Iterator[None]:
     """Hold the lock while a stack runs; the kernel releases it when the launcher dies, however it dies.
 
     Args:
+        run_dir: the run directory.
         label: shown to a second stack that tries to start.
 
     Raises:

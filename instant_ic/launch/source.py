@@ -48,12 +48,12 @@ class YamlPlace:
 
     @property
     def is_single(self) -> bool:
-        """Whether it is neither a list nor a mapping."""
+        """True if it is neither a list nor a mapping."""
         return isinstance(self.node, yaml.ScalarNode)
 
     @property
     def is_quoted(self) -> bool:
-        """Whether it is quoted or block text, which is never a number or a boolean."""
+        """True if it is quoted or block text, which is never a number or a boolean."""
         return isinstance(self.node, yaml.ScalarNode) and bool(self.node.style)
 
     def problem(self, text: str) -> LaunchProblem:

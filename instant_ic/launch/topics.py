@@ -36,17 +36,18 @@ class TopicRate:
     when: str = ""
 
     def alive(self, age_s: float) -> bool:
-        """Whether the newest message is recent enough; age inf: there was none."""
+        """Return whether the newest message is recent enough; its age is inf before the first."""
         return age_s * self.rate_hz < ALIVE_PERIODS
 
     def freq_ok(self, rate_hz: float) -> bool:
-        """Whether a measured rate is close enough to the nominal one."""
+        """Return whether a measured rate is close enough to the nominal one."""
         return rate_hz > FREQ_OK_SHARE * self.rate_hz
 
     def fault(self, rate_hz: float, age_s: float) -> str:
-        """Description of the fault, with the numbers; empty if there is none.
+        """Return a description of the fault, with the numbers; empty if there is none.
 
         Args:
+            rate_hz: measured rate.
             age_s: age of the newest message; inf before the first.
         """
         if not self.alive(age_s):
@@ -59,7 +60,7 @@ class TopicRate:
 
 
 def read_topic_rates(file: Path) -> dict[str, TopicRate]:
-    """Read a table of rates: topic → expected rate.
+    """Read a table of rates: topic to expected rate.
 
     Raises:
         TopicTableError: the first mistake: an unreadable file, an unknown key, or a rate that is not a number > 0.
@@ -85,7 +86,7 @@ def _topic_rate(topic: str, entry: YamlPlace) -> TopicRate:
 
 @functools.cache
 def topic_rates() -> dict[str, TopicRate]:
-    """The shipped table, ``config/topics.yaml``; read once.
+    """Return the shipped table, ``config/topics.yaml``; it is read once.
 
     Raises:
         TopicTableError: see :func:`read_topic_rates`.
@@ -94,7 +95,7 @@ def topic_rates() -> dict[str, TopicRate]:
 
 
 def nominal_rate(topic: str, namespace: str = "") -> TopicRate | None:
-    """Expected rate of a topic, or None if the table does not have it.
+    """Return the expected rate of a topic, or None if the table does not have it.
 
     Args:
         topic: full name, ``/left/scan``.
