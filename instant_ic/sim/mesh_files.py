@@ -1,4 +1,4 @@
-"""Worlds from mesh files (GLB, glTF, OBJ and other formats that trimesh reads)."""
+"""Worlds from mesh files (GLB, glTF, PLY, OBJ)."""
 
 from pathlib import Path
 from typing import Any
@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic.geometry.mesh_parts import is_y_up, mesh_parts
+from instant_ic.geometry.mesh_file import load_parts
 from instant_ic.sim.lighting import bake_mesh
 from instant_ic.sim.textures import srgb_to_linear, texture_set
 from instant_ic.sim.world import World
 
 
 def _linear(image: Any) -> npt.NDArray[np.float32]:
-    """Linear light (H, W, 3) of a PIL image."""
+    """Convert a PIL image to linear light, (H, W, 3)."""
     return srgb_to_linear(np.asarray(image.convert("RGB"), np.float32) / 255.0)
 
 
 def _affine_uv(triangles: npt.NDArray[np.float64], uv: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Affine maps (F, 2, 4) from points on triangles (F, 3, 3) to their texture coordinates (F, 3, 2)."""
+    """Return the affine maps (F, 2, 4) from points on triangles (F, 3, 3) to their texture coordinates (F, 3, 2)."""
     edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=1)
     change = np.stack([uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]], axis=1)
     gram = np.einsum("nij,nkj->nik", edges, edges)
@@ -31,7 +31,7 @@ def _affine_uv(triangles: npt.NDArray[np.float64], uv: npt.NDArray[np.float64]) 
 
 
 def _spawn(world: World) -> tuple[float, float, float]:
-    """Centre of the largest free area of the floor plan that has a floor and something overhead."""
+    """Return the centre of the largest free area of the floor plan that has a floor and something overhead."""
     mask = world.occupied(0.05, 1.9, 0.05)
     clearance = mask.distance_m()
     candidates = np.argwhere(clearance > 0.3)
@@ -56,31 +56,21 @@ def load_world(path: str | Path) -> World:
     Raises:
         ValueError: the file cannot be read or has no triangles.
     """
-    import trimesh
-
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"world {path}: no such file")
-    try:
-        scene = trimesh.load_scene(str(path))
-    except Exception as error:
-        raise ValueError(f"world {path}: trimesh cannot read it ({error})") from error
     sources: list[str | npt.NDArray[np.floating]] = []
     known: dict[int, int] = {}
-    parts: list[dict[str, npt.NDArray[Any]]] = []
-    for part in mesh_parts(scene, is_y_up(path)):
-        if part.image is None or part.corner_uv is None:
-            key, corner_uv = -1, np.zeros((*part.faces.shape, 2))
-        else:
-            key, corner_uv = id(part.image), part.corner_uv.astype(float)
+    arrays: list[dict[str, npt.NDArray[Any]]] = []
+    parts = load_parts(path)
+    for part in parts:
+        key = -1 if part.image is None else id(part.image)
+        corner_uv = np.zeros((*part.faces.shape, 2)) if part.corner_uv is None else part.corner_uv.astype(float)
         if key not in known:
             known[key] = len(sources)
-            sources.append(np.ones((1, 1, 3), np.float32) if key == -1 else _linear(part.image))
+            sources.append(np.ones((1, 1, 3), np.float32) if part.image is None else _linear(part.image))
         colour = part.factor
         if colour is None:
             colour = np.full(3, 0.7 if getattr(part.visual, "material", None) is None else 1.0)
         triangles = part.vertices[part.faces]
-        parts.append(
+        arrays.append(
             {
                 "triangles": triangles,
                 "uv": _affine_uv(triangles, corner_uv),
@@ -88,9 +78,14 @@ def load_world(path: str | Path) -> World:
                 "tint": np.repeat(colour[None].astype(np.float32), len(triangles), axis=0),
             }
         )
-    if not parts:
-        raise ValueError(f"world {path}: the file has no triangles")
-    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    world = _world(Path(path).name, {key: np.concatenate([part[key] for part in arrays]) for key in arrays[0]}, sources)
+    world.spawn = _spawn(world)
+    bake_mesh(world)
+    return world
+
+
+def _world(name: str, joined: dict[str, npt.NDArray[Any]], sources: list[str | npt.NDArray[np.floating]]) -> World:
+    """Build a world without light from the arrays of its triangles, leaving out those without an area."""
     cross = np.cross(
         joined["triangles"][:, 1] - joined["triangles"][:, 0], joined["triangles"][:, 2] - joined["triangles"][:, 0]
     )
@@ -100,8 +95,8 @@ def load_world(path: str | Path) -> World:
     normal = cross[keep] / twice_area[keep, None]
     triangles = joined["triangles"]
     count = len(triangles)
-    world = World(
-        name=path.name,
+    return World(
+        name=name,
         vertices=triangles.reshape(-1, 3).astype(np.float32),
         faces=np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
         face_surface=np.arange(count, dtype=np.int32),
@@ -118,6 +113,3 @@ def load_world(path: str | Path) -> World:
         light=np.ones((1, 3), np.float32),
         two_sided=True,
     )
-    world.spawn = _spawn(world)
-    bake_mesh(world)
-    return world

@@ -1,5 +1,6 @@
 """Virtual space: hash-grid radiance field from a panorama with depth (needs numpy; numba or torch to compute)."""
 
+from instant_ic.geometry.mesh_file import MeshError
 from instant_ic.vspace.config import (
     FieldConfig,
     GeometryConfig,
@@ -8,7 +9,6 @@ from instant_ic.vspace.config import (
     TrainConfig,
     VirtualSpaceConfig,
 )
-from instant_ic.vspace.mesh_file import MeshError
 from instant_ic.vspace.mesh_space import MeshSpace, Space, make_space
 from instant_ic.vspace.prior import KeyframeError
 from instant_ic.vspace.saved import SpaceFileError

@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.mesh_file import MeshError
 from instant_ic.util.limits import decode_image, load_image
 from instant_ic.vspace.config import VirtualSpaceConfig
 from instant_ic.vspace.devices import is_device_fault
 from instant_ic.vspace.layers import Layers, encode
-from instant_ic.vspace.mesh_file import MeshError
 from instant_ic.vspace.mesh_space import Space, make_space
 from instant_ic.vspace.prior import KeyframeError
 from instant_ic.vspace.space import SpaceStatus, VirtualSpace

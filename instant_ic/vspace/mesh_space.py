@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.image_quality import psnr_of_mse
+from instant_ic.geometry.mesh_file import MeshError
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.raycast import RayCaster
 from instant_ic.vspace.config import VirtualSpaceConfig
-from instant_ic.vspace.mesh_file import MeshError, load_mesh
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import KeyframeError, area_average
 from instant_ic.vspace.readiness import UNSEEN_GAIN, Texture
+from instant_ic.vspace.scanned_mesh import load_mesh
 from instant_ic.vspace.space import SpaceState, SpaceStatus, TrainStats, VirtualSpace
 from instant_ic.vspace.view import RayRenderer, View, checked_pose, continue_unseen, equirect_rays, perspective_rays
 

@@ -915,14 +915,14 @@ def _meshes() -> list[bytes]:
 
 
 def _parse_mesh() -> Callable[[bytes], object]:
-    from instant_ic.vspace.mesh_file import load_mesh
+    from instant_ic.vspace.scanned_mesh import load_mesh
 
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)
     return _by_file("mesh.glb", lambda path: load_mesh(path, 100_000))
 
 
 def _mesh_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.vspace.mesh_file import MeshError
+    from instant_ic.geometry.mesh_file import MeshError
 
     return (MeshError,)
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from instant_ic.experiments import box_room
+from instant_ic.geometry.mesh_file import MeshError
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace import KeyframeError, SpaceState, VirtualSpaceConfig
-from instant_ic.vspace.mesh_file import MeshError, load_mesh
 from instant_ic.vspace.mesh_space import MeshSpace, make_space
+from instant_ic.vspace.scanned_mesh import load_mesh
 from instant_ic.vspace.space import VirtualSpace
 
 trimesh = pytest.importorskip("trimesh")
@@ -225,7 +226,7 @@ def damaged(folder, name, content):
         (lambda d: damaged(d, "a.glb", b"glTF\x02\x00\x00\x00 not really"), "damaged"),
         (lambda d: damaged(d, "a.ply", b"ply\nformat ascii 1.0\nelement vertex 3\n"), "damaged|no triangles"),
         (lambda d: damaged(d, "a.obj", b""), "damaged|no triangles"),
-        (lambda d: damaged(d, "a.stl", b"solid"), "is not read; use one of .glb"),
+        (lambda d: damaged(d, "a.stl", b"solid"), "is not read. Use one of .glb"),
         (lambda d: damaged(d, "b.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"), "no triangles with an area"),
         (lambda d: damaged(d, "n.obj", b"v nan 0 0\nv 1 0 0\nv 2 1 0\nf 1 2 3\n"), "no triangles with an area"),
     ],
@@ -239,9 +240,9 @@ def test_files_that_are_no_good_say_why(tmp_path, make, words):
 
 def test_a_mesh_too_large_is_refused(tmp_path, monkeypatch):
     path = wall_file(tmp_path)
-    with pytest.raises(MeshError, match=r"2 triangles, space\.mesh_max_triangles is 1"):
+    with pytest.raises(MeshError, match=r"2 triangles, the limit is 1"):
         load_mesh(path, max_triangles=1)
-    monkeypatch.setattr("instant_ic.vspace.mesh_file.MAX_FILE_BYTES", 10)
+    monkeypatch.setattr("instant_ic.geometry.mesh_file.MAX_FILE_BYTES", 10)
     with pytest.raises(MeshError, match="GiB"):
         load_mesh(path)
 
