@@ -1,4 +1,4 @@
-"""V.C, Figs. 6 and 8: what depth, scaling, keyframes and fill contribute, beside the paper's own choices."""
+"""V.C, Figs. 6 and 8: contributions of depth, scaling and fill, beside the paper's own choices."""
 
 from __future__ import annotations
 
@@ -22,21 +22,18 @@ from instant_ic.experiments.report import Answer, Part, Section, Table, Text
 from instant_ic.experiments.vspace_sources import SOURCES
 
 measure = measure_views
-_OURS = (
-    *("ours", "older", "no-scale", "no-depth", "depth-warp", "point-warp", "panorama", "true-depth", "exact-fill"),
-    "slam-pose",
-)
+_OURS = ("ours", "no-scale", "no-depth", "depth-warp", "panorama", "true-depth", "exact-fill", "slam-pose")
 _PAPER = ("paper", "paper-no-scale", "no-depth", "ours", "depth-warp", "panorama", "true-depth", "slam-pose")
 
 
 def units(options: Options) -> list[Unit]:
-    """Straight ahead, as in the paper."""
+    """Return units along a straight path, as in the paper."""
     sources = _PAPER if options.method == "paper" else (*_OURS, "paper", "paper-no-scale")
     return view_units("ablation", options, sources, (WORLD,) if options.quick else (WORLD, "random"), ("straight",))
 
 
 def section(results: Sequence[Result], options: Options) -> Section:
-    """Curves, tables, and each source's mean difference from ours."""
+    """Return curves, tables, and each source's mean over all distances."""
     command = command_of(options, "ablation")
     parts: list[Part] = [
         Table("Sources", ("source", "what it is"), [[name, SOURCES[name]] for name in (*_OURS, *_PAPER[:2])]),
@@ -74,7 +71,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
 
 
 def _answer(results: Sequence[Result], better: str, worse: str) -> Answer:
-    """Whether a source is above another in PSNR and SSIM in the mean from 0.5 to 2 m."""
+    """Return whether a source is above another in PSNR and SSIM in the mean from 0.5 to 2 m."""
     pairs = [(near_mean(results, better, key), near_mean(results, worse, key)) for key in ("psnr_db", "ssim")]
     gains = [ours - theirs for ours, theirs in pairs if ours is not None and theirs is not None]
     if len(gains) < 2:
@@ -83,7 +80,7 @@ def _answer(results: Sequence[Result], better: str, worse: str) -> Answer:
 
 
 def _means(results: Sequence[Result], name: str, key: str) -> dict[str, list[float]]:
-    """Source → mean over the distances above 0, one for each seed."""
+    """Return the mean of each source over the distances above 0, one for each seed."""
     found: dict[str, list[float]] = {}
     for one in results:
         path = "recorded" if "bag" in one.unit.arguments else "straight"

@@ -1,4 +1,4 @@
-"""What the experiments on views share: units, rows by source and distance, curves, tables and image strips."""
+"""Shared parts of the experiments on views: units, rows by source and distance, curves, tables and image strips."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from instant_ic.experiments import recorded
 from instant_ic.experiments.lab import WORLD, Options, Result, Unit, kind_of
 from instant_ic.experiments.plots import Series, curves_svg, image_strip, jpeg
+from instant_ic.experiments.recorded import count_keyframes
 from instant_ic.experiments.report import Figure, Part, Table, image_address
-from instant_ic.experiments.vspace import compare
-from instant_ic.experiments.vspace_sources import PATHS, VspaceSettings
+from instant_ic.experiments.vspace import compare, compare_recorded
+from instant_ic.experiments.vspace_sources import PATHS, RECORDED, VspaceSettings
 
 TABLE_M = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """Distances of the tables."""
-UNSHOWN = ("fill", "slam-pose", "still")
+UNSHOWN = ("fill", "slam-pose")
 """Sources left out of the strips: they look like others."""
 LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
 _TILE_PX = 240
-_COST_S = {"survey": 16.0, "tripod": 12.0, "mobile": 5.0, "phone": 3.0}
-_TRAINED = ("no-depth", "paper", "paper-no-scale")
+_COST_S = {"tripod": 12.0, "phone": 3.0, "no-depth": 8.0, "paper": 8.0, "paper-no-scale": 8.0}
+"""Expected CPU seconds of a source; others take one."""
 _BASE_COST_S = 7.0
 
 
@@ -37,7 +37,17 @@ def view_units(
     keep_images: bool = True,
     **settings: Any,
 ) -> list[Unit]:
-    """A unit for each world and seed; ``settings`` are further ones of ``VspaceSettings``."""
+    """Return a unit for each world and seed, or for some keyframes of a recording.
+
+    Args:
+        experiment: name of the experiment.
+        options: choice of what to measure.
+        sources: sources of views.
+        worlds: worlds if the options name none.
+        paths: paths of ``PATHS``.
+        keep_images: the first of each kind of world keeps images.
+        settings: further values of ``VspaceSettings``.
+    """
     common: dict[str, Any] = {
         "method": options.method,
         "sources": list(sources),
@@ -49,38 +59,34 @@ def view_units(
         "reach_m": 2.0 if options.quick else 4.0,
         **settings,
     }
-    cost_s = _BASE_COST_S + sum(
-        _COST_S.get(name, 1.0) + (common["seconds"] if name in _TRAINED else 0.0) for name in sources
-    )
-    if options.quick:
-        cost_s *= 0.4
+    cost_s = (_BASE_COST_S + sum(_COST_S.get(name, 1.0) for name in sources)) * (0.4 if options.quick else 1.0)
     if options.bag is not None:
         common |= {"bag": str(options.bag), "paths": ["straight"], "seed": 0}
-        common["sources"] = [name for name in sources if name in recorded.SOURCES]
-        count = recorded.count_keyframes(options.bag) - 1
+        common["sources"] = [name for name in sources if name in RECORDED]
+        count = count_keyframes(options.bag) - 1
         chosen = sorted({round(at) for at in np.linspace(0, count - 1, min(options.seeds, count))})
-        shown_first = {k: keep_images and k == chosen[0] for k in chosen}
-        return [Unit(experiment, {**common, "number": k, "images": shown_first[k]}, cost_s) for k in chosen]
+        return [
+            Unit(experiment, {**common, "number": number, "images": keep_images and number == chosen[0]}, cost_s)
+            for number in chosen
+        ]
     cases = options.cases(worlds)
     shown = {kind_of(world): (world, seed) for world, seed in reversed(cases)}  # the first of each kind
-    return [
-        Unit(
-            experiment,
-            {
-                "world": world,
-                "seed": _number(world, seed),
-                "start_seed": seed,
-                **common,
-                "images": keep_images and shown[kind_of(world)] == (world, seed),
-            },
-            cost_s,
-        )
-        for world, seed in cases
-    ]
+    units = []
+    for world, seed in cases:
+        images = keep_images and shown[kind_of(world)] == (world, seed)
+        own = {"world": world, "seed": _seed_of(world, seed), "start_seed": seed, **common, "images": images}
+        units.append(Unit(experiment, own, cost_s))
+    return units
+
+
+def _seed_of(world: str, start_seed: int) -> int:
+    """Return the seed in a world's name, or that of its start."""
+    own = world.partition(":")[2]
+    return int(own) if own.isdigit() else start_seed
 
 
 def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Compare the sources in one world; the rows, and one image strip a path for the first of each kind of world."""
+    """Compare the sources in one world; return the rows, and an image strip for each path if images are kept."""
     given: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in arguments.items()
@@ -88,7 +94,7 @@ def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
     }
     settings = VspaceSettings(**given)
     if "bag" in arguments:
-        comparison = recorded.compare_recorded(Path(arguments["bag"]), settings, arguments["number"])
+        comparison = compare_recorded(Path(arguments["bag"]), settings, arguments["number"])
     else:
         comparison = compare(arguments["world"], settings)
     images = {}
@@ -98,7 +104,6 @@ def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
         rows = [(f"{at:g} m", [strip[at][name] for name in columns]) for at in sorted(strip)]
         images[path] = image_address(jpeg(image_strip(columns, rows, _TILE_PX)))
     return {
-        "start": list(comparison.start),
         "depth": comparison.depth,
         "slam_error_m": comparison.slam_error_m,
         "rows": [asdict(row) for row in comparison.rows],
@@ -107,20 +112,20 @@ def measure_views(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def family(result: Result) -> str:
-    """World without its seed, or the recording: results of one family are averaged."""
+    """Return the world without its seed, or the recording; results of one family are averaged."""
     given = result.unit.arguments
     return str(given["bag"]) if "bag" in given else kind_of(given["world"])
 
 
 def rows(results: Sequence[Result], of_family: str, path: str) -> Iterator[dict[str, Any]]:
-    """All rows of a family of worlds along a path."""
+    """Yield all rows of a family of worlds along a path."""
     for result in results:
         if family(result) == of_family:
             yield from (row for row in result.data.get("rows", ()) if row["path"] == path)
 
 
 def series(results: Sequence[Result], of_family: str, path: str, key: str) -> Series:
-    """Source → distance → values over the seeds."""
+    """Return values over the seeds, by source and distance."""
     found: Series = {}
     for row in rows(results, of_family, path):
         found.setdefault(row["source"], {}).setdefault(row["distance_m"], []).append(row[key])
@@ -128,7 +133,7 @@ def series(results: Sequence[Result], of_family: str, path: str, key: str) -> Se
 
 
 def curves_and_tables(results: Sequence[Result], command: str) -> list[Part]:
-    """For each family of worlds: curves, a table of PSNR and SSIM a path, and the strips."""
+    """Return curves, tables of PSNR and SSIM for each path, and image strips of each family of worlds."""
     parts: list[Part] = []
     for name in dict.fromkeys(family(one) for one in results if one.data):
         paths = [path for path in (*PATHS, "recorded") if any(True for _ in rows(results, name, path))]
@@ -150,13 +155,13 @@ def curves_and_tables(results: Sequence[Result], command: str) -> list[Part]:
 
 
 def of_the_paper(results: Sequence[Result]) -> list[Result]:
-    """Results in corridors, the paper's kind of place; all results where there are none."""
+    """Return the results in corridors, the paper's kind of place, or all results if there are none."""
     done = [one for one in results if one.data]
     return [one for one in done if family(one) == WORLD] or done
 
 
 def near_mean(results: Sequence[Result], source: str, key: str = "psnr_db") -> float | None:
-    """Mean of a source over all paths from 0.5 to 2 m; None without any."""
+    """Return the mean of a source over all paths from 0.5 to 2 m, or None if it has no views there."""
     found = [
         row[key]
         for one in results
@@ -167,7 +172,7 @@ def near_mean(results: Sequence[Result], source: str, key: str = "psnr_db") -> f
 
 
 def command_of(options: Options, experiment: str) -> str:
-    """The command that measures again what a section shows."""
+    """Return the command that measures a section again."""
     quick = " --quick" if options.quick else f" --seeds {options.seeds}"
     method = "" if options.method == "ours" else f" --method {options.method}"
     size = "" if options.size is None else f" --size {options.size[0]}x{options.size[1]}"
@@ -183,9 +188,3 @@ def _table(caption: str, found: Series, command: str) -> Table:
     distances = [at for at in TABLE_M if any(at in values for values in found.values())]
     lines = [[source, *(values.get(at, []) for at in distances)] for source, values in found.items()]
     return Table(caption, ["source", *(f"{at:g} m" for at in distances)], lines, command)
-
-
-def _number(world: str, seed: int) -> int:
-    """Seed of a world by its name, else the given one."""
-    own = world.partition(":")[2]
-    return int(own) if own.isdigit() else seed

@@ -1,4 +1,4 @@
-"""V.F, Fig. 11: many kinds of places, and what each loses to depth, unseen places, the pose and people who move."""
+"""V.F, Fig. 11: many kinds of places, and the losses of each by depth, unseen places and the pose."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from instant_ic.vspace.config import ReadinessConfig
 
 measure = measure_views
 FIT_DB = ReadinessConfig().psnr_db
-"""A view below this fails: the stack regards a virtual space as fit to show from here on."""
-LOSSES = ("depth", "unseen", "pose", "motion")
+"""PSNR from which the stack regards a virtual space as fit to show; a place below it fails."""
+LOSSES = ("depth", "unseen", "pose")
 NAMES = {
     WORLD: "corridor with side rooms",
     "random": "random interior",
@@ -24,110 +24,65 @@ NAMES = {
     **KINDS,
 }
 _HARD = ("hall", "windows", "crossing")
-"""The paper: these do not always work."""
+"""Places that do not always work in the paper."""
 _LEAST_DB = 0.3
 """A loss below this is no reason."""
 
 
 def units(options: Options) -> list[Unit]:
-    """All kinds of worlds, and the meshes; a recording instead."""
-    sources = (options.method, "fill", "true-depth", "exact-fill", "slam-pose", "still", "panorama")
-    worlds = (WORLD, "windows", "people") if options.quick else (WORLD, "long", *KINDS)
+    """Return units of all kinds of worlds and the meshes, or of a recording."""
+    sources = (options.method, "fill", "true-depth", "exact-fill", "slam-pose", "panorama")
+    worlds = (WORLD, "windows") if options.quick else (WORLD, "long", *KINDS)
     return view_units("environments", options, sources, (*worlds, *options.meshes), reach_m=2.0, step_m=0.5)
 
 
 def losses(one: Result, method: str) -> dict[str, float | None]:
-    """What a place loses from 0.5 to 2 m, dB, by reason; None where it cannot be known.
+    """Return the losses of a place from 0.5 to 2 m in dB, by reason; None where one cannot be known.
 
-    ``unseen``: what the truth gains where no keyframe has seen the place. ``depth``: what true depth gains beyond that.
-    ``pose``: what the poses of SLAM lose. ``motion``: what a world gains in which nobody has moved.
+    ``unseen``: gain of the truth where the keyframe has not seen the place. ``depth``: gain of true depth beyond that.
+    ``pose``: loss by the poses of SLAM.
     """
-    mean = {
-        name: near_mean([one], source)
-        for name, source in (
-            ("shown", method), ("fill", "fill"), ("exact", "exact-fill"), ("slam", "slam-pose"), ("still", "still"),
-        )
-    }  # fmt: skip
-
-    def gain(better: str, worse: str) -> float | None:
-        a, b = mean[better], mean[worse]
-        return None if a is None or b is None else a - b
-
-    return {
-        "depth": gain("exact", "fill"),
-        "unseen": gain("fill", "shown"),
-        "pose": gain("shown", "slam"),
-        "motion": gain("still", "shown"),
-    }
+    pairs = {"depth": ("exact-fill", "fill"), "unseen": ("fill", method), "pose": (method, "slam-pose")}
+    found: dict[str, float | None] = {}
+    for name, sources in pairs.items():
+        better, worse = (near_mean([one], source) for source in sources)
+        found[name] = None if better is None or worse is None else better - worse
+    return found
 
 
 def reason(lost: dict[str, float | None]) -> str:
-    """The largest loss by its name; ``resolution`` where none counts."""
+    """Return the name of the largest loss, or ``resolution`` if none counts."""
     found = {name: value for name, value in lost.items() if value is not None and value >= _LEAST_DB}
     return max(found, key=lambda name: found[name]) if found else "resolution"
 
 
 def section(results: Sequence[Result], options: Options) -> Section:
-    """PSNR of each kind of place from 0.5 to 2 m, its losses, where it fails and why, the worst kind first."""
+    """Return PSNR of each kind of place from 0.5 to 2 m, its losses, and where and why it fails; the worst first."""
     command = command_of(options, "environments")
     done = [one for one in results if one.data and near_mean([one], options.method) is not None]
-    each: list[list[Any]] = []
-    kinds: list[list[Any]] = []
-    means: dict[str, list[float]] = {}
+    kinds, means = [], {}
     for name in dict.fromkeys(map(family, done)):
         own = [one for one in done if family(one) == name]
-        lost = [losses(one, options.method) for one in own]
-        shown = [near_mean([one], options.method) or 0.0 for one in own]
-        means[name] = shown
-        failed = [reason(losts) for psnr, losts in zip(shown, lost, strict=True) if psnr < FIT_DB]
-        reasons = Counter(failed or [reason(losts) for losts in lost])
-        kinds.append(
-            [
-                NAMES.get(name, name),
-                shown,
-                [near_mean([one], options.method, "ssim") for one in own],
-                f"{len(failed)} of {len(own)}",
-                ", ".join(f"{why} ({count})" for why, count in reasons.most_common()),
-                *([losts[key] for losts in lost] for key in LOSSES),
-                [near_mean([one], "panorama") for one in own],
-            ]
-        )
-        for one, psnr, losts in zip(own, shown, lost, strict=True):
-            depth = [known["mean_relative_error"] for known in one.data["depth"].values()]
-            slam = max(one.data.get("slam_error_m", {}).values(), default=None)
-            place = one.unit.arguments.get("number", one.unit.arguments.get("start_seed"))
-            label = one.unit.place if ":" in one.unit.place else f"{one.unit.place}, {place}"
-            each.append(
-                [label, psnr, *(losts[key] for key in LOSSES), depth[0] if depth else None, slam, reason(losts)]
-            )
+        means[name] = [near_mean([one], options.method) or 0.0 for one in own]
+        kinds.append(_kind_row(name, own, means[name], options.method))
     kinds.sort(key=lambda line: statistics.fmean(line[1]))
-    each.sort(key=lambda line: float(line[1]))
+    each = sorted((_place_row(one, options.method) for one in done), key=lambda line: float(line[1]))
     lost_columns = [f"{name}, dB" for name in LOSSES]
+    kind_columns = ("place", "PSNR, dB", "SSIM", "fails", "main reason (seeds)", *lost_columns, "panorama, dB")
+    place_columns = ("world", "PSNR, dB", *lost_columns, "depth error", "SLAM error, m", "main reason")
     parts: list[Part] = [
         Text(
             f"Mean PSNR from 0.5 to 2 m, straight and on a curve. A place fails below {FIT_DB:g} dB, the value from "
-            "which the stack regards a virtual space as fit to show. unseen: what the truth would gain where no "
-            "keyframe has seen the place. depth: what true depth would gain beyond that. pose: what the poses of SLAM "
-            "lose against true ones (the stack's SLAM with either method; the paper used GMapping; slipping tracks). "
-            "motion: what a world would gain in which nobody walks on after the panorama; the robot drives "
-            f"at 0.4 m/s. The reason is the largest loss; resolution where none reaches {_LEAST_DB:g} dB: what remains "
-            "is sharpness and looks that depend on the direction of view."
+            "which the stack regards a virtual space as fit to show. unseen: gain of the truth where the keyframe has "
+            "not seen the place. depth: gain of true depth beyond that. pose: loss by the poses of the stack's SLAM on "
+            "slipping tracks. The reason is the largest loss, or resolution where none reaches "
+            f"{_LEAST_DB:g} dB: sharpness, and looks that depend on the direction of view."
         ),
-        Table(
-            "Kinds of places, the worst first",
-            ("place", "PSNR, dB", "SSIM", "fails", "main reason (seeds)", *lost_columns, "panorama, dB"),
-            kinds,
-            command,
-        ),
-        Table(
-            "Each place, the worst first",
-            ("world", "PSNR, dB", *lost_columns, "depth error", "SLAM error, m", "main reason"),
-            each,
-            command,
-        ),
+        Table("Kinds of places, the worst first", kind_columns, kinds, command),
+        Table("Each place, the worst first", place_columns, each, command),
     ]
     if options.bag is not None:
-        parts.append(Text("A recording has no true depth, no true poses and no world without its people: unseen only."))
+        parts.append(Text("A recording has no true depth and no true poses: unseen only."))
     for one in results:
         for path, address in one.data.get("images", {}).items():
             parts.append(Figure(f"Views, {one.unit.place}, {path}", address, command, wide=True))
@@ -138,8 +93,32 @@ def section(results: Sequence[Result], options: Options) -> Section:
     return Section("Environments (V.F, Fig. 11)", parts, verdict, _answers(means))
 
 
+def _kind_row(name: str, own: Sequence[Result], shown: Sequence[float], method: str) -> list[Any]:
+    lost = [losses(one, method) for one in own]
+    failed = [reason(losts) for psnr, losts in zip(shown, lost, strict=True) if psnr < FIT_DB]
+    reasons = Counter(failed or map(reason, lost))
+    return [
+        NAMES.get(name, name),
+        shown,
+        [near_mean([one], method, "ssim") for one in own],
+        f"{len(failed)} of {len(own)}",
+        ", ".join(f"{why} ({count})" for why, count in reasons.most_common()),
+        *([losts[key] for losts in lost] for key in LOSSES),
+        [near_mean([one], "panorama") for one in own],
+    ]
+
+
+def _place_row(one: Result, method: str) -> list[Any]:
+    lost = losses(one, method)
+    place = one.unit.arguments.get("number", one.unit.arguments.get("start_seed"))
+    label = one.unit.place if ":" in one.unit.place else f"{one.unit.place}, {place}"
+    slam = max(one.data.get("slam_error_m", {}).values(), default=None)
+    depth = one.data["depth"].get("mean_relative_error")
+    return [label, near_mean([one], method), *(lost[key] for key in LOSSES), depth, slam, reason(lost)]
+
+
 def _answers(means: dict[str, list[float]]) -> dict[str, Answer]:
-    """The paper's claim: the corridor is shown well, and one of the hard kinds is worse."""
+    """Answer the paper's claim: the corridor is shown well, and one of the hard kinds is worse."""
     hard = {name: statistics.fmean(means[name]) for name in _HARD if name in means}
     if WORLD not in means or not hard:
         return {}

@@ -1,61 +1,37 @@
-"""Places of ``ic experiment environments`` (V.F) that the simulator has no world for: one kind each, and people."""
+"""Worlds of the experiments by name, and the paths of a camera through them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from instant_ic.experiments.illusion_truth import moved_by
+from instant_ic.geometry.poses import pose_matrix
 
 if TYPE_CHECKING:
     from instant_ic.sim.building import Building, Zone
-    from instant_ic.sim.world import World
+    from instant_ic.sim.worlds import World
 
 KINDS = {
     "hall": "open hall",
     "furnished": "furnished room",
     "crossing": "crossing corridors",
     "windows": "corridor with windows side by side",
-    "people": "corridor in which people walk",
 }
-"""Kinds of worlds, each with seeds (``hall:3``)."""
+"""Kinds of worlds beside those of the simulator, each with seeds (``hall:3``)."""
 GENERATED = ("corridor", "corridor-free", "random", "long", *KINDS)
 """Worlds that have seeds."""
-_PLANS = {"furnished": "room", "windows": "corridor", "people": "corridor"}
-_PEOPLE = (2, 4)
-_AHEAD_M = (1.5, 7.0)
-_PACE_M_S = (0.5, 1.4)
-_SHOULDER_M = 0.23
+_PLANS = {"furnished": "room", "windows": "corridor"}
+CAMERA_HEIGHT_M, LIDAR_HEIGHT_M = 1.2, 0.6
+CLEARANCE_M = 0.3
+_RADII_M = (2.5, 4.0, 6.0, 10.0, 16.0)
 
 
-@dataclass(frozen=True)
-class Walker:
-    """A person who walks along x between two ends and turns round there.
-
-    Attributes:
-        surfaces: first and last number + 1 of the person's surfaces in the world.
-        x: metres, at first.
-        pace: m/s along x, signed.
-        ends: lowest and highest x, metres.
-    """
-
-    surfaces: tuple[int, int]
-    x: float
-    pace: float
-    ends: tuple[float, float]
-
-    def moved_m(self, seconds: float) -> float:
-        """Displacement along x after some time."""
-        low, high = self.ends
-        length = high - low
-        at = (self.x - low + self.pace * seconds) % (2 * length)
-        return low + min(at, 2 * length - at) - self.x
-
-
-def make_place_world(name: str) -> tuple[World, tuple[Walker, ...]]:
-    """World of a kind of ``KINDS`` with its seed, or any of ``sim.worlds.make_world``, and who walks in it.
+def make_place_world(name: str) -> World:
+    """Make a world of ``KINDS`` with its seed, or any of ``sim.worlds.make_world``.
 
     Raises:
         ValueError: no such world.
@@ -64,22 +40,18 @@ def make_place_world(name: str) -> tuple[World, tuple[Walker, ...]]:
 
     kind, _, number = name.partition(":")
     if kind not in KINDS:
-        return make_world(name), ()
+        return make_world(name)
     if number and not number.isdigit():
         raise ValueError(f"world {name!r}: the seed must be an integer")
     rng = np.random.default_rng([97, list(KINDS).index(kind), int(number or 0)])
-    walkers: list[Walker] = []
 
     def fit_out(rng: np.random.Generator, building: Building, zone: Zone) -> None:
-        first = zone is building.zones[0]
-        if kind == "windows" and first:
+        if kind == "windows" and zone is building.zones[0]:
             glaze(rng, building, zone)
-            return
-        decorate(rng, building, zone)
-        if kind == "people" and first:
-            walkers.extend(add_people(rng, building, zone))
+        else:
+            decorate(rng, building, zone)
 
-    return interior(rng, name, _PLANS.get(kind, kind), fit_out), tuple(walkers)
+    return interior(rng, name, _PLANS.get(kind, kind), fit_out)
 
 
 def glaze(rng: np.random.Generator, building: Building, zone: Zone) -> None:
@@ -92,35 +64,55 @@ def glaze(rng: np.random.Generator, building: Building, zone: Zone) -> None:
                 building.window(zone, side, at, width, int(rng.integers(0, 12)), float(rng.uniform(1.2, 2.2)))
 
 
-def add_people(rng: np.random.Generator, building: Building, zone: Zone) -> list[Walker]:
-    """Add people on either side of a corridor's middle, ahead of the origin."""
-    from instant_ic.sim.world import Material
-    from instant_ic.sim.worlds import tint
+def path_poses(world: World, start: tuple[float, float, float], path: str, distances: Iterable[float]) -> list[Any]:
+    """Return camera poses (4, 4) at straight-line distances from the start, looking along the path.
 
-    found = []
-    aside = 0.5 * (zone.y1 - zone.y0) - _SHOULDER_M - 0.02
-    ends = zone.x0 + 0.5, zone.x1 - 0.5
-    for number in range(int(rng.integers(_PEOPLE[0], _PEOPLE[1] + 1))):
-        x = float(rng.uniform(_AHEAD_M[0], min(_AHEAD_M[1], ends[1])))
-        y = (-1) ** number * min(aside, float(rng.uniform(0.55, 0.9)))
-        begin = len(building.builder.panels)
-        cloth, legs = (Material("fabric", 0.5, tint(rng, 0.15)) for _ in range(2))
-        skin = Material("paint", 0.5, (0.75, 0.55, 0.42))
-        for size, low, look in (
-            ((0.24, 0.34, 0.85), 0.0, legs),
-            ((0.26, 2 * _SHOULDER_M, 0.6), 0.85, cloth),
-            ((0.2, 0.17, 0.26), 1.46, skin),
-        ):
-            building.builder.box((x, y), size, low, side=look)
-        pace = float(rng.uniform(*_PACE_M_S) * rng.choice([-1, 1]))
-        found.append(Walker((begin, len(building.builder.panels)), x, pace, ends))
-    return found
+    The path ends at an obstacle. ``curve`` is an arc: the tightest free one of the radii and sides tried, else the one
+    that reaches furthest.
+    """
+    mask = world.occupied(0.03, 1.9, 0.05)
+    clearance = mask.distance_m()
+
+    def free(pose: NDArray[np.float64]) -> bool:
+        row, column = mask.index(pose[None, :2, 3])[0]
+        inside = 0 <= row < clearance.shape[0] and 0 <= column < clearance.shape[1]
+        return bool(inside and clearance[row, column] >= CLEARANCE_M)
+
+    x, y, yaw = start
+    origin = pose_matrix(x, y, CAMERA_HEIGHT_M, yaw=yaw)
+    wanted = list(distances)
+
+    def along(curvature: float) -> list[Any]:
+        poses: list[Any] = []
+        for distance in wanted:
+            if curvature and abs(distance * curvature) >= 2:
+                break
+            turn = 2 * math.asin(distance * curvature / 2)
+            ahead = math.sin(turn) / curvature if curvature else distance
+            aside = (1 - math.cos(turn)) / curvature if curvature else 0.0
+            pose = origin @ pose_matrix(ahead, aside, yaw=turn)
+            if not free(pose):
+                break
+            poses.append(pose)
+        return poses
+
+    if path == "straight":
+        return along(0.0)
+    return max((along(side / radius) for radius in _RADII_M for side in (1, -1)), key=len)
 
 
-def world_after(world: World, walkers: tuple[Walker, ...], seconds: float) -> World:
-    """The world when its people have walked for some time."""
-    for walker in walkers:
-        surfaces = np.zeros(len(world.normal), bool)
-        surfaces[slice(*walker.surfaces)] = True
-        world = moved_by(world, surfaces, np.array([walker.moved_m(seconds), 0.0, 0.0]))
-    return world
+def start_pose(world: World, seed: int = 0) -> tuple[float, float, float]:
+    """Return the world's own start, or with a seed above 0 a random free one, facing the longest straight path.
+
+    Raises:
+        ValueError: the start is not free.
+    """
+    starts = [world.spawn]
+    if seed:
+        starts = [tuple(pose) for pose in world.sample_free_poses(np.random.default_rng([79, seed]), 4, 0.5).tolist()]
+    candidates = [(x, y, yaw + k * math.pi / 4) for x, y, yaw in starts for k in range(8)]
+    steps = np.arange(0, 4.01, 0.25)
+    best = max(candidates, key=lambda pose: len(path_poses(world, pose, "straight", steps)))
+    if not path_poses(world, best, "straight", [0.0]):
+        raise ValueError(f"the world's own start ({best[0]:g}, {best[1]:g}) is not free: choose another world")
+    return best

@@ -1,4 +1,4 @@
-"""V.A, Figs. 3, 4 and 7: one panorama's virtual space against conventional IC, by distance and scan quality."""
+"""V.A, Figs. 3, 4 and 7: the virtual space of one panorama against conventional IC of several scan qualities."""
 
 from __future__ import annotations
 
@@ -24,20 +24,19 @@ from instant_ic.experiments.vspace_sources import PATHS
 measure = measure_views
 _SCANS = ("mesh", *QUALITIES)
 _CLAIM_M = {"straight": 2.0, "curve": 1.0}
-"""The paper: instant IC is above in SSIM for about 2 m straight, and for 1 to 2 m on the curve."""
+"""Distances of the paper's claim: SSIM is above for about 2 m straight, and for 1 to 2 m on the curve."""
 _PAPERS_SCAN = "tripod"
 """The paper's scanner is a FARO Focus3D on a tripod."""
 
 
 def units(options: Options) -> list[Unit]:
-    """All sources in each world."""
-    scans = ("mesh", "tripod", "phone") if options.quick else _SCANS
+    """Return units with all sources in each world."""
     worlds = (WORLD,) if options.quick else (WORLD, "random")
-    return view_units("reconstruction", options, (options.method, *scans), worlds)
+    return view_units("reconstruction", options, (options.method, *_SCANS), worlds)
 
 
 def section(results: Sequence[Result], options: Options) -> Section:
-    """Curves, tables, and the distance up to which ours is above each scan."""
+    """Return curves, tables, and the distance up to which ours is above each scan."""
     command = command_of(options, "reconstruction")
     parts: list[Part] = [
         Text(
@@ -86,7 +85,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
 
 
 def _above(results: Sequence[Result], name: str, path: str, key: str, ours: str, scan: str) -> list[float]:
-    """Distance up to which ours is above a scan without a break, one for each seed."""
+    """Return the distance up to which ours is above a scan without a break, one for each seed."""
     found = []
     for one in results:
         values = series([one], name, path, key)

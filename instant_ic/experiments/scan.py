@@ -68,13 +68,11 @@ class ScanQuality:
 
 
 QUALITIES = {
-    "survey": ScanQuality(0.002, 0.003, 0.02, 0.03, 3.0, 4096, 0.05, 0.0),
     "tripod": ScanQuality(0.004, 0.01, 0.1, 0.04, 3.0, 4096, 0.12, 0.5),
-    "mobile": ScanQuality(0.01, 0.03, 0.4, 0.06, 3.0, 2048, 0.12, 0.5),
     "phone": ScanQuality(0.02, 0.06, 1.0, 0.08, 3.0, 1024, 0.15, 0.5),
 }
-"""``survey``: a tripod scanner with targets, on the same day. The others are a year older. ``tripod``: registered by
-its clouds alone; ``mobile``: a walked scanner; ``phone``: a telephone with a LiDAR."""
+"""Both scans are a year old. ``tripod``: a scanner registered by its clouds alone, as in the paper; ``phone``: a
+telephone with a LiDAR."""
 
 
 @dataclass(frozen=True)

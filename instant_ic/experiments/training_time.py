@@ -12,9 +12,8 @@ import numpy as np
 from instant_ic.experiments.compared import LABELS, command_of, family, view_units
 from instant_ic.experiments.lab import WORLD, Options, Result, Unit
 from instant_ic.experiments.plots import Series, curves_svg
-from instant_ic.experiments.recorded import converge_recorded
 from instant_ic.experiments.report import Answer, Figure, Part, Section, Table, Text
-from instant_ic.experiments.vspace import converge
+from instant_ic.experiments.vspace import converge, converge_recorded
 from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.vspace import VirtualSpaceConfig
 from instant_ic.vspace.devices import make_device

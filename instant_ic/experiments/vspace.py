@@ -1,22 +1,28 @@
-"""Reconstruction away from the panorama: PSNR and SSIM by distance and training time (paper, V.A-C, Figs. 3-6)."""
+"""Reconstruction away from the panorama: PSNR and SSIM by distance and training time (paper, V.A-C, Figs. 3-6).
+
+1. A keyframe is taken at the start (``take_shot``), or read from a recording (``read_keyframes``).
+2. True views come from the world along a path (``true_views``), or from later keyframes (``later_views``).
+3. Each source renders the same poses and is compared with the true views (``compare``, ``compare_recorded``).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.experiments.places import make_place_world, path_poses, start_pose
+from instant_ic.experiments.recorded import later_keyframes, read_keyframes
 from instant_ic.experiments.vspace_sources import (
-    CAMERA_HEIGHT_M,
-    FOV_RAD,
-    KEYFRAMES,
-    Drawer,
-    Picture,
+    FILLED,
     Place,
+    RenderView,
+    RgbImage,
     Shot,
     VspaceSettings,
     base_of,
@@ -30,23 +36,31 @@ from instant_ic.experiments.vspace_sources import (
 )
 from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix, relative2
+from instant_ic.sim.render import EquirectRenderer
+from instant_ic.sim.worlds import World, make_world
+from instant_ic.vspace import VirtualSpaceConfig
+from instant_ic.vspace.warm_up import warm_up
 
-if TYPE_CHECKING:
-    from instant_ic.sim.render import EquirectRenderer
-    from instant_ic.sim.worlds import World
-    from instant_ic.vspace import VirtualSpaceConfig
-
-CLEARANCE_M = 0.3
-_RADII_M = (2.5, 4.0, 6.0, 10.0, 16.0)
 STRIP_AT_M = (0.5, 1.0, 2.0, 3.0)
-FILLED = ("fill", "exact-fill")
-CRUISE_M_S = 0.4
-"""Speed of the robot, from which the time at each pose follows."""
+"""Distances of the views that are kept as images."""
+FOV_RAD = math.pi / 2
+"""Horizontal field of view of the views."""
+Pose = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Row:
-    """One image; ``seconds`` is the preparation time of its source, CPU seconds."""
+class ViewRow:
+    """Figures of one view.
+
+    Attributes:
+        path: path, or ``recorded``.
+        source: source of the view.
+        distance_m: distance from the panorama.
+        psnr_db: PSNR against the true view, at most 99.
+        ssim: SSIM against the true view.
+        seconds: CPU seconds of the source's preparation.
+        confidence: share of the image that the panorama has seen.
+    """
 
     path: str
     source: str
@@ -55,180 +69,157 @@ class Row:
     ssim: float
     seconds: float
     confidence: float
-    """Share of the image that a panorama has seen."""
+
+
+@dataclass(frozen=True)
+class TrueView:
+    """A true view: distance from the panorama, camera pose (4, 4), image, and the pose that SLAM estimates there."""
+
+    distance_m: float
+    pose: Pose
+    rgb: RgbImage
+    slam_pose: Pose | None = None
 
 
 @dataclass
 class Comparison:
-    """Result of ``compare``: the rows, and images by path, distance and source (``truth`` among the sources)."""
+    """Result of a comparison.
 
-    start: tuple[float, float, float]
+    Attributes:
+        depth: figures of the panorama's depth.
+        slam_error_m: largest position error of the SLAM along each path.
+        rows: figures of each view.
+        strips: images by path, distance and source, ``truth`` among the sources.
+    """
+
     depth: dict[str, Any] = field(default_factory=dict)
     slam_error_m: dict[str, float] = field(default_factory=dict)
-    """Largest position error of the SLAM along each path."""
-    rows: list[Row] = field(default_factory=list)
-    strips: dict[str, dict[float, dict[str, Picture]]] = field(default_factory=dict)
+    rows: list[ViewRow] = field(default_factory=list)
+    strips: dict[str, dict[float, dict[str, RgbImage]]] = field(default_factory=dict)
 
 
-def path_poses(world: World, start: tuple[float, float, float], path: str, distances: Iterable[float]) -> list[Any]:
-    """Camera poses (4, 4) at straight-line distances from the start, looking along the path; ends at an obstacle.
-
-    ``curve`` is an arc: the tightest free one of the radii and sides tried, else the one that reaches furthest.
-    Negative distances lie behind the start.
-    """
-    mask = world.occupied(0.03, 1.9, 0.05)
-    clearance = mask.distance_m()
-
-    def free(pose: NDArray[np.float64]) -> bool:
-        row, column = mask.index(pose[None, :2, 3])[0]
-        inside = 0 <= row < clearance.shape[0] and 0 <= column < clearance.shape[1]
-        return bool(inside and clearance[row, column] >= CLEARANCE_M)
-
-    x, y, yaw = start
-    origin = pose_matrix(x, y, CAMERA_HEIGHT_M, yaw=yaw)
-    wanted = list(distances)
-
-    def along(curvature: float) -> list[Any]:
-        poses: list[Any] = []
-        for distance in wanted:
-            if curvature and abs(distance * curvature) >= 2:
-                break
-            turn = 2 * math.asin(distance * curvature / 2)
-            ahead = math.sin(turn) / curvature if curvature else distance
-            aside = (1 - math.cos(turn)) / curvature if curvature else 0.0
-            pose = origin @ pose_matrix(ahead, aside, yaw=turn)
-            if not free(pose):
-                break
-            poses.append(pose)
-        return poses
-
-    if path == "straight":
-        return along(0.0)
-    return max((along(side / radius) for radius in _RADII_M for side in (1, -1)), key=len)
-
-
-def start_pose(world: World, seed: int = 0) -> tuple[float, float, float]:
-    """The world's own start; with a seed above 0 a random free one; rotated to the longest straight path.
-
-    Raises:
-        ValueError: the start is not free.
-    """
-    places = [world.spawn]
-    if seed:
-        places = [tuple(pose) for pose in world.sample_free_poses(np.random.default_rng([79, seed]), 4, 0.5).tolist()]
-    candidates = [(x, y, yaw + k * math.pi / 4) for x, y, yaw in places for k in range(8)]
-    steps = np.arange(0, 4.01, 0.25)
-    best = max(candidates, key=lambda pose: len(path_poses(world, pose, "straight", steps)))
-    if not path_poses(world, best, "straight", [0.0]):
-        raise ValueError(f"the world's own start ({best[0]:g}, {best[1]:g}) is not free: choose another world")
-    return best
-
-
-def make_place(world: str, settings: VspaceSettings, config: VirtualSpaceConfig | None = None) -> Place:
-    """Make what the sources need.
+def make_place(world: str, start_seed: int = 0) -> Place:
+    """Make a world, its renderer and its start.
 
     Raises:
         ValueError: no such world, or its start is not free.
     """
-    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-    from instant_ic.experiments.places import make_place_world
-    from instant_ic.sim.render import EquirectRenderer
-    from instant_ic.sim.worlds import make_world
-    from instant_ic.util import paths
-    from instant_ic.vspace import VirtualSpaceConfig
-    from instant_ic.vspace.warm_up import warm_up
-
-    made, walkers = make_place_world(world)
-    config = config or VirtualSpaceConfig(source="auto", panorama_width=settings.panorama_width)
-    warm_up(config)
-    model = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1)
-    # When the place was scanned, the obstacle was not there yet.
-    before = (
-        made if world.partition(":")[0] != "corridor" else make_world(world.replace("corridor", "corridor-free", 1))
-    )
-    start = start_pose(made, settings.start_seed)
-    return Place(made, before, EquirectRenderer(made), start, config, model, walkers)
+    made = before = make_place_world(world)
+    if world.partition(":")[0] == "corridor":  # the obstacle was not there when the place was scanned
+        before = make_world(world.replace("corridor", "corridor-free", 1))
+    return Place(made, before, EquirectRenderer(made), start_pose(made, start_seed))
 
 
-def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
-    """PSNR (dB, at most 99) and SSIM of two images (H, W, 3) uint8."""
-    return min(psnr_db(picture, truth), 99.0), ssim(picture, truth)
+def default_config(settings: VspaceSettings) -> VirtualSpaceConfig:
+    """Return the configuration of the virtual space."""
+    return VirtualSpaceConfig(source="auto", panorama_width=settings.panorama_width)
+
+
+def scores(image: RgbImage, truth: RgbImage) -> tuple[float, float]:
+    """Return PSNR (dB, at most 99) and SSIM of two images (H, W, 3)."""
+    return min(psnr_db(image, truth), 99.0), ssim(image, truth)
 
 
 def compare(world: str, settings: VspaceSettings, config: VirtualSpaceConfig | None = None) -> Comparison:
     """Compare the views of each source with the world's own along each path.
 
     Raises:
-        ValueError: no such world, its start is not free, or the depth of a panorama cannot be scaled.
+        ValueError: no such world, its start is not free, or the depth of the panorama cannot be scaled.
     """
-    place = make_place(world, settings, config)
-    comparison = Comparison(place.start)
-    width, height = settings.size
-    fov = FOV_RAD
-    ready: dict[str, tuple[Drawer, float]] = {}
+    config = config or default_config(settings)
+    warm_up(config)
+    place = make_place(world, settings.start_seed)
+    (pose,) = path_poses(place.world, place.start, "straight", [0.0])
+    shot = take_shot(place.renderer, pose, settings.panorama_width, settings.seed)
+    comparison = Comparison(depth_figures(shot))
+    ready: dict[str, tuple[RenderView, float]] = {}
     for path in settings.paths:
-        # The path must also be free behind the start; where it ends, fewer keyframes are taken.
-        keyframes = max(KEYFRAMES.get(source, 1) for source in settings.sources)
-        back = path_poses(place.world, place.start, path, [-float(k) for k in range(keyframes)])
-        shots = [take_shot(place.renderer, pose, settings, place.model) for pose in reversed(back)]
-        if keyframes > 1:  # the last panorama alone is the same on all paths
-            ready = {}
-        comparison.depth[path] = depth_figures(shots)
-        poses = path_poses(place.world, place.start, path, settings.distances_m)
-        seconds = [distance / CRUISE_M_S for distance in settings.distances_m[: len(poses)]]
-        errors = slam_errors(place.world, poses, settings) if "slam-pose" in settings.sources else None
-        if errors is not None:
-            comparison.slam_error_m[path] = float(np.linalg.norm(errors[:, :2], axis=1).max())
-        renderers = [renderer_after(place, passed) for passed in seconds]
-        truths = [
-            renderer.render_perspective(pose, width, height, fov, supersample=3).rgb
-            for renderer, pose in zip(renderers, poses, strict=True)
-        ]
+        views = true_views(place, path, settings)
+        errors = [_apart_m(view.pose, view.slam_pose) for view in views if view.slam_pose is not None]
+        if errors:
+            comparison.slam_error_m[path] = max(errors)
         for source in settings.sources:
-            if (source == "slam-pose" and errors is None) or (source == "still" and not place.walkers):
-                continue
             base = base_of(source, settings.method)
             if base not in ready:
-                ready[base] = make_source(base, shots, settings, place)
-            draw, spent = ready[base]
-            for number, (distance, pose, truth) in enumerate(zip(settings.distances_m, poses, truths, strict=False)):
-                seen_from = pose
-                if source == "slam-pose" and errors is not None:
-                    x, y, yaw = errors[number]
-                    seen_from = pose @ pose_matrix(x, y, yaw=yaw)
-                picture, confidence = draw(seen_from, width, height, fov)
-                if source in FILLED:
-                    picture = filled(picture, confidence, truth)
-                against = truth
-                if source == "still":
-                    against = place.renderer.render_perspective(pose, width, height, fov, supersample=3).rgb
-                comparison.rows.append(
-                    _row(path, source, distance, picture, against, spent, float(np.mean(confidence)))
-                )
-                if distance in STRIP_AT_M:
-                    strip = comparison.strips.setdefault(path, {}).setdefault(distance, {"truth": truth})
-                    strip[source] = picture
+                ready[base] = make_source(base, shot, settings, config, place)
+            _add_views(comparison, path, source, ready[base], views, settings)
     return comparison
 
 
-def filled(picture: Picture, confidence: Any, truth: Picture) -> Picture:
-    """The image (H, W, 3) with the truth where no keyframe has seen the place."""
-    return np.where(np.broadcast_to(confidence, truth.shape[:2])[..., None] > 0, picture, truth)
+def compare_recorded(bag: Path, settings: VspaceSettings, number: int) -> Comparison:
+    """Compare the views of a recorded keyframe with what later keyframes saw, at their poses.
+
+    Args:
+        bag: recording with ``/keyframe``.
+        settings: sources of ``RECORDED``; keyframes up to ``reach_m`` away count, by steps of ``step_m``.
+        number: number of the keyframe.
+
+    Raises:
+        ValueError: the recording has no usable keyframes, or no later one is near enough.
+    """
+    keyframes = read_keyframes(bag)
+    near = later_keyframes(keyframes, number, settings, FOV_RAD)
+    if not near:
+        raise ValueError(f"{bag}: no keyframe after number {number} lies within {settings.reach_m:g} m of it")
+    views = [TrueView(settings.step_m * round(at / settings.step_m), pose, rgb) for at, pose, rgb in near]
+    comparison = Comparison()
+    config, ready = default_config(settings), {}
+    for source in settings.sources:
+        base = base_of(source, settings.method)
+        if base not in ready:
+            ready[base] = make_source(base, keyframes[number], settings, config, None)
+        _add_views(comparison, "recorded", source, ready[base], views, settings)
+    return comparison
 
 
-def renderer_after(place: Place, seconds: float) -> EquirectRenderer:
-    """Renderer of the place some time after the panorama, when people have walked on."""
-    from instant_ic.experiments.places import world_after
-    from instant_ic.sim.render import EquirectRenderer
+def true_views(place: Place, path: str, settings: VspaceSettings) -> list[TrueView]:
+    """Render the world along a path, with the poses of SLAM if a source needs them."""
+    poses = path_poses(place.world, place.start, path, settings.distances_m)
+    errors = slam_errors(place.world, poses, settings) if "slam-pose" in settings.sources else None
+    views = []
+    for number, (distance, pose) in enumerate(zip(settings.distances_m, poses, strict=False)):
+        rgb = place.renderer.render_perspective(pose, *settings.size, FOV_RAD, supersample=3).rgb
+        slam_pose = None
+        if errors is not None:
+            x, y, yaw = errors[number]
+            slam_pose = pose @ pose_matrix(x, y, yaw=yaw)
+        views.append(TrueView(distance, pose, rgb, slam_pose))
+    return views
 
-    return EquirectRenderer(world_after(place.world, place.walkers, seconds)) if place.walkers else place.renderer
+
+def _apart_m(pose: Pose, other: Pose) -> float:
+    return float(np.linalg.norm((pose - other)[:2, 3]))
 
 
-def slam_errors(world: World, poses: Sequence[Any], settings: VspaceSettings) -> NDArray[np.float64] | None:
-    """Error (x, y, yaw) of the SLAM's pose at each camera pose (4, 4) of a path, (N, 3), in the robot's true frame.
+def _add_views(
+    comparison: Comparison, path: str, source: str, ready: tuple[RenderView, float], views: Sequence[TrueView],
+    settings: VspaceSettings,
+) -> None:  # fmt: skip
+    """Render a source at the poses of the true views, and add rows and images to the comparison."""
+    render, seconds = ready
+    for view in views:
+        pose = view.slam_pose if source == "slam-pose" else view.pose
+        if pose is None:
+            continue
+        image, confidence = render(pose, *settings.size, FOV_RAD)
+        if source in FILLED:
+            image = filled(image, confidence, view.rgb)
+        share = float(np.mean(confidence))
+        comparison.rows.append(_row(path, source, view.distance_m, image, view.rgb, seconds, share))
+        if view.distance_m in STRIP_AT_M:
+            strip = comparison.strips.setdefault(path, {}).setdefault(view.distance_m, {"truth": view.rgb})
+            strip.setdefault(source, image)
 
-    The robot drives along the path on slipping tracks and is localised by the stack's SLAM. None where the robot
-    cannot drive there.
+
+def filled(image: RgbImage, confidence: Any, truth: RgbImage) -> RgbImage:
+    """Return an image (H, W, 3) with the truth where the keyframe has not seen the place."""
+    return np.where(np.broadcast_to(confidence, truth.shape[:2])[..., None] > 0, image, truth)
+
+
+def slam_errors(world: World, poses: Sequence[Pose], settings: VspaceSettings) -> NDArray[np.float64] | None:
+    """Drive along camera poses (4, 4) on slipping tracks; return the errors (N, 3) of the stack's SLAM there.
+
+    An error is (x, y, yaw) in the robot's true frame. None is returned where the robot cannot drive.
     """
     from instant_ic.experiments.slam import run_log
     from instant_ic.experiments.slam_sim import round_trip
@@ -252,51 +243,57 @@ def slam_errors(world: World, poses: Sequence[Any], settings: VspaceSettings) ->
 
 def converge(
     world: str, settings: VspaceSettings, times_s: Sequence[float], config: VirtualSpaceConfig | None = None
-) -> list[Row]:
-    """Views at the panorama and 1 m ahead by training time: ``ours`` as shown, its ``field`` alone, and ``paper``.
-
-    Args: as ``compare``; ``times_s`` are CPU seconds.
-    """
-    place = make_place(world, settings, config)
-    width, height = settings.size
+) -> list[ViewRow]:
+    """Compare views at the panorama and 1 m ahead by training time in CPU seconds (see ``converge_on``)."""
+    config = config or default_config(settings)
+    warm_up(config)
+    place = make_place(world, settings.start_seed)
     poses = path_poses(place.world, place.start, "straight", (0.0, 1.0))
+    render = place.renderer.render_perspective
     views = [
-        (distance, pose, place.renderer.render_perspective(pose, width, height, FOV_RAD, 3).rgb)
+        TrueView(distance, pose, render(pose, *settings.size, FOV_RAD, 3).rgb)
         for distance, pose in zip((0.0, 1.0), poses, strict=False)
     ]
-    shot = take_shot(place.renderer, poses[0], settings, place.model)
-    return converge_on(shot, views, settings, place.config, times_s)
+    shot = take_shot(place.renderer, poses[0], settings.panorama_width, settings.seed)
+    return converge_on(shot, views, settings, times_s, config)
+
+
+def converge_recorded(bag: Path, settings: VspaceSettings, number: int, times_s: Sequence[float]) -> list[ViewRow]:
+    """Compare views at a recorded keyframe, and at the later one nearest to 1 m away (0.5 to 1.5 m)."""
+    keyframes = read_keyframes(bag)
+    here, *later = later_keyframes(keyframes, number, settings, FOV_RAD, itself=True)
+    beside = sorted((one for one in later if 0.5 <= one[0] <= 1.5), key=lambda one: abs(one[0] - 1.0))
+    views = [TrueView(at, pose, rgb) for at, (_, pose, rgb) in zip((0.0, 1.0), (here, *beside[:1]), strict=False)]
+    return converge_on(keyframes[number], views, settings, times_s, default_config(settings))
 
 
 def converge_on(
-    shot: Shot,
-    views: Sequence[tuple[float, NDArray[np.float64], Picture]],
-    settings: VspaceSettings,
+    shot: Shot, views: Sequence[TrueView], settings: VspaceSettings, times_s: Sequence[float],
     config: VirtualSpaceConfig,
-    times_s: Sequence[float],
-) -> list[Row]:
-    """As ``converge``, from a keyframe and views: distance in metres, camera pose (4, 4), and true image."""
-    width, height = settings.size
+) -> list[ViewRow]:  # fmt: skip
+    """Train from a keyframe and compare at each time: ``ours`` as shown, its ``field`` alone, and ``paper``."""
     rows = []
     trained = replace(config, source="field")
     for name, shown_as in (("ours", ("ours", "field")), ("paper", ("paper",))):
         own = paper_config(trained) if name == "paper" else trained
-        space, spent = make_space([shot], name, settings, own), 0.0
+        space, spent = make_space(shot, name, own), 0.0
         for seconds in sorted(times_s):
             train(space, seconds - spent)
             spent = seconds
             for source in shown_as:
                 space.config = field_alone(own) if source == "field" else own
-                for distance, pose, truth in views:
-                    view = space.render(pose, width, height, FOV_RAD)
-                    confidence = float(view.confidence.mean())
-                    rows.append(_row("straight", source, distance, view.rgb, truth, seconds, confidence))
+                for view in views:
+                    made = space.render(view.pose, *settings.size, FOV_RAD)
+                    share = float(made.confidence.mean())
+                    rows.append(_row("straight", source, view.distance_m, made.rgb, view.rgb, seconds, share))
             space.config = own
     return rows
 
 
 def _row(
-    path: str, source: str, distance: float, picture: Picture, truth: Picture, seconds: float, confidence: float
-) -> Row:
-    psnr, ssim = scores(picture, truth)
-    return Row(path, source, distance, round(psnr, 3), round(ssim, 4), round(seconds, 2), round(confidence, 3))
+    path: str, source: str, distance: float, image: RgbImage, truth: RgbImage, seconds: float, confidence: float
+) -> ViewRow:
+    psnr, similarity = scores(image, truth)
+    return ViewRow(
+        path, source, distance, round(psnr, 3), round(similarity, 4), round(seconds, 2), round(confidence, 3)
+    )

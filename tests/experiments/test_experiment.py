@@ -29,7 +29,7 @@ from instant_ic.experiments import (
 from instant_ic.experiments.depth_lidar import measure_world
 from instant_ic.experiments.illusion_truth import moved_by, things
 from instant_ic.experiments.lab import Options, Result, Unit
-from instant_ic.experiments.places import Walker, make_place_world, world_after
+from instant_ic.experiments.places import make_place_world
 from instant_ic.experiments.plots import curves_svg, image_strip
 from instant_ic.experiments.recorded_drive import Moment
 from instant_ic.experiments.scan import (
@@ -242,25 +242,23 @@ def view_result(world: str, values: dict[str, float], path: str = "straight") ->
         {"path": path, "source": name, "distance_m": 1.0, "psnr_db": value, "ssim": value / 100}
         for name, value in values.items()
     ]
-    data = {"rows": rows, "depth": {path: {"mean_relative_error": 0.1}}, "slam_error_m": {path: 0.02}, "images": {}}
+    data = {"rows": rows, "depth": {"mean_relative_error": 0.1}, "slam_error_m": {path: 0.02}, "images": {}}
     return Result(Unit("environments", {"world": world, "seed": 0, "start_seed": 0}), data, 1.0, 1.0)
 
 
 def test_a_place_fails_for_its_largest_measured_loss() -> None:
     corridor = view_result("corridor:0", {"ours": 26, "fill": 29, "exact-fill": 30, "slam-pose": 25.5, "panorama": 15})
     windows = view_result("windows:0", {"ours": 20, "fill": 21, "exact-fill": 25, "slam-pose": 19, "panorama": 18})
-    people = view_result("people:0", {"ours": 22, "fill": 23, "exact-fill": 23, "slam-pose": 22, "still": 27})
-    assert environments.losses(windows, "ours") == {"depth": 4.0, "unseen": 1.0, "pose": 1.0, "motion": None}
-    assert [environments.reason(environments.losses(one, "ours")) for one in (corridor, windows, people)] == [
-        "unseen", "depth", "motion",
+    assert environments.losses(windows, "ours") == {"depth": 4.0, "unseen": 1.0, "pose": 1.0}
+    assert [environments.reason(environments.losses(one, "ours")) for one in (corridor, windows)] == [
+        "unseen", "depth",
     ]  # fmt: skip
     assert environments.reason({"depth": 0.1, "unseen": None}) == "resolution"
-    section = environments.section([corridor, windows, people], Options())
+    section = environments.section([corridor, windows], Options())
     kinds = section.parts[1]
     assert isinstance(kinds, report.Table)
     assert [(line[0], line[3], line[4]) for line in kinds.rows] == [
         ("corridor with windows side by side", "1 of 1", "depth (1)"),
-        ("corridor in which people walk", "1 of 1", "motion (1)"),
         ("corridor with side rooms", "0 of 1", "unseen (1)"),
     ]
     assert section.answers["places"].held is True
@@ -307,27 +305,10 @@ def test_full_size_fits_into_an_hour_on_two_cores() -> None:
     assert sum(unit.cost_s for unit in quick) < 0.8 * 2 * 300
 
 
-def test_people_walk_to_the_end_and_back() -> None:
-    walker = Walker((0, 17), 4.0, 1.0, (0.0, 10.0))
-    # 6 m to the end, then 9 m back: 1 m; to the start and 2 m on.
-    assert [walker.moved_m(t) for t in (0.0, 6.0, 15.0, 18.0)] == pytest.approx([0.0, 6.0, -3.0, -2.0])
-    assert Walker((0, 17), 4.0, -1.0, (0.0, 10.0)).moved_m(5.0) == pytest.approx(-3.0)
-
-
 def test_places_have_what_they_are_named_for() -> None:
-    world, walkers = make_place_world("people:0")
-    assert 2 <= len(walkers) <= 4
-    begin, end = walkers[0].surfaces
-    corners = world.vertices.reshape(len(world.normal), -1, 3)[begin:end]
-    assert corners[..., 2].max() == pytest.approx(1.72) and corners[..., 2].min() == 0
-    assert corners[..., 0].mean() == pytest.approx(walkers[0].x, abs=0.05)
-    later = world_after(world, walkers, 2.0)
-    moved = (later.vertices - world.vertices).reshape(len(world.normal), -1, 3)
-    assert moved[begin:end, :, 0] == pytest.approx(walkers[0].moved_m(2.0), abs=1e-4)
-    assert np.count_nonzero(np.abs(moved).max(axis=(1, 2))) <= 17 * len(walkers)
-    glass, none = make_place_world("windows:0")
+    glass = make_place_world("windows:0")
     upright = (glass.emission > 0) & (np.abs(glass.normal[:, 2]) < 0.5)
-    assert none == () and upright.sum() >= 6
+    assert upright.sum() >= 6
     points, through = (
         measure_world(EquirectRenderer(glass), pose_matrix(0.0, 0.0, 1.2), 1.3, 1.2, None, through)
         for through in (False, True)

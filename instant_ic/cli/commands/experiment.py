@@ -32,7 +32,7 @@ def add_parser(subparsers: Any) -> None:
     add("name", choices=_NAMES, metavar="NAME", help=", ".join(_NAMES))
     add("-o", "--out", type=Path, required=True, metavar="REPORT", help="output folder")
     add("--seeds", type=positive_int, default=5, metavar="N", help="number of seeds (default: %(default)s)")
-    text = "corridor, random, long, hall, furnished, crossing, windows, people, one of them with its seed (random:7), "
+    text = "corridor, random, long, hall, furnished, crossing, windows, one of them with its seed (random:7), "
     add("--world", action="append", default=[], metavar="W", help=text + "or a mesh file (.glb, ...); repeatable")
     add("--method", choices=("ours", "paper"), default="ours", help="virtual space (default: %(default)s)")
     text = "recording to use instead of worlds (not for operators): later panoramas are the truth"
