@@ -17,11 +17,11 @@ from reporting import parser_for, report
 
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments.illusion import TeleopSettings
-from instant_ic.experiments.illusion_stack import LIVE, FilmedStack, IllusionFrame
+from instant_ic.experiments.illusion_stack import FOV_RAD, LIVE, FilmedStack, IllusionFrame
 from instant_ic.experiments.plots import new_figure, save_figure
 from instant_ic.experiments.teleop import run_episode
 from instant_ic.vspace import readiness
-from instant_ic.vspace.view import perspective_rays
+from instant_ic.vspace.view import View, perspective_rays
 
 if TYPE_CHECKING:
     from instant_ic.experiments.teleop_stack import StackConfig
@@ -36,16 +36,17 @@ class _JudgedStack(FilmedStack):
 
     terms: tuple[float, float] = (0.0, 0.0)
 
-    def _render(self, live: Any, truth_space: Any) -> Any:
-        priors, order = self.nodes["nerf"].work.space.keyframes, live.order
-        rays = perspective_rays(order.pose(), order.width, order.height, order.fov_rad)
-        step = max(1, order.width // COLUMNS)
-        rows, columns = np.arange(step // 2, order.height, step), np.arange(step // 2, order.width, step)
-        chosen = (rows[:, None] * order.width + columns).reshape(-1)
-        depth, confidence = (image.reshape(-1)[chosen] for image in (live.view.depth_m, live.view.confidence))
+    def on_view(self, view: View, map_from_camera: NDArray[np.float64]) -> None:
+        assert self.space is not None
+        height, width = view.depth_m.shape
+        rays = perspective_rays(map_from_camera, width, height, FOV_RAD)
+        step = max(1, width // COLUMNS)
+        rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
+        chosen = (rows[:, None] * width + columns).reshape(-1)
+        depth, confidence = (image.reshape(-1)[chosen] for image in (view.depth_m, view.confidence))
+        priors = self.space.keyframes
         texture = readiness.Texture.of(priors[0].rgb)
         self.terms = readiness.error_terms(priors, texture, rays.some(chosen), depth, confidence)
-        return super()._render(live, truth_space)
 
 
 def samples(world: str, seed: int, episodes: int) -> list[dict[str, Any]]:

@@ -12,7 +12,7 @@ from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
 from instant_ic.bus.node import Subscription, Timer
 from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.config import ConsoleConfig
-from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed
+from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed, PageServer
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.control.robot_lease import RELEASED
 from instant_ic.util.paths import sign_in_file
@@ -27,6 +27,11 @@ class ConsoleNode(Node[ConsoleConfig]):
     name = "console"
     live_parameters = ("view",)
     feed: PageFeed
+
+    def __init__(self, *wiring: Any, page: PageServer | None = None, **named: Any) -> None:
+        super().__init__(*wiring, **named)
+        self.page = page
+        """Receiver of images and state; the node's own server if None."""
 
     def setup(self) -> None:
         config = self.config
@@ -51,7 +56,9 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.recording = RecordingDesk(self.ask_recorder, lambda status: self.server.publish("recording", status))
         self.on_record, self.on_snapshot = self.recording.record, self.recording.snapshot
         outputs = requests.publish, shown.publish
-        self.feed = feed = PageFeed(config, self.server, self.tf, inputs, *outputs, self.clock, self.diagnose)
+        self.feed = feed = PageFeed(
+            config, self.page or self.server, self.tf, inputs, *outputs, self.clock, self.diagnose
+        )
         self.subscribe("/camera/image/compressed", msg.CompressedImage, feed.take_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", msg.RenderedView, feed.take_view, qos=SENSOR)
         self.mesher = self.background(feed.layers_of, feed.take_layers)  # 30 ms: commands must not wait for it

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from instant_ic.adapters.base import estimate_message, read_command
 from instant_ic.base.command_source import CommandSource
@@ -29,7 +30,12 @@ STATE_S = 1.0
 class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     name = "crawler_base"
     live_parameters = ("battery_full_v", "battery_empty_v")
-    open_port: Callable[[RoboclawConfig], SerialPort] = staticmethod(open_serial)
+
+    def __init__(
+        self, *wiring: Any, open_port: Callable[[RoboclawConfig], SerialPort] = open_serial, **named: Any
+    ) -> None:
+        super().__init__(*wiring, **named)
+        self.open_port = open_port
 
     def setup(self) -> None:
         config = self.config
@@ -38,9 +44,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         except PaceError as error:
             raise NodeError(str(error)) from None
         clock = self.clock
-        self.controller = BaseController(
-            config, clock.now_ns, clock.steady_ns, type(self).open_port, clock.suspended_ns
-        )
+        self.controller = BaseController(config, clock.now_ns, clock.steady_ns, self.open_port, clock.suspended_ns)
         self.stepped_ns = clock.steady_ns()  # by the node's thread
         also = "/cmd_vel is also published by %s; it must be the arbiter alone"
         self.source = CommandSource(config, lambda publisher: self.log.warning(also, publisher))

@@ -32,7 +32,6 @@ class NerfNode(Node[NerfConfig]):
     """One thread takes keyframes, renders and trains in turn; ``JobSchedule`` decides what is next."""
 
     name = "nerf"
-    worker_class: type[SpaceWorker] = SpaceWorker
     live_parameters = ("render_fps", "train_ms_per_frame", "max_view_pixels", "jpeg_quality")
 
     def setup(self) -> None:
@@ -45,7 +44,7 @@ class NerfNode(Node[NerfConfig]):
         self.image_out = self.publisher("/vspace/image/compressed", CompressedImage, qos=SENSOR)
         self.status_out = self.publisher("/vspace/status", VspaceStatus, qos=LATCHED)
         self.layers_out = self.publisher("/vspace/layers", VspaceLayers, qos=LATCHED)
-        self.work = self.worker_class(config.space, robot, warm=not self.lockstep)
+        self.work = SpaceWorker(config.space, robot, warm=not self.lockstep)
         worker = self.background(self.work.run, self.on_outcome)
         turns = Turns(config.render_fps, config.train_ms_per_frame)
         self.schedule = JobSchedule(config.space, turns, worker.submit, self.lockstep)

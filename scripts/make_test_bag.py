@@ -71,12 +71,9 @@ def make(path: Path, seconds: float, quality: int) -> None:
             if entry.topic in ("/wheel/odom", "/tf"):
                 writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
 
-        class Base(CrawlerBaseNode):
-            open_port = staticmethod(lambda config: EmulatedPort(simulation.controller))
-
         write("/tf_static", mounts(simulation), START_NS, LATCHED)
         with LockstepBus(start_ns=START_NS, keep=False, on_record=record) as bus:
-            bus.add(Base, CrawlerBaseConfig())
+            bus.add(CrawlerBaseNode, CrawlerBaseConfig(), open_port=lambda _: EmulatedPort(simulation.controller))
             lidar = _Lidar(simulation)
             picture: tuple[int, CompressedImage] | None = None
             next_picture_s, next_truth_s, next_command_s = CAMERA_PERIOD_S, 0.0, 0.0

@@ -141,12 +141,20 @@ class LockstepBus(Closing):
         name: str | None = None,
         namespace: str = "",
         remaps: dict[str, str] | None = None,
+        **parts: Any,
     ) -> NodeT:
-        """Create a node and run its ``setup``; without a configuration it takes the defaults."""
+        """Create a node and run its ``setup``.
+
+        Args:
+            node_class: class of the node.
+            config: parameters; the defaults if None.
+            name, namespace, remaps: see ``Node``.
+            parts: further arguments of the node's constructor, such as a simulated device.
+        """
         configuration = node_class.config_class()() if config is None else config
         label = name or node_class.name
         transport = _Transport(self, label)
-        node = node_class(configuration, transport, self.clock, name, namespace, remaps, lockstep=True)
+        node = node_class(configuration, transport, self.clock, name, namespace, remaps, lockstep=True, **parts)
         self.nodes.append(node)
         self._transports[node] = transport
         node.start()

@@ -17,7 +17,7 @@ from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import MOST_LAYERS, PageLayers
 from instant_ic.console.protocol import FrameKind, ProtocolError
 from instant_ic.console.scene import Newest, Scene
-from instant_ic.console.server import PLAIN_HTTP, ConsoleServer
+from instant_ic.console.server import PLAIN_HTTP
 from instant_ic.console.view_requests import ViewRequests
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.msg import (
@@ -63,12 +63,46 @@ class Clock(Protocol):
         """Time that is never set back."""
 
 
+class PageServer(Protocol):
+    """Receiver of everything that the feed sends to pages; ``ConsoleServer`` is one."""
+
+    on_drawn: Callable[[], None]
+
+    @property
+    def plain_http(self) -> bool:
+        """Pages come over the network without encryption."""
+
+    def now_ms(self) -> float:
+        """Return the server's time in milliseconds."""
+
+    def needs_views(self) -> bool:
+        """Return whether a page shows rendered views."""
+
+    def drawn_ms(self) -> float | None:
+        """Return the time of the newest state that the driver's page has rendered by itself, or None."""
+
+    def show(self, *kinds: FrameKind) -> None:
+        """Note the kinds of images in the foreground."""
+
+    def follow_robot(self, holder: str | None, estop: bool = False) -> None:
+        """Note who drives the robot, and its emergency stop."""
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        """Send a message to all pages."""
+
+    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
+        """Send an image to all pages."""
+
+    def send_layers(self, layers: PageLayers) -> None:
+        """Send the layers of the virtual space to pages that render them."""
+
+
 class PageFeed:
     """Sends to the page's server what comes from the stack.
 
     Args:
         config: parameters of the console.
-        server: the page's server.
+        server: receiver of the messages.
         tf: transform tree.
         inputs: newest messages.
         send_request: requests a rendered view.
@@ -84,7 +118,7 @@ class PageFeed:
     def __init__(
         self,
         config: ConsoleConfig,
-        server: ConsoleServer,
+        server: PageServer,
         tf: TransformBuffer,
         inputs: Inputs,
         send_request: Callable[[ViewRequest], None],

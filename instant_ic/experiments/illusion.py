@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments.illusion_stack import (
+    FOV_RAD,
     FRAME_S,
+    HEIGHT,
     LIVE,
     SOURCES,
-    VIEW_AGE_S,
+    WIDTH,
     FilmedStack,
     IllusionFrame,
-    Screen,
     StackConfig,
 )
 from instant_ic.experiments.processes import run_all
@@ -103,15 +104,13 @@ def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
     frames = [frame for film in films for frame in film.frames]
     if not frames:
         raise ValueError(f"world {settings.world!r}: the virtual space was not shown in {len(films)} episode(s)")
-    screen = Screen()
     result = {
         "world": settings.world,
         "episodes": len(films),
         "seed": settings.seed,
         "overrides": list(settings.overrides),
-        "screen": [screen.width, screen.height, round(math.degrees(screen.fov_rad), 1)],
+        "screen": [WIDTH, HEIGHT, round(math.degrees(FOV_RAD), 1)],
         "seconds_between_frames": FRAME_S,
-        "view_age_s": VIEW_AGE_S,
         "completed": sum(film.completed for film in films),
         **figures(frames, LIVE),
         "by_distance": by_distance(frames, LIVE),

@@ -11,34 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.illusion import Film
-from instant_ic.experiments.illusion_stack import (
-    LIVE,
-    SOURCES,
-    TRUE_DEPTH,
-    TRUE_FILL,
-    TRUE_VIEW,
-    WEBGL,
-    WEBGL_TRUE_DEPTH,
-)
+from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, TRUE_FILL
 from instant_ic.experiments.plots import image_strip, new_figure, save_figure
 
 _TILE = 400
-_COLUMNS = {
-    LIVE: "shown",
-    WEBGL: "shown in WebGL",
-    "truth": "true",
-    TRUE_DEPTH: "with true depth",
-    TRUE_FILL: "with true depth and fill",
-}
-_NAMES = {**_COLUMNS, TRUE_VIEW: "true view (the page alone)", WEBGL_TRUE_DEPTH: "in WebGL, true depth"}
-_COLOURS = {
-    LIVE: "tab:red",
-    TRUE_DEPTH: "tab:blue",
-    TRUE_FILL: "tab:green",
-    TRUE_VIEW: "0.4",
-    WEBGL: "tab:orange",
-    WEBGL_TRUE_DEPTH: "tab:cyan",
-}
+_COLUMNS = {LIVE: "shown", "truth": "true", TRUE_DEPTH: "with true depth", TRUE_FILL: "with true depth and fill"}
+_COLOURS = {LIVE: "tab:red", TRUE_DEPTH: "tab:blue", TRUE_FILL: "tab:green"}
 
 
 def save_strip(path: Path, films: Sequence[Film]) -> None:
@@ -62,7 +40,7 @@ def save_plot(path: Path, report: dict[str, Any]) -> None:
     left, right = axes[0]
     each = report["each"]
     for source in SOURCES:
-        label, colour = _NAMES[source], _COLOURS[source]
+        label, colour = _COLUMNS[source], _COLOURS[source]
         known = [frame for frame in each if frame["distance_m"] is not None]
         left.plot(
             [frame["distance_m"] for frame in known],

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.plots import new_figure, perspective_crop, save_figure, save_map
-from instant_ic.experiments.teleop_figures import STEP_S, TeleopDrive, judge
+from instant_ic.experiments.teleop_figures import STEP_S, DriveLog, TeleopDrive, judge
 from instant_ic.experiments.teleop_plot import draw_modes
-from instant_ic.experiments.teleop_stack import Log
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.slam.occupancy import OccupancyGrid
 
@@ -90,7 +89,7 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
     return RecordedDrive(drive, _moments(log, times, photos, keyframes), _plot(drive, grid), _modes(drive))
 
 
-def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> Log:
+def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> DriveLog:
     """States (seconds, ControlState), which come at uneven times, in the steps of a log.
 
     Poses are interpolated, as their differences are speeds; all else is held until the next state.
@@ -107,7 +106,7 @@ def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> Log:
 
     held = [states[row][1] for row in np.searchsorted(at, grid + 1e-9) - 1]
     robot = poses("robot_pose")
-    return Log(
+    return DriveLog(
         time_s=grid.tolist(),
         mode=[int(one.mode) for one in held],
         virtual=[int(one.shown) == one.SHOWN_VIRTUAL for one in held],
@@ -123,7 +122,7 @@ def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> Log:
     )
 
 
-def film_times(log: Log, frame_s: float) -> NDArray[np.float64]:
+def film_times(log: DriveLog, frame_s: float) -> NDArray[np.float64]:
     """Times around the first passage through the virtual space; of the first minute without one."""
     times, virtual = np.array(log.time_s), np.array(log.virtual)
     begin, end = times[0], times[-1]
@@ -136,7 +135,7 @@ def film_times(log: Log, frame_s: float) -> NDArray[np.float64]:
 
 
 def _moments(
-    log: Log,
+    log: DriveLog,
     times: NDArray[np.float64],
     photos: Sequence[tuple[float, bytes]],
     keyframes: Sequence[tuple[float, Any]],

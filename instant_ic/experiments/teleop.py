@@ -22,14 +22,13 @@ from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import teleop_figures as figures
 from instant_ic.experiments.processes import run_all
 from instant_ic.experiments.results import finite
-from instant_ic.experiments.teleop_figures import Switch, TeleopDrive
+from instant_ic.experiments.teleop_figures import Shown, Switch, TeleopDrive
 from instant_ic.experiments.teleop_operator import ScriptedOperator, Sight
 from instant_ic.experiments.teleop_stack import (
     CAMERA_HEIGHT_M,
     METHODS,
     NODES,
     VSPACE_NODES,
-    Shown,
     SimulatedStack,
     StackConfig,
 )
@@ -97,11 +96,10 @@ class _Episode:
         course: Course,
         index: int,
         method: str,
-        filmed: bool = False,
         make_stack: Callable[[World, StackConfig], SimulatedStack] = SimulatedStack,
     ) -> None:
         seed, overrides = 1000 * settings.seed + index, settings.overrides
-        config = StackConfig(method, settings.depth, seed, whole_views=filmed, overrides=overrides)
+        config = StackConfig(method, settings.depth, seed, overrides=overrides)
         self.settings, self.course = settings, course
         self.drive = TeleopDrive(index, method, way_m=course.way_m)
         self.operator = ScriptedOperator(course.goals, floor_plan(course.world))
@@ -220,11 +218,10 @@ def run_episode(
         make_stack: returns the stack of a world.
         course: course to drive; that of the settings and the index if None.
     """
-    course, filmed = course or settings.course(index), on_step is not None
+    course = course or settings.course(index)
     with _quiet():
         return [
-            _Episode(settings, course, index, name, filmed, make_stack).run(on_step)
-            for name in methods or settings.methods
+            _Episode(settings, course, index, name, make_stack).run(on_step) for name in methods or settings.methods
         ]
 
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from instant_ic.control.kinematics import MotionLimits, accelerate
 from instant_ic.control.states import Mode
-from instant_ic.experiments.teleop_stack import Log, Shown
 from instant_ic.geometry.poses import relative2, wrap_angle
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -29,6 +28,53 @@ FLICKER_S = 2.0
 """A switch reversed within this time counts as flicker."""
 MET_M = 1.2
 """Distance between the centres of an obstacle and the shown robot below which the obstacle counts as met."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """An image on the operator's screen.
+
+    Attributes:
+        time_s: when it was displayed.
+        came_s: when it arrived at the page; a switch shows the newest image that has already arrived.
+        virtual: True for a rendered view, False for the camera's image.
+        pose: (3,) of the robot from which the image was taken, in the world's frame; the true pose for a camera image.
+        place: (2,) its position, as the stack knows it.
+        heading: yaw at which it is shown: the page rotates the camera's image to the newest heading.
+        jpeg, fov_rad: of a rendered view.
+    """
+
+    time_s: float
+    came_s: float
+    virtual: bool
+    pose: FloatArray
+    place: FloatArray
+    heading: float
+    jpeg: bytes = b""
+    fov_rad: float = math.pi / 2
+
+
+@dataclass
+class DriveLog:
+    """Events of a drive, one row per twentieth of a second; poses (x, y, yaw) in the world's frame."""
+
+    time_s: list[float] = field(default_factory=list)
+    mode: list[int] = field(default_factory=list)
+    virtual: list[bool] = field(default_factory=list)
+    """True where the rendered view is shown."""
+    robot: list[FloatArray] = field(default_factory=list)
+    estimate: list[FloatArray] = field(default_factory=list)
+    """The r-bot's pose as the stack knows it."""
+    vbot: list[FloatArray] = field(default_factory=list)
+    yaw_gap_rad: list[float] = field(default_factory=list)
+    """v-bot heading minus the r-bot's true heading at the time of the v-bot's message."""
+    known_yaw_gap_rad: list[float] = field(default_factory=list)
+    """The same from the headings the arbiter knows; the page rotates the images to these."""
+    command: list[tuple[float, float]] = field(default_factory=list)
+    blocked: list[bool] = field(default_factory=list)
+    reason: list[str] = field(default_factory=list)
+    pictures: list[Shown] = field(default_factory=list)
+    keyframes: int = 0
 
 
 @dataclass(frozen=True)
@@ -102,13 +148,13 @@ class TeleopDrive:
     """
 
 
-def shown_poses(log: Log) -> FloatArray:
+def shown_poses(log: DriveLog) -> FloatArray:
     """(N, 3) poses of the robot that is shown."""
     virtual = np.array(log.virtual)[:, None]
     return np.where(virtual, np.array(log.vbot), np.array(log.robot))
 
 
-def shown_speeds(log: Log) -> FloatArray:
+def shown_speeds(log: DriveLog) -> FloatArray:
     """(N, 2) forward m/s and rad/s of the shown robot, over 0.1 s; NaN across a switch and at the ends."""
     poses, virtual = shown_poses(log), np.array(log.virtual)
     speeds = np.full((len(poses), 2), math.nan)
@@ -128,7 +174,7 @@ def ramped(commands: FloatArray) -> FloatArray:
     return out
 
 
-def obeys(log: Log) -> FloatArray:
+def obeys(log: DriveLog) -> FloatArray:
     """(N,) 1 where the shown robot obeyed the command, 0 where it did not, NaN without a command.
 
     It obeyed if its forward speed and yaw rate lie between the minimum and maximum of the ramped command within the
@@ -147,13 +193,13 @@ def obeys(log: Log) -> FloatArray:
     return out
 
 
-def obedience(log: Log) -> float:
+def obedience(log: DriveLog) -> float:
     """Share of the commanded time in which the shown robot obeyed; NaN without commands."""
     done = obeys(log)
     return math.nan if np.isnan(done).all() else float(np.nanmean(done))
 
 
-def longest_stall_s(log: Log) -> float:
+def longest_stall_s(log: DriveLog) -> float:
     """Longest time that the shown robot stood still under a command."""
     commands, speeds = np.array(log.command).reshape(-1, 2), shown_speeds(log)
     standing = (np.abs(speeds[:, 0]) < 0.01) & (np.abs(speeds[:, 1]) < 0.02) & commands.any(axis=1)
@@ -172,7 +218,7 @@ def longest_freeze_s(pictures: list[Shown], until_s: float) -> float:
     return float(np.diff([*times, until_s]).max())
 
 
-def find_switches(log: Log) -> list[Switch]:
+def find_switches(log: DriveLog) -> list[Switch]:
     """All changes of the shown view; position errors are NaN if one of the images is missing."""
     found = []
     for k in range(1, len(log.virtual)):
@@ -210,7 +256,7 @@ def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple
     return None
 
 
-def picture_errors_m(before: Shown, after: Shown, log: Log) -> tuple[float, float, float]:
+def picture_errors_m(before: Shown, after: Shown, log: DriveLog) -> tuple[float, float, float]:
     """Distances between the positions of two images that should coincide: as known, in truth, and as the eye sees it.
 
     The shown robot moves between the two images; its mean speed around the switch gives that distance.
@@ -227,7 +273,7 @@ def picture_errors_m(before: Shown, after: Shown, log: Log) -> tuple[float, floa
     return error, truly, seen
 
 
-def obstacles_met(log: Log, centres: FloatArray) -> int:
+def obstacles_met(log: DriveLog, centres: FloatArray) -> int:
     """Number of obstacles (N, 2) that the shown robot came near."""
     if len(centres) == 0 or not log.time_s:
         return 0
@@ -235,7 +281,7 @@ def obstacles_met(log: Log, centres: FloatArray) -> int:
     return int((away.min(axis=0) < MET_M).sum())
 
 
-def judge(drive: TeleopDrive, log: Log, centres: FloatArray) -> None:
+def judge(drive: TeleopDrive, log: DriveLog, centres: FloatArray) -> None:
     """Fill in the figures that follow from the log; image figures of the switches are set elsewhere."""
     drive.obedience = obedience(log)
     drive.switches = find_switches(log)

@@ -264,7 +264,7 @@ def operator_image(stack: SimulatedStack) -> NDArray[np.uint8]:
 
     shown = stack.log.pictures[-1]
     if shown.virtual:
-        rgb = decode(shown.jpeg if shown.draw is None else shown.draw())
+        rgb = decode(shown.jpeg)
     else:
         rgb = photograph(stack, shown, *_PICTURE, math.pi / 2)
     frame = np.ascontiguousarray(cv2.resize(rgb, _PICTURE)[..., ::-1])

@@ -7,18 +7,16 @@
 - Modelled: the delay of commands to the base and of images to the page; the age of depth (its network takes no
   simulated time); and the page itself, which shows what the console sends.
 
-Camera images are rendered only where depth uses them. The console and the arbiter need only their stamps, and get a
-small placeholder at the camera's rate. Rendered views are small, except on either side of a switch, where they are
-compared at full size.
+Camera images are rendered only where depth uses them. The console and the arbiter need only their stamps, and get an
+empty image at the camera's rate.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -26,8 +24,8 @@ from numpy.typing import NDArray
 
 from instant_ic.bag.replay import make_node
 from instant_ic.bus.lockstep import LockstepBus, Record
-from instant_ic.console.server import ConsoleServer
 from instant_ic.experiments.plots import jpeg
+from instant_ic.experiments.teleop_figures import DriveLog, Shown
 from instant_ic.geometry.poses import (
     compose2,
     matrix_from_quaternion,
@@ -46,7 +44,6 @@ from instant_ic.msg import (
     stamp_ns,
     to_time,
 )
-from instant_ic.vspace.jobs import EncodedView, Job, JobOutcome, SpaceWorker
 
 if TYPE_CHECKING:
     from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
@@ -67,8 +64,11 @@ _FIRST_CUT_S = 0.05
 """The driver cuts revolutions at 180°."""
 _OVERDUE_S = 0.5
 """Time beyond the depth latency after which an image passed to depth no longer leads to a keyframe."""
-_SMALLER = 4
-"""Scale factor of each side of a view that is not compared."""
+_REMAPS = {
+    "crawler_base": {"/cmd_vel": "/base/cmd_vel"},
+    "depth_estimator": {"/camera/image/compressed": "/camera/for_depth"},
+    "depth_scaler": {"/camera/image/compressed": "/camera/for_depth"},
+}
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,13 @@ class StackConfig:
     """Configuration of the stack, and the delays that the lockstep bus does not model.
 
     Attributes:
-        method: of ``METHODS``.
+        method: one of ``METHODS``.
         depth: depth source, ``completed``, ``fused`` or ``lidar``.
-        seed: of the robot's slip, the LiDAR's noise and the delays.
+        seed: seed of the robot's slip, the LiDAR's noise and the delays.
         camera_hz: images per second.
         camera_latency_s: from the exposure to the page, as for the simulated camera.
         depth_latency_s: from the exposure to the keyframe.
         command_latency_s: minimum and maximum from the arbiter to the base; one value is drawn per stack.
-        whole_views: render all views at full size, for a video; else only those on either side of a switch.
         overrides: further parameters ``node.key:=value``; the images for depth and virtual space have the size of
             ``theta_camera.theta``.
     """
@@ -95,42 +94,17 @@ class StackConfig:
     camera_latency_s: float = 0.2
     depth_latency_s: float = 1.0
     command_latency_s: tuple[float, float] = (0.02, 0.08)
-    whole_views: bool = False
     overrides: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise ValueError(f"method must be one of {', '.join(METHODS)} (got {self.method!r})")
+        names = (*NODES, *VSPACE_NODES, "theta_camera")
         for word in self.overrides:
-            if word.partition(".")[0] not in (*NODES, *VSPACE_NODES, "theta_camera") or ":=" not in word:
-                names = ", ".join((*NODES, *VSPACE_NODES, "theta_camera"))
-                raise ValueError(f"parameter {word!r}: expected NODE.KEY:=VALUE with one of the nodes {names}")
-
-
-@dataclass(frozen=True)
-class Shown:
-    """An image on the operator's screen.
-
-    Attributes:
-        time_s: when it was displayed.
-        came_s: when it arrived at the page; a switch shows the newest image that has already arrived.
-        virtual: True for a rendered view, False for the camera's image.
-        pose: (3,) of the robot from which the image was taken, in the world's frame; the true pose for a camera image.
-        place: (2,) its position, as the stack knows it.
-        heading: yaw at which it is shown: the page rotates the camera's image to the newest heading.
-        jpeg, fov_rad: of a rendered view.
-        draw: renders the JPEG of this view at full size.
-    """
-
-    time_s: float
-    came_s: float
-    virtual: bool
-    pose: FloatArray
-    place: FloatArray
-    heading: float
-    jpeg: bytes = b""
-    fov_rad: float = math.pi / 2
-    draw: Callable[[], bytes] | None = None
+            if word.partition(".")[0] not in names or ":=" not in word:
+                raise ValueError(
+                    f"parameter {word!r}: expected NODE.KEY:=VALUE with one of the nodes {', '.join(names)}"
+                )
 
 
 class EmulatedPort:
@@ -152,13 +126,14 @@ class EmulatedPort:
         self.received.clear()
 
     def close(self) -> None:
-        pass
+        """Do nothing: the line is in memory."""
 
 
-class SilentPage:
-    """Replaces the console's server; no page is connected."""
+class UnseenPage:
+    """A connected page without a person in front of it; a :class:`~instant_ic.console.feed.PageServer`."""
 
     plain_http = False
+    on_drawn: Callable[[], None] = staticmethod(lambda: None)
 
     def now_ms(self) -> float:
         return 0.0
@@ -166,25 +141,39 @@ class SilentPage:
     def needs_views(self) -> bool:
         return True
 
-    def __getattr__(self, name: str) -> Any:
-        """Method that ignores what it is given; ``drawn_ms`` is None as it shows rendered views."""
-        if not hasattr(ConsoleServer, name):
-            raise AttributeError(f"the console's server has no {name}")
-        return lambda *_: None
+    def drawn_ms(self) -> float | None:
+        return None
+
+    def show(self, *kinds: Any) -> None:
+        """Ignore which kinds of images are in the foreground."""
+
+    def follow_robot(self, holder: str | None, estop: bool = False) -> None:
+        """Ignore who drives the robot."""
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        """Ignore a message to the page."""
+
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
+        """Ignore an image to the page."""
+
+    def send_layers(self, layers: Any) -> None:
+        """Ignore the layers of the virtual space."""
 
 
-class _Page(SilentPage):
-    """Records what the console's server is given to show."""
+class _Page(UnseenPage):
+    """Passes on the images and the state that the console sends to its page."""
 
     def __init__(self, stack: SimulatedStack) -> None:
         self._stack = stack
         self.virtual = False
-        self.state: dict[str, Any] = {}  # newest message
+        self.state: dict[str, Any] = {}
+        """Newest message."""
 
     def now_ms(self) -> float:
         return self._stack.bus.clock.now_ns() / 1e6
 
     def publish(self, kind: str, message: dict[str, Any]) -> None:
+        """Keep the newest state; switch to the other kind of image where it says so."""
         if kind != "state":
             return
         self.state = message
@@ -194,31 +183,9 @@ class _Page(SilentPage):
             self._stack.on_show()
 
     def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
-        if kind.name in ("VIEW", "PANORAMA"):  # but not the map
+        """Pass on images of camera and virtual space, but not maps."""
+        if kind.name in ("VIEW", "PANORAMA"):
             self._stack.on_frame(kind.name == "VIEW", header, payload)
-
-
-@dataclass
-class Log:
-    """Events of a drive, one row per twentieth of a second; poses (x, y, yaw) in the world's frame."""
-
-    time_s: list[float] = field(default_factory=list)
-    mode: list[int] = field(default_factory=list)
-    virtual: list[bool] = field(default_factory=list)
-    """Whether the rendered view is shown."""
-    robot: list[FloatArray] = field(default_factory=list)
-    estimate: list[FloatArray] = field(default_factory=list)
-    """The r-bot's pose as the stack knows it."""
-    vbot: list[FloatArray] = field(default_factory=list)
-    yaw_gap_rad: list[float] = field(default_factory=list)
-    """v-bot heading minus the r-bot's true heading at the time of the v-bot's message."""
-    known_yaw_gap_rad: list[float] = field(default_factory=list)
-    """The same from the headings the arbiter knows; the page rotates the images to these."""
-    command: list[tuple[float, float]] = field(default_factory=list)
-    blocked: list[bool] = field(default_factory=list)
-    reason: list[str] = field(default_factory=list)
-    pictures: list[Shown] = field(default_factory=list)
-    keyframes: int = 0
 
 
 class SimulatedStack:
@@ -234,11 +201,13 @@ class SimulatedStack:
         self.simulation.scanner.skip_to(_FIRST_CUT_S)
         self.rng = np.random.default_rng([53, config.seed])
         self.start = np.array(world.spawn)
-        self.log = Log()
+        self.log = DriveLog()
         self.state: Any = None
         self.vbot: FloatArray = self.start.copy()
         self.yaw_gap_rad = 0.0
         self.page = _Page(self)
+        self.newest: dict[bool, Shown] = {}
+        """Newest image that has arrived at the page: rendered views (True), camera images (False)."""
         self.command_delay_ns = round(1e9 * self.rng.uniform(*config.command_latency_s))
         self._commands: deque[tuple[int, Record]] = deque()
         self._steps = 0
@@ -247,11 +216,38 @@ class SimulatedStack:
         self._for_depth: deque[tuple[float, float, bytes]] = deque()  # due, exposure, JPEG
         self._keyframe_at: FloatArray | None = None
         self._drawn: dict[int, FloatArray] = {}  # images on their way to a keyframe: stamp, r-bot's true pose
-        # newest view: its request, and a function that renders it at full size
-        self._whole: tuple[int, Callable[[], EncodedView]] | None = None
-        self._newest: dict[bool, Shown] = {}
-        self.bus = LockstepBus(START_NS, keep=False, on_record=self._on_record)
-        self._add_nodes()
+        self.bus = LockstepBus(START_NS, keep=False, on_record=self.on_record)
+        self._words = [
+            "vlp16_driver.source:=topic",
+            "nerf.space.source:=warp",
+            f"depth_scaler.source:={config.depth}",
+            "theta_camera.source:=files",
+            "console.map_rate_hz:=0.1",
+            *config.overrides,
+        ]
+        names = list(NODES)
+        if config.method == "ic":
+            names += [name for name in VSPACE_NODES if name != "depth_estimator" or config.depth != "lidar"]
+        self.nodes: dict[str, Any] = {}
+        for name in names:
+            self.start_node(name)
+        if config.method == "ic":
+            images_to = self.nodes["depth_estimator" if config.depth != "lidar" else "depth_scaler"]
+            self._depth_hz = float(images_to.config.max_rate_hz)
+        camera = make_node("theta_camera", None, self._words).config
+        self._preview = camera.theta
+        self.nodes["console"].tf_broadcast_static("base_link", "camera", pose_matrix(*camera.camera_mount.pose))
+
+    def start_node(self, name: str) -> None:
+        """Start a node, also in place of one that was taken off the bus."""
+        node = make_node(name, None, self._words)
+        parts: dict[str, Any] = {}
+        if name == "crawler_base":
+            port = EmulatedPort(self.simulation.controller)
+            parts["open_port"] = lambda _: port
+        elif name == "console":
+            parts["page"] = self.page
+        self.nodes[name] = self.bus.add(node.node_class, node.config, name, remaps=_REMAPS.get(name), **parts)
 
     def close(self) -> None:
         """Close the nodes."""
@@ -264,47 +260,8 @@ class SimulatedStack:
         """Close the nodes at the end of the block."""
         self.close()
 
-    # -- nodes
-
-    def _add_nodes(self) -> None:
-        config = self.config
-        words = [
-            "vlp16_driver.source:=topic",
-            "nerf.space.source:=warp",
-            f"depth_scaler.source:={config.depth}",
-            "theta_camera.source:=files",
-            "console.map_rate_hz:=0.1",
-            *config.overrides,
-        ]
-        names = list(NODES)
-        if config.method == "ic":
-            names += [name for name in VSPACE_NODES if name != "depth_estimator" or config.depth != "lidar"]
-        pictures = {"/camera/image/compressed": "/camera/for_depth"}
-        remaps = {
-            "crawler_base": {"/cmd_vel": "/base/cmd_vel"},
-            "depth_estimator": pictures,
-            "depth_scaler": pictures,
-        }
-        port = EmulatedPort(self.simulation.controller)
-        self.nodes: dict[str, Any] = {}
-        for name in names:
-            node = make_node(name, None, words)
-            node_class: Any = node.node_class
-            if name == "crawler_base":
-                node_class = type(node_class.__name__, (node_class,), {"open_port": staticmethod(lambda _: port)})
-            if name == "nerf" and not config.whole_views:
-                node_class = type(node_class.__name__, (node_class,), {"worker_class": self._small_views()})
-            self.nodes[name] = self.bus.add(node_class, node.config, name, remaps=remaps.get(name))
-        if config.method == "ic":
-            looks = self.nodes["depth_estimator" if config.depth != "lidar" else "depth_scaler"]
-            self._depth_hz = float(looks.config.max_rate_hz)
-        camera = make_node("theta_camera", None, words).config
-        self._preview = camera.theta
-        mount = pose_matrix(*camera.camera_mount.pose)
-        self.nodes["console"].tf_broadcast_static("base_link", "camera", mount)
-        self.nodes["console"].feed.server = self.page
-
-    def _on_record(self, record: Record) -> None:
+    def on_record(self, record: Record) -> None:
+        """Take a message that a node has published."""
         topic = record.topic
         if topic == "/cmd_vel":
             self._commands.append((record.stamp_ns + self.command_delay_ns, record))
@@ -320,91 +277,61 @@ class SimulatedStack:
             of = stamp_ns(deserialize(record.payload, record.type_name))
             self._keyframe_at = self._drawn.pop(of, self._keyframe_at)
 
-    def _small_views(self) -> type[SpaceWorker]:
-        """A virtual space's worker that renders views small, and keeps what a full-size render of the newest needs."""
-        stack = self
-
-        class SmallViews(SpaceWorker):
-            def do(self, job: Job) -> JobOutcome:
-                order = job.view
-                if order is None:
-                    return super().do(job)
-                as_now = copy.copy(self)
-                as_now.space = copy.copy(self.space)  # rendering changes the space's state; the keyframes stay the same
-                stack._whole = int(order.id), lambda: _encoded(SpaceWorker.do(as_now, job))
-                width, height = (max(16, int(side) // _SMALLER) for side in (order.width, order.height))
-                return super().do(replace(job, view=replace(order, width=width, height=height)))
-
-        return SmallViews
-
     def _in_world(self, in_map: FloatArray) -> FloatArray:
         return np.asarray(compose2(self.start, in_map))
 
     # -- images
 
     def on_frame(self, virtual: bool, header: dict[str, Any], payload: bytes) -> None:
-        """Handle an image that arrives at the page."""
+        """Take an image that arrives at the page."""
         if virtual:
             map_from_camera = matrix_from_quaternion(np.array(header["q"]))
             map_from_camera[:3, 3] = header["p"]
             pose = self._in_world(pose2_from_matrix(map_from_camera))
-            now, fov, whole = self.time_s, float(header["fov"]), self._whole_view(header)
-            draw = None if whole is None else lambda: whole().jpeg
-            shown = Shown(now, now, True, pose, pose[:2], float(pose[2]), payload, fov, draw)
+            now, fov_rad = self.time_s, float(header["fov"])
+            shown = Shown(now, now, True, pose, pose[:2], float(pose[2]), payload, fov_rad)
         else:
             exposure_s, taken_from = self._exposed.popleft()
             stamp = START_NS + round(exposure_s * 1e9)
             known = self.nodes["console"].feed.scene.lookup("map", "camera", stamp)
             place = taken_from if known is None else self._in_world(pose2_from_matrix(known))
             shown = Shown(self.time_s, self.time_s, False, taken_from, place[:2], float(self.robot[2]))
-        self._newest[virtual] = shown
+        self.newest[virtual] = shown
         if virtual == self.page.virtual:
-            self._show(shown)
-
-    def _whole_view(self, header: dict[str, Any]) -> Callable[[], EncodedView] | None:
-        """Function that renders the view of a frame's header at full size; None if another view is the newest."""
-        return self._whole[1] if self._whole is not None and self._whole[0] == header["request_id"] else None
+            self.log.pictures.append(shown)
 
     def on_show(self) -> None:
         """Switch the page to the other kind of image: its newest one, if it is fresh."""
-        newest = self._newest.get(self.page.virtual)
+        newest = self.newest.get(self.page.virtual)
         if newest is not None and self.time_s - newest.time_s < 0.5:
             heading = newest.heading if newest.virtual else float(self.robot[2])
-            self._show(replace(newest, time_s=self.time_s, heading=heading))
-
-    def _show(self, shown: Shown) -> None:
-        """Display an image; at a switch, render it and the previous one at full size. Drop other views' renderers."""
-        pictures = self.log.pictures
-        if pictures:
-            switched = pictures[-1].virtual != shown.virtual
-            pictures[-1] = _settled(pictures[-1], switched)
-            shown = _settled(shown, True) if switched else shown
-        pictures.append(shown)
+            self.log.pictures.append(replace(newest, time_s=self.time_s, heading=heading))
 
     def _photograph(self) -> None:
         now = self.time_s
         if now >= self._next_exposure_s - 1e-9:
             self._next_exposure_s += 1.0 / self.config.camera_hz
             self._exposed.append((now, self.robot))
-            if self.config.method == "ic" and self._worth_drawing():
+            if self.config.method == "ic" and self._leads_to_keyframe():
                 self._drawn[START_NS + round(now * 1e9)] = self.robot
-                self._for_depth.append((now + self.config.depth_latency_s, now, self._draw()))
+                self._for_depth.append((now + self.config.depth_latency_s, now, self.photo_jpeg()))
         # Images in transit: the console itself takes the first off the queue.
         while self._exposed and now - self._exposed[0][0] >= self.config.camera_latency_s - 1e-9:
             waiting, exposure = len(self._exposed), self._exposed[0][0]
-            self._publish_picture("/camera/image/compressed", b"", exposure)
+            self.publish_image("/camera/image/compressed", b"", exposure)
             if len(self._exposed) == waiting:  # the console is not available
                 self._exposed.popleft()
         while self._for_depth and now >= self._for_depth[0][0] - 1e-9:
             _, exposure, image = self._for_depth.popleft()
-            self._publish_picture("/camera/for_depth", image, exposure)
+            self.publish_image("/camera/for_depth", image, exposure)
 
-    def _publish_picture(self, topic: str, image: bytes, exposure_s: float) -> None:
+    def publish_image(self, topic: str, image: bytes, exposure_s: float) -> None:
+        """Publish a camera image (JPEG) that was exposed at a time in seconds."""
         message = compressed_image_message(image, "camera", START_NS + round(exposure_s * 1e9))
         self.bus.publish(topic, message)
 
-    def _worth_drawing(self) -> bool:
-        """Whether depth would make a keyframe of an image taken now, because there is none near this position."""
+    def _leads_to_keyframe(self) -> bool:
+        """Return whether depth would make a keyframe of an image taken now: there is none near this position."""
         if self.time_s < self._next_depth_s - 1e-9:
             return False
         now_ns = START_NS + round(self.time_s * 1e9)
@@ -419,7 +346,8 @@ class SimulatedStack:
             self._next_depth_s = self.time_s + 1.0 / self._depth_hz
         return worth
 
-    def _draw(self) -> bytes:
+    def photo_jpeg(self) -> bytes:
+        """Return the camera's image from the present pose, in the size of its preview."""
         return jpeg(self.simulation.panorama(self._preview.width, self._preview.height).rgb, 92)
 
     # -- time
@@ -438,7 +366,7 @@ class SimulatedStack:
         """Pose (3,) of the shown robot: the r-bot's position as in the newest image, with its current heading."""
         if self.page.virtual:
             return self.vbot
-        seen = self._newest.get(False)
+        seen = self.newest.get(False)
         place = self.robot[:2] if seen is None else seen.pose[:2]
         return np.array([*place, self.robot[2]])
 
@@ -482,17 +410,6 @@ class SimulatedStack:
         log.command.append(command)
         log.blocked.append(bool(state.blocked))
         log.reason.append(str(state.reason))
-
-
-def _encoded(outcome: JobOutcome) -> EncodedView:
-    assert outcome.encoded is not None
-    return outcome.encoded
-
-
-def _settled(shown: Shown, whole: bool) -> Shown:
-    if shown.draw is None:
-        return shown
-    return replace(shown, jpeg=shown.draw() if whole else shown.jpeg, draw=None)
 
 
 def _moved(a: FloatArray, b: FloatArray, distance_m: float, angle_rad: float) -> bool:

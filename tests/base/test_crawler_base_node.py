@@ -28,12 +28,9 @@ class Bench:
         self.emulator = RoboclawEmulator()
         self.port = EmulatorPort(self.emulator)
 
-        class Node(CrawlerBaseNode):
-            open_port = staticmethod(opener(self.port))
-
         self.bus = LockstepBus(start_ns=1_000_000_000_000)
         config = CrawlerBaseConfig(roboclaw=RoboclawConfig(port="memory"))
-        self.node = self.bus.add(Node, dataclasses.replace(config, **changes))
+        self.node = self.bus.add(CrawlerBaseNode, dataclasses.replace(config, **changes), open_port=opener(self.port))
 
     def run(self, seconds: float, v: float | None = None, w: float = 0.0) -> None:
         """Move on in steps of a millisecond; with v, a command comes each 50 ms."""

@@ -82,8 +82,7 @@ class FakeServer:
 @pytest.fixture
 def setup():
     with LockstepBus(START) as bus:
-        node = bus.add(ConsoleNode, ConsoleConfig(view=ViewConfig(virtual_rate_hz=10)))
-        node.feed.server = FakeServer(bus.clock)
+        node = bus.add(ConsoleNode, ConsoleConfig(view=ViewConfig(virtual_rate_hz=10)), page=FakeServer(bus.clock))
         yield bus, node, node.feed.server
 
 

@@ -20,7 +20,7 @@ from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.server import ServerConfig
 from instant_ic.control.states import Mode
-from instant_ic.experiments.teleop_stack import SilentPage
+from instant_ic.experiments.teleop_stack import UnseenPage
 from instant_ic.msg import (
     ControlState,
     PoseWithCovariance,
@@ -103,8 +103,7 @@ class RateWorld:
         for node in (VirtualRobotNode, NavigatorNode):
             self.bus.add(node)
         self.arbiter = self.bus.add(ArbiterNode)
-        self.console = self.bus.add(ConsoleNode, ConsoleConfig(server=ServerConfig(port=0)))
-        self.console.feed.server = SilentPage()
+        self.console = self.bus.add(ConsoleNode, ConsoleConfig(server=ServerConfig(port=0)), page=UnseenPage())
         static = draw_map(walls, (-2, -1.2, length_m - 2, 1.2))
         self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
         mounts = [("velodyne", 0.6), ("camera", 1.2)]

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,19 +14,19 @@ import pytest
 from instant_ic.cli.main import main
 from instant_ic.control.states import Mode
 from instant_ic.experiments import teleop, teleop_figures, teleop_worlds
-from instant_ic.experiments.teleop_figures import Switch, TeleopDrive
+from instant_ic.experiments.teleop_figures import DriveLog, Shown, Switch, TeleopDrive
 from instant_ic.experiments.teleop_operator import ScriptedOperator, Sight
 from instant_ic.experiments.teleop_plot import Video, save_plot
-from instant_ic.experiments.teleop_stack import Log, Shown, SimulatedStack, StackConfig
+from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
 from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.contact import OccupancyMask
 
 
-def log_of(speeds: list[float], commands: list[float], virtual: list[bool] | None = None) -> Log:
+def log_of(speeds: list[float], commands: list[float], virtual: list[bool] | None = None) -> DriveLog:
     """A straight drive: forward m/s of the shown robot and of the command, each twentieth of a second."""
     virtual = virtual or [False] * len(speeds)
     x = 0.05 * np.concatenate([[0.0], np.cumsum(speeds)])[: len(speeds)]
-    log = Log()
+    log = DriveLog()
     for k, place in enumerate(x):
         pose = np.array([place, 0.0, 0.0])
         log.time_s.append(0.05 * k)
@@ -295,10 +293,15 @@ def short_course() -> teleop_worlds.Course:
 @pytest.mark.parametrize("method", ["ic", "stop"])
 def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp_path: Path) -> None:
     settings = teleop.TeleopSettings(episodes=1, world="corridor", depth="lidar", methods=(method,), pictures=False)
-    episode = teleop._Episode(settings, short_course, 0, method)
+    stacks: list[SimulatedStack] = []
+
+    def make_stack(world: teleop_worlds.World, config: StackConfig) -> SimulatedStack:
+        stacks.append(SimulatedStack(world, config))
+        return stacks[-1]
+
     if method == "stop":  # its film and its plot, once
         with Video(tmp_path / "drive.mp4") as video:
-            drive = episode.run(video.on_step)
+            (drive,) = teleop.run_episode(settings, 0, video.on_step, (method,), make_stack, short_course)
         read = cv2.VideoCapture(str(tmp_path / "drive.mp4"))
         frames = int(read.get(cv2.CAP_PROP_FRAME_COUNT))
         picture, plan = np.hsplit(read.read()[1], [640])
@@ -307,22 +310,14 @@ def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp
         save_plot(tmp_path / "drive.png", [drive], teleop.report([drive], settings), settings)
         assert cv2.imread(str(tmp_path / "drive.png")).std() > 10
     else:
-        drive = episode.run()
+        (drive,) = teleop.run_episode(settings, 0, None, (method,), make_stack, short_course)
     assert drive.completed and drive.contacts == 0 and not drive.switches
     assert 1.0 < drive.seconds < 4.0
     # He lets go where the picture, 0.2 s old, is 0.25 m before the goal; then come the command's way and braking.
     assert drive.driven_m == pytest.approx(0.75, abs=0.15)
     assert drive.obedience > 0.9
     assert drive.longest_freeze_s < 0.35 and (drive.keyframes > 0) == (method == "ic")
-    if method == "ic":  # a view is drawn small, and as it was then at full size where that is wanted
-        newest = episode.stack._newest[True]
-        assert newest.draw is not None
-        whole, small = teleop.decode(newest.draw()), teleop.decode(newest.jpeg)
-        assert whole.shape[1] == 4 * small.shape[1] and whole.shape[0] // 4 == small.shape[0]
-        assert np.array_equal(whole, teleop.decode(newest.draw()))
-        shrunk = cv2.resize(whole, small.shape[1::-1], interpolation=cv2.INTER_AREA)
-        assert np.abs(shrunk.astype(float) - small).mean() < 12 < small.std()
-    nodes = set(episode.stack.nodes)
+    nodes = set(stacks[0].nodes)
     assert {"crawler_base", "vlp16_driver", "grid_slam", "arbiter", "navigator", "console"} <= nodes
     assert ("nerf" in nodes) == (method == "ic")
 
@@ -335,16 +330,8 @@ def test_the_stack_refuses_what_it_cannot_run() -> None:
 def test_the_camera_s_images_have_the_size_of_its_preview(short_course: teleop_worlds.Course) -> None:
     words = ("theta_camera.theta.width:=640", "theta_camera.theta.height:=320", "theta_camera.theta.rate_hz:=8")
     with SimulatedStack(short_course.world, StackConfig(overrides=words)) as stack:
-        image = cv2.imdecode(np.frombuffer(stack._draw(), np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(stack.photo_jpeg(), np.uint8), cv2.IMREAD_COLOR)
     assert image.shape == (320, 640, 3)
-
-
-def test_at_a_switch_both_pictures_are_drawn_whole() -> None:
-    stack = SimpleNamespace(log=Log())
-    for k, virtual in enumerate([False, True, True, True, False]):
-        SimulatedStack._show(stack, replace(photo(float(k), 0.0, virtual), jpeg=b"small", draw=lambda: b"whole"))
-    assert [shown.jpeg for shown in stack.log.pictures[1:4]] == [b"whole", b"small", b"whole"]
-    assert all(shown.draw is None for shown in stack.log.pictures)
 
 
 def test_a_command_reaches_the_base_late(short_course: teleop_worlds.Course) -> None:

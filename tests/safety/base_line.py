@@ -192,14 +192,14 @@ class NodeBench:
     def __init__(self, **changes: Any) -> None:
         roboclaw = RoboclawConfig(port="memory")
         self.line = Line(roboclaw)
-        line = self.line
-
-        class Node(CrawlerBaseNode):
-            open_port = staticmethod(line.open)
 
         self.bus = LockstepBus(start_ns=10**18)
         self.clock = self.bus.clock = SetClock(10**18)
-        self.node = self.bus.add(Node, dataclasses.replace(CrawlerBaseConfig(roboclaw=roboclaw), **changes))
+        self.node = self.bus.add(
+            CrawlerBaseNode,
+            dataclasses.replace(CrawlerBaseConfig(roboclaw=roboclaw), **changes),
+            open_port=self.line.open,
+        )
 
     def run(self, seconds: float, v: float | None = None, publisher: str = "arbiter") -> None:
         """Goes on in steps of a millisecond; with ``v`` a command comes each 50 ms."""

@@ -54,15 +54,11 @@ def thaw(rig: Rig) -> None:
 
 def restart(rig: Rig, name: str, after_s: float) -> None:
     """Kill a node and start it again."""
-    old, stack = rig.stack.nodes[name], rig.stack
     rig.freeze(name)
     run(rig, after_s)
     rig.dead.clear()
     rig.operates = True
-    remaps = {"/cmd_vel": "/base/cmd_vel"} if name == "crawler_base" else {}
-    stack.nodes[name] = rig.bus.add(type(old), old.config, name, remaps=remaps)
-    if name == "console":
-        stack.nodes[name].feed.server = stack.page
+    rig.stack.start_node(name)
 
 
 def assert_stands(rig: Rig, start: tuple[float, float], text: str = "") -> None:

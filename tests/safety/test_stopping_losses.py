@@ -40,8 +40,8 @@ class Stop:
 class Watched(SimulatedStack):
     """Keeps what the arbiter sends."""
 
-    def _on_record(self, record: Record) -> None:
-        super()._on_record(record)
+    def on_record(self, record: Record) -> None:
+        super().on_record(record)
         if record.topic == "/cmd_vel":
             message = deserialize(record.payload, record.type_name)
             self.sent.append((record.stamp_ns, twist_values(message), message.header.frame_id))
@@ -65,7 +65,7 @@ class Rig:
         self.command = (0.0, 0.0)
         self.dead: list = []
         self.packets = self.stack.simulation.scan_packets
-        self.publish_picture = self.stack._publish_picture
+        self.publish_picture = self.stack.publish_image
         for _ in range(round(3.0 / STEP_S)):
             self.step()
 
@@ -113,7 +113,7 @@ class Rig:
         self.dead.clear()
         self.operates = True
         self.stack.simulation.scan_packets = self.packets
-        self.stack._publish_picture = self.publish_picture
+        self.stack.publish_image = self.publish_picture
 
     def lose(self, lose: Callable[[], None], phase: int) -> Stop:
         """Drives, loses something and watches what the robot does for two seconds."""
@@ -152,7 +152,7 @@ def cease_packets(rig: Rig) -> None:
 
 
 def cease_images(rig: Rig) -> None:
-    rig.stack._publish_picture = lambda *_: None
+    rig.stack.publish_image = lambda *_: None
 
 
 def cease_commands(rig: Rig) -> None:

@@ -24,9 +24,9 @@ def add_kind(kinds: Any) -> None:
         kinds, "illusion", "compare the operator's view inside and behind obstacles with the truth", run,
         "ic evaluate illusion --episodes 4 --json illusion.json --strip strip.png --plot plot.png",
         "The drive of ic evaluate teleop with illusory control. Every frame in which the page shows the virtual "
-        "space is composed as on the page and compared with the simulator's image from the same pose: with the "
-        "obstacle before its near face, without it from there on. The same frames are also composed with true "
-        "depth, and with true depth and exact fill of unseen places. Reports PSNR, SSIM, unseen share, floor shown "
+        "space is rendered by the CPU and compared with the simulator's image from the same pose: with the obstacle "
+        "before its near face, without it from there on. The same frames are also rendered with true depth, and "
+        "with true depth and exact fill of unseen places. Reports PSNR, SSIM, unseen share, floor shown "
         "as fog, and the error of the expected PSNR. The same seed gives the same figures.",
     )  # fmt: skip
     add_options(parser, 20, 1, 7200.0, "PSNR by distance, and expected PSNR,")
