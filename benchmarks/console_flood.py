@@ -25,7 +25,7 @@ import aiohttp
 import numpy as np
 from reporting import parser_for, report
 
-from instant_ic.console import ConsoleClient, ConsoleServer, ServerConfig
+from instant_ic.console import ConsoleClient, ConsoleServer, ConsoleServerConfig
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 
@@ -61,9 +61,8 @@ class Backend:
 def serve(channel: Connection, max_clients: int) -> None:
     """Server process: sends its port, and at the end the times of the stops."""
     backend: Any = Backend()
-    server = ConsoleServer(
-        backend, ServerConfig(port=0, max_clients=max_clients, drive=PATIENT, access=AccessConfig(simulated=True))
-    )
+    access = AccessConfig(simulated=True)
+    server = ConsoleServer(backend, ConsoleServerConfig(port=0, max_clients=max_clients, drive=PATIENT, access=access))
     server.start()
     for n in range(4):  # data of a running stack, which a new client gets at once
         server.publish(f"state{n}", {"filler": "x" * 400})

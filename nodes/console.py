@@ -69,9 +69,9 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.subscribe("/heartbeat", msg.NodeStatus, feed.take_heartbeat, qos=RELIABLE)
         self.timer(1.0, feed.send_health)
         self.page_timers: list[Timer] = []
-        self.server.on_released = self.release_lease
-        self.server.on_renders = lambda: self.call_soon(self.feed_layers, True)
-        self.server.on_watched = lambda watched: self.call_soon(self.feed_page, watched)
+        self.server.drive.on_released = self.release_lease
+        self.server.pages.on_renders = lambda: self.call_soon(self.feed_layers, True)
+        self.server.pages.on_watched = lambda watched: self.call_soon(self.feed_page, watched)
         self.feed_page(self.run_dir is None)  # in lockstep there are no pages that could come
         for warning in self.server.warnings:
             self.log.warning(warning)
@@ -128,7 +128,7 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_drive(self, linear: float, angular: float) -> None:
         # At once: a detour through the node's thread would add latency.
-        self.command_out.publish(msg.twist_stamped(linear, angular, self.clock.now_ns(), self.server.client))
+        self.command_out.publish(msg.twist_stamped(linear, angular, self.clock.now_ns(), self.server.drive.client))
 
     def release_lease(self, client: str) -> None:
         """Give the robot's lease back in the name of a page that drove."""

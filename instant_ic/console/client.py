@@ -13,7 +13,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import aiohttp
 
-from instant_ic.console.protocol import Frame, FrameKind, Parts, decode_frame, parse_text
+from instant_ic.console.protocol import FrameKind, PageFrame, Parts, decode_frame, parse_text
 
 
 class ConsoleClient:
@@ -52,7 +52,7 @@ class ConsoleClient:
         self._ssl = ssl.create_default_context(cafile=ca_file) if parts.scheme == "https" else True
         self.acknowledge = acknowledge
         self.messages: dict[str, dict[str, Any]] = {}
-        self.frames: dict[FrameKind, Frame] = {}
+        self.frames: dict[FrameKind, PageFrame] = {}
         self._parts = Parts()
         self.frame_counts: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
         self.refused: list[str] = []
@@ -208,7 +208,7 @@ class ConsoleClient:
             async with self._news:
                 self._news.notify_all()
 
-    async def _on_frame(self, frame: Frame) -> None:
+    async def _on_frame(self, frame: PageFrame) -> None:
         if frame.kind is FrameKind.PART:
             await self.send({"type": "ack", "kind": int(frame.kind), "seq": frame.sequence})
             if (whole := self._parts.take(frame)) is None:

@@ -5,10 +5,39 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from instant_ic.config.ranges import Checked, Positive, Range
+from instant_ic.config.ranges import Checked, Positive, PositiveInt, Range
 from instant_ic.config.robot import CAMERA_MOUNT, MotionLimits, Mount, Rectangle
-from instant_ic.console.server import ServerConfig
+from instant_ic.console.access import AccessConfig
+from instant_ic.console.drive import DriveConfig
 from instant_ic.console.view import ViewConfig
+
+
+@dataclass(frozen=True)
+class ConsoleServerConfig(Checked):
+    """Address, limits and access of the server.
+
+    Attributes:
+        host: listen address; any but loopback (e.g. 0.0.0.0) opens the page to the network.
+        port: 0 = any free port; the log states it.
+        allowed_hosts: host names by which browsers may reach the page, besides localhost and IP addresses.
+        max_clients: simultaneous pages; two places are reserved for pages that may drive.
+        max_connections: simultaneous connections; at the limit the address with the most idle ones loses its oldest.
+        max_connections_per_address: the same for one address (IPv6: one /64).
+        max_messages_per_s: limit for the driver's page, with bursts of twice this number; 0.4 of it for others; above,
+            the WebSocket is closed.
+        background_picture_hz: rate of images that are not shown (the camera while in the virtual space).
+    """
+
+    host: str = "127.0.0.1"
+    port: Annotated[int, Range(0, 65535)] = 8080  # 0 = any free port
+    allowed_hosts: tuple[str, ...] = ()  # host names by which browsers may reach the page besides localhost
+    max_clients: PositiveInt = 16
+    max_connections: PositiveInt = 128
+    max_connections_per_address: PositiveInt = 32
+    max_messages_per_s: Positive = 300.0  # of one page; above, its WebSocket is closed; see BURST_S
+    background_picture_hz: Positive = 2.0  # images that are not shown (camera in the v-space)
+    access: AccessConfig = field(default_factory=AccessConfig)
+    drive: DriveConfig = field(default_factory=DriveConfig)
 
 
 @dataclass(frozen=True)
@@ -25,7 +54,7 @@ class ConsoleConfig(Checked):
         recorder: node behind the page's record, snapshot and bookmark buttons.
     """
 
-    server: ServerConfig = field(default_factory=ServerConfig)
+    server: ConsoleServerConfig = field(default_factory=ConsoleServerConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
     map_rate_hz: Positive = 2.0
     dissolve_ms: Annotated[float, Range(0, 5000)] = 250.0

@@ -15,7 +15,7 @@ from instant_ic.console.faults import ERROR, OK, WARN, FaultList
 from instant_ic.console.gridimage import GridLayers
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import MOST_LAYERS, PageLayers
-from instant_ic.console.protocol import FrameKind, ProtocolError
+from instant_ic.console.protocol import FrameKind, PageProtocolError
 from instant_ic.console.scene import Newest, Scene
 from instant_ic.console.server import PLAIN_HTTP
 from instant_ic.console.view_requests import ViewRequests
@@ -128,7 +128,7 @@ class PageFeed:
     ) -> None:
         self.watched = True
         self.server = server
-        server.on_drawn = self.report_shown
+        server.pages.on_drawn = self.report_shown
         self._meshes = LayerMeshes()
         self._mount = config.camera_mount.xyz
         self.scene = Scene(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
@@ -178,7 +178,7 @@ class PageFeed:
             return
         try:
             self.server.send_layers(layers)
-        except ProtocolError as error:
+        except PageProtocolError as error:
             self._diagnose("layers", ERROR, f"virtual space dropped: {error}")
             return
         self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))

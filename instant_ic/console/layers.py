@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console.protocol import ProtocolError
+from instant_ic.console.protocol import PageProtocolError
 from instant_ic.geometry.poses import Matrix, quaternion_from_matrix
 
 MOST_LAYERS = 8
@@ -66,13 +66,13 @@ class PageLayer:
         return content.hexdigest()
 
     def check(self, name: str) -> None:
-        """Check what comes from a message, not the triangles of our own mesher; raise ProtocolError with its name."""
+        """Check the fields of a layer that come from a message; raise PageProtocolError, which names the field."""
         if not np.isfinite(self.gain).all():
-            raise ProtocolError(f"{name}.gain must be 3 finite numbers (got {self.gain})")
+            raise PageProtocolError(f"{name}.gain must be 3 finite numbers (got {self.gain})")
         if not np.isfinite(self.map_from_camera).all():
-            raise ProtocolError(f"{name}.map_from_camera must be 4 x 4 finite numbers")
+            raise PageProtocolError(f"{name}.map_from_camera must be 4 x 4 finite numbers")
         if not self.image:
-            raise ProtocolError(f"{name}.image is empty")
+            raise PageProtocolError(f"{name}.image is empty")
 
 
 @dataclass(frozen=True)
@@ -90,13 +90,13 @@ class PageLayers:
     layers: tuple[PageLayer, ...]
 
     def check(self) -> None:
-        """Check all layers; raise ProtocolError, which names what is wrong."""
+        """Check all layers; raise PageProtocolError, which names what is wrong."""
         if not 1 <= self.version <= 2**53:
-            raise ProtocolError(f"layers.version must be from 1 to 2**53 (got {self.version})")
+            raise PageProtocolError(f"layers.version must be from 1 to 2**53 (got {self.version})")
         if not 1 <= len(self.layers) <= MOST_LAYERS:
-            raise ProtocolError(f"layers: there must be 1 to {MOST_LAYERS} (got {len(self.layers)})")
+            raise PageProtocolError(f"layers: there must be 1 to {MOST_LAYERS} (got {len(self.layers)})")
         if not np.isfinite(self.mount).all():
-            raise ProtocolError(f"layers.mount must be 3 finite numbers (got {self.mount})")
+            raise PageProtocolError(f"layers.mount must be 3 finite numbers (got {self.mount})")
         for number, layer in enumerate(self.layers):
             layer.check(f"layers[{number}]")
 

@@ -27,7 +27,7 @@ VERSION = 1
 PREFIX = struct.Struct("<BBHII")
 
 
-class ProtocolError(ValueError):
+class PageProtocolError(ValueError):
     """A message violates the protocol; the text names the field and its value."""
 
 
@@ -43,7 +43,7 @@ class FrameKind(IntEnum):
 
 
 @dataclass(frozen=True)
-class Frame:
+class PageFrame:
     """One binary frame."""
 
     kind: FrameKind
@@ -52,34 +52,34 @@ class Frame:
     payload: bytes
 
 
-def encode_frame(frame: Frame) -> bytes:
+def encode_frame(frame: PageFrame) -> bytes:
     """Encode ``frame`` as one binary WebSocket message."""
     header = json.dumps(frame.header, separators=(",", ":"), allow_nan=False).encode()
     return PREFIX.pack(VERSION, frame.kind, 0, frame.sequence, len(header)) + header + frame.payload
 
 
-def decode_frame(data: bytes) -> Frame:
+def decode_frame(data: bytes) -> PageFrame:
     """Decode one binary WebSocket message.
 
     Raises:
-        ProtocolError: too short, unknown version or kind, or the header is not a JSON object.
+        PageProtocolError: too short, unknown version or kind, or the header is not a JSON object.
     """
     if len(data) < PREFIX.size:
-        raise ProtocolError(f"binary frame of {len(data)} bytes is shorter than its prefix of {PREFIX.size} bytes")
+        raise PageProtocolError(f"binary frame of {len(data)} bytes is shorter than its prefix of {PREFIX.size} bytes")
     version, kind, _, sequence, header_length = PREFIX.unpack_from(data)
     if version != VERSION:
-        raise ProtocolError(f"binary frame of version {version}: expected {VERSION}")
+        raise PageProtocolError(f"binary frame of version {version}: expected {VERSION}")
     end = PREFIX.size + header_length
     if end > len(data):
-        raise ProtocolError(f"binary frame of {len(data)} bytes: its header should end at {end}")
+        raise PageProtocolError(f"binary frame of {len(data)} bytes: its header should end at {end}")
     try:
         frame_kind = FrameKind(kind)
         header = json.loads(data[PREFIX.size : end])
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors too
-        raise ProtocolError(f"binary frame: {error}") from None
+        raise PageProtocolError(f"binary frame: {error}") from None
     if not isinstance(header, dict):
-        raise ProtocolError(f"binary frame: header is {type(header).__name__}, not an object")
-    return Frame(frame_kind, sequence, header, data[end:])
+        raise PageProtocolError(f"binary frame: header is {type(header).__name__}, not an object")
+    return PageFrame(frame_kind, sequence, header, data[end:])
 
 
 class Parts:
@@ -88,17 +88,17 @@ class Parts:
     def __init__(self) -> None:
         self._data = bytearray()
 
-    def take(self, part: Frame) -> Frame | None:
+    def take(self, part: PageFrame) -> PageFrame | None:
         """Take a piece; return the frame once it is complete.
 
         Raises:
-            ProtocolError: a piece is missing, or what they make is no frame.
+            PageProtocolError: a piece is missing, or what they make is no frame.
         """
         start, size = part.header.get("start"), part.header.get("size")
         if start == 0:
             self._data.clear()
         if start != len(self._data):
-            raise ProtocolError(f"part.start must be {len(self._data)} (got {start})")
+            raise PageProtocolError(f"part.start must be {len(self._data)} (got {start})")
         self._data += part.payload
         if len(self._data) != size:
             return None
@@ -108,40 +108,40 @@ class Parts:
 
 
 def parse_text(text: str) -> dict[str, Any]:
-    """Parse a JSON object with a string ``type``; raise ProtocolError for anything else."""
+    """Parse a JSON object with a string ``type``; raise PageProtocolError for anything else."""
     try:
         message = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ProtocolError(f"text message is not valid JSON: {error}") from None
+        raise PageProtocolError(f"text message is not valid JSON: {error}") from None
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
-        raise ProtocolError("text message must be an object with a string 'type'")
+        raise PageProtocolError("text message must be an object with a string 'type'")
     return message
 
 
 def number(message: dict[str, Any], key: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return ``message[key]`` as a finite number in [low, high]; raise ProtocolError otherwise."""
+    """Return ``message[key]`` as a finite number in [low, high]; raise PageProtocolError otherwise."""
     value = message.get(key)
     # json.loads accepts NaN, Infinity and integers of any length; none of them may reach a motor.
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(_as_float(value)):
-        raise ProtocolError(f"{message['type']}.{key} must be a finite number (got {value!r:.40})")
+        raise PageProtocolError(f"{message['type']}.{key} must be a finite number (got {value!r:.40})")
     if not low <= value <= high:
-        raise ProtocolError(f"{message['type']}.{key} must be in [{low:g}, {high:g}] (got {value:g})")
+        raise PageProtocolError(f"{message['type']}.{key} must be in [{low:g}, {high:g}] (got {value:g})")
     return float(value)
 
 
 def whole(message: dict[str, Any], key: str) -> int:
-    """Return ``message[key]`` as an integer in [0, 2**53]; raise ProtocolError otherwise."""
+    """Return ``message[key]`` as an integer in [0, 2**53]; raise PageProtocolError otherwise."""
     value = message.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 2**53:
-        raise ProtocolError(f"{message['type']}.{key} must be an integer from 0 to 2**53 (got {value!r:.40})")
+        raise PageProtocolError(f"{message['type']}.{key} must be an integer from 0 to 2**53 (got {value!r:.40})")
     return value
 
 
 def flag(message: dict[str, Any], key: str, default: bool | None = None) -> bool:
-    """Return ``message[key]`` as a bool; raise ProtocolError for another type or a missing key without default."""
+    """Return ``message[key]`` as a bool; raise PageProtocolError for another type or a missing key without default."""
     value = message.get(key, default)
     if not isinstance(value, bool):
-        raise ProtocolError(f"{message['type']}.{key} must be true or false (got {value!r:.40})")
+        raise PageProtocolError(f"{message['type']}.{key} must be true or false (got {value!r:.40})")
     return value
 
 

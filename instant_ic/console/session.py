@@ -13,7 +13,7 @@ from aiohttp import web
 
 from instant_ic.console.connections import LimitedConnection
 from instant_ic.console.layers import PageLayers
-from instant_ic.console.protocol import Frame, FrameKind, encode_frame
+from instant_ic.console.protocol import FrameKind, PageFrame, encode_frame
 from instant_ic.util.web_access import TokenBucket
 
 MAX_REPLIES = 256  # pending, about one second of a page's traffic; a client with more does not read
@@ -24,7 +24,7 @@ PART_BYTES = 64 * 1024  # a larger frame of layers is sent in pieces: on a slow 
 
 @dataclass(frozen=True)
 class PendingFrame:
-    """Frame that has no sequence number yet."""
+    """PageFrame that has no sequence number yet."""
 
     header: dict[str, Any]
     payload: bytes
@@ -34,7 +34,7 @@ class PendingFrame:
         return self.header, self.payload
 
 
-class Session:
+class PageSession:
     """Send queue of one client. Used on the server's loop only.
 
     Replies are sent in order. A text replaces a pending text of the same key, and a frame a pending frame of the
@@ -76,7 +76,7 @@ class Session:
         self._frames: dict[FrameKind, PendingFrame | PageLayers] = {}
         self._sent_frames: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
         self._unacknowledged: dict[FrameKind, int] = {}
-        self._parts: deque[Frame] = deque()  # of the layers that are being sent; their sequence numbers are still open
+        self._parts: deque[PageFrame] = deque()  # of the layers being sent; not numbered yet
         self._last_sent: dict[FrameKind, float] = {}
         self._foreground: frozenset[FrameKind] = frozenset({FrameKind.PANORAMA})
         self._background_period_s = 0.0
@@ -146,11 +146,11 @@ class Session:
             self._last_sent[kind] = now
             if isinstance(pending, PageLayers):
                 self._offered = pending.digests
-            data = encode_frame(Frame(kind, self._sent_frames[kind], *pending.frame(self._held)))
+            data = encode_frame(PageFrame(kind, self._sent_frames[kind], *pending.frame(self._held)))
             if kind is not FrameKind.LAYERS or len(data) <= PART_BYTES:
                 return data
             self._parts.extend(
-                Frame(FrameKind.PART, 0, {"start": start, "size": len(data)}, data[start : start + PART_BYTES])
+                PageFrame(FrameKind.PART, 0, {"start": start, "size": len(data)}, data[start : start + PART_BYTES])
                 for start in range(0, len(data), PART_BYTES)
             )
             return self._next_part()

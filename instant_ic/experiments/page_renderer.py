@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from instant_ic import console
 from instant_ic.console.layers import PageLayers
-from instant_ic.console.protocol import Frame, FrameKind, encode_frame
+from instant_ic.console.protocol import FrameKind, PageFrame, encode_frame
 
 CHROMIUM_FLAGS = [
     "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
@@ -77,7 +77,7 @@ class PageRenderer:
     def load(self, layers: PageLayers) -> None:
         """Show these layers, as the server sends them."""
         layers.check()
-        self._frame = encode_frame(Frame(FrameKind.LAYERS, 1, *layers.frame(frozenset())))
+        self._frame = encode_frame(PageFrame(FrameKind.LAYERS, 1, *layers.frame(frozenset())))
         self._page.evaluate("load()")
 
     def render(self, map_from_camera: NDArray[np.floating], fov_rad: float) -> NDArray[np.uint8]:

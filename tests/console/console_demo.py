@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.console.access import AccessConfig
+from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.gridimage import GridImage, grid_image
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
-from instant_ic.console.server import ConsoleServer, ServerConfig
+from instant_ic.console.server import ConsoleServer
 from instant_ic.console.view import PROBE_HZ, Look, ViewConfig, view_shape
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix, quaternion_from_matrix, wrap_angle
 from instant_ic.geometry.projections import equirect_directions, perspective_directions
@@ -78,7 +79,7 @@ class Demo:
 
     def __init__(
         self,
-        server_config: ServerConfig,
+        server_config: ConsoleServerConfig,
         config: DemoConfig | None = None,
         page_values: dict[str, float] | None = None,
     ) -> None:
@@ -380,7 +381,7 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO)
-    demo = Demo(ServerConfig(port=arguments.port, access=AccessConfig(simulated=True)), DemoConfig(layers=True))
+    demo = Demo(ConsoleServerConfig(port=arguments.port, access=AccessConfig(simulated=True)), DemoConfig(layers=True))
     demo.start()
     logging.getLogger("console_demo").info("open %s (Ctrl-C stops)", demo.server.url)
     try:

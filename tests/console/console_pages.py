@@ -13,8 +13,8 @@ import pytest
 from console_demo import Demo, DemoConfig
 
 from instant_ic.console.access import AccessConfig
+from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.drive import DriveConfig
-from instant_ic.console.server import ServerConfig
 from instant_ic.console.view import ViewConfig
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import perspective_directions
@@ -55,7 +55,7 @@ def make_demo(port=0, panorama_width=192, view_width=160, **access):
     drive = Patient(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
     view = ViewConfig(width=view_width, height=view_width * 5 // 8, virtual_rate_hz=5)
     config = DemoConfig(panorama_width=panorama_width, panorama_hz=4, view=view)
-    demo = Demo(ServerConfig(port=port, drive=drive, access=AccessConfig(simulated=True, **access)), config)
+    demo = Demo(ConsoleServerConfig(port=port, drive=drive, access=AccessConfig(simulated=True, **access)), config)
     demo.start()
     return demo
 

@@ -8,7 +8,7 @@ import subprocess
 import aiohttp
 import pytest
 
-from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, ServerConfig
+from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, ConsoleServerConfig
 from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, read_token
 from instant_ic.util.web_access import is_loopback
 
@@ -54,7 +54,7 @@ def serve():
     servers = []
 
     def start(**access):
-        server = ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(simulated=True, **access)))
+        server = ConsoleServer(Nobody(), ConsoleServerConfig(port=0, access=AccessConfig(simulated=True, **access)))
         server.start()
         servers.append(server)
         return server
@@ -99,7 +99,7 @@ def test_when_a_sign_in_is_needed(files, host, sign_in, simulated, with_file, re
 
 def test_fault_every_local_user_drives_a_real_robot():
     """A console that does not know whether its robot is real asks for a token on this machine too."""
-    server = ConsoleServer(Nobody(), ServerConfig(port=0))
+    server = ConsoleServer(Nobody(), ConsoleServerConfig(port=0))
     server.start()
     try:
 
@@ -157,7 +157,9 @@ def test_bad_token_files_are_named(tmp_path):
             read_token(token_file(tmp_path, name, token))
     same = token_file(tmp_path, "a", DRIVE), token_file(tmp_path, "b", DRIVE)
     with pytest.raises(ConsoleError, match="the same token"):
-        ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(token_file=same[0], watch_token_file=same[1])))
+        ConsoleServer(
+            Nobody(), ConsoleServerConfig(port=0, access=AccessConfig(token_file=same[0], watch_token_file=same[1]))
+        )
 
 
 @pytest.mark.parametrize(
@@ -398,7 +400,7 @@ def check_headers(headers):
 
 @pytest.mark.parametrize(("host", "warned"), [("0.0.0.0", True), ("127.0.0.1", False)])
 def test_plain_http_on_a_network_address_is_warned_of(files, host, warned):
-    server = ConsoleServer(Nobody(), ServerConfig(host=host, port=0, access=AccessConfig(**files)))
+    server = ConsoleServer(Nobody(), ConsoleServerConfig(host=host, port=0, access=AccessConfig(**files)))
     assert server.plain_http is warned
     server.start()
     try:
@@ -478,4 +480,4 @@ def test_bad_certificates_are_named(tmp_path):
     for name in ("c.pem", "missing.pem"):
         files = {"tls_certificate": str(tmp_path / name), "tls_key": str(tmp_path / "c.pem")}
         with pytest.raises(ConsoleError, match=rf"TLS certificate .*{name}"):
-            ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(**files)))
+            ConsoleServer(Nobody(), ConsoleServerConfig(port=0, access=AccessConfig(**files)))

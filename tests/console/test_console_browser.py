@@ -52,7 +52,7 @@ def test_without_webgl_the_page_says_what_to_do_and_does_not_connect(browser, de
     page.goto(demo.server.url)
     page.get_by_text("WebGL 2 is missing. Use a current Chrome, Edge, Firefox or Safari").wait_for(timeout=WAIT_MS)
     assert not page.locator("#estop").count()
-    assert demo.server.gate.driver is None
+    assert demo.server.drive.gate.driver is None
     context.close()
 
 

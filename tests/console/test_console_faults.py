@@ -127,7 +127,7 @@ def test_gamepads_right_stick_looks_and_an_unknown_layout_is_told(pad, shared_de
 
 
 def test_fault_any_client_drives_and_idle_zeros_fight_the_drivers_commands(driver, open_page, shared_demo, monkeypatch):
-    gate = shared_demo.server.gate  # a page that a busy machine delays is not lost here: that would send zeros, too
+    gate = shared_demo.server.drive.gate  # a page that a busy machine delays is not lost: that would send zeros, too
     monkeypatch.setattr(gate, "config", dataclasses.replace(gate.config, beat_timeout_s=30.0))
     watcher = open_page(driver="other", at=shared_demo)
     start_driving(driver, shared_demo)

@@ -8,8 +8,8 @@ import aiohttp
 import numpy as np
 import pytest
 
-from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ProtocolError, ServerConfig
-from instant_ic.console import server as server_module
+from instant_ic.console import ConsoleClient, ConsoleServer, ConsoleServerConfig, FrameKind, PageProtocolError
+from instant_ic.console import pages as pages_module
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayer, PageLayers
@@ -79,13 +79,13 @@ def test_a_layer_that_the_page_holds_is_not_sent_again():
     ],
 )
 def test_a_layer_that_no_page_could_render_is_refused_by_name(change, text):
-    with pytest.raises(ProtocolError, match=text):
+    with pytest.raises(PageProtocolError, match=text):
         layers(1, layer(**change)).check()
 
 
 def test_version_number_of_layers_and_pose_are_checked():
     for wrong in (layers(0), layers(1, *[layer()] * 9), dataclasses.replace(layers(1), mount=(0.0, 0.0, math.nan))):
-        with pytest.raises(ProtocolError, match="layers"):
+        with pytest.raises(PageProtocolError, match="layers"):
             wrong.check()
     layers(1).check()
 
@@ -99,7 +99,7 @@ class Nobody:
 
 @pytest.fixture
 def server():
-    server = ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(simulated=True)))
+    server = ConsoleServer(Nobody(), ConsoleServerConfig(port=0, access=AccessConfig(simulated=True)))
     server.start()
     yield server
     server.stop()
@@ -187,7 +187,7 @@ def test_each_page_gets_a_version_once_and_only_what_it_lacks(server):
 def test_views_are_needed_unless_every_page_renders_the_newest_layers_by_itself(server, monkeypatch):
     server.send_layers(layers(5))
     news = []
-    server.on_drawn = lambda: news.append(server.drawn_ms())
+    server.pages.on_drawn = lambda: news.append(server.drawn_ms())
 
     async def scenario():
         async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
@@ -211,7 +211,7 @@ def test_views_are_needed_unless_every_page_renders_the_newest_layers_by_itself(
             await until(lambda: not server.needs_views())
             assert server.drawn_ms() == now_ms - 30  # the driver's counts
             # What the page shows of outdated layers, or of those of another server, is no news.
-            monkeypatch.setattr(server_module, "SUPERSEDED_S", 0.05)
+            monkeypatch.setattr(pages_module, "SUPERSEDED_S", 0.05)
             server.send_layers(layers(6))
             await asyncio.sleep(0.3)
             for version in (5, 99):

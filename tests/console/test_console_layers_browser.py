@@ -75,7 +75,7 @@ def test_the_dissolve_mixes_two_views_of_the_same_place(open_page, room, query, 
     demo = room
     demo.place(*KEYFRAME)
     demo.forced_mode = "real"
-    demo.server.page |= SLOW_DISSOLVE | {"dissolve_ms": dissolve_ms}
+    demo.server.pages.page |= SLOW_DISSOLVE | {"dissolve_ms": dissolve_ms}
     try:
         page = open_layers(open_page, demo, query)
         wait_until(lambda: not demo.server.needs_views(), page, "the layers")
@@ -94,7 +94,7 @@ def test_the_dissolve_mixes_two_views_of_the_same_place(open_page, room, query, 
         assert edge[:, :3].mean() < 3 * edge.mean()
     finally:
         demo.forced_mode = "virtual"
-        demo.server.page |= {"dissolve_ms": 250, "colour_release_s": 6, "ease_ms": 400}
+        demo.server.pages.page |= {"dissolve_ms": 250, "colour_release_s": 6, "ease_ms": 400}
 
 
 def test_a_bad_frame_of_layers_is_refused_and_the_ones_before_stay(open_page, room):
@@ -111,7 +111,9 @@ def test_a_bad_frame_of_layers_is_refused_and_the_ones_before_stay(open_page, ro
     wait_place(page, 1.9, 0.2, 0.1)
     demo.send_layers(np.array([1.7, 0.2, 0.0]))
     version = demo._version
-    wait_until(lambda: any(s.drawn and s.drawn[0] == version for s in demo.server._sessions.values()), page, "the next")
+    wait_until(
+        lambda: any(s.drawn and s.drawn[0] == version for s in demo.server.pages.sessions.values()), page, "the next"
+    )
     # A page that lost its link on a busy machine got the bad frame twice.
     page.faults[:] = [fault for fault in page.faults if "layers.mount must be" not in fault]
 

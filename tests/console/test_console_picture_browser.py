@@ -21,8 +21,8 @@ from console_pages import (
 )
 
 from instant_ic.console.access import AccessConfig
+from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.drive import DriveConfig
-from instant_ic.console.server import ServerConfig
 from instant_ic.console.view import ViewConfig
 
 pytestmark = BROWSER_TEST
@@ -49,7 +49,9 @@ def passage_demo(**page_values):
     drive = DriveConfig(lease_timeout_s=60.0)
     config = DemoConfig(panorama_width=448, panorama_hz=4, view=view)
     demo = Demo(
-        ServerConfig(port=0, drive=drive, access=AccessConfig(simulated=True)), config, SLOW_PASSAGE | page_values
+        ConsoleServerConfig(port=0, drive=drive, access=AccessConfig(simulated=True)),
+        config,
+        SLOW_PASSAGE | page_values,
     )
     demo.forced_mode = "real"
     demo.start()
@@ -87,7 +89,7 @@ def test_a_tinted_view_has_the_cameras_colours_at_the_switch_and_the_camera_the_
     demo.tint = TINT
     page = open_page(at=demo, bypass_csp=True)
     expect_body(page, "image", "live")
-    wait_until(lambda: demo.server.gate.driver is not None, page, "the lease")
+    wait_until(lambda: demo.server.drive.gate.driver is not None, page, "the lease")
     never_grey(page)
     page.wait_for_timeout(500)
     real = picture_of(page).mean(axis=(0, 1))

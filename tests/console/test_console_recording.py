@@ -10,7 +10,7 @@ import pytest
 
 from instant_ic.bus.control import ControlServer
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.console import ConsoleClient, ConsoleServer, ServerConfig
+from instant_ic.console import ConsoleClient, ConsoleServer, ConsoleServerConfig
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.recording import RecorderError, RecordingDesk
@@ -184,7 +184,7 @@ def served(tmp_path):
         tokens[role].chmod(0o600)
     backend = Backend()
     access = AccessConfig(**{role: str(path) for role, path in tokens.items()})
-    server = ConsoleServer(backend, ServerConfig(port=0, access=access))
+    server = ConsoleServer(backend, ConsoleServerConfig(port=0, access=access))
     server.start()
     yield server, backend
     server.stop()

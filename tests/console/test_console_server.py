@@ -7,7 +7,7 @@ import time
 import aiohttp
 import pytest
 
-from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, FrameKind, ServerConfig
+from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, ConsoleServerConfig, FrameKind
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import origin_allowed
@@ -62,7 +62,9 @@ def serve():
 
     def start(drive=PATIENT, access=AccessConfig(simulated=True), **config):  # noqa: B008
         backend = Recorder()
-        server = ConsoleServer(backend, ServerConfig(port=0, drive=drive, access=access, **config), {"dissolve_ms": 1})
+        server = ConsoleServer(
+            backend, ConsoleServerConfig(port=0, drive=drive, access=access, **config), {"dissolve_ms": 1}
+        )
         server.start()
         servers.append(server)
         return server, backend
@@ -114,13 +116,13 @@ def test_page_and_modules_are_served_with_a_content_policy(serve):
 def test_the_first_page_and_the_end_of_the_last_are_reported(serve):
     server, _ = serve()
     watched = []
-    server.on_watched = watched.append
+    server.pages.on_watched = watched.append
 
     async def scenario():
         async with ConsoleClient(server.url):
             async with ConsoleClient(server.url):
                 assert watched == [True]
-            await until(lambda: len(server._sessions) == 1)
+            await until(lambda: len(server.pages.sessions) == 1)
             assert watched == [True]
         await until(lambda: watched == [True, False])
 
@@ -257,7 +259,7 @@ def test_zeros_end_when_the_drivers_page_beats_no_more_and_come_back_with_it(ser
 
 def test_a_console_that_starts_again_names_its_clients_anew():
     """Behind a bridge the arbiter notices the restart by these names alone."""
-    first, second = (ConsoleServer(Recorder(), ServerConfig(port=0)).client for _ in range(2))
+    first, second = (ConsoleServer(Recorder(), ConsoleServerConfig(port=0)).drive.client for _ in range(2))
     assert first != second
 
 
@@ -346,14 +348,14 @@ def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_releases_it(s
 def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(serve):
     server, backend = serve()
     released = []
-    server.on_released = released.append
+    server.drive.on_released = released.append
 
     async def scenario():
         async with ConsoleClient(server.url) as client, ConsoleClient(server.url) as second:
             server.follow_robot("host_bridge/tablet/console/page 1 abc", False)
             await client.send({"type": "lease", "take": False})
             await in_thread(backend.wait, lambda b: b.commands)  # zeros ask the robot for its lease
-            name = server.client
+            name = server.drive.client
             other = ("other", "host_bridge/tablet/console")
             for one in (client, second):
                 await one.wait_for(lambda c: (c.session["driver"], c.session["door"]) == other, WAIT_S)
@@ -369,7 +371,7 @@ def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(se
             await until(lambda: released == [name])
             await client.wait_for(lambda c: c.session["driver"] == "other", WAIT_S)
             assert second.session["driver"] == "other"  # until the robot has granted it
-            server.follow_robot(f"console/{server.client}", False)
+            server.follow_robot(f"console/{server.drive.client}", False)
             await second.wait_for(lambda c: c.session["driver"] == "you", WAIT_S)
 
     asyncio.run(scenario())
@@ -381,20 +383,20 @@ def test_a_page_shows_the_robots_emergency_stop_whoever_pressed_or_released_it(s
     async def scenario():
         async with ConsoleClient(server.url) as client:
             await client.acquire()
-            server.follow_robot(f"console/{server.client}", False)
+            server.follow_robot(f"console/{server.drive.client}", False)
             await client.estop()
             await client.wait_for(lambda c: c.session["estop"], WAIT_S)
-            server.follow_robot(f"console/{server.client}", True)
-            server.follow_robot(f"console/{server.client}", False)  # another console has released it
+            server.follow_robot(f"console/{server.drive.client}", True)
+            server.follow_robot(f"console/{server.drive.client}", False)  # another console has released it
             await client.wait_for(lambda c: not c.session["estop"], WAIT_S)
-            server.follow_robot(f"console/{server.client}", True)  # and pressed it
+            server.follow_robot(f"console/{server.drive.client}", True)  # and pressed it
             await client.wait_for(lambda c: c.session["estop"], WAIT_S)
             await client.release_estop()
             await in_thread(backend.wait, lambda b: b.estops == [True, False])
             await client.send_drive(0.3, 0.0)
             await client.wait_for(lambda c: c.refused == ["stopped"], WAIT_S)  # the robot has not released it
             assert client.session["estop"]
-            server.follow_robot(f"console/{server.client}", False)
+            server.follow_robot(f"console/{server.drive.client}", False)
             await client.wait_for(lambda c: not c.session["estop"], WAIT_S)
 
     asyncio.run(scenario())
@@ -604,7 +606,7 @@ def test_end_of_the_server_stops_the_robot_and_closes_the_clients(serve):
 def test_used_port_is_told(serve):
     server, _ = serve()
     with pytest.raises(ConsoleError, match=f"{server.port}.*server.port"):
-        ConsoleServer(Recorder(), ServerConfig(port=server.port)).start()
+        ConsoleServer(Recorder(), ConsoleServerConfig(port=server.port)).start()
 
 
 def test_idle_server_costs_little(serve):

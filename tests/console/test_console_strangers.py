@@ -17,14 +17,14 @@ import pytest
 from aiohttp import WSMsgType
 from test_console_access import DRIVE, WATCH, Nobody, certificate, token_file
 
-from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ServerConfig
+from instant_ic.console import ConsoleClient, ConsoleServer, ConsoleServerConfig, FrameKind
 from instant_ic.console import connections as connections_module
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.connections import AddressBuckets, network_of
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.faults import MOST_NAMES, FaultList
 from instant_ic.console.log_rate import LogRate
-from instant_ic.console.server import WATCHER_SHARE
+from instant_ic.console.pages import WATCHER_SHARE
 from instant_ic.console.session import MAX_REPLIES
 from instant_ic.util.web_access import TokenBucket
 
@@ -50,7 +50,7 @@ def serve():
     servers = []
 
     def start(access=AccessConfig(simulated=True), **config):  # noqa: B008
-        server = ConsoleServer(Nobody(), ServerConfig(port=0, drive=PATIENT, access=access, **config))
+        server = ConsoleServer(Nobody(), ConsoleServerConfig(port=0, drive=PATIENT, access=access, **config))
         server.start()
         servers.append(server)
         return server
@@ -193,8 +193,11 @@ def test_fault_an_emergency_stop_waits_behind_other_clients_messages(serve):
     """Each client has one message a turn: between stop and topic comes one of each flooder, not its queue."""
     server = serve(max_messages_per_s=1e6)
     handled, at_the_stop = Counter(), []
-    handle, on_estop = server._handle, server.backend.on_estop
-    server._handle = lambda session, message, now: (handled.update([session.number]), handle(session, message, now))
+    handle, on_estop = server.pages.handle, server.backend.on_estop
+    server.pages.handle = lambda session, message, now: (
+        handled.update([session.number]),
+        handle(session, message, now),
+    )
     asked = asyncio.Event()
 
     def stop(stopped):
@@ -206,8 +209,8 @@ def test_fault_an_emergency_stop_waits_behind_other_clients_messages(serve):
     async def scenario():
         flooders = [await raw_socket(server, ELSEWHERE) for _ in range(5)]
         watcher, stopper = await raw_socket(server)
-        await until(lambda: len(server._sessions) == 6)
-        number = max(server._sessions)
+        await until(lambda: len(server.pages.sessions) == 6)
+        number = max(server.pages.sessions)
         # On the server's own thread: its turns stand still until all bytes lie in the sockets.
         gate = asyncio.run_coroutine_threadsafe(hold(), server._loop)
         await asked.wait()
@@ -288,9 +291,9 @@ def test_fault_a_client_that_does_not_read_grows_the_servers_memory(serve, monke
             await driver.acquire()
             reader, writer = await raw_socket(server)  # reads nothing from here on
             reader._transport.pause_reading()
-            await until(lambda: len(server._sessions) == 2)
-            session = server._sessions[max(server._sessions)]
-            while session.number in server._sessions:
+            await until(lambda: len(server.pages.sessions) == 2)
+            session = server.pages.sessions[max(server.pages.sessions)]
+            while session.number in server.pages.sessions:
                 most.append(len(session._replies))
                 assert most[-1] <= MAX_REPLIES
                 server.send_frame(FrameKind.PANORAMA, {}, bytes(200_000))
@@ -427,7 +430,7 @@ def test_a_request_that_is_no_websockets_keeps_no_place(serve):
             async with http.get(server.url + "ws") as response:
                 assert response.status == 400
             (connection,) = server.listener.admitted
-            assert not connection.kept and not server._sessions
+            assert not connection.kept and not server.pages.sessions
 
     run(scenario)
 
@@ -603,12 +606,12 @@ def test_connections_without_complete_headers_are_few_and_small(serve, monkeypat
 SERVER_WITHOUT_FILES = """
     import resource, sys
     from types import SimpleNamespace
-    from instant_ic.console import ConsoleServer, ServerConfig
+    from instant_ic.console import ConsoleServer, ConsoleServerConfig
     from instant_ic.console.access import AccessConfig
     nothing = lambda *args: None
     backend = SimpleNamespace(on_drive=nothing, on_operator=nothing, on_estop=nothing, on_look=nothing)
     many = dict(max_connections=1000, max_connections_per_address=1000)
-    server = ConsoleServer(backend, ServerConfig(port=0, access=AccessConfig(simulated=True), **many))
+    server = ConsoleServer(backend, ConsoleServerConfig(port=0, access=AccessConfig(simulated=True), **many))
     server.start()
     resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
     print(server.port, flush=True)
@@ -719,7 +722,7 @@ def test_messages_that_no_page_sends_close_the_socket(serve, kind, payload, code
 
 def test_the_page_keeps_within_its_limits():
     """What page and client send at most, by their own periods, with a touch display of 120 Hz."""
-    config = ServerConfig()
+    config = ConsoleServerConfig()
     watching = 20 + 2 * 30 + 10  # beats, acknowledgements (which count by their bytes only), looks
     messages_per_s = watching + 120 + 20  # stick, repeated commands
     assert messages_per_s < config.max_messages_per_s

@@ -357,9 +357,9 @@ _JSON_WORDS = tuple(
 
 def _parse_console() -> Callable[[bytes], object]:
     from instant_ic.console.drive import DriveGate
-    from instant_ic.console.protocol import ProtocolError, parse_text
+    from instant_ic.console.protocol import PageProtocolError, parse_text
     from instant_ic.console.server import ConsoleServer
-    from instant_ic.console.session import Session
+    from instant_ic.console.session import PageSession
 
     logging.getLogger("instant_ic.console").setLevel(logging.CRITICAL)
     nothing = lambda *_: None  # noqa: E731
@@ -372,21 +372,21 @@ def _parse_console() -> Callable[[bytes], object]:
             text = data.decode()
         except UnicodeDecodeError:  # aiohttp closes such a socket
             return
-        session = Session(1, None, None, None)  # type: ignore[arg-type]
-        server.gate = DriveGate(server.config.drive)  # nothing of an input is left for the next
+        session = PageSession(1, None, None, None)  # type: ignore[arg-type]
+        server.drive.gate = DriveGate(server.config.drive)  # nothing of an input is left for the next
         for line in text.split("\n")[:20]:
             try:
-                server._handle(session, parse_text(line), 1.0)
-            except ProtocolError:
+                server.pages.handle(session, parse_text(line), 1.0)
+            except PageProtocolError:
                 continue
 
     return parse
 
 
 def _console_frames() -> list[bytes]:
-    from instant_ic.console.protocol import Frame, FrameKind, encode_frame
+    from instant_ic.console.protocol import FrameKind, PageFrame, encode_frame
 
-    return [encode_frame(Frame(kind, 5, {"stamp": 1.5, "width": 4}, b"payload")) for kind in FrameKind]
+    return [encode_frame(PageFrame(kind, 5, {"stamp": 1.5, "width": 4}, b"payload")) for kind in FrameKind]
 
 
 def _parse_console_frame() -> Callable[[bytes], object]:
@@ -396,9 +396,9 @@ def _parse_console_frame() -> Callable[[bytes], object]:
 
 
 def _console_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.console.protocol import ProtocolError
+    from instant_ic.console.protocol import PageProtocolError
 
-    return (ProtocolError,)
+    return (PageProtocolError,)
 
 
 def _parse_http_headers() -> Callable[[bytes], object]:

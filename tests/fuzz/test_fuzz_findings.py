@@ -17,7 +17,7 @@ from instant_ic.bag.recover import recover
 from instant_ic.bus.qos import RELIABLE, SENSOR
 from instant_ic.camera.http import Session
 from instant_ic.config.params import ParameterError, load_file
-from instant_ic.console.protocol import PREFIX, VERSION, ProtocolError, decode_frame
+from instant_ic.console.protocol import PREFIX, VERSION, PageProtocolError, decode_frame
 from instant_ic.depth.manifest import ManifestError, load_manifest
 from instant_ic.experiments.slam_logs import LogError, read_log
 from instant_ic.msg import message_type, serialize
@@ -169,7 +169,7 @@ def test_redirect_of_the_camera_is_not_even_read() -> None:
 
 
 def test_nested_header_of_a_console_frame_is_a_protocol_error() -> None:
-    with pytest.raises(ProtocolError, match="binary frame"):
+    with pytest.raises(PageProtocolError, match="binary frame"):
         decode_frame(PREFIX.pack(VERSION, 1, 0, 1, len(NESTED)) + NESTED)
     good = json.dumps({"a": 1}).encode()
     assert decode_frame(PREFIX.pack(VERSION, 1, 0, 1, len(good)) + good).header == {"a": 1}
