@@ -15,7 +15,7 @@ from instant_ic.lidar.feed import PacketFeed, Packets
 from instant_ic.lidar.flatscan import check_level, warm_up
 from instant_ic.lidar.packets import DATA_PACKET_BYTES
 from instant_ic.lidar.player import CapturePlayer
-from instant_ic.lidar.receiver import PacketReceiver, Received, ReceiverError, ReceiverThread
+from instant_ic.lidar.receiver import PacketReceiver, ReceiverError, ReceiverThread, SensorDatagram
 from instant_ic.lidar.report import LidarReport
 from instant_ic.lidar.stream import Revolution
 from instant_ic.msg import LaserScan, PointCloud2, VelodyneScan, cloud_message, stamp_ns
@@ -83,7 +83,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             return
         for stamp, port, payload in self.player.due(self.clock.steady_ns()):
             is_data = port != self.config.position_port or len(payload) == DATA_PACKET_BYTES
-            self.on_datagram(Received(stamp, payload, is_data))
+            self.on_datagram(SensorDatagram(stamp, payload, is_data))
         if not self.player.ended:
             return
         if (last := self.feed.finish()) is not None:
@@ -95,7 +95,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.report.capture_restarts()
             self.open_capture()
 
-    def on_datagram(self, received: Received) -> None:
+    def on_datagram(self, received: SensorDatagram) -> None:
         """Take a datagram, on whichever thread it arrives."""
         if received.is_data:
             self.take(received.payload, received.stamp_ns)

@@ -9,7 +9,7 @@ from instant_ic.depth.inputs import HeldImage
 from instant_ic.depth.keyframes import encode_sigma
 from instant_ic.depth.sources import DepthResult
 from instant_ic.geometry.poses import Matrix
-from instant_ic.lidar.deskew import Revolution
+from instant_ic.lidar.deskew import TimedPoints
 from instant_ic.msg import Keyframe, cloud_array, cloud_points, header, image_message, pose_message, stamp_ns
 
 
@@ -18,7 +18,7 @@ def held_image(message: Any) -> HeldImage:
     return HeldImage(message.header.frame_id, stamp_ns(message))
 
 
-def revolution_of(message: Any) -> Revolution:
+def revolution_of(message: Any) -> TimedPoints:
     """The revolution of a PointCloud2.
 
     Raises:
@@ -26,7 +26,7 @@ def revolution_of(message: Any) -> Revolution:
     """
     points = cloud_array(message)
     xyz = functools.partial(cloud_points, points)
-    return Revolution(message.header.frame_id, stamp_ns(message), points["time"], xyz)
+    return TimedPoints(message.header.frame_id, stamp_ns(message), points["time"], xyz)
 
 
 def keyframe_message(number: int, frame: str, frame_from_camera: Matrix, panorama: Any, depth: DepthResult) -> Any:

@@ -24,7 +24,7 @@ _CHUNK = 16 << 10
 class _DeadlineSocket(socket.socket):
     """Socket whose reads end at its session's deadline; a plain time-out restarts with each byte."""
 
-    session: Session
+    session: DeviceSession
 
     def recv_into(self, buffer: Any, nbytes: int = 0, flags: int = 0) -> int:
         """Receive into a buffer; raise TimeoutError at the deadline."""
@@ -38,19 +38,19 @@ class _DeadlineSocket(socket.socket):
 class _Adapter(HTTPAdapter):
     """Adapter that reads every reply except the preview, within the limits, before authentication sees it."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: DeviceSession) -> None:
         super().__init__()
 
-        class Connection(urllib3.connection.HTTPConnection):
+        class DeadlineConnection(urllib3.connection.HTTPConnection):
             def _new_conn(self) -> socket.socket:
                 bound = _DeadlineSocket(fileno=super()._new_conn().detach())
                 bound.session = session
                 return bound
 
-        class Pool(urllib3.HTTPConnectionPool):
-            ConnectionCls = Connection
+        class DeadlinePool(urllib3.HTTPConnectionPool):
+            ConnectionCls = DeadlineConnection
 
-        self.poolmanager.pool_classes_by_scheme = {"http": Pool}
+        self.poolmanager.pool_classes_by_scheme = {"http": DeadlinePool}
 
     def send(self, request: requests.PreparedRequest, *arguments: Any, **keywords: Any) -> requests.Response:
         """Send a request; raise CameraError if the reply is encoded or too long."""
@@ -66,8 +66,8 @@ class _Adapter(HTTPAdapter):
         return response
 
 
-class Session(requests.Session):
-    """Session with one device over plain HTTP.
+class DeviceSession(requests.Session):
+    """DeviceSession with one device over plain HTTP.
 
     Attributes:
         deadline_s: monotonic time at which reading a reply ends, however slowly its bytes arrive.

@@ -13,7 +13,7 @@ import requests
 import urllib3
 
 from instant_ic.camera.config import FORMATS_FIRMWARE, OLD_PREVIEW_FORMATS, ThetaConfig
-from instant_ic.camera.http import Session, is_multipart
+from instant_ic.camera.http import DeviceSession, is_multipart
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.util.jpeg import JpegError, jpeg_size
@@ -99,7 +99,7 @@ class ThetaClient:
         self._password = password
         self.sleep = sleep
         self._lock = threading.Lock()
-        self._session = Session(user, password)
+        self._session = DeviceSession(user, password)
 
     def close(self) -> None:
         self._session.close()
@@ -145,9 +145,9 @@ class ThetaClient:
         """``camera.setOptions``; refused if the camera does not know an option or its value."""
         self.execute("camera.setOptions", {"options": dict(options)})
 
-    def open_preview(self) -> tuple[Session, requests.Response]:
+    def open_preview(self) -> tuple[DeviceSession, requests.Response]:
         """Start ``camera.getLivePreview`` on its own connection; the caller must close both."""
-        session = Session(self._user, self._password)
+        session = DeviceSession(self._user, self._password)
         try:
             body, timeout_s = {"name": "camera.getLivePreview"}, current().timeout_s(self.config.read_timeout_s)
             response = self._request(session, "POST", "/osc/commands/execute", body, timeout_s)
@@ -172,7 +172,7 @@ class ThetaClient:
         return reply
 
     def _request(
-        self, session: Session, method: str, path: str, body: Mapping[str, Any] | None, timeout_s: float
+        self, session: DeviceSession, method: str, path: str, body: Mapping[str, Any] | None, timeout_s: float
     ) -> requests.Response:
         """Send one request; repeat it with growing waits while the camera is busy."""
         wait_s = self.config.busy_wait_s
@@ -206,7 +206,7 @@ class ThetaCamera(Camera):
         self.client = client
         self._refused: set[tuple[str, Format]] = set()
         """Firmware and the preview formats that it refused."""
-        self._session: Session | None = None
+        self._session: DeviceSession | None = None
         self._response: requests.Response | None = None
         self._parser = PreviewParser()
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from instant_ic.console.protocol import FrameKind
-from instant_ic.console.scene import Scene
+from instant_ic.console.robot_poses import RobotPoses
 from instant_ic.control.states import Mode
 from instant_ic.msg import ControlState, Pose, ShownPictures, header, pose_message, to_time
 from instant_ic.util.pace import current
@@ -24,9 +24,9 @@ class Display:
         image_stamp_ns: stamp of the newest camera image; 0 without one.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, poses: RobotPoses) -> None:
         self.mode = self.shown = "none"
-        self._scene = scene
+        self._poses = poses
         self._image_ns: int | None = None  # arrival of the newest camera image, steady clock
         self.image_stamp_ns = 0
         self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
@@ -109,5 +109,5 @@ class Display:
 
     def _vbot_camera(self, unknown: Pose) -> Pose:
         """Pose of the v-bot's camera."""
-        vbot = self._scene.vbot_pose()
-        return unknown if vbot is None else pose_message(vbot @ self._scene.camera_mount())
+        vbot = self._poses.vbot_pose()
+        return unknown if vbot is None else pose_message(vbot @ self._poses.camera_mount())

@@ -16,7 +16,7 @@ from instant_ic.console.gridimage import GridLayers
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import MOST_LAYERS, PageLayers
 from instant_ic.console.protocol import FrameKind, PageProtocolError
-from instant_ic.console.scene import Newest, Scene
+from instant_ic.console.robot_poses import Newest, RobotPoses
 from instant_ic.console.server import PLAIN_HTTP
 from instant_ic.console.view_requests import ViewRequests
 from instant_ic.geometry.transforms import TransformBuffer
@@ -53,7 +53,7 @@ class Inputs:
     battery: Newest  # BatteryState
 
 
-class Clock(Protocol):
+class FeedClock(Protocol):
     """Time of the stack's stamps, and a steady clock."""
 
     def now_ns(self) -> int:
@@ -107,7 +107,7 @@ class PageFeed:
         inputs: newest messages.
         send_request: requests a rendered view.
         send_shown: reports to the arbiter which images are available. Called on any thread.
-        clock: see :class:`Clock`.
+        clock: see :class:`FeedClock`.
         diagnose: sets a diagnosis: name, level, text, values.
 
     Attributes:
@@ -123,17 +123,17 @@ class PageFeed:
         inputs: Inputs,
         send_request: Callable[[ViewRequest], None],
         send_shown: Callable[[ShownPictures], None],
-        clock: Clock,
+        clock: FeedClock,
         diagnose: Callable[..., None],
     ) -> None:
         self.watched = True
         self.server = server
-        server.pages.on_drawn = self.report_shown
+        server.on_drawn = self.report_shown
         self._meshes = LayerMeshes()
         self._mount = config.camera_mount.xyz
-        self.scene = Scene(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
-        self.display = Display(self.scene)
-        self.requests = ViewRequests(config.view, self.scene, self.display)
+        self.poses = RobotPoses(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
+        self.display = Display(self.poses)
+        self.requests = ViewRequests(config.view, self.poses, self.display)
         self.grids, self.faults = GridLayers(), FaultList()
         self._state_sent_ns = 0
         self._inputs, self._clock, self._diagnose = inputs, clock, diagnose
@@ -146,7 +146,7 @@ class PageFeed:
         stamp = stamp_ns(message)
         self.display.take_image(stamp, self._clock.steady_ns())
         self.report_shown()
-        header = page.panorama_header(self._captured_ms(stamp), self.scene.lookup("map", "camera", stamp))
+        header = page.panorama_header(self._captured_ms(stamp), self.poses.lookup("map", "camera", stamp))
         self.server.send_frame(FrameKind.PANORAMA, header, bytes(message.data))
 
     def take_view(self, message: RenderedView) -> None:
@@ -224,21 +224,21 @@ class PageFeed:
         if control is None:
             self.server.follow_robot(None)
         self.server.show(*self.display.foreground)
-        self.server.publish("state", page.state_message(self.server.now_ms(), self.display, self.scene, control, vbot))
+        self.server.publish("state", page.state_message(self.server.now_ms(), self.display, self.poses, control, vbot))
         self.report_shown()
         self._request_view()
 
     def send_plan(self) -> None:
         """Send trajectory, path and subgoal."""
         newest = (self._inputs.trajectory.message, self._inputs.path.message, self._inputs.subgoal.message)
-        self.server.publish("plan", page.plan_message(self.display, self.scene, *newest))
+        self.server.publish("plan", page.plan_message(self.display, self.poses, *newest))
 
     def send_health(self) -> None:
         """Send virtual space, battery, CPU of the nodes, and faults in the text of the node that found them."""
         age_s = self.display.image_age_s(self._clock.steady_ns())
         self._check("camera", age_s <= IMAGE_TIMEOUT_S, "no image from the camera", age_s=age_s)
         self._check("controller", self._inputs.control.message is not None, "no state from the arbiter")
-        self._check("pose", self.scene.robot_pose() is not None, "the robot's pose is unknown")
+        self._check("pose", self.poses.robot_pose() is not None, "the robot's pose is unknown")
         now_s = self._clock.steady_ns() / 1e9
         faults = self.faults.worst(now_s)
         if self.server.plain_http:  # on the page only, not as a diagnosis: the node itself works

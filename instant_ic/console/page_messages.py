@@ -7,7 +7,7 @@ from typing import Any
 
 from instant_ic.console.display import Display
 from instant_ic.console.layers import pose_fields
-from instant_ic.console.scene import Scene, planar
+from instant_ic.console.robot_poses import RobotPoses, planar
 from instant_ic.geometry.poses import Matrix
 from instant_ic.msg import (
     BatteryState,
@@ -30,7 +30,7 @@ VSPACE_STATES: dict[int, str] = {
 
 
 def state_message(
-    at_ms: float, display: Display, scene: Scene, control: ControlState | None, vbot: Odometry | None
+    at_ms: float, display: Display, poses: RobotPoses, control: ControlState | None, vbot: Odometry | None
 ) -> dict[str, Any]:
     """Return the ``state`` message: mode, poses and commands."""
     moving = vbot if display.shown == "virtual" and vbot is not None else control and control.robot_twist
@@ -38,8 +38,8 @@ def state_message(
         "at_ms": at_ms,
         "mode": display.mode,
         "shown": display.shown,
-        "robot": planar(scene.robot_pose()),
-        "vbot": planar(scene.vbot_pose()) if display.with_vbot else None,
+        "robot": planar(poses.robot_pose()),
+        "vbot": planar(poses.vbot_pose()) if display.with_vbot else None,
         "twist": [0.0, 0.0] if moving is None else [finite(value) or 0.0 for value in twist_values(moving)],
     }
     if control is None:
@@ -58,13 +58,13 @@ def state_message(
 
 
 def plan_message(
-    display: Display, scene: Scene, trajectory: Path | None, path: Path | None, subgoal: PoseStamped | None
+    display: Display, poses: RobotPoses, trajectory: Path | None, path: Path | None, subgoal: PoseStamped | None
 ) -> dict[str, Any]:
     """Return the ``plan`` message; path and subgoal belong to the virtual mode."""
     virtual = display.mode == "virtual"
     return {
-        "trajectory": scene.points(trajectory),
-        "path": scene.points(path) if virtual else [],
+        "trajectory": poses.points(trajectory),
+        "path": poses.points(path) if virtual else [],
         "subgoal": planar(matrix_from_pose(subgoal)) if virtual and subgoal is not None else None,
     }
 

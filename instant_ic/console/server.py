@@ -72,6 +72,7 @@ class ConsoleServer:
         access: sign-ins.
         drive: lease, commands and emergency stop.
         pages: WebSockets of the pages.
+        on_drawn: called when :meth:`drawn_ms` has changed.
         port: port on which the server listens; 0 before the start.
 
     Raises:
@@ -92,6 +93,8 @@ class ConsoleServer:
             raise ConsoleError(f"console: {error}") from error
         self.drive = DriveService(backend, self.config.drive)
         self.pages = Pages(backend, self.config, page or {}, self.drive, self.access)
+        self.pages.on_drawn = lambda: self.on_drawn()
+        self.on_drawn: Callable[[], None] = lambda: None
         self.port = 0
         self._requests = AddressBuckets(REQUESTS_PER_S, BURST_REQUESTS)
         self._sockets = AddressBuckets(SOCKETS_PER_S, BURST_SOCKETS)

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 from instant_ic.console.display import Display
-from instant_ic.console.scene import Scene
+from instant_ic.console.robot_poses import RobotPoses
 from instant_ic.console.view import PROBE, PROBE_HZ, RESPONSE_TIMEOUT_S, Look, ViewConfig, view_shape
 from instant_ic.msg import ViewRequest, header, pose_message
 
@@ -23,10 +23,10 @@ class ViewRequests:
         look: the driver's look direction.
     """
 
-    def __init__(self, config: ViewConfig, scene: Scene, display: Display) -> None:
+    def __init__(self, config: ViewConfig, poses: RobotPoses, display: Display) -> None:
         self.config = config
         self.look = Look()
-        self._scene, self._display = scene, display
+        self._poses, self._display = poses, display
         self._newest, self._outstanding, self._asked_ns = 0, False, -math.inf
         self._sent_ns: dict[int, int | None] = {}  # recent requests: id -> send time (steady ns); None: only judged
 
@@ -40,7 +40,7 @@ class ViewRequests:
             now_ns: steady clock.
         """
         virtual = self._display.with_vbot
-        map_from_base = self._scene.vbot_pose() if virtual else self._scene.robot_pose()
+        map_from_base = self._poses.vbot_pose() if virtual else self._poses.robot_pose()
         rate_hz = self.config.virtual_rate_hz if virtual and needed else PROBE_HZ
         if not (virtual or renders) or map_from_base is None or not self._due((now_ns - self._asked_ns) / 1e9, rate_hz):
             return None
@@ -54,7 +54,7 @@ class ViewRequests:
         return ViewRequest(
             header=header("map", stamp_ns),
             id=self._newest,
-            pose=pose_message(map_from_base @ self._scene.camera_mount() @ self.look.rotation()),
+            pose=pose_message(map_from_base @ self._poses.camera_mount() @ self.look.rotation()),
             fov_rad=shape.fov_rad,
             width=shape.width,
             height=shape.height,

@@ -15,7 +15,7 @@ from instant_ic.depth.metric_depth import DepthScalerConfig, MetricDepth
 from instant_ic.depth.sources import DepthResult
 from instant_ic.geometry.poses import Matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.lidar.deskew import Revolution
+from instant_ic.lidar.deskew import TimedPoints
 from instant_ic.util.diagnosis import Level
 
 _SILENT_S = 10.0  # without an answer to any request
@@ -91,7 +91,7 @@ class DepthChain:
             self._diagnose("scale", Level.WARN, f"no /depth/raw for {silent_s:.0f} s: {text}")
         return True
 
-    def add_revolution(self, revolution: Revolution) -> HeldImage | None:
+    def add_revolution(self, revolution: TimedPoints) -> HeldImage | None:
         """Add a revolution to the local model; returns the held image that it completes."""
         self._diagnose("points", Level.OK, f"{len(revolution.time_s)} points")
         self.inputs.revolutions.append(revolution)

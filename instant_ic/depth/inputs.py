@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from instant_ic.lidar.deskew import Revolution
+from instant_ic.lidar.deskew import TimedPoints
 
 KEEP_NS = 4_000_000_000
 """Images and revolutions that differ more from the newest depth are discarded."""
@@ -22,7 +22,7 @@ class RecentInputs:
 
     def __init__(self) -> None:
         self.images: dict[int, Any] = {}
-        self.revolutions: deque[Revolution] = deque(maxlen=_MAX_REVOLUTIONS)
+        self.revolutions: deque[TimedPoints] = deque(maxlen=_MAX_REVOLUTIONS)
 
     def add_image(self, stamp_ns: int, image: Any) -> None:
         """Keep an image; the oldest one goes when there are too many."""
@@ -30,10 +30,10 @@ class RecentInputs:
         if len(self.images) > _MAX_IMAGES:
             del self.images[next(iter(self.images))]
 
-    def nearest_revolution(self, stamp_ns: int) -> Revolution | None:
+    def nearest_revolution(self, stamp_ns: int) -> TimedPoints | None:
         """The revolution whose middle is nearest in time; None when none is within ``MAX_CLOUD_AGE_S``."""
 
-        def gap_ns(revolution: Revolution) -> int:
+        def gap_ns(revolution: TimedPoints) -> int:
             return abs(revolution.middle_ns - stamp_ns)
 
         found = min((one for one in self.revolutions if len(one.time_s)), key=gap_ns, default=None)

@@ -12,7 +12,7 @@ from instant_ic.geometry.poses import transform_points
 
 
 @dataclass(frozen=True)
-class Revolution:
+class TimedPoints:
     """A LiDAR revolution.
 
     Attributes:

@@ -55,7 +55,7 @@ class ReceiverConfig:
                 raise ValueError(f"sensor must be an IPv4 address or empty (got {self.sensor!r})") from error
 
 
-class Received(NamedTuple):
+class SensorDatagram(NamedTuple):
     """A datagram from the sensor."""
 
     stamp_ns: int
@@ -103,7 +103,7 @@ class PacketReceiver(Closing):
             bound.close()
         self._selector.close()
 
-    def read(self, timeout_s: float) -> Iterator[Received]:
+    def read(self, timeout_s: float) -> Iterator[SensorDatagram]:
         """Yield the sensor's datagrams; wait at most ``timeout_s`` for the first one, and yield nothing after that."""
         if self._selector.select(timeout_s):
             time.sleep(_GATHER_S)
@@ -117,7 +117,7 @@ class PacketReceiver(Closing):
                     break
                 well_formed = check_data_packet(payload) is None if is_data else len(payload) == POSITION_PACKET_BYTES
                 if self.sources.admit(sender, is_data, well_formed, self._steady_ns()):
-                    yield Received(_stamp_ns(ancillary), payload, is_data)
+                    yield SensorDatagram(_stamp_ns(ancillary), payload, is_data)
 
     def _bind(self, host: str, port: int, is_data: bool) -> int:
         bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -149,7 +149,7 @@ class ReceiverThread(threading.Thread):
     def __init__(
         self,
         receiver: PacketReceiver,
-        on_datagram: Callable[[Received], None],
+        on_datagram: Callable[[SensorDatagram], None],
         on_fault: Callable[[Exception], None],
     ) -> None:
         super().__init__(name="vlp16 receiver", daemon=True)

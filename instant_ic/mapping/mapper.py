@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import Checked, Positive
 from instant_ic.geometry.poses import Matrix, inverse
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.lidar.deskew import Revolution, points_at
+from instant_ic.lidar.deskew import TimedPoints, points_at
 from instant_ic.mapping.local_model import STRIDE, LocalDepth, LocalModel, LocalModelConfig
 
 _JUMP_M, _JUMP_RAD = 0.2, math.radians(2.0)
@@ -68,13 +68,13 @@ class LocalMapper:
     def clear(self) -> None:
         """Forget everything."""
         self.model.clear()
-        self._held: Revolution | None = None
+        self._held: TimedPoints | None = None
         self._taken_ns: int | None = None
         self._taken_at: Matrix | None = None
         self._reference: tuple[int, Matrix] | None = None  # stamp and correction of the last look-up
         self._model_from_map = np.eye(4)
 
-    def revolution(self, new: Revolution) -> None:
+    def revolution(self, new: TimedPoints) -> None:
         """Hold a revolution; add the one held before if it is due. ``xyz`` is called only for those that are added.
 
         Raises:
@@ -94,7 +94,7 @@ class LocalMapper:
         if held is not None:
             self._add(held)
 
-    def _add(self, revolution: Revolution) -> None:
+    def _add(self, revolution: TimedPoints) -> None:
         """Add a revolution if the robot has moved or enough time has passed."""
         frame, stamp_ns, middle_ns = revolution.frame, revolution.stamp_ns, revolution.middle_ns
         odom_from_lidar = self.transforms.lookup(self.odom_frame, frame, middle_ns)

@@ -15,7 +15,7 @@ from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import preset_of_text, schema_or_unknown, with_hash
 from instant_ic.bag.recover import recover
 from instant_ic.bus.qos import RELIABLE, SENSOR
-from instant_ic.camera.http import Session
+from instant_ic.camera.http import DeviceSession
 from instant_ic.config.params import ParameterError, load_file
 from instant_ic.console.protocol import PREFIX, VERSION, PageProtocolError, decode_frame
 from instant_ic.depth.manifest import ManifestError, load_manifest
@@ -165,7 +165,7 @@ def test_redirect_of_the_camera_is_not_even_read() -> None:
 
     response = requests.Response()
     response.status_code, response.headers["Location"] = 302, "http://\xbe/"
-    assert Session("", "").get_redirect_target(response) is None
+    assert DeviceSession("", "").get_redirect_target(response) is None
 
 
 def test_nested_header_of_a_console_frame_is_a_protocol_error() -> None:

@@ -11,7 +11,7 @@ from instant_ic.geometry.ply import write_ply
 from instant_ic.geometry.poses import Matrix, pose_matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.lidar.deskew import Revolution
+from instant_ic.lidar.deskew import TimedPoints
 from instant_ic.mapping import kernels
 from instant_ic.mapping.local_model import LocalModel, LocalModelConfig
 from instant_ic.mapping.mapper import CloudError, LocalMapper, LocalView, MapperConfig
@@ -248,7 +248,7 @@ def feed(mapper: LocalMapper, start: int, end: int) -> None:
         x = 0.5 * max(k / 10 + 0.05 - 1, 0.0)
         points, origin = measured(x, (), k)
         mapper.revolution(
-            Revolution("velodyne", k * S // 10, np.linspace(0, 0.1, len(RAYS)), lambda p=points, o=origin: p - o)
+            TimedPoints("velodyne", k * S // 10, np.linspace(0, 0.1, len(RAYS)), lambda p=points, o=origin: p - o)
         )
 
 
@@ -291,14 +291,14 @@ def test_odometry_that_slips_in_a_turn_does_not_turn_the_model() -> None:
         transforms.set("odom", "base_link", k * S // 10, pose_matrix(yaw=seen))
         transforms.set("map", "odom", k * S // 10, pose_matrix(yaw=true - seen))
         turned = (points - origin) @ pose_matrix(yaw=true)[:3, :3]
-        mapper.revolution(Revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=turned: p))
+        mapper.revolution(TimedPoints("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=turned: p))
     pose = mapper.model_from_camera("camera", 2 * S)  # an image one second old
     np.testing.assert_allclose(pose, pose_matrix(0, 0, 1.2, yaw=1.6), atol=1e-9)
     # The next revolution is 1.1 s newer than that image: its correction is another by 5 degrees, and nothing jumped.
     transforms.set("odom", "base_link", 31 * S // 10, pose_matrix(yaw=2.232))
     transforms.set("map", "odom", 31 * S // 10, pose_matrix(yaw=0.248))
     for k in (31, 32):
-        mapper.revolution(Revolution("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=points - origin: p))
+        mapper.revolution(TimedPoints("velodyne", k * S // 10, np.zeros(len(RAYS)), lambda p=points - origin: p))
     np.testing.assert_allclose(mapper.model_from_camera("camera", 2 * S), pose, atol=1e-9)
     depth = MetricDepth(DepthScalerConfig(), transforms, RecentInputs())
     np.testing.assert_allclose(depth.map_from_camera("camera", 2 * S), pose, atol=1e-9)
@@ -311,17 +311,17 @@ def test_bad_revolutions_are_refused_with_the_reason() -> None:
     feed(mapper, 0, 11)
     times = np.linspace(0, 0.1, 100)
     with pytest.raises(CloudError, match="a revolution of 0 points"):
-        mapper.revolution(Revolution("velodyne", 11 * S // 10, np.empty(0), lambda: np.empty((0, 3))))
-    mapper.revolution(Revolution("laser2", 15 * S // 10, times, lambda: np.zeros((100, 3))))
+        mapper.revolution(TimedPoints("velodyne", 11 * S // 10, np.empty(0), lambda: np.empty((0, 3))))
+    mapper.revolution(TimedPoints("laser2", 15 * S // 10, times, lambda: np.zeros((100, 3))))
     with pytest.raises(TransformError, match="no path from laser2 to odom"):
-        mapper.revolution(Revolution("velodyne", 25 * S // 10, times, lambda: np.full((100, 3), np.nan)))
+        mapper.revolution(TimedPoints("velodyne", 25 * S // 10, times, lambda: np.full((100, 3), np.nan)))
     with pytest.raises(CloudError, match="without a finite point"):
-        mapper.revolution(Revolution("velodyne", 35 * S // 10, times, lambda: np.zeros((99, 3))))
+        mapper.revolution(TimedPoints("velodyne", 35 * S // 10, times, lambda: np.zeros((99, 3))))
     with pytest.raises(CloudError, match="99 points with 100 times"):
-        mapper.revolution(Revolution("velodyne", 45 * S // 10, times, lambda: np.zeros((100, 3))))
+        mapper.revolution(TimedPoints("velodyne", 45 * S // 10, times, lambda: np.zeros((100, 3))))
     assert mapper.model.revolutions == 1
     with pytest.raises(CloudError, match="time went back"):
-        mapper.revolution(Revolution("velodyne", S, times, lambda: np.zeros((100, 3))))
+        mapper.revolution(TimedPoints("velodyne", S, times, lambda: np.zeros((100, 3))))
     assert mapper.model.revolutions == 0 and len(mapper.cloud()) == 0
 
 

@@ -86,7 +86,7 @@ def _local_of_bag(path: Path, topic: str) -> NDArray[np.float32]:
     from instant_ic.bag.files import BagReader
     from instant_ic.calibration.bag import read_clouds
     from instant_ic.geometry.transforms import TransformError
-    from instant_ic.lidar.deskew import Revolution
+    from instant_ic.lidar.deskew import TimedPoints
     from instant_ic.mapping.mapper import LocalMapper
     from instant_ic.msg import cloud_points
 
@@ -98,7 +98,7 @@ def _local_of_bag(path: Path, topic: str) -> NDArray[np.float32]:
             try:
                 points = cloud.points
                 xyz = functools.partial(cloud_points, points)
-                mapper.revolution(Revolution(cloud.frame_id, cloud.stamp_ns, points["time"], xyz))
+                mapper.revolution(TimedPoints(cloud.frame_id, cloud.stamp_ns, points["time"], xyz))
             except (TransformError, ValueError) as error:
                 problem = str(error)
     if mapper.model.revolutions == 0:

@@ -19,7 +19,7 @@ class Newest(Protocol):
         """The newest message; None if there is none or it is too old."""
 
 
-class Scene:
+class RobotPoses:
     """Poses for the page, all in the map frame.
 
     Args:
