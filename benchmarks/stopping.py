@@ -31,7 +31,6 @@ import math
 import os
 import random
 import select
-import shutil
 import signal
 import socket
 import statistics
@@ -49,7 +48,7 @@ from typing import Any, NamedTuple
 
 import aiohttp
 import numpy as np
-from reporting import parser_for, report
+from reporting import note, parser_for, report
 
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.protocol import ESTOP_BITS, Command, encode_reply, read_request, write_frame
@@ -156,7 +155,7 @@ class PacketRelay(Closing):
                 continue
 
     def _repeated(self, data: bytes) -> bytes:
-        """A packet itself, or one of the last revolution with its stamp."""
+        """Return the packet, or one of the last revolution with its stamp."""
         if not self.repeats:
             self._recent.append(data)
             return data
@@ -177,11 +176,11 @@ class SerialRelay(Closing):
 
     def __init__(self, link: Path, controller: Path) -> None:
         self.mute = False
-        """True: the controller's replies are dropped."""
+        """Drops the controller's replies."""
         self.dead = False
-        """True: the left motor's count stays as it is, and its speed loop drives it as fast as it can."""
+        """Freezes the left motor's count, and drives that motor as fast as it can."""
         self.pressed = False
-        """True: the status reports a pressed stop button, which does not latch in the controller."""
+        """Reports a pressed stop button, which does not latch in the controller."""
         self._request, self._count = b"", bytes(4)
         self.speeds: list[tuple[int, float]] = []
         """Each request that changes the commanded speed: machine time in ns, encoder counts per second."""
@@ -249,13 +248,13 @@ class SerialRelay(Closing):
                 os.write(self._master, data)
 
     def _with_count(self, reply: bytes) -> bytes:
-        """Reply of both counts, with the left one as it was when its encoder died."""
+        """Return the reply of both counts, the left one as it was when its encoder died."""
         if not self.dead:
             self._count = reply[:4]
         return encode_reply(self._listener.address, Command.READ_ENCODERS, self._count + reply[4:8])
 
     def _run_away(self, data: bytes) -> bytes:
-        """Frame of a command to drive, with the left motor at full speed in its direction, without a ramp."""
+        """Return a command to drive with the left motor at full speed in its direction, without a ramp."""
         if len(data) != 16 or data[1] != Command.SPEED_ACCELERATION_BOTH:
             return data
         _, left, right = struct.unpack(">Iii", data[2:-2])
@@ -305,7 +304,7 @@ class Rig:
         self.state = message
 
     def ready(self) -> bool:
-        """Whether the arbiter currently allows driving."""
+        """Return whether the arbiter allows driving now."""
         if self.state is None or not self.truth:
             return False
         fresh = self.pace.now_ns() - stamp_ns(self.state) < 0.3e9
@@ -313,7 +312,7 @@ class Rig:
         return fresh and self.state.mode == ControlState.REAL and not held and self.truth[-1].speed < STANDS_M_S
 
     def pid(self, node: str) -> int:
-        """Process id of a running node.
+        """Return the process id of a running node.
 
         Raises:
             StackError: it is not running.
@@ -356,7 +355,7 @@ async def act(does: Act, rig: Rig, page: ConsoleClient) -> None:
 
 
 def freeze(name: str, nodes: Sequence[str], frozen_s: float = 0.0) -> Fault:
-    """Fault of processes that are frozen."""
+    """Return the fault of processes that are frozen."""
     frozen: list[int] = []
 
     def breaks(rig: Rig, page: ConsoleClient) -> None:
@@ -372,16 +371,14 @@ def freeze(name: str, nodes: Sequence[str], frozen_s: float = 0.0) -> Fault:
     return Fault(name, breaks, mends, frozen_s=frozen_s)
 
 
-def process_faults(node: str) -> list[Fault]:
-    return [
-        freeze(f"{node} frozen", [node]),
-        Fault(f"{node} killed", lambda rig, page: os.kill(rig.pid(node), signal.SIGKILL)),
-    ]
+def kill(node: str) -> Fault:
+    """Return the fault of a process that is killed."""
+    return Fault(f"{node} killed", lambda rig, page: os.kill(rig.pid(node), signal.SIGKILL))
 
 
 def second_console_fault() -> Fault:
-    """The driver's console freezes while an idle operator at another one would drive, too."""
-    (frozen, _), pages = process_faults("console"), list[ConsoleClient]()
+    """Return the fault that freezes the driver's console while an idle operator waits at another one."""
+    frozen, pages = freeze("console frozen", ["console"]), list[ConsoleClient]()
 
     async def open_page(rig: Rig, page: ConsoleClient) -> None:
         await page.wait_for(lambda c: rig.state is not None and rig.state.holder.startswith("console/"), 90.0)
@@ -397,9 +394,13 @@ def second_console_fault() -> Fault:
     return Fault("second console idle, the driver's frozen", frozen.breaks, mend, open_page)
 
 
-def link_fault(name: str) -> Fault:
-    breaks, mends = LINKS[name]
-    return Fault(name, lambda rig, page: breaks(rig), lambda rig, page: mends(rig))
+def attribute_fault(name: str, part: str, attribute: str, broken: Any, whole: Any) -> Fault:
+    """Return the fault of a relay that ``attribute`` switches on and off."""
+    return Fault(
+        name,
+        lambda rig, page: setattr(getattr(rig, part), attribute, broken),
+        lambda rig, page: setattr(getattr(rig, part), attribute, whole),
+    )
 
 
 async def release_estop(rig: Rig, page: ConsoleClient) -> None:
@@ -427,24 +428,8 @@ def silence_page(rig: Rig, page: ConsoleClient) -> None:
         task.cancel()
 
 
-LINKS: dict[str, tuple[Callable[[Rig], None], Callable[[Rig], None]]] = {
-    "page link cut": (lambda rig: rig.page_link.cut(), lambda rig: rig.page_link.mend()),
-    "camera link cut": (lambda rig: rig.camera_link.cut(), lambda rig: rig.camera_link.mend()),
-    "LiDAR packets cease": (lambda r: setattr(r.packets, "cut", True), lambda r: setattr(r.packets, "cut", False)),
-    "LiDAR repeats a revolution": (
-        lambda rig: setattr(rig.packets, "repeats", "copies"),
-        lambda rig: setattr(rig.packets, "repeats", ""),
-    ),
-    "contradiction (tracks turn, LiDAR sees no motion)": (
-        lambda rig: setattr(rig.packets, "repeats", "noise"),
-        lambda rig: setattr(rig.packets, "repeats", ""),
-    ),
-    "serial replies lost": (lambda r: setattr(r.serial, "mute", True), lambda r: setattr(r.serial, "mute", False)),
-    "serial cable pulled": (lambda rig: rig.serial.pull(), lambda rig: rig.serial.plug()),
-}
-"""Faults of links: functions that cause and end them."""
 FAULTS = [
-    *(fault for node in PROCESSES for fault in process_faults(node)),
+    *(fault for node in PROCESSES for fault in (freeze(f"{node} frozen", [node]), kill(node))),
     second_console_fault(),
     *(freeze(f"{node} thawed after {FROZEN_S:g} s", [node], FROZEN_S) for node in CONTROL[:3]),
     freeze(f"all thawed after {FROZEN_S:g} s", CONTROL, FROZEN_S),
@@ -458,27 +443,32 @@ FAULTS = [
     Fault("key let go (no loss; soft ramp)", lambda rig, page: page.stop()),
     Fault("page closed", lambda rig, page: page.close()),
     Fault("page silent", silence_page),
-    *map(link_fault, LINKS),
+    Fault("page link cut", lambda rig, page: rig.page_link.cut(), lambda rig, page: rig.page_link.mend()),
+    Fault("camera link cut", lambda rig, page: rig.camera_link.cut(), lambda rig, page: rig.camera_link.mend()),
+    attribute_fault("LiDAR packets cease", "packets", "cut", True, False),
+    attribute_fault("LiDAR repeats a revolution", "packets", "repeats", "copies", ""),
+    attribute_fault("contradiction (tracks turn, LiDAR sees no motion)", "packets", "repeats", "noise", ""),
+    attribute_fault("serial replies lost", "serial", "mute", True, False),
+    Fault("serial cable pulled", lambda rig, page: rig.serial.pull(), lambda rig, page: rig.serial.plug()),
 ]
 
 
 @contextlib.contextmanager
-def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
-    """A started stack with relays at everything that can be cut."""
-    run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
+def running_rig(factor: float, log: Path | None) -> Iterator[Rig]:
+    """Start a stack with relays at everything that can be cut."""
     ports = {"camera": 0, "console": 0, "second_console": 0}
     while len(set(ports.values())) < len(ports):  # a port that was free may be given again
         ports = {name: free_port() for name in ports}
     ports |= {name: free_port(socket.SOCK_DGRAM) for name in ("lidar", "lidar_link", "position")}
-    (run_dir / "dev").mkdir(mode=0o700)
-    launch = run_dir / "stopping.yaml"
     with contextlib.ExitStack() as ends:
-        ends.callback(shutil.rmtree, run_dir, ignore_errors=True)
+        run_dir = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="ic-", ignore_cleanup_errors=True)))
+        (run_dir / "dev").mkdir(mode=0o700)
+        launch = run_dir / "stopping.yaml"
         page_link = ends.enter_context(ImpairedLink(("127.0.0.1", ports["console"])))
         camera_link = ends.enter_context(ImpairedLink(("127.0.0.1", ports["camera"])))
         packets = ends.enter_context(PacketRelay(ports["lidar"], ports["lidar_link"]))
         serial = ends.enter_context(SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw"))
-        launch.write_text(text.format(**ports, camera_link=camera_link.port, folder=share_dir("launch")))
+        launch.write_text(LAUNCH.format(**ports, camera_link=camera_link.port, folder=share_dir("launch")))
         stack = ends.enter_context(Stack(str(launch), run_dir, {}, log, pace=factor))
         stack.wait_for(lambda: registry.list_nodes(run_dir), 600, "first node")  # it may compile the kernels
         made = Rig(stack, run_dir, page_link, camera_link, packets, serial, pace.read(run_dir), ports["second_console"])
@@ -489,7 +479,7 @@ def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
 
 @contextlib.asynccontextmanager
 async def driver(rig: Rig) -> AsyncIterator[ConsoleClient]:
-    """A page that drives; retries, because the console may just be restarting."""
+    """Open a page that drives; try again while the console restarts."""
     page = ConsoleClient(f"http://127.0.0.1:{rig.page_link.port}/")
     for left in reversed(range(40)):
         try:
@@ -568,7 +558,7 @@ async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[st
 
 
 def stands_ns(truth: Sequence[Truth], lost_ns: int, cruise: float) -> int | None:
-    """Time at which the robot, which drove at ``cruise`` m/s, began to stand for ``STANDS_S``; None if it has not."""
+    """Return the time at which the robot, driven at ``cruise`` m/s, began to stand for ``STANDS_S``, or None."""
     began: int | None = None
     limit = min(STANDS_M_S, cruise / 3)
     for row in truth:
@@ -584,39 +574,43 @@ def stands_ns(truth: Sequence[Truth], lost_ns: int, cruise: float) -> int | None
 
 
 def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
-    """Figures of one drive."""
+    """Return the figures of one drive."""
     rows = [row for row in rig.truth if row.at_ns >= lost_ns]
+    signs = signs_of_the_stop(rig, rows, lost_ns, cruise)
+    found: dict[str, Any] = dict.fromkeys(("detect_s", "stand_s", "distance_m", "after_m", "again_s"))
+    found["cruise_m_s"] = round(cruise, 3)
+    if signs:
+        found["detect_s"] = round((min(signs) - lost_ns) / 1e9, 3)
+    stand_ns = stands_ns(rows, lost_ns, cruise)
+    if stand_ns is None:
+        return found
     start = max((row for row in rig.truth if row.at_ns <= lost_ns), key=lambda row: row.at_ns)
     gap_s = (lost_ns - start.at_ns) / 1e9  # driving time between this sample and the loss
+    end = next(row for row in rows if row.at_ns == stand_ns)
+    later = [row for row in rows if row.at_ns > stand_ns]
+    found["stand_s"] = round((stand_ns - lost_ns) / 1e9, 3)
+    found["distance_m"] = round(math.dist(start[1:3], end[1:3]) - gap_s * cruise, 3)
+    found["after_m"] = round(max((math.dist(end[1:3], row[1:3]) for row in later), default=0.0), 3)
+    again_ns = next((row.at_ns for row in later if row.speed >= STANDS_M_S), None)
+    if again_ns is not None:
+        found["again_s"] = round((again_ns - lost_ns) / 1e9, 3)
+    return found
+
+
+def signs_of_the_stop(rig: Rig, rows: Sequence[Truth], lost_ns: int, cruise: float) -> list[int]:
+    """Return the times at which a commanded or true speed is a tenth below that before the loss."""
     signs = [at for at, speed in rig.commands if at >= lost_ns and speed < 0.9 * cruise]
     if cruise > 5 * STANDS_M_S:  # below, the true speed falls by a tenth by itself
         signs += [row.at_ns for row in rows if row.speed < 0.9 * cruise]
     requests = [(rig.pace.stamp_ns(at), speed) for at, speed in rig.serial.speeds]
     driven = max((request for request in requests if request[0] <= lost_ns), default=(0, 0.0))[1]
-    signs += [at for at, speed in requests if at > lost_ns and speed < 0.9 * driven]
-    stand_ns = stands_ns(rows, lost_ns, cruise)
-    found: dict[str, Any] = {
-        "cruise_m_s": round(cruise, 3),
-        "detect_s": round((min(signs) - lost_ns) / 1e9, 3) if signs else None,
-        "stand_s": None,
-        "distance_m": None,
-        "after_m": None,
-        "again_s": None,
-    }
-    if stand_ns is not None:
-        end = next(row for row in rows if row.at_ns == stand_ns)
-        later = [row for row in rows if row.at_ns > stand_ns]
-        found["stand_s"] = round((stand_ns - lost_ns) / 1e9, 3)
-        found["distance_m"] = round(math.dist(start[1:3], end[1:3]) - gap_s * cruise, 3)
-        found["after_m"] = round(max((math.dist(end[1:3], row[1:3]) for row in later), default=0.0), 3)
-        again_ns = next((row.at_ns for row in later if row.speed >= STANDS_M_S), None)
-        found["again_s"] = None if again_ns is None else round((again_ns - lost_ns) / 1e9, 3)
-    return found
+    return signs + [at for at, speed in requests if at > lost_ns and speed < 0.9 * driven]
 
 
-async def drives(rig: Rig, faults: Sequence[Fault], repeat: int, seed: int) -> dict[str, list[dict[str, Any]]]:
+async def drives(rig: Rig, faults: Sequence[Fault], repeat: int) -> dict[str, list[dict[str, Any]]]:
     """Run all faults in turn, repeatedly."""
-    rng, found = random.Random(seed), {fault.name: [] for fault in faults}  # type: dict[str, list[dict[str, Any]]]
+    rng = random.Random(1)
+    found: dict[str, list[dict[str, Any]]] = {fault.name: [] for fault in faults}
     async with pump(rig.stack) as until:
         for turn in range(repeat):
             for fault in faults:
@@ -624,16 +618,16 @@ async def drives(rig: Rig, faults: Sequence[Fault], repeat: int, seed: int) -> d
                     figures = await one(rig, until, fault, rng)
                 except StackError as error:
                     rig.stack.check_alive(fault.name)
-                    print(f"{turn + 1}/{repeat} {fault.name}: not measured: {error}", file=sys.stderr, flush=True)
+                    note(f"{turn + 1}/{repeat} {fault.name}: not measured: {error}")
                     continue
                 found[fault.name].append(figures)
-                print(f"{turn + 1}/{repeat} {fault.name}: {figures}", file=sys.stderr, flush=True)
+                note(f"{turn + 1}/{repeat} {fault.name}: {figures}")
                 del rig.truth[:-1], rig.commands[:], rig.serial.speeds[:-1]
     return found
 
 
-def summary(drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Median and worst; the worst is None if the robot did not stop in one of the drives."""
+def worst(drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return median and worst of some drives; the worst is None if the robot did not stop in one of them."""
     result: dict[str, Any] = {"n": len(drives)}
     for key in ("detect_s", "stand_s", "distance_m", "after_m"):
         values = [drive[key] for drive in drives]
@@ -649,11 +643,8 @@ def main() -> int:
     parser = parser_for(__doc__)
     parser.add_argument("--only", action="append", default=[], help="faults whose name begins so; may be repeated")
     parser.add_argument("--repeat", type=int, default=2, help="drives for each fault (default 2)")
-    parser.add_argument(
-        "--pace", type=float, default=0.0, help="of the stack's time (default: what the machine can do)"
-    )
-    parser.add_argument("--seed", type=int, default=1, help="of the moments of the losses")
-    parser.add_argument("--log", type=Path, default=None, help="where the stack's output goes")
+    parser.add_argument("--pace", type=float, default=0.0, help="fixed pace (default: what the machine can do)")
+    parser.add_argument("--log", type=Path, default=None, help="file for the stack's output")
     args = parser.parse_args()
     faults = [fault for fault in FAULTS if not args.only or fault.name.startswith(tuple(args.only))]
     if not faults or args.repeat < 1:
@@ -665,9 +656,9 @@ def main() -> int:
         "pace": factor,
         "speed_m_s": SPEED_M_S,
     }
-    with rig(factor, args.log) as made:
-        found = asyncio.run(drives(made, faults, args.repeat, args.seed))
-    result["faults"] = {name: summary(rows) for name, rows in found.items()}
+    with running_rig(factor, args.log) as rig:
+        found = asyncio.run(drives(rig, faults, args.repeat))
+    result["faults"] = {name: worst(rows) for name, rows in found.items()}
     result["drives"] = found
     report(result, args.json)
     return 0 if all(len(rows) == args.repeat for rows in found.values()) else 1
