@@ -1,7 +1,7 @@
-"""Bridge between two machines: latency of commands, age of images and state with and without the bridge, CPU; as JSON.
+#!/usr/bin/env python3
+"""Latency of commands, images and states between two machines, with and without the bridge, and its CPU; prints JSON.
 
-python benchmarks/bridge.py [SECONDS]     # seconds per scenario, default 20
-python benchmarks/bridge.py --losses      # seconds until the link detects a loss and until it is back
+    python benchmarks/bridge.py --seconds 15 --json bridge.json
 
 Commands go 20 times per second from the station to the robot; images (200 kB, 10 per second) and states (20 per second)
 the other way. Two bridges with CURVE and the shipped topic lists run in their own processes; the network is
@@ -11,9 +11,6 @@ the other way. Two bridges with CURVE and the shipped topic lists run in their o
 from __future__ import annotations
 
 import contextlib
-import json
-import platform
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -25,16 +22,12 @@ from typing import Any
 
 import numpy as np
 import psutil
+from reporting import parser_for, report, summary
 
-from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyStore, Peer
-from instant_ic.bridge.host_listener import ListeningLink
-from instant_ic.bridge.host_session import Ended, LinkTimes, Side, Up
-from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.bus import SENSOR
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.experiments.impaired_link import ImpairedLink, Impairment
 from instant_ic.experiments.stack import Observer, _NoParameters, free_port
 from instant_ic.msg import (
     CompressedImage,
@@ -47,8 +40,8 @@ from instant_ic.msg import (
 )
 from instant_ic.util.paths import node_file, shipped_file
 
-COMMAND, PICTURE, STATE = "/operator/cmd_vel", "/camera/image/compressed", "/vbot/odom"
-PICTURE_BYTES = 200_000
+COMMAND, IMAGE, STATE = "/operator/cmd_vel", "/camera/image/compressed", "/vbot/odom"
+IMAGE_BYTES = 200_000
 SCENARIOS: dict[str, list[str] | None] = {
     "no bridge, one host": None,
     "bridge over loopback": [],
@@ -58,7 +51,7 @@ SCENARIOS: dict[str, list[str] | None] = {
 }
 
 
-class Host:
+class BusHost:
     """A node that publishes and subscribes, spinning on its own thread."""
 
     def __init__(self, run_dir: Path, name: str) -> None:
@@ -85,7 +78,7 @@ class Host:
 
 @contextlib.contextmanager
 def bridges(folder: Path, network: list[str]) -> Iterator[list[psutil.Process]]:
-    """Robot's and station's bridge, with a network between them."""
+    """Start the bridges of robot and station with a network between them; yield their processes."""
     stores = {host: KeyStore(folder / f"k{host[0]}") for host in ("robot", "station")}
     made = {host: store.create(host) for host, store in stores.items()}
     stores["robot"].allow(Peer("station", "driver", made["station"].public_key))
@@ -108,27 +101,21 @@ def bridges(folder: Path, network: list[str]) -> Iterator[list[psutil.Process]]:
             process.wait(10)
 
 
-def summary(ages_ms: list[float]) -> dict[str, float]:
-    if not ages_ms:
-        return {"count": 0}
-    p50, p99 = np.percentile(ages_ms, [50, 99])
-    return {"count": len(ages_ms), "p50_ms": round(p50, 2), "p99_ms": round(p99, 2), "max_ms": round(max(ages_ms), 2)}
-
-
 def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
+    """Measure one scenario; without a network, robot and station share one bus."""
     with tempfile.TemporaryDirectory(prefix="icb") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         processes = [] if network is None else stack.enter_context(bridges(folder, network))
         robot_dir, station_dir = folder / "r", folder / ("r" if network is None else "s")
-        robot, station = Host(robot_dir, "bench_robot"), Host(station_dir, "bench_station")
+        robot, station = BusHost(robot_dir, "bench_robot"), BusHost(station_dir, "bench_station")
         stack.callback(robot.close)
         stack.callback(station.close)
         robot.listen(COMMAND, TwistStamped)
-        station.listen(PICTURE, CompressedImage)
+        station.listen(IMAGE, CompressedImage)
         station.listen(STATE, Odometry)
         command = station.node.publisher(COMMAND, TwistStamped)
-        picture, state = robot.node.publisher(PICTURE, CompressedImage), robot.node.publisher(STATE, Odometry)
-        jpeg = np.random.default_rng(0).bytes(PICTURE_BYTES)
+        image, state = robot.node.publisher(IMAGE, CompressedImage), robot.node.publisher(STATE, Odometry)
+        jpeg = np.random.default_rng(0).bytes(IMAGE_BYTES)
         robot.thread.start()
         station.thread.start()
 
@@ -137,7 +124,7 @@ def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
             command.publish(twist_stamped(0.1, 0.0, now))
             state.publish(odometry_message(np.eye(4), 0.0, 0.0, "map", "vbot", now))
             if step % 2 == 0:
-                picture.publish(compressed_image_message(jpeg, "camera", now))
+                image.publish(compressed_image_message(jpeg, "camera", now))
 
         def pace(duration_s: float, until: Any = None) -> None:
             begin = time.monotonic()
@@ -147,7 +134,7 @@ def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
                 if until is not None and until():
                     return
 
-        every = (robot.ages_ms[COMMAND], station.ages_ms[PICTURE], station.ages_ms[STATE])
+        every = (robot.ages_ms[COMMAND], station.ages_ms[IMAGE], station.ages_ms[STATE])
         pace(60.0, lambda: all(len(ages) > 20 for ages in every))  # connected and warm
         if not all(every):
             raise SystemExit("the bridges did not link within 60 s")
@@ -158,98 +145,24 @@ def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
         pace(seconds)
         elapsed_s = time.monotonic() - begin
         cpu = [sum(p.cpu_times()[:2]) - before for p, before in zip(processes, cpu_before, strict=True)]
-        report: dict[str, Any] = {
+        figures: dict[str, Any] = {
             "command": summary(robot.ages_ms[COMMAND]),
-            "picture": summary(station.ages_ms[PICTURE]),
+            "image": summary(station.ages_ms[IMAGE]),
             "state": summary(station.ages_ms[STATE]),
         }
         if processes:
-            report["cpu_percent"] = {
+            figures["cpu_percent"] = {
                 host: round(100 * used / elapsed_s, 1) for host, used in zip(("robot", "station"), cpu, strict=True)
             }
-        return report
-
-
-class LinkEnd:
-    """One end of a link on its own, with the monotonic time of each of its events."""
-
-    def __init__(self, link_class: Any, *where: Any, name: str, store: KeyStore, exports: Any, imports: Any) -> None:
-        self.events: list[tuple[float, Any]] = []
-        side = Side(name, f"{name}-{time.monotonic_ns()}", {imports.topic: imports}, lambda type_name: "same")
-        self.link = link_class(*where, side, {exports.topic: exports}, store, self._note, LinkTimes())
-        self.link.start()
-
-    def _note(self, peer: str, event: Any) -> None:
-        self.events.append((time.monotonic(), event))
-
-    def since(self, begin_s: float, kind: Any) -> float:
-        """Seconds from a time to the first later event of a kind.
-
-        Raises:
-            SystemExit: there is none within 30 s.
-        """
-        give_up_s = time.monotonic() + 30
-        while time.monotonic() < give_up_s:
-            for at_s, event in self.events:
-                if at_s >= begin_s and isinstance(event, kind):
-                    return at_s - begin_s
-            time.sleep(0.001)
-        raise SystemExit(f"no {kind.__name__} within 30 s")
-
-
-def losses(repeat: int) -> dict[str, Any]:
-    """Network outage, restart of the robot's bridge, and revocation of a key: seconds, median and worst."""
-    seconds: dict[str, list[float]] = {name: [] for name in ("hole_noticed", "hole_back", "restart_back", "revoked")}
-    command, state = TopicRule(COMMAND, lane="command", max_age_s=0.25), TopicRule(STATE)
-    for _ in range(repeat):
-        with tempfile.TemporaryDirectory(prefix="icb") as name, contextlib.ExitStack() as ends:
-            stores = {host: KeyStore(Path(name) / host) for host in ("robot", "station")}
-            keys = {host: store.create(host) for host, store in stores.items()}
-            peers = {host: Peer(host, "driver", key.public_key) for host, key in keys.items()}
-            stores["robot"].allow(peers["station"])
-            port = free_port()
-
-            def robot(stores: Any = stores, port: int = port) -> LinkEnd:
-                address = f"tcp://127.0.0.1:{port}"
-                return LinkEnd(
-                    ListeningLink, address, name="robot", store=stores["robot"], exports=state, imports=command
-                )
-
-            first = robot()
-            network = ends.enter_context(ImpairedLink(("127.0.0.1", port), Impairment(delay_s=0.01)))
-            station = LinkEnd(
-                ConnectingLink, f"tcp://127.0.0.1:{network.port}", peers["robot"],
-                name="station", store=stores["station"], exports=command, imports=state,
-            )  # fmt: skip
-            ends.callback(station.link.stop)
-            station.since(0.0, Up)
-            began = time.monotonic()
-            network.cut()
-            seconds["hole_noticed"].append(max(first.since(began, Ended), station.since(began, Ended)))
-            began = time.monotonic()
-            network.mend()
-            seconds["hole_back"].append(station.since(began, Up))
-            first.link.stop()
-            began = time.monotonic()
-            second = robot()
-            ends.callback(second.link.stop)
-            seconds["restart_back"].append(station.since(began, Up))
-            began = time.monotonic()
-            stores["robot"].revoke("station")
-            seconds["revoked"].append(second.since(began, Ended))
-    return {
-        f"{name}_s": {"median": round(statistics.median(each), 2), "worst": round(max(each), 2)}
-        for name, each in seconds.items()
-    }
+        return figures
 
 
 def main() -> None:
-    if sys.argv[1:] == ["--losses"]:
-        print(json.dumps({"repeat": 10, **losses(10)}, indent=2))
-        return
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
-    scenarios = {name: run(network, seconds) for name, network in SCENARIOS.items()}
-    print(json.dumps({"python": platform.python_version(), "seconds": seconds, "scenarios": scenarios}, indent=2))
+    parser = parser_for(__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of each scenario (default 20)")
+    args = parser.parse_args()
+    scenarios = {name: run(network, args.seconds) for name, network in SCENARIOS.items()}
+    report({"seconds": args.seconds, "scenarios": scenarios}, args.json)
 
 
 if __name__ == "__main__":

@@ -6,27 +6,26 @@
 
 All transports send the same frames at the same pace, alternating within one run, so that other load on the machine
 affects all of them alike. Latency is measured from before the send call until the receiver has read one byte of every
-4096. A transport whose package is missing is "not measured". iceoryx2 and eCAL are not in the `dev` extra (eCAL needs
-an older protobuf): `pip install --no-deps --target FOLDER iceoryx2==0.10.0 eclipse_ecal==6.1.1`, with FOLDER in
-PYTHONPATH.
+4096. A transport whose package is missing is "not measured". iceoryx2 is not in the `dev` extra:
+`pip install --no-deps --target FOLDER iceoryx2==0.10.0`, with FOLDER in PYTHONPATH.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-import socket
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from reporting import parser_for, report
+from reporting import note, parser_for, report, summary
+
+from instant_ic.experiments.stack import free_port
 
 PEER = Path(__file__).with_name("bus_peer.py")
 SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_500_000}
@@ -41,12 +40,11 @@ NAMES = {
     "zmq": "ZeroMQ ipc (raw)",
     "zenoh_shm": "Zenoh, shared memory",
     "iceoryx2": "iceoryx2",
-    "ecal": "eCAL",
     "lcm": "LCM udpm",
 }
 
 
-class Peer:
+class BusPeer:
     """A process of benchmarks/bus_peer.py."""
 
     def __init__(self, transport: str, role: str, topics: dict[str, int], address: str) -> None:
@@ -81,11 +79,11 @@ class Peer:
 
 
 @dataclass
-class Pair:
+class PeerPair:
     """Both sides of one transport."""
 
-    pub: Peer
-    subs: list[Peer]
+    pub: BusPeer
+    subs: list[BusPeer]
 
     def send(self, topic: str, count: int, period_s: float, seconds: float = 60.0) -> tuple[dict[str, Any], list[Any]]:
         """Send frames and wait until all expected ones have arrived."""
@@ -130,37 +128,31 @@ def joined(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def addresses(folder: Path) -> dict[str, str]:
-    """Address of each transport."""
+    """Return the address of each transport."""
     return {
-        **{name: str(folder / name) for name in ("ours", "image", "iceoryx2", "ecal")},
+        **{name: str(folder / name) for name in ("ours", "image", "iceoryx2")},
         "zmq": f"ipc://{folder}/zmq",
         "zenoh_shm": f"tcp/127.0.0.1:{free_port()}",
         "lcm": f"udpm://239.255.76.67:{free_port()}?ttl=0&recv_buf_size=4194304",
     }
 
 
-def open_pair(transport: str, address: str, topics: dict[str, int], readers: int) -> Pair:
+def open_pair(transport: str, address: str, topics: dict[str, int], readers: int) -> PeerPair:
     """Start both sides.
 
     Raises:
         RuntimeError: the transport is not installed or does not work.
     """
-    peers: list[Peer] = []
+    peers: list[BusPeer] = []
     try:
-        pub = Peer(transport, "pub", topics, address)
+        pub = BusPeer(transport, "pub", topics, address)
         peers.append(pub)
         pub.answer()
         for _ in range(readers):
-            peers.append(Peer(transport, "sub", topics, address))
+            peers.append(BusPeer(transport, "sub", topics, address))
             peers[-1].answer()
-        pair = Pair(pub, peers[1:])
+        pair = PeerPair(pub, peers[1:])
         for topic in topics:
             pair.warm_up(topic)
         return pair
@@ -170,79 +162,64 @@ def open_pair(transport: str, address: str, topics: dict[str, int], readers: int
         raise
 
 
-def summary(latencies: list[float], sent: int) -> dict[str, Any]:
-    """Figures of one table cell."""
-    if not latencies:
-        return {"p50_us": None, "p99_us": None, "received": 0, "sent": sent}
-    ordered = sorted(latencies)
-    return {
-        "p50_us": round(statistics.median(ordered), 1),
-        "p99_us": round(ordered[min(len(ordered) - 1, int(len(ordered) * 0.99))], 1),
-        "received": len(ordered),
-        "sent": sent,
-    }
-
-
-def measure(transports: list[str], rounds: int, count: int, flood_s: float, note: Any) -> dict[str, Any]:
-    """All figures by transport."""
-    latency: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    sent: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+def measure(transports: list[str], rounds: int, count: int, flood_s: float) -> dict[str, Any]:
+    """Return all figures by transport."""
     result: dict[str, Any] = {"not_measured": {}, "latency": {}, "throughput": {}, "fanout": {}}
-    topics = dict(SIZES)
     with tempfile.TemporaryDirectory(prefix="ic") as folder:
         address = addresses(Path(folder))
-        pairs: dict[str, Pair] = {}
-        try:
+        with contextlib.ExitStack() as ends:
+            pairs: dict[str, PeerPair] = {}
             for transport in transports:
                 try:
-                    pairs[transport] = open_pair(transport, address[transport], topics, 1)
+                    pair = open_pair(transport, address[transport], SIZES, 1)
+                    pairs[transport] = ends.enter_context(contextlib.closing(pair))
                 except RuntimeError as error:
                     result["not_measured"][transport] = str(error)
                     note(f"{transport}: not measured: {error}")
-            for turn in range(rounds):
-                for topic in topics:
-                    for transport, pair in pairs.items():
-                        written, got = pair.send(topic, count, PERIOD_S[topic])
-                        latency[transport][topic] += got[0]["latencies_us"]
-                        sent[transport][topic] += written["sent"]
-                note(f"latency, round {turn + 1} of {rounds}")
-        finally:
-            for pair in pairs.values():
-                pair.close()
-        for transport in pairs:
-            result["latency"][transport] = {t: summary(latency[transport][t], sent[transport][t]) for t in topics}
+            result["latency"] = latencies(pairs, rounds, count)
         for transport in pairs:
             try:
                 result["throughput"][transport] = flood(transport, address[transport], flood_s)
                 note(f"throughput, {transport}")
             except RuntimeError as error:
                 note(f"{transport}: throughput not measured: {error}")
-        gathered: dict[str, list[float]] = defaultdict(list)
-        fan_sent: dict[str, int] = defaultdict(int)
-        for _ in range(max(1, rounds // 2)):
-            for transport in pairs:
-                try:
-                    pair = open_pair(transport, address[transport], {"m5": SIZES["m5"]}, FANOUT)
-                except RuntimeError as error:
-                    note(f"{transport}: fan-out not measured: {error}")
-                    continue
-                try:
-                    written, got = pair.send("m5", count, PERIOD_S["m5"])
-                finally:
-                    pair.close()
-                gathered[transport] += [value for g in got for value in g["latencies_us"]]
-                fan_sent[transport] += written["sent"] * FANOUT
-            note("fan-out")
-        result["fanout"] = {t: summary(gathered[t], fan_sent[t]) for t in pairs if t in gathered}
+        result["fanout"] = fanout({name: address[name] for name in pairs}, max(1, rounds // 2), count)
     return result
 
 
+def latencies(pairs: dict[str, PeerPair], rounds: int, count: int) -> dict[str, Any]:
+    """Return the latencies by transport and size; the transports take turns."""
+    gathered: dict[str, dict[str, list[float]]] = {name: {size: [] for size in SIZES} for name in pairs}
+    for turn in range(rounds):
+        for topic in SIZES:
+            for name, pair in pairs.items():
+                _, got = pair.send(topic, count, PERIOD_S[topic])
+                gathered[name][topic] += got[0]["latencies_us"]
+        note(f"latency, round {turn + 1} of {rounds}")
+    return {name: {size: summary(values, "us") for size, values in sizes.items()} for name, sizes in gathered.items()}
+
+
+def fanout(address: dict[str, str], rounds: int, count: int) -> dict[str, Any]:
+    """Return the latencies of the largest frames to several readers, by transport."""
+    gathered: dict[str, list[float]] = {name: [] for name in address}
+    for _ in range(rounds):
+        for name in address:
+            try:
+                with contextlib.closing(open_pair(name, address[name], {"m5": SIZES["m5"]}, FANOUT)) as pair:
+                    _, got = pair.send("m5", count, PERIOD_S["m5"])
+            except RuntimeError as error:
+                note(f"{name}: fan-out not measured: {error}")
+                continue
+            gathered[name] += [value for one in got for value in one["latencies_us"]]
+        note("fan-out")
+    return {name: summary(values, "us") for name, values in gathered.items()}
+
+
 def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
-    """Throughput by size when the sender never waits."""
+    """Return the throughput by size when the sender never waits."""
     topics = {f"flood_{name}": size for name, size in SIZES.items()}
-    pair = open_pair(transport, address, topics, 1)
-    try:
-        cells = {}
+    cells = {}
+    with contextlib.closing(open_pair(transport, address, topics, 1)) as pair:
         for topic in topics:
             written, got = pair.send(topic, 10**9, 0.0, seconds)
             took = max(written["seconds"], got[0]["seconds"])
@@ -251,23 +228,7 @@ def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
                 "messages_per_s": round(got[0]["count"] / took),
                 "delivered": round(got[0]["count"] / max(1, written["sent"]), 4),
             }
-        return cells
-    finally:
-        pair.close()
-
-
-def verdicts(result: dict[str, Any]) -> dict[str, Any]:
-    """Check the targets, each with its figure."""
-    latency = result["latency"]
-
-    def p50(transport: str, topic: str) -> float | None:
-        return latency.get(transport, {}).get(topic, {}).get("p50_us")
-
-    found: dict[str, Any] = {}
-    for rival, topic, most in (("zmq", "k20", 1.15), ("zmq", "m5", 0.8), ("zenoh_shm", "m5", 0.5)):
-        if (value := p50(rival, topic)) and (own := p50("ours", topic)):
-            found[f"p50 at {LABELS[topic]} over {NAMES[rival]}"] = {"ratio": round(own / value, 2), "at most": most}
-    return found
+    return cells
 
 
 def table(result: dict[str, Any]) -> str:
@@ -300,19 +261,13 @@ def main() -> int:
         help=", ".join(NAMES),
     )
     args = parser.parse_args()
-    started = time.monotonic()
-
-    def note(text: str) -> None:
-        print(f"{time.monotonic() - started:5.0f} s  {text}", file=sys.stderr, flush=True)
-
     rounds, count, flood_s = (2, 40, 0.5) if args.quick else (6, 100, 2.0)
     result = {
         "cores": os.cpu_count(),
         "load_before": os.getloadavg()[0],
-        **measure(args.only, rounds, count, flood_s, note),
+        **measure(args.only, rounds, count, flood_s),
         "load_after": os.getloadavg()[0],
     }
-    result["targets"] = verdicts(result)
     report(result, args.json)
     print(table(result), file=sys.stderr)
     return 0

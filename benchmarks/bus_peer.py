@@ -249,25 +249,6 @@ def iceoryx2_pub(topics, address):
     return send
 
 
-def ecal_sub(topics, address, receiver):
-    import ecal.nanobind_core as ecal
-
-    ecal.initialize("sub")
-    for topic in topics:
-        subscriber = ecal.Subscriber(address.replace("/", "_") + topic)
-        subscriber.set_receive_callback(lambda _publisher, _type, data: receiver.got(data.buffer))
-        KEEP.append(subscriber)
-    return threading.Event().wait
-
-
-def ecal_pub(topics, address):
-    import ecal.nanobind_core as ecal
-
-    ecal.initialize("pub")
-    publishers = {topic: ecal.Publisher(address.replace("/", "_") + topic) for topic in topics}
-    return lambda topic, frame: publishers[topic].send(bytes(frame))
-
-
 def lcm_sub(topics, address, receiver):
     import lcm
 

@@ -1,18 +1,17 @@
 #!/usr/bin/env python3
-"""The virtual space's field on an NVIDIA GPU: kernels, training, views, and the field against the warp.
+"""The virtual space's field on an NVIDIA GPU: training, views, and the field against the warp.
 
-    python benchmarks/gpu.py [--step kernels,train,views,field-or-warp] [--out runs/gpu]
+    python benchmarks/gpu.py [--step train,views,field-or-warp] [--out runs/gpu]
     python benchmarks/gpu.py --cpu --step train,views --worlds corridor
 
-- kernels: views of the Triton kernels against plain torch with the same weights, and the time of both.
 - train: time until views of the field are within 1 dB of its last. The paper needs 3 to 4 s; target: at most 1 s.
 - views: views a second, alone and while training. The paper has 10; target: at least 60 at 1280 x 720.
 - field-or-warp: PSNR and SSIM of the field and of the paper's field (density) against the warp of the same keyframes,
   with one and several keyframes, true and wrong depth, on views of places that were left out.
 
 Each step takes less than 10 minutes (``--seconds`` limits each training) and writes OUT/STEP.json. Times are wall time;
-every call ends with a copy to the CPU. ``--cpu`` runs all steps but kernels on the CPU, in CPU seconds of one thread.
-Otherwise an NVIDIA GPU, torch's CUDA build and ``pip install 'instant-ic[triton]'`` are needed.
+every call ends with a copy to the CPU. ``--cpu`` measures the CPU's kernels, in CPU seconds of one thread. Otherwise an
+NVIDIA GPU, torch's CUDA build and ``pip install 'instant-ic[triton]'`` are needed.
 """
 
 from __future__ import annotations
@@ -39,10 +38,6 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import make_world
 from instant_ic.vspace import FieldConfig, PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
-from instant_ic.vspace.nerf.field import Lattice, TrainingScene
-from instant_ic.vspace.nerf.occupancy import build_occupancy
-from instant_ic.vspace.prior import prepare
-from instant_ic.vspace.view import perspective_rays
 
 FOV = math.pi / 2
 PANORAMA = 1024
@@ -127,49 +122,6 @@ class SimulatedPlace:
     def shown(self, space: VirtualSpace, pose: Any) -> Any:
         """Return the space from a pose, (H, W, 3) uint8."""
         return space.render(self.start @ pose, *self._view, FOV).rgb
-
-
-def kernels(run: GpuRun) -> dict[str, Any]:
-    """Compare views of both kernels with the same weights, with one keyframe and with three."""
-    place, config = SimulatedPlace(run.worlds[0], run.view), run.config("triton")
-    result: dict[str, Any] = {}
-    for name in ("one", "three"):
-        priors = [prepare(*place.keyframe(x), config.geometry, PANORAMA) for x in reversed(KEYFRAMES[name])]
-        lattice = Lattice.for_prior(priors[0], config.field)
-        gains = np.array([[1, 1, 1], [0.9, 1.1, 1.2], [1.1, 1.0, 0.9]], np.float32)[: len(priors)]
-        result[name] = _compared(
-            TrainingScene(tuple(priors), lattice, build_occupancy(priors, config.geometry), gains), run
-        )
-    return result
-
-
-def _compared(scene: TrainingScene, run: GpuRun) -> dict[str, Any]:
-    from instant_ic.vspace.nerf.torch_device import TorchDevice
-    from instant_ic.vspace.nerf.triton_device import TritonDevice
-
-    ours, peer = TritonDevice(FieldConfig(), run.train, "cuda"), TorchDevice(FieldConfig(), run.train, "cuda")
-    rng, result = np.random.default_rng(5), {}
-    shape = (run.train.ray_columns * run.train.ray_rows, 3)
-    for device in (ours, peer):
-        device.set_scene(scene)
-    for _ in range(50):
-        peer.step(rng.random(shape, np.float32), 0.02, 0.01)
-    ours.load(peer.parameters())
-    ours.set_scene(scene)
-    rays = perspective_rays(scene.prior.map_from_camera @ pose_matrix(0.8, 0.2, yaw=0.2), *run.view, FOV)
-    for shares in ((0.0, 0.0), (0.6, 0.5), (1.0, 1.0)):
-        (colour, depth, _), (colours, depths, _) = (device.draw(rays, *shares) for device in (ours, peer))
-        same = np.isclose(depth, depths, rtol=0.01)
-        result[f"view, panorama {shares[0]:g}, depth {shares[1]:g}"] = {
-            "same_depth": round(float(same.mean()), 4),
-            "colour_error_p98": round(float(np.quantile(np.abs(colour[same] - colours[same]), 0.98)), 4),
-        }
-    uniform = rng.random(shape, np.float32)
-    for name, device in (("ours", ours), ("torch", peer)):
-        step_s = run.median_s(lambda d=device: d.step(uniform, 1e-4, 1e-4))
-        view_s = run.median_s(lambda d=device: d.draw(rays, 0.0, 0.5))
-        result[name] = {"step_ms": round(1e3 * step_s, 3), "view_ms": round(1e3 * view_s, 3)}
-    return result
 
 
 def train(run: GpuRun) -> dict[str, Any]:
@@ -290,7 +242,7 @@ def _left_out_views(
     return found | {"seconds": round(seconds, 2), "iterations": space.status.iterations}
 
 
-STEPS = {"kernels": kernels, "train": train, "views": views, "field-or-warp": field_or_warp}
+STEPS = {"train": train, "views": views, "field-or-warp": field_or_warp}
 
 
 def main() -> int:
@@ -298,14 +250,12 @@ def main() -> int:
     parser.add_argument("--step", default=",".join(STEPS), help="steps, by commas (default: all)")
     parser.add_argument("--out", type=Path, default=Path("runs/gpu"), help="folder of the results (default runs/gpu)")
     parser.add_argument("--seconds", type=float, default=10.0, help="longest time of a training (default 10)")
-    parser.add_argument("--cpu", action="store_true", help="train, views and field-or-warp on the CPU; CPU seconds")
+    parser.add_argument("--cpu", action="store_true", help="measure the kernels of the CPU; CPU seconds")
     parser.add_argument("--worlds", default="corridor,random:11,random:12", help="worlds, by commas")
     args = parser.parse_args()
     steps = args.step.split(",")
     if unknown := sorted(set(steps) - set(STEPS)):
         parser.error(f"--step: no such step: {', '.join(unknown)}; there are {', '.join(STEPS)}")
-    if args.cpu and "kernels" in steps:
-        parser.error("--cpu: the step kernels needs a GPU; give --step train,views,field-or-warp")
     if not (args.cpu or torch.cuda.is_available()):
         parser.error("torch finds no CUDA device; --cpu measures the CPU's kernels")
     run = GpuRun(("triton", "torch-cuda"), args.seconds, args.worlds.split(","))
