@@ -44,14 +44,14 @@ class Inference:
         self._load(provider)
 
     def _load(self, provider: str) -> None:
-        """Load the model; report its provider and why a faster one is not used."""
+        """Load the model; report its provider."""
         self.model = model = DepthModel.find(self._name, self._threads, provider)
         manifest = model.manifest
         kind = f"{manifest.output_kind}, {manifest.input_width}x{manifest.input_height}"
-        why = f" ({'; '.join(model.notes)})" if model.notes else ""
-        logger.info("%s (%s) on %s%s", manifest.name, kind, model.provider, why)
+        logger.info("%s (%s) on %s", manifest.name, kind, model.provider)
         if provider not in ("auto", model.provider):
-            logger.warning("provider %s was requested, the model runs on %s%s", provider, model.provider, why)
+            why = "see onnxruntime's messages, or: pip install onnxruntime-gpu instead of onnxruntime"
+            logger.warning("provider %s was requested, the model runs on %s (%s)", provider, model.provider, why)
 
     def estimate(self, image: bytes | NDArray[np.uint8]) -> Floats:
         """Return ``DepthModel.estimate`` of an encoded panorama.

@@ -12,50 +12,45 @@ from numpy.typing import NDArray
 
 from instant_ic.depth.completion import PRIOR_CHANNELS
 from instant_ic.depth.manifest import InferenceError, ManifestError, ModelManifest, load_manifest, manifest_path
-from instant_ic.depth.providers import OpenSession, open_session
-from instant_ic.geometry.projections import equirect_directions
+from instant_ic.depth.providers import open_session, provider_of
 from instant_ic.util.paths import shipped_file
 
 DEFAULT_MODEL = "slicenet_small.onnx"
 DEFAULT_COMPLETION = "completion.onnx"
 MAX_GAIN = 2.5
 """An image's brightness is changed by this factor at most, up or down."""
-INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
 class DepthModel:
     """A depth network ready to run.
 
     Attributes:
-        manifest: its interface.
+        manifest: interface of the model.
         provider: ``tensorrt``, ``cuda`` or ``cpu``: what runs it.
-        notes: why a faster provider was not taken, a line each.
 
     Example:
         >>> model = DepthModel.load("models/slicenet_small.onnx")      # doctest: +SKIP
         >>> depth = model.estimate(panorama)   # (H, W, 3) uint8 RGB -> (256, 512) float32, metres  # doctest: +SKIP
     """
 
-    def __init__(self, opened: OpenSession, manifest: ModelManifest, where: str | Path = "") -> None:
+    def __init__(self, session: Any, manifest: ModelManifest, where: str | Path = "") -> None:
         self.manifest = manifest
-        self.provider = opened.provider
-        self.notes = opened.notes
+        self.provider = provider_of(session)
         self._where = where or manifest.model
-        self._session = opened.session
-        self._input, self._dtype = self._check_input()
+        self._session = session
+        self._input = self._check_input()
         self._outputs = self._check_outputs()
         self._run_options: Any = None
-        self._radial: NDArray[np.float32] | None = None
 
     @classmethod
     def load(cls, path: str | Path, threads: int = 2, provider: str = "auto") -> DepthModel:
-        """Opens a model by its ``.onnx`` or its manifest.
+        """Open a model by its ``.onnx`` or its manifest.
 
         Args:
             path: the model or the manifest beside it.
             threads: CPU threads of one inference. The result does not depend on the time of day or on load.
             provider: ``auto`` (the fastest that works), ``tensorrt``, ``cuda`` or ``cpu``. One that does not
-                work falls back to the next; see :attr:`provider` and :attr:`notes`.
+                work falls back to the next; see :attr:`provider`.
 
         Raises:
             ManifestError: manifest or model is missing or they do not fit each other.
@@ -73,16 +68,21 @@ class DepthModel:
                 raise ManifestError(f"{model_file}: SHA-256 differs from the manifest's: the file is damaged or "
                                     f"another (got {found})")  # fmt: skip
         try:
-            opened = open_session(model_file, threads, provider)
+            session = open_session(model_file, threads, provider)
         except ValueError:
             raise
         except Exception as error:  # onnxruntime's exceptions share no public base
             raise ManifestError(f"{model_file}: onnxruntime cannot load it: {error}") from error
-        return cls(opened, manifest, model_file)
+        return cls(session, manifest, model_file)
 
     @classmethod
     def find(cls, name: str, threads: int = 2, provider: str = "auto") -> DepthModel:
-        """:meth:`load` of a file; a bare name is searched for in ``models/``.
+        """Open a model; a bare name is searched for in ``models/``.
+
+        Args:
+            name: path or bare name of the model.
+            threads: as for :meth:`load`.
+            provider: as for :meth:`load`.
 
         Raises:
             FileNotFoundError: there is no model of this name.
@@ -92,16 +92,16 @@ class DepthModel:
 
     @property
     def inputs(self) -> list[tuple[str, str, list[Any]]]:
-        """Name, type and shape of the network's inputs."""
+        """Names, types and shapes of the network's inputs."""
         return [(a.name, a.type, list(a.shape)) for a in self._session.get_inputs()]
 
     @property
     def outputs(self) -> list[tuple[str, str, list[Any]]]:
-        """Name, type and shape of the network's outputs."""
+        """Names, types and shapes of the network's outputs."""
         return [(a.name, a.type, list(a.shape)) for a in self._session.get_outputs()]
 
     def estimate(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Depth in the model's own unit (metres for metric models), radial, 0 = unknown.
+        """Estimate depth in the model's own unit (metres for metric models), radial, 0 = unknown.
 
         Args:
             rgb: equirect panorama of any size, (H, W, 3) uint8, twice as wide as high.
@@ -117,16 +117,20 @@ class DepthModel:
         """
         if self.manifest.prior_input:
             raise ValueError(f"{self.manifest.name} corrects fused depth: use it as completion of depth_scaler")
-        return self._finish(*self._run({self._input: self.prepare(rgb)}))
+        (depth,) = self._run({self._input: self.prepare(rgb)})
+        return self._finish(depth)
 
     def complete(
         self, rgb: NDArray[np.uint8], prior: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Dense depth and its relative standard deviation, (h, 2h) float32 each, from an image and incomplete depth.
+        """Estimate dense depth from an image and incomplete depth.
 
         Args:
             rgb: as for :meth:`estimate`.
-            prior: (6, h, 2h), see ``depth.completion.prior_channels``.
+            prior: channels of ``depth.completion.prior_channels``, (6, h, 2h).
+
+        Returns:
+            Depth in metres and its relative standard deviation, (h, 2h) float32 each.
 
         Raises:
             ValueError: the model takes no prior, or another shape than this one's.
@@ -161,8 +165,8 @@ class DepthModel:
         if (options := self._run_options) is not None:
             options.terminate = True
 
-    def prepare(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
-        """The network's input, (1, 3, h, w) or (1, h, w, 3): resized by area averaging, then normalised.
+    def prepare(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return the network's input, (1, 3, h, 2h): resized by area averaging, then normalised.
 
         Raises:
             ValueError: ``rgb`` is not (H, W, 3) uint8, or no panorama.
@@ -180,37 +184,16 @@ class DepthModel:
         if manifest.brightness:
             gain = np.clip(manifest.brightness / max(float(rgb.mean()), 1.0), 1 / MAX_GAIN, MAX_GAIN)
             levels = np.minimum(np.round(levels * gain), 255).astype(np.float32)  # saturates, as a camera does
-        # A byte has 256 values, so all arithmetic goes into a table: (256, 1, 3), the channels in the network's order.
+        # A byte has 256 values, so all arithmetic goes into a table, (256, 1, 3).
         mean, std = np.array(manifest.mean, np.float32), np.array(manifest.std, np.float32)
-        table = (levels[:, None, None] * np.float32(manifest.input_scale) - mean) / std
-        picture = rgb[..., ::-1] if manifest.channels == "bgr" else rgb
-        values = cv2.LUT(
-            np.ascontiguousarray(picture), table.astype(np.uint8 if self._dtype is np.uint8 else np.float32)
-        )
-        if manifest.input_layout == "nchw":
-            values = np.stack(cv2.split(values))
-        return np.ascontiguousarray(values[None], dtype=self._dtype)
+        table = ((levels[:, None, None] * np.float32(1 / 255) - mean) / std).astype(np.float32)
+        values = cv2.LUT(np.ascontiguousarray(rgb), table)
+        return np.ascontiguousarray(np.stack(cv2.split(values))[None])
 
-    def _finish(self, output: Any, mask: Any = None) -> NDArray[np.float32]:
-        """Network's outputs → depth as :meth:`estimate` gives it."""
+    def _finish(self, output: Any) -> NDArray[np.float32]:
+        """Convert the network's depth output to depth as :meth:`estimate` returns it."""
         manifest = self.manifest
-        depth = self._plane(output, self._outputs[0], points=manifest.output_form == "points")
-        with np.errstate(divide="ignore", invalid="ignore"):
-            if manifest.output_form == "inverse":
-                depth = np.where(depth > 0, 1 / depth, 0)
-            depth = (depth * np.float32(manifest.output_scale)).astype(np.float32)
-        if mask is not None:
-            above = (self._plane(mask, self._outputs[1]) > manifest.mask_threshold).astype(np.uint8)
-            if above.shape != depth.shape:
-                above = np.asarray(cv2.resize(above, depth.shape[::-1], interpolation=cv2.INTER_NEAREST))
-            depth[(above == 1) == (manifest.mask_means == "invalid")] = np.nan
-        rows, columns = depth.shape
-        if columns != 2 * rows:  # the pixels of a panorama are square; no averages over depth edges
-            depth = np.asarray(cv2.resize(depth, (2 * rows, rows), interpolation=cv2.INTER_NEAREST))
-        if manifest.geometry == "planar":
-            if self._radial is None or self._radial.shape != depth.shape:
-                self._radial = 1.0 / np.abs(equirect_directions(2 * rows, rows)).max(axis=-1)
-            depth *= self._radial
+        depth = self._plane(output, self._outputs[0])
         known = np.isfinite(depth)
         if manifest.output_kind in ("relative", "disparity"):
             low, high = (depth[known].min(), depth[known].max()) if known.any() else (1.0, 1.0)
@@ -223,26 +206,23 @@ class DepthModel:
         depth[~known] = 0.0
         return depth
 
-    def _plane(self, values: Any, name: str, points: bool = False) -> NDArray[np.float32]:
-        """An output without its axes of one element, (h, w); the length of the vectors where it holds points."""
+    def _plane(self, values: Any, name: str) -> NDArray[np.float32]:
+        """Return an output without its axes of one element, (h, 2h)."""
         array = np.asarray(values)
         found = array.shape
         array = array.reshape([length for length in found if length != 1]).astype(np.float32)
-        if points and array.ndim == 3 and 3 in (array.shape[0], array.shape[-1]):
-            array = np.linalg.norm(array, axis=0 if array.shape[0] == 3 else -1)
-        if array.ndim != 2 or min(array.shape) < 8 or not 1.5 <= array.shape[1] / array.shape[0] <= 2.5:
-            wanted = "3 coordinates a pixel" if points else "one number a pixel"
-            names = ", ".join(a[0] for a in self.outputs)
-            raise ManifestError(f"{self._where}: output {name!r} is {list(found)}; {wanted} of a panorama is needed "
-                                f"(depth_output names one of {names}; see output_form)")  # fmt: skip
+        if array.ndim != 2 or array.shape[0] < 8 or array.shape[1] != 2 * array.shape[0]:
+            raise ManifestError(f"{self._where}: output {name!r} is {list(found)}; a panorama of (h, 2 h) is needed")
         return array
 
-    def _check_input(self) -> tuple[str, type]:
+    def _check_input(self) -> str:
+        """Check the network's inputs, and return the name of the image's."""
         manifest, inputs = self.manifest, self.inputs
-        names = ", ".join(a[0] for a in inputs)
+        size = [manifest.input_height, manifest.input_width]
+        names = ", ".join(name for name, _, _ in inputs)
         if manifest.prior_input:
             found = [shape for name, _, shape in inputs if name == manifest.prior_input]
-            if not found or not _fits(found[0], [1, PRIOR_CHANNELS, manifest.input_height, manifest.input_width]):
+            if not found or not _fits(found[0], [1, PRIOR_CHANNELS, *size]):
                 raise ManifestError(f"{self._where}: no input {manifest.prior_input!r} of {PRIOR_CHANNELS} channels in "
                                     f"the image's size (has: {names})")  # fmt: skip
             inputs = [one for one in inputs if one[0] != manifest.prior_input]
@@ -250,40 +230,26 @@ class DepthModel:
             raise ManifestError(f"{self._where}: takes {len(self.inputs)} inputs ({names}); only the image, and with "
                                 "prior_input incomplete depth, can be given")  # fmt: skip
         name, kind, shape = inputs[0]
-        if kind not in INPUT_TYPES:
-            raise ManifestError(f"{self._where}: input {name!r} is {kind}; one of {', '.join(INPUT_TYPES)} is needed")
-        dtype = INPUT_TYPES[kind]
-        if dtype is np.uint8 and (manifest.input_scale, manifest.mean, manifest.std) != (1.0, (0.0,) * 3, (1.0,) * 3):
-            raise ManifestError(f"{self._where}: input {name!r} takes bytes: the manifest must say input_scale 1, mean "
-                                "0, std 1")  # fmt: skip
-        size = [manifest.input_height, manifest.input_width]
-        layouts = {"nchw": [1, 3, *size], "nhwc": [1, *size, 3]}
-        if not _fits(shape, expected := layouts[manifest.input_layout]):
-            hint = next((f"; its input_layout is {other}" for other, s in layouts.items() if _fits(shape, s)), "")
-            raise ManifestError(f"{self._where}: takes an input of shape {shape}, the manifest says {expected}{hint}")
-        return name, dtype
+        if kind != "tensor(float)" or not _fits(shape, [1, 3, *size]):
+            raise ManifestError(f"{self._where}: input {name!r} is {kind} {shape}; the manifest says tensor(float) "
+                                f"{[1, 3, *size]}")  # fmt: skip
+        return name
 
     def _check_outputs(self) -> list[str]:
-        manifest = self.manifest
-        names = [name for name, _, _ in self.outputs]
-        for key in ("depth_output", "mask_output", "sigma_output"):
-            name, purpose = getattr(manifest, key), key.split("_")[0]
-            if name and name not in names:
-                raise ManifestError(f"{self._where}: no output {name!r} for the {purpose} (has: {', '.join(names)})")
-        depth = manifest.depth_output or next(
-            (name for name in names if name not in (manifest.mask_output, manifest.sigma_output)), ""
-        )
+        """Check the network's outputs, and return the names of depth and standard deviation."""
+        sigma, names = self.manifest.sigma_output, [name for name, _, _ in self.outputs]
+        if sigma and sigma not in names:
+            raise ManifestError(f"{self._where}: no output {sigma!r} for the sigma (has: {', '.join(names)})")
+        depth = next((name for name in names if name != sigma), "")
         if not depth:
-            raise ManifestError(f"{self._where}: no output besides the mask")
-        chosen = [depth, *(name for name in (manifest.mask_output, manifest.sigma_output) if name)]
+            raise ManifestError(f"{self._where}: no output besides the sigma")
+        chosen = [depth, sigma] if sigma else [depth]
         for name, _, shape in self.outputs:
             if name in chosen and all(isinstance(length, int) and length > 0 for length in shape):
-                self._plane(
-                    np.broadcast_to(np.float32(0), shape), name, name == depth and manifest.output_form == "points"
-                )
+                self._plane(np.broadcast_to(np.float32(0), shape), name)
         return chosen
 
 
 def _fits(shape: list[Any], expected: list[int]) -> bool:
-    """Whether a network's input shape, with text or None for what is open, takes ``expected``."""
+    """Return whether a network's input shape, with text or None for what is open, takes ``expected``."""
     return len(shape) == 4 and all(not isinstance(a, int) or a == b for a, b in zip(shape, expected, strict=True))

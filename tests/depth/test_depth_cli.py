@@ -27,22 +27,22 @@ def tiny(tmp_path: Path) -> Path:
     path = tmp_path / "tiny.onnx"
     nodes = tiny_onnx.channel("image", 0, "depth")
     tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, tiny_onnx.CHANNELS)
-    save_manifest(ModelManifest("tiny.onnx", "tiny", "MIT", 64, 128, output_scale=10.0), path.with_suffix(".yaml"))
+    save_manifest(ModelManifest("tiny.onnx", "tiny", "MIT", 64, 128), path.with_suffix(".yaml"))
     return path
 
 
 def test_estimate(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = np.zeros((128, 256, 3), np.uint8)
-    picture[..., 2] = 102  # red, as OpenCV orders it: 0.4, 4 m
+    picture[..., 2] = 102  # red, as OpenCV orders it: 0.4 m
     cv2.imwrite(str(tmp_path / "pano.png"), picture)
     out, npy = tmp_path / "depth.png", tmp_path / "depth.npy"
     words = ("estimate", str(tmp_path / "pano.png"), "--model", str(tiny), "-o", str(out), "--npy", str(npy))
     assert ic(*words, "--provider", "cpu") == 0
     assert cv2.imread(str(out)).shape == (64, 128, 3)
-    np.testing.assert_allclose(np.load(npy), 4.0, rtol=1e-5)
+    np.testing.assert_allclose(np.load(npy), 0.4, rtol=1e-5)
     assert "tiny on cpu" in capsys.readouterr().out
     assert ic(*words, "--provider", "cuda") == 0
-    assert "runs on cpu; cuda: " in capsys.readouterr().err
+    assert "runs on cpu: cuda does not work here" in capsys.readouterr().err
 
 
 def test_check(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,7 +53,7 @@ def test_check(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert ic("check", str(tiny.with_suffix(".yaml")), "--json", "--runs", "1") == 0
     record = json.loads(capsys.readouterr().out)
     assert record["manifest"]["name"] == "tiny" and record["provider"] == "cpu"
-    assert record["depth_shape"] == [64, 128] and 0 < record["depth_range"][1] <= 10.0
+    assert record["depth_shape"] == [64, 128] and 0 < record["depth_range"][1] <= 1.0
     assert 0 < record["seconds"] < 60
 
 

@@ -28,7 +28,7 @@ def config(tmp_path: Path) -> DepthEstimatorConfig:
     path = tmp_path / "tiny.onnx"
     nodes = tiny_onnx.channel("image", 0, "depth")
     tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, tiny_onnx.CHANNELS)
-    manifest = ModelManifest("tiny.onnx", "tiny", "MIT", 64, 128, output_kind="relative", output_scale=10.0)
+    manifest = ModelManifest("tiny.onnx", "tiny", "MIT", 64, 128, output_kind="relative")
     save_manifest(manifest, path.with_suffix(".yaml"))
     return DepthEstimatorConfig(model=str(path), timeout_s=5.0)
 
@@ -62,7 +62,7 @@ def test_tells_what_its_numbers_are(config: DepthEstimatorConfig) -> None:
         bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
         (depth,) = bus.messages("/depth/raw")
     assert (info.name, info.licence, info.output_kind, info.provider) == ("tiny", "MIT", "relative", "cpu")
-    np.testing.assert_allclose(image_array(depth), 10 * 128 / 255, rtol=0.02)
+    np.testing.assert_allclose(image_array(depth), 128 / 255, rtol=0.02)
 
 
 def test_png_is_taken_as_well(config: DepthEstimatorConfig) -> None:
@@ -70,7 +70,7 @@ def test_png_is_taken_as_well(config: DepthEstimatorConfig) -> None:
         bus.add(DepthEstimatorNode, config)
         bus.publish(TOPIC, compressed_image_message(picture(".png"), "camera", START), stamp_ns=START)
         (depth,) = bus.messages("/depth/raw")
-    np.testing.assert_allclose(image_array(depth), 10 * 128 / 255, rtol=1e-5)
+    np.testing.assert_allclose(image_array(depth), 128 / 255, rtol=1e-5)
 
 
 def test_what_is_no_panorama_is_told(config: DepthEstimatorConfig) -> None:

@@ -820,7 +820,7 @@ def _launch_errors() -> tuple[type[BaseException], ...]:
 
 def _manifests() -> list[bytes]:
     return [path.read_bytes() for path in sorted((ROOT / "models").rglob("*.yaml"))] + [
-        b"name: m\ninput_width: 512\ninput_height: 256\noutput_kind: metric\ninput: in\ndepth_output: out\n"
+        b"name: m\ninput_width: 512\ninput_height: 256\noutput_kind: metric\ninput: in\nsigma_output: out\n"
     ]
 
 

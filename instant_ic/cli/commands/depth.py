@@ -122,7 +122,8 @@ def _load(args: argparse.Namespace) -> DepthModel:
 
     model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), args.threads, args.provider)
     if args.provider not in ("auto", model.provider):
-        print(f"runs on {model.provider}; {'; '.join(model.notes)}", file=sys.stderr)
+        print(f"runs on {model.provider}: {args.provider} does not work here (pip install onnxruntime-gpu?)",
+              file=sys.stderr)  # fmt: skip
     return model
 
 
@@ -147,7 +148,7 @@ def check(args: argparse.Namespace) -> int:
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     if args.json:
         summary = {
-            "manifest": asdict(manifest), "provider": model.provider, "notes": model.notes, "threads": args.threads,
+            "manifest": asdict(manifest), "provider": model.provider, "threads": args.threads,
             "inputs": model.inputs, "outputs": model.outputs, "depth_shape": depth.shape, "depth_range": [low, high],
             "known": known.size / depth.size, "load_s": load_s, "first_s": first_s, "seconds": seconds,
         }  # fmt: skip
@@ -159,8 +160,6 @@ def check(args: argparse.Namespace) -> int:
         for name, dtype, shape in ends:
             print(f"{kind:>14}  {name}: {dtype} {shape}")
     print(f"{'runs on':>14}  {model.provider}, CPU threads: {args.threads}")
-    for note in model.notes:
-        print(f"{'not on':>14}  {note}")
     print(f"{'output depth':>14}  {depth.shape[1]} x {depth.shape[0]}, {low:.3g} to {high:.3g}, "
           f"{known.size / depth.size:.0%} known (on a random test image)")  # fmt: skip
     print(f"{'time':>14}  {seconds:.3f} s per panorama (first run {first_s:.3f} s, loading {load_s:.2f} s)")
