@@ -31,8 +31,6 @@ from instant_ic.experiments.teleop import TeleopSettings, run_episode
 
 STEP_M = 0.5
 """Width of a row of ``by_distance``."""
-BEHIND_M = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)
-"""Rows of ``by_distance`` behind the near face of an obstacle."""
 WITHIN_DB = 2.0
 """Error allowed in the expected PSNR."""
 Still = dict[str, NDArray[np.uint8]]
@@ -114,7 +112,6 @@ def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
         "completed": sum(film.completed for film in films),
         **figures(frames, LIVE),
         "by_distance": by_distance(frames, LIVE),
-        "behind_m": {source: behind_m(frames, source) for source in SOURCES},
         "frames_without_obstacle": sum(frame.distance_m is None for frame in frames),
     }
     for source in SOURCES[1:]:
@@ -147,16 +144,6 @@ def by_distance(frames: Sequence[IllusionFrame], source: str) -> list[dict[str, 
         if frame.distance_m is not None:
             rows.setdefault(_row(frame.distance_m), []).append(frame)
     return [{"distance_m": row, **figures(rows[row], source)} for row in sorted(rows)]
-
-
-def behind_m(frames: Sequence[IllusionFrame], source: str) -> dict[str, float]:
-    """Mean PSNR in dB by metres behind the near face, and that of 0.5 to 2 m; NaN without frames there.
-
-    The rows weigh alike, however long the v-bot was there.
-    """
-    rows = {row["distance_m"]: row["psnr_mean_db"] for row in by_distance(frames, source)}
-    found = {f"{at:g}": rows.get(at, math.nan) for at in BEHIND_M}
-    return found | {"0.5 to 2": float(np.mean([rows.get(at, math.nan) for at in BEHIND_M[1:5]]))}
 
 
 def readiness(frames: Sequence[IllusionFrame]) -> dict[str, Any]:

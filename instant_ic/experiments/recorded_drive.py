@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from instant_ic.experiments.plots import new_figure, perspective_crop, save_figure, save_map
 from instant_ic.experiments.teleop_figures import STEP_S, DriveLog, TeleopDrive, judge
-from instant_ic.experiments.teleop_plot import draw_modes
+from instant_ic.experiments.teleop_plot import plot_modes
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.slam.occupancy import OccupancyGrid
 
@@ -113,8 +113,7 @@ def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> DriveLog:
         robot=robot,
         estimate=robot,
         vbot=poses("vbot_pose"),
-        yaw_gap_rad=[math.nan] * len(held),  # the true heading is unknown
-        known_yaw_gap_rad=[float(one.yaw_gap_rad) for one in held],
+        yaw_gap_rad=[float(one.yaw_gap_rad) for one in held],
         command=[(float(v), float(w)) for v, w in (twist_values(one.operator_command) for one in held)],
         blocked=[bool(one.blocked) for one in held],
         reason=[str(one.reason) for one in held],
@@ -197,7 +196,7 @@ def _plot(drive: TeleopDrive, grid: Any) -> bytes:
 
 def _modes(drive: TeleopDrive) -> bytes:
     figure, axes = new_figure(1, 1, (9.0, 1.4))
-    draw_modes(axes[0, 0], [drive])
+    plot_modes(axes[0, 0], [drive])
     out = io.BytesIO()
     save_figure(figure, out)
     return out.getvalue()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -114,7 +113,7 @@ class _Episode:
         Raises:
             RuntimeError: the stack did not become ready.
         """
-        drive, stack, began = self.drive, self.stack, time.process_time()
+        drive, stack = self.drive, self.stack
         with stack:
             while stack.time_s < self.limit_s and not self._over():
                 stack.step(self._operate)
@@ -123,7 +122,6 @@ class _Episode:
                 if self.began_s is None and stack.time_s > READY_S:
                     reason = stack.state.reason if stack.state is not None else "the arbiter says nothing"
                     raise RuntimeError(f"the simulated robot was not ready within {READY_S:g} s: {reason}")
-            drive.cpu_s = time.process_time() - began
             end_s = self.ended_s or stack.time_s
             drive.seconds = end_s - (self.began_s or 0.0)
             drive.contacts = stack.simulation.robot.contacts
@@ -208,7 +206,7 @@ def run_episode(
     make_stack: Callable[[World, StackConfig], SimulatedStack] = SimulatedStack,
     course: Course | None = None,
 ) -> list[TeleopDrive]:
-    """Drive one course by each method in turn; the same settings and index give the same result, except for times.
+    """Drive one course by each method in turn; the same settings and index give the same result.
 
     Args:
         settings: methods, depth and parameters.

@@ -67,9 +67,7 @@ class DriveLog:
     """The r-bot's pose as the stack knows it."""
     vbot: list[FloatArray] = field(default_factory=list)
     yaw_gap_rad: list[float] = field(default_factory=list)
-    """v-bot heading minus the r-bot's true heading at the time of the v-bot's message."""
-    known_yaw_gap_rad: list[float] = field(default_factory=list)
-    """The same from the headings the arbiter knows; the page rotates the images to these."""
+    """v-bot heading minus r-bot heading, as the arbiter knows them; the page rotates the images to these."""
     command: list[tuple[float, float]] = field(default_factory=list)
     blocked: list[bool] = field(default_factory=list)
     reason: list[str] = field(default_factory=list)
@@ -88,24 +86,18 @@ class Switch:
             minus the distance that the shown robot drove between the arrivals of the two images.
         yaw_error_deg: between the headings of v-bot and r-bot just before the switch, as the stack knows them; the page
             rotates the images to these headings.
-        true_position_error_m: as position_error_m, with the true position of the camera's image.
-        jump_m: as position_error_m, but minus the distance that the shown robot drove between the display times of the
+        jump_m: the same, but minus the distance that the shown robot drove between the display times of the
             two images, which include how long the camera's image had already been waiting. This is the jump that the
             eye sees, before the page smooths it.
-        gap_m: between r-bot and v-bot in that step: the camera's image is older than the r-bot's pose.
         psnr_db: between the two images; None if they were not rendered.
-        true_yaw_error_deg: as yaw_error_deg, with the r-bot's true heading.
     """
 
     time_s: float
     to_virtual: bool
     position_error_m: float
     yaw_error_deg: float
-    true_position_error_m: float
     jump_m: float
-    gap_m: float
     psnr_db: float | None = None
-    true_yaw_error_deg: float = math.nan
 
 
 @dataclass
@@ -127,18 +119,12 @@ class TeleopDrive:
     """Number of times the operator was blocked, looked, and drove around the obstacle manually."""
     obedience: float = math.nan
     flicker: int = 0
-    transitions: int = 0
     mode_seconds: dict[str, float] = field(default_factory=dict)
-    disobeyed_seconds: dict[str, float] = field(default_factory=dict)
-    """Seconds of disobedience by mode."""
-    virtual_m: float = 0.0
-    """Distance driven by the v-bot while it was shown."""
     gap_mean_m: float = math.nan
     gap_max_m: float = math.nan
     longest_freeze_s: float = 0.0
     longest_stall_s: float = 0.0
     keyframes: int = 0
-    cpu_s: float = 0.0
     reason: str = ""
     """The stack's last message if the drive was not completed."""
     switches: list[Switch] = field(default_factory=list)
@@ -224,21 +210,10 @@ def find_switches(log: DriveLog) -> list[Switch]:
     for k in range(1, len(log.virtual)):
         if log.virtual[k] == log.virtual[k - 1]:
             continue
-        gap = relative2(log.estimate[k], log.vbot[k])
         pictures = pictures_at(log.pictures, log.time_s[k], log.virtual[k])
-        error, true, jump = (math.nan,) * 3 if pictures is None else picture_errors_m(*pictures, log)
-        found.append(
-            Switch(
-                log.time_s[k],
-                bool(log.virtual[k]),
-                error,
-                abs(math.degrees(log.known_yaw_gap_rad[k - 1])),
-                true,
-                jump,
-                math.hypot(float(gap[0]), float(gap[1])),
-                true_yaw_error_deg=abs(math.degrees(log.yaw_gap_rad[k - 1])),
-            )
-        )
+        error, jump = (math.nan, math.nan) if pictures is None else picture_errors_m(*pictures, log)
+        yaw_error_deg = abs(math.degrees(log.yaw_gap_rad[k - 1]))
+        found.append(Switch(log.time_s[k], bool(log.virtual[k]), error, yaw_error_deg, jump))
     return found
 
 
@@ -256,8 +231,8 @@ def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple
     return None
 
 
-def picture_errors_m(before: Shown, after: Shown, log: DriveLog) -> tuple[float, float, float]:
-    """Distances between the positions of two images that should coincide: as known, in truth, and as the eye sees it.
+def picture_errors_m(before: Shown, after: Shown, log: DriveLog) -> tuple[float, float]:
+    """Return the distances between the positions of two images that should coincide: as known, and as the eye sees it.
 
     The shown robot moves between the two images; its mean speed around the switch gives that distance.
     """
@@ -268,9 +243,8 @@ def picture_errors_m(before: Shown, after: Shown, log: DriveLog) -> tuple[float,
     heading = np.array([math.cos(before.heading), math.sin(before.heading)])
     between = speed * (after.came_s - before.came_s) * heading
     shown_between = speed * (after.time_s - before.time_s) * heading
-    known, true = after.place - before.place, after.pose[:2] - before.pose[:2]
-    error, truly, seen = (float(np.hypot(*apart)) for apart in (known - between, true - between, known - shown_between))
-    return error, truly, seen
+    known = after.place - before.place
+    return float(np.hypot(*(known - between))), float(np.hypot(*(known - shown_between)))
 
 
 def obstacles_met(log: DriveLog, centres: FloatArray) -> int:
@@ -287,18 +261,13 @@ def judge(drive: TeleopDrive, log: DriveLog, centres: FloatArray) -> None:
     drive.switches = find_switches(log)
     drive.flicker = count_flicker(drive.switches)
     modes = np.array(log.mode)
-    drive.transitions = int((np.diff(modes) != 0).sum())
     drive.mode_seconds = {mode.label: round(float((modes == mode).sum()) * STEP_S, 2) for mode in Mode}
     robot, vbot = np.array(log.robot), np.array(log.vbot)
-    disobeyed = obeys(log) == 0.0
-    drive.disobeyed_seconds = {mode.label: round(float(disobeyed[modes == mode].sum()) * STEP_S, 2) for mode in Mode}
     drive.driven_m = float(np.linalg.norm(np.diff(robot[:, :2], axis=0), axis=1).sum())
     virtual = np.array(log.virtual)
     if virtual.any():
         gaps = np.linalg.norm(robot[virtual, :2] - vbot[virtual, :2], axis=1)
         drive.gap_mean_m, drive.gap_max_m = float(gaps.mean()), float(gaps.max())
-        steps_m = np.linalg.norm(np.diff(vbot[:, :2], axis=0), axis=1)
-        drive.virtual_m = float(steps_m[virtual[1:] & virtual[:-1]].sum())
     drive.longest_freeze_s = longest_freeze_s(log.pictures, log.time_s[-1])
     drive.longest_stall_s = longest_stall_s(log)
     drive.obstacles = obstacles_met(log, centres)
@@ -314,11 +283,10 @@ def judge(drive: TeleopDrive, log: DriveLog, centres: FloatArray) -> None:
 
 
 def summary(drives: list[TeleopDrive], stop: list[TeleopDrive] | None = None) -> dict[str, Any]:
-    """Figures of one method over its episodes; ``stop`` are the drives of the robot that only stops."""
+    """Return the figures of one method; ``stop`` are the drives of the robot that only stops, to compare times."""
     switches = [switch for drive in drives for switch in drive.switches]
     into, back = ([s for s in switches if s.to_virtual == to_virtual] for to_virtual in (True, False))
     obstacles = sum(drive.obstacles for drive in drives)
-    psnr = [s.psnr_db for s in switches if s.psnr_db is not None]
     figures: dict[str, Any] = {
         "episodes": len(drives),
         "contacts": sum(drive.contacts for drive in drives),
@@ -327,43 +295,23 @@ def summary(drives: list[TeleopDrive], stop: list[TeleopDrive] | None = None) ->
         "switches_per_obstacle": len(switches) / 2 / obstacles if obstacles else None,
         "switches_to_virtual_per_obstacle": len(into) / obstacles if obstacles else None,
         "switches_to_real_per_obstacle": len(back) / obstacles if obstacles else None,
-        "switch_position_error_m": _most([s.position_error_m for s in switches]),
-        "switch_yaw_error_deg": _most([s.yaw_error_deg for s in switches]),
-        "switch_psnr_db": _mean(psnr),
-        "longest_freeze_s": _most([drive.longest_freeze_s for drive in drives]),
-        "longest_stall_s": _most([drive.longest_stall_s for drive in drives]),
+        "switch_position_error_m": _max([s.position_error_m for s in switches]),
         "switch_position_error_mean_m": _mean([s.position_error_m for s in switches]),
+        "switch_yaw_error_deg": _max([s.yaw_error_deg for s in switches]),
         "switch_yaw_error_mean_deg": _mean([s.yaw_error_deg for s in switches]),
-        "switch_true_yaw_error_deg": _most([s.true_yaw_error_deg for s in switches]),
-        "switch_true_yaw_error_mean_deg": _mean([s.true_yaw_error_deg for s in switches]),
-        "switch_true_position_error_m": _most([s.true_position_error_m for s in switches]),
-        "switch_true_position_error_mean_m": _mean([s.true_position_error_m for s in switches]),
-        "switch_jump_m": _most([s.jump_m for s in switches]),
-        "switch_jump_mean_m": _mean([s.jump_m for s in switches]),
-        "switch_gap_mean_m": _mean([s.gap_m for s in switches]),
-        "switch_psnr_min_db": min(psnr, default=None),
+        "switch_jump_m": _max([s.jump_m for s in switches]),
+        "switch_psnr_db": _mean([s.psnr_db for s in switches if s.psnr_db is not None]),
         "switch_to_virtual_psnr_db": _mean([s.psnr_db for s in into if s.psnr_db is not None]),
         "switch_to_real_psnr_db": _mean([s.psnr_db for s in back if s.psnr_db is not None]),
+        "longest_freeze_s": _max([drive.longest_freeze_s for drive in drives]),
+        "longest_stall_s": _max([drive.longest_stall_s for drive in drives]),
         "obstacles": obstacles,
         "detours": sum(drive.detours for drive in drives),
-        "gave_up": sum(drive.gave_up for drive in drives),
         "flicker": sum(drive.flicker for drive in drives),
-        "transitions": sum(drive.transitions for drive in drives),
-        "mode_seconds": {
-            name: round(sum(d.mode_seconds.get(name, 0.0) for d in drives), 2) for name in drives[0].mode_seconds
-        },
-        "disobeyed_seconds": {
-            name: round(sum(d.disobeyed_seconds.get(name, 0.0) for d in drives), 2)
-            for name in drives[0].disobeyed_seconds
-        },
-        "virtual_m_per_obstacle": sum(drive.virtual_m for drive in drives) / obstacles if obstacles else None,
-        "virtual_share": sum(drive.mode_seconds.get(name, 0.0) for drive in drives for name in ("virtual", "returning"))
-        / max(sum(drive.seconds for drive in drives), 1e-9),
         "gap_mean_m": _mean([drive.gap_mean_m for drive in drives]),
-        "gap_max_m": _most([drive.gap_max_m for drive in drives]),
+        "gap_max_m": _max([drive.gap_max_m for drive in drives]),
         "seconds_mean": _mean([drive.seconds for drive in drives if drive.completed]),
         "path_ratio_mean": _mean([d.driven_m / d.way_m for d in drives if d.completed and d.way_m > 0]),
-        "cpu_s_per_simulated_s": sum(d.cpu_s for d in drives) / max(sum(d.seconds for d in drives), 1e-9),
     }
     if stop:
         others = {drive.index: drive for drive in stop if drive.completed}
@@ -399,6 +347,6 @@ def _mean(values: list[float], weights: list[float] | None = None) -> float | No
     return float(np.average([values[k] for k in known], weights=chosen))
 
 
-def _most(values: list[float]) -> float | None:
+def _max(values: list[float]) -> float | None:
     known = [value for value in values if not math.isnan(value)]
     return max(known) if known else None

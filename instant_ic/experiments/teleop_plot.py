@@ -30,101 +30,36 @@ _MODE_COLOURS = {
     Mode.REAL: "#BBBBBB", Mode.ENTERING: "#F0E442", Mode.VIRTUAL: "#56B4E9", Mode.RETURNING: "#CC79A7",
     Mode.STOPPED: "#D55E00",
 }  # fmt: skip
-_BARS = (
-    ("completed_fraction", "completed"),
-    ("obedience", "obedience"),
-    ("contacts", "contacts"),
-    ("detours", "detours by hand"),
-    ("seconds_mean", "seconds a drive"),
-    ("longest_stall_s", "longest stall, s"),
-)
-_COURSES = (("seconds", "seconds"), ("obedience", "obedience"))
 _MARGIN_M = 1.4
 _PICTURE, _MAP = (640, 360), 360
 FPS = 10
 
 
-def save_plot(
-    path: Path | io.BytesIO,
-    drives: Sequence[TeleopDrive],
-    report: dict[str, Any],
-    settings: TeleopSettings,
-    most: int = 4,
-) -> None:
-    """Save figures by method, every course's time and obedience, and maps of the worst courses.
-
-    Below each map: the arbiter's modes over time, one bar per method. Of a single course: its map and modes alone.
-    """
+def save_plot(path: Path | io.BytesIO, drives: Sequence[TeleopDrive], settings: TeleopSettings, most: int = 4) -> None:
+    """Save maps of the worst courses; below each map the arbiter's modes over time, one bar per method."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    indices = sorted({d.index for d in drives})
-    shown = sorted(indices, key=lambda index: _how_well([d for d in drives if d.index == index]))[:most]
-    courses = [(settings.course(index), [d for d in drives if d.index == index]) for index in shown]
-    columns = min(2, len(shown))
-    rows = [courses[k : k + columns] for k in range(0, len(courses), columns)]
-    heights = [h for row in rows for h in (max(_map_height(course, of) for course, of in row), 0.75)]
-    if len(indices) > 1:
-        heights = [1.7, 1.9, *heights]
-    figure = Figure(figsize=(13.0, 1.1 * sum(heights) + 0.6 * len(rows) + 1.0), dpi=110, layout="constrained")
+    indices = sorted({d.index for d in drives}, key=lambda index: _quality([d for d in drives if d.index == index]))
+    courses = [(settings.course(index), [d for d in drives if d.index == index]) for index in indices[:most]]
+    heights = [height for course, own in courses for height in (_map_height(course, own), 0.75)]
+    figure = Figure(figsize=(8.0, 1.1 * sum(heights) + 0.6 * len(courses) + 1.0), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
-    names = [name for name in METHODS if name in report["methods"]]
-    if len(indices) > 1:
-        bars = grid[0].subgridspec(1, len(_BARS))
-        for k, (key, label) in enumerate(_BARS):
-            _draw_bars(figure.add_subplot(bars[k]), label, {name: report["methods"][name][key] for name in names})
-        strips = grid[1].subgridspec(1, len(_COURSES))
-        for k, (key, label) in enumerate(_COURSES):
-            _draw_courses(figure.add_subplot(strips[k]), key, label, drives, names)
-    first = len(heights) - 2 * len(rows)
-    for number, row in enumerate(rows):
-        maps, modes = (grid[first + 2 * number + k].subgridspec(1, columns) for k in range(2))
-        for k, (course, of) in enumerate(row):
-            _draw_course(figure.add_subplot(maps[k]), course, of)
-            draw_modes(figure.add_subplot(modes[k]), of)
+    for number, (course, own) in enumerate(courses):
+        _plot_course(figure.add_subplot(grid[2 * number]), course, own)
+        plot_modes(figure.add_subplot(grid[2 * number + 1]), own)
+    names = [name for name in METHODS if any(d.method == name for d in drives)]
     figure.legend(handles=_legend(names), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
-    if len(indices) > 1:
-        figure.suptitle(
-            f"{settings.world}, seed {settings.seed}: {len(indices)} courses; the maps are of those that went worst"
-        )
     save_figure(figure, path)
 
 
-def _how_well(drives: Sequence[TeleopDrive]) -> tuple[float, ...]:
-    """Sort key of courses: not completed first, then contacts, flicker, disobedience of the first method."""
+def _quality(drives: Sequence[TeleopDrive]) -> tuple[float, ...]:
+    """Return a sort key: courses not completed first, then contacts, flicker, disobedience of the first method."""
     contacts, flicker = (sum(getattr(d, name) for d in drives) for name in ("contacts", "flicker"))
     obedience = drives[0].obedience
     missing = sum(not d.completed for d in drives)
     return -missing, -contacts, -flicker, 0.0 if math.isnan(obedience) else obedience
-
-
-def _draw_bars(axis: Any, label: str, values: dict[str, float | None]) -> None:
-    heights = [value or 0.0 for value in values.values()]
-    axis.bar(list(values), heights, color=[_COLOURS[name] for name in values])
-    axis.set_ylim(0, 1.2 * max(heights) or 1.0)
-    for k, value in enumerate(values.values()):
-        words = "none" if value is None else f"{value:.3g}"
-        axis.annotate(words, (k, value or 0.0), ha="center", va="bottom", fontsize=8)
-    axis.set_title(label, fontsize=9)
-    axis.tick_params(labelsize=7)
-
-
-def _draw_courses(axis: Any, key: str, label: str, drives: Sequence[TeleopDrive], names: Sequence[str]) -> None:
-    """Plot a dot per drive, by course; a ring if it was not completed, a cross if it touched something."""
-    for name in names:
-        of = [d for d in drives if d.method == name]
-        at, values = np.array([d.index for d in of]), np.array([getattr(d, key) for d in of])
-        done, touched = (np.array([getattr(d, what) for d in of]) > 0 for what in ("completed", "contacts"))
-        colour = _COLOURS[name]
-        axis.scatter(at[done], values[done], s=12, color=colour)
-        axis.scatter(at[~done], values[~done], s=22, facecolors="none", edgecolors=colour)
-        axis.scatter(at[touched], values[touched], s=40, marker="x", color="black", lw=1)
-    axis.set_title(f"{label} of each course", fontsize=9)
-    axis.set_xlabel("course", fontsize=7)
-    axis.xaxis.get_major_locator().set_params(integer=True)
-    axis.tick_params(labelsize=7)
-    axis.grid(alpha=0.3)
 
 
 def _tracks(drives: Sequence[TeleopDrive]) -> FloatArray:
@@ -146,7 +81,7 @@ def _map_height(course: Course, drives: Sequence[TeleopDrive]) -> float:
     return float(np.clip(5.8 * (high[1] - low[1]) / (high[0] - low[0]), 1.2, 4.0))
 
 
-def _draw_course(axis: Any, course: Course, drives: Sequence[TeleopDrive]) -> None:
+def _plot_course(axis: Any, course: Course, drives: Sequence[TeleopDrive]) -> None:
     plan = floor_plan(course.world)
     rows, columns = plan.cells.shape
     x, y = plan.origin
@@ -179,7 +114,7 @@ def _where(drive: TeleopDrive, time_s: float) -> FloatArray:
     return np.array(track[min(max(0, round((time_s - modes[0][0]) / TRACK_S)), len(track) - 1)])[:2]
 
 
-def draw_modes(axis: Any, drives: Sequence[TeleopDrive]) -> None:
+def plot_modes(axis: Any, drives: Sequence[TeleopDrive]) -> None:
     """Plot the arbiter's mode over time, one bar per method."""
     for k, drive in enumerate(drives):
         modes = drive.tracks["modes"]
@@ -204,8 +139,6 @@ def _legend(names: Sequence[str]) -> list[Any]:
         Line2D([], [], color="black", ls="--", label="v-bot"),
         dot(">", "into the virtual space", mfc="none"),
         dot("<", "back", mfc="none"),
-        dot("o", "not completed", mfc="none"),
-        dot("x", "contact"),
         *(Patch(color=colour, label=mode.name) for mode, colour in _MODE_COLOURS.items()),
     ]
 

@@ -204,7 +204,6 @@ class SimulatedStack:
         self.log = DriveLog()
         self.state: Any = None
         self.vbot: FloatArray = self.start.copy()
-        self.yaw_gap_rad = 0.0
         self.page = _Page(self)
         self.newest: dict[bool, Shown] = {}
         """Newest image that has arrived at the page: rendered views (True), camera images (False)."""
@@ -270,8 +269,6 @@ class SimulatedStack:
         elif topic == "/vbot/odom":
             message = deserialize(record.payload, record.type_name)
             self.vbot = self._in_world(pose2_from_message(message))
-            truth = self.simulation.poses_at([(stamp_ns(message) - START_NS) / 1e9])[0]
-            self.yaw_gap_rad = wrap_angle(float(self.vbot[2] - truth[2]))
         elif topic == "/keyframe":
             self.log.keyframes += 1
             of = stamp_ns(deserialize(record.payload, record.type_name))
@@ -405,8 +402,7 @@ class SimulatedStack:
         log.robot.append(self.robot)
         log.estimate.append(self._in_world(pose2_from_message(state.robot_pose)))
         log.vbot.append(self.vbot.copy())
-        log.yaw_gap_rad.append(self.yaw_gap_rad)
-        log.known_yaw_gap_rad.append(float(state.yaw_gap_rad))
+        log.yaw_gap_rad.append(float(state.yaw_gap_rad))
         log.command.append(command)
         log.blocked.append(bool(state.blocked))
         log.reason.append(str(state.reason))

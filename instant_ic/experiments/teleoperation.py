@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments import illusion, teleop
+from instant_ic.experiments import illusion
 from instant_ic.experiments.compared import command_of
 from instant_ic.experiments.illusion_stack import SOURCES, FilmedStack
 from instant_ic.experiments.lab import Options, Result, Unit
@@ -80,7 +80,7 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
     if arguments["images"] and frames:
         images = _shown(frames, _FRAME_S)
         plot = io.BytesIO()
-        save_plot(plot, [drive], teleop.report([drive], settings), settings, 1)
+        save_plot(plot, [drive], settings)
         images["Trajectories of r-bot and v-bot, state over time"] = image_address(plot.getvalue(), "image/png")
     row = {key: value for key, value in asdict(drive).items() if key != "tracks"}
     views = {source: illusion.figures(film.frames, source) for source in SOURCES} if film.frames else {}

@@ -122,10 +122,6 @@ def test_figures_by_hand() -> None:
     assert whole["psnr_p05_db"] == pytest.approx(20.6)  # 0.15 of the way from the first to the second of four
     rows = illusion.by_distance(frames, TRUE_DEPTH)
     assert [(row["distance_m"], row["frames"], row["psnr_mean_db"]) for row in rows] == [(0.0, 2, 22.0), (0.5, 1, 28.0)]
-    # Rows weigh alike, not frames: (20, 22, 24, 26) for 0.5 to 2 m.
-    at = {0.5: 18.0, 0.6: 22.0, 1.1: 22.0, 1.5: 24.0, 2.1: 26.0}
-    behind = illusion.behind_m([frame(distance, db) for distance, db in at.items()], LIVE)
-    assert behind["0.5"] == 20.0 and behind["0.5 to 2"] == 23.0 and math.isnan(behind["2.5"]) and len(behind) == 7
     ready = illusion.readiness(frames)  # errors 5, 1, −3, 1
     assert ready["mean_error_db"] == 1.0 and ready["rms_error_db"] == 3.0 and ready["share_within_2_db"] == 0.5
     figures = illusion.report([illusion.Film(0, True, [frame(None, 24.0)])], illusion.TeleopSettings(methods=("ic",)))

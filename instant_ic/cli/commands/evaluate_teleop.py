@@ -30,7 +30,7 @@ def add_kind(kinds: Any) -> None:
         "the operator looks and steers around them (stop). Reports contacts, obedience, switches, image jumps at "
         "switches, and lost time. The same seed gives the same drives.",
     )  # fmt: skip
-    add_options(parser, 50, os.cpu_count() or 1, 7200.0, "paths, and bars by method,")
+    add_options(parser, 50, os.cpu_count() or 1, 7200.0, "the paths of the worst courses")
     worlds = (
         "corridors (random), or a world of the simulator: corridor, where the operator drives straight on, "
         "random:SEED or a mesh file, where the operator drives to random visible places"
@@ -72,7 +72,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.plot:
         from instant_ic.experiments.teleop_plot import save_plot
 
-        save_plot(args.plot, drives, figures, settings)
+        save_plot(args.plot, drives, settings)
     if args.video:
         from instant_ic.experiments.teleop_plot import Video
 
