@@ -20,8 +20,16 @@ def _quiet(function: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
     return complete
 
 
+def _nodes() -> dict[str, Any]:
+    from instant_ic.bus import registry
+    from instant_ic.util import paths
+
+    return {node.name: node for node in registry.list_nodes(paths.run_dir())}
+
+
 @_quiet
 def topics(args: Any) -> Iterable[str]:
+    """Return the topics of the running nodes."""
     from instant_ic.cli.names import topic_types
 
     return topic_types()
@@ -29,26 +37,21 @@ def topics(args: Any) -> Iterable[str]:
 
 @_quiet
 def nodes(args: Any) -> Iterable[str]:
-    from instant_ic.bus import registry
-    from instant_ic.util import paths
-
-    return [node.name for node in registry.list_nodes(paths.run_dir())]
+    """Return the running nodes."""
+    return _nodes()
 
 
 @_quiet
 def parameters(args: Any) -> Iterable[str]:
-    from instant_ic.bus import registry
-    from instant_ic.config import params
-    from instant_ic.util import paths
+    """Return the parameters of the node on the command line."""
+    from instant_ic.config.params import flatten
 
-    for node in registry.list_nodes(paths.run_dir()):
-        if args is not None and node.name == str(args.node).strip("/"):
-            return params.flatten(node.params)
-    return []
+    return flatten(_nodes()[str(args.node).strip("/")].params)
 
 
 @_quiet
 def types(args: Any) -> Iterable[str]:
+    """Return the message types."""
     from instant_ic.msg import typestore
 
     return sorted(typestore().types)
@@ -56,6 +59,7 @@ def types(args: Any) -> Iterable[str]:
 
 @_quiet
 def programs(args: Any) -> Iterable[str]:
+    """Return the shipped nodes."""
     from instant_ic.util import paths
 
     return paths.node_names()
@@ -63,6 +67,7 @@ def programs(args: Any) -> Iterable[str]:
 
 @_quiet
 def launch_files(args: Any) -> Iterable[str]:
+    """Return the shipped launch files, and the YAML files in this folder."""
     from instant_ic.util import paths
 
     shipped = [path.stem for path in paths.share_dir("launch").glob("*.yaml")]
@@ -71,6 +76,7 @@ def launch_files(args: Any) -> Iterable[str]:
 
 @_quiet
 def launch_arguments(args: Any) -> Iterable[str]:
+    """Return the arguments of the launch file on the command line."""
     from instant_ic.launch.description import find_launch_file
     from instant_ic.launch.reader import read_arguments
 
@@ -79,5 +85,6 @@ def launch_arguments(args: Any) -> Iterable[str]:
 
 @_quiet
 def bags(args: Any) -> Iterable[str]:
+    """Return the bags in this folder and the folders inside."""
     found = [path.parent for pattern in ("*/metadata.yaml", "*/*/metadata.yaml") for path in Path().glob(pattern)]
-    return sorted(str(path) for path in [*found, *Path().glob("*.mcap")])
+    return sorted(str(path) for path in [*found, *Path().glob("*.mcap"), *Path().glob("*.bag")])

@@ -50,7 +50,7 @@ ADVICE: dict[Reason, str] = {
 
 def check_running(run_dir: Path, seconds: float = 2.5) -> Iterator[Finding]:
     """Faults that running nodes report within some seconds of the stack's time; nothing where no node runs."""
-    from instant_ic.cli.observer import Observer
+    from instant_ic.cli.observer import TopicObserver
 
     nodes = registry.list_nodes(run_dir)
     if not nodes:
@@ -58,7 +58,7 @@ def check_running(run_dir: Path, seconds: float = 2.5) -> Iterator[Finding]:
     found: dict[str, DiagnosticStatus] = {}
     try:
         factor = pace.read(run_dir).factor
-        with Observer("/diagnostics", run_dir=run_dir) as observer:
+        with TopicObserver("/diagnostics", run_dir=run_dir) as observer:
             for batch in observer.batches(min(seconds / factor, _LONGEST_S), 0.2):
                 for received in batch:
                     message: DiagnosticArray = deserialize(received.payload, received.type_name)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from instant_ic.bus import registry
 from instant_ic.bus.heartbeat import TYPE, Heartbeat, from_message
-from instant_ic.cli.observer import Observer
+from instant_ic.cli.observer import TopicObserver
 from instant_ic.msg import deserialize
 
 
-class Heartbeats(Observer):
+class Heartbeats(TopicObserver):
     """Listens to the heartbeats of every node in a run directory, in every namespace."""
 
     def __init__(self, run_dir: Path) -> None:

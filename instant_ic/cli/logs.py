@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -13,7 +13,6 @@ from pathlib import Path
 from instant_ic.util.safe_text import masked, visible
 
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
-_ALIASES = {"warn": "WARNING", "fatal": "CRITICAL"}
 _LINE = re.compile(r"(\d\d):(\d\d):(\d\d)\.(\d{3}) (DEBUG|INFO|WARNING|ERROR|CRITICAL) +([^\s:]+): (.*)")
 _COLOURS = {"DEBUG": "2", "WARNING": "33", "ERROR": "31", "CRITICAL": "1;31"}
 
@@ -33,26 +32,29 @@ class LogLine:
     node: str
     text: str
 
+    def at_least(self, level: str) -> bool:
+        """Return whether the entry has this level or a higher one."""
+        return LEVELS.index(self.level) >= LEVELS.index(level)
 
-def level_number(word: str) -> int:
-    """Index of a level in ``LEVELS``.
-
-    Raises:
-        ValueError: there is no such level.
-    """
-    name = _ALIASES.get(word.lower(), word.upper())
-    if name not in LEVELS:
-        raise ValueError(f"level must be one of {', '.join(level.lower() for level in LEVELS)} (got {word!r})")
-    return LEVELS.index(name)
+    def show(self, colour: bool) -> str:
+        """Return the entry for the terminal."""
+        stamp = datetime.fromtimestamp(self.stamp_s).strftime("%H:%M:%S.%f")[:-3]
+        node, text = visible(self.node), visible(masked(self.text))
+        if not colour:
+            return f"{stamp} {self.level:<7} {node}: {text}"
+        code = _COLOURS.get(self.level, "")
+        start, end = (f"\x1b[{code}m", "\x1b[0m") if code else ("", "")
+        return f"\x1b[2m{stamp}\x1b[0m {start}{self.level:<7}{end} \x1b[1m{node}\x1b[0m: {start}{text}{end}"
 
 
 def parse(text: str, node: str, end_s: float) -> list[LogLine]:
-    """Lines of a node's log file.
+    """Return the entries of a node's log file.
 
     The lines carry the time of day without a date. The last one was written just before ``end_s``. Where a line has a
     later time of day than the next one, midnight lies between them.
 
     Args:
+        text: content of the file.
         node: owner of the file; a line in another format (output of a library) is attributed to it.
         end_s: when the file was last written, seconds since the epoch.
     """
@@ -82,31 +84,19 @@ def parse(text: str, node: str, end_s: float) -> list[LogLine]:
     return lines
 
 
-def show(line: LogLine, colour: bool) -> str:
-    """Format a line for the terminal."""
-    stamp = datetime.fromtimestamp(line.stamp_s).strftime("%H:%M:%S.%f")[:-3]
-    node, text = visible(line.node), visible(masked(line.text))
-    if not colour:
-        return f"{stamp} {line.level:<7} {node}: {text}"
-    code = _COLOURS.get(line.level, "")
-    start, end = (f"\x1b[{code}m", "\x1b[0m") if code else ("", "")
-    return f"\x1b[2m{stamp}\x1b[0m {start}{line.level:<7}{end} \x1b[1m{node}\x1b[0m: {start}{text}{end}"
-
-
-class LogFile:
+class GrowingLog:
     """A growing log file, which is replaced when its node restarts."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.node = path.stem
+        self._path = path
         self._inode = -1
         self._offset = 0
         self._partial = b""
 
     def new_lines(self) -> list[LogLine]:
-        """Lines written since the last call; the first call returns all of them."""
+        """Return the entries written since the last call; the first call returns all of them."""
         try:
-            with self.path.open("rb") as file:
+            with self._path.open("rb") as file:
                 status = os.fstat(file.fileno())
                 if status.st_ino != self._inode or status.st_size < self._offset:
                     self._inode, self._offset, self._partial = status.st_ino, 0, b""
@@ -118,7 +108,7 @@ class LogFile:
         # An incomplete line waits for its rest.
         whole, separator, rest = (self._partial + data).rpartition(b"\n")
         self._partial = rest
-        return parse((whole + separator).decode(errors="replace"), self.node, status.st_mtime)
+        return parse((whole + separator).decode(errors="replace"), self._path.stem, status.st_mtime)
 
 
 class LogFolder:
@@ -132,31 +122,26 @@ class LogFolder:
     def __init__(self, folder: Path, nodes: Collection[str] = ()) -> None:
         self._folder = folder
         self._nodes = set(nodes)
-        self._files: dict[Path, LogFile] = {}
+        self._files: dict[Path, GrowingLog] = {}
 
     def new_lines(self) -> list[LogLine]:
-        """Lines of all files written since the last call, sorted by time."""
+        """Return the entries of all files written since the last call, sorted by time."""
         for path in sorted(self._folder.glob("*.log")):
             if not self._nodes or path.stem in self._nodes:
-                self._files.setdefault(path, LogFile(path))
+                self._files.setdefault(path, GrowingLog(path))
         lines = [line for file in self._files.values() for line in file.new_lines()]
         return sorted(lines, key=lambda line: line.stamp_s)
 
     def has(self, node: str, since_s: float) -> bool:
-        """Whether a node that was started at ``since_s`` has a log file here."""
+        """Return whether a node that was started at ``since_s`` has a log file here."""
         try:
             return (self._folder / f"{node}.log").stat().st_mtime >= since_s
         except FileNotFoundError:
             return False
 
 
-def chosen(lines: Iterable[LogLine], level: int, since_s: float = 0.0) -> Iterator[LogLine]:
-    """Lines of at least a level, not older than ``since_s``."""
-    return (line for line in lines if LEVELS.index(line.level) >= level and line.stamp_s >= since_s)
-
-
 def from_rosout(message: object) -> LogLine:
-    """Log line from a ``/rosout`` message (rcl_interfaces/Log)."""
+    """Return the entry of a ``/rosout`` message (rcl_interfaces/Log)."""
     from instant_ic.msg import stamp_ns
 
     level = min(max(int(message.level) // 10 - 1, 0), len(LEVELS) - 1)  # type: ignore[attr-defined]

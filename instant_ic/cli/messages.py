@@ -1,35 +1,16 @@
-"""Messages as text: YAML-like with long arrays shortened for people, a line of CSV or JSON for programs."""
+"""Messages as text: YAML-like with long arrays shortened for people, a line of JSON for programs."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 
-@dataclass(frozen=True)
-class Style:
-    """How much of a message is shown.
-
-    Attributes:
-        full: show long arrays and strings in full.
-        length: shorten arrays above this many values, and strings above ten times as many characters.
-        arrays: show the values of arrays.
-        strings: show strings.
-    """
-
-    full: bool = False
-    length: int = 12
-    arrays: bool = True
-    strings: bool = True
-
-
 def field(message: Any, path: str) -> Any:
-    """Field by dotted path; an index selects an entry of a list or array (``transforms.0.transform``).
+    """Return a field by its dotted path; an index selects an entry of a list (``transforms.0.transform``).
 
     Raises:
         AttributeError: there is no such field; the message lists the existing ones.
@@ -53,39 +34,37 @@ def _fields(message: Any) -> list[tuple[str, Any]]:
     return [(f.name, getattr(message, f.name)) for f in dataclasses.fields(message) if not f.name.startswith("__")]
 
 
-def describe(value: Any, style: Style | None = None, indent: str = "") -> str:
-    """Format a message, or a field of one, as indented lines."""
-    style = style or Style()
+def describe(value: Any, most: int | None = 12, indent: str = "") -> str:
+    """Format a message, or a field of one, as indented lines.
+
+    Args:
+        value: the message or field.
+        most: shorten arrays above this many values, and strings above ten times as many characters; None: never.
+        indent: spaces before each line.
+    """
     if dataclasses.is_dataclass(value):
         lines = []
         for name, inner in _fields(value):
-            if dataclasses.is_dataclass(inner) or (isinstance(inner, list) and inner and _nested(inner)):
-                lines.append(f"{indent}{name}:")
-                lines.append(describe(inner, style, indent + "  "))
+            if dataclasses.is_dataclass(inner) or _is_nested(inner):
+                lines += [f"{indent}{name}:", describe(inner, most, indent + "  ")]
             else:
-                lines.append(f"{indent}{name}: {describe(inner, style)}")
+                lines.append(f"{indent}{name}: {describe(inner, most)}")
         return "\n".join(lines)
-    if isinstance(value, list) and value and _nested(value):
-        return "\n".join(f"{indent}- {describe(entry, style, indent + '  ').lstrip()}" for entry in value)
+    if _is_nested(value):
+        return "\n".join(f"{indent}- {describe(entry, most, indent + '  ').lstrip()}" for entry in value)
     if isinstance(value, (np.ndarray, list)):
-        return indent + _array(value, style)
-    return indent + _scalar(value, style)
+        if most is None or len(value) <= most:
+            return f"{indent}[{', '.join(_scalar(entry, most) for entry in value)}]"
+        head = ", ".join(_scalar(entry, most) for entry in value[: max(1, most // 2)])
+        return f"{indent}[{head}, ... {len(value)} values]"
+    return indent + _scalar(value, most)
 
 
-def _nested(values: list[Any]) -> bool:
-    return dataclasses.is_dataclass(values[0])
+def _is_nested(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and dataclasses.is_dataclass(value[0])
 
 
-def _array(values: Any, style: Style) -> str:
-    if not style.arrays:
-        return f"<{len(values)} values>"
-    if style.full or len(values) <= style.length:
-        return "[" + ", ".join(_scalar(v, style) for v in values) + "]"
-    head = ", ".join(_scalar(v, style) for v in values[: max(1, style.length // 2)])
-    return f"[{head}, ... {len(values)} values]"
-
-
-def _scalar(value: Any, style: Style) -> str:
+def _scalar(value: Any, most: int | None) -> str:
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, bool):
@@ -94,14 +73,13 @@ def _scalar(value: Any, style: Style) -> str:
         return f"{value:.9g}"
     if not isinstance(value, str):
         return str(value)
-    if not style.strings:
-        return f"<{len(value)} characters>"
-    most = 10 * style.length
-    return repr(value) if style.full or len(value) <= most else f"{value[:most]!r}... {len(value)} characters"
+    if most is None or len(value) <= 10 * most:
+        return repr(value)
+    return f"{value[: 10 * most]!r}... {len(value)} characters"
 
 
 def json_line(value: Any) -> str:
-    """A message, or a field of one, as one line of JSON with every value."""
+    """Return a message, or a field of one, as one line of JSON with every value."""
     return json.dumps(_plain(value), ensure_ascii=False)
 
 
@@ -111,27 +89,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list):
         return [_plain(entry) for entry in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
-
-
-def csv_line(value: Any, style: Style | None = None) -> str:
-    """All values of a message, or of a field of one, in the order of its definition, separated by commas."""
-    import csv
-    import io
-
-    out = io.StringIO()
-    csv.writer(out, lineterminator="").writerow(_cells(value, style or Style()))
-    return out.getvalue()
-
-
-def _cells(value: Any, style: Style) -> Iterator[str]:
-    if dataclasses.is_dataclass(value):
-        for _, inner in _fields(value):
-            yield from _cells(inner, style)
-    elif isinstance(value, (list, np.ndarray)):
-        for entry in value if style.arrays else ():
-            yield from _cells(entry, style)
-    elif isinstance(value, str):
-        if style.strings:
-            yield value
-    else:
-        yield _scalar(value, style)

@@ -22,7 +22,7 @@ from instant_ic.util.closing import Closing
 _CLOCK = "/clock"
 
 
-class Observer(Closing):
+class TopicObserver(Closing):
     """Subscribes to topics until the end of its ``with`` block.
 
     Args:
@@ -106,5 +106,5 @@ class Observer(Closing):
 
 def newest(topic: str, timeout_s: float) -> Received | None:
     """The next message of a topic; None without one within ``timeout_s``."""
-    with Observer(topic) as observer:
+    with TopicObserver(topic) as observer:
         return next((received for batch in observer.batches(timeout_s, 0.1) for received in batch), None)

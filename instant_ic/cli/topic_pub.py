@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import time
 
@@ -10,9 +11,9 @@ from instant_ic.bus import LATCHED, RELIABLE, SENSOR, registry
 from instant_ic.bus.node import Publisher
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.message_input import build, fields, parse
-from instant_ic.cli.messages import Style, describe
+from instant_ic.cli.messages import describe
 from instant_ic.cli.names import absolute
-from instant_ic.cli.observer import Observer
+from instant_ic.cli.observer import TopicObserver
 from instant_ic.msg import message_type, type_name
 from instant_ic.util import paths
 
@@ -34,21 +35,18 @@ def publish(args: argparse.Namespace) -> int:
         )
     wanted = 1 if args.once else args.times
     readers = args.readers if args.readers is not None else int(wanted > 0)
-    with Observer([], args.use_sim_time) as observer:
+    with TopicObserver([], args.use_sim_time) as observer:
         transport = observer.transport
         if args.use_sim_time:
             _wait_for_clock(observer, args.max_wait_time_secs)
         publisher = Publisher(transport.advertise(topic, full, _QOS[args.qos]))
         _wait_for_readers(publisher, readers, args.max_wait_time_secs)
-        count = 0
         next_s = time.monotonic()
-        while True:
+        for count in itertools.count(1):
             observer.follow_clock()
             message = build(full, values, observer.clock.now_ns())
             publisher.publish(message)
-            count += 1
-            if count % args.print == 0:
-                print(f"publishing #{count}: {full}\n{describe(message, Style())}\n", flush=True)
+            print(f"publishing #{count}: {full}\n{describe(message)}\n", flush=True)
             if count == wanted:
                 break
             next_s = max(next_s + 1.0 / args.rate, time.monotonic())
@@ -80,7 +78,7 @@ def _check_topic(topic: str, full: str, force: bool) -> None:
     print(f"ic: {topic} moves the robot ({readers}){beside}: keep the emergency stop within reach", file=sys.stderr)
 
 
-def _wait_for_clock(observer: Observer, seconds: float) -> None:
+def _wait_for_clock(observer: TopicObserver, seconds: float) -> None:
     deadline_s = time.monotonic() + seconds
     while observer.clock.now_ns() == 0:
         if time.monotonic() > deadline_s:

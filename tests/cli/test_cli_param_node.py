@@ -79,11 +79,9 @@ def registry_dir():
 
 def test_dump_and_load(ic, tmp_path):
     file = tmp_path / "talker.yaml"
-    status, out, _ = ic("param", "dump", "talker", "-o", str(file))
-    assert status == 0 and str(file) in out
+    file.write_text(ic("param", "dump", "talker")[1])
     content = yaml.safe_load(file.read_text())["talker"]["ros__parameters"]
     assert content["inner"] == {"depth": 7, "share": 0.5} and content["use_sim_time"] is False
-    assert yaml.safe_load(ic("param", "dump", "talker")[1])["talker"]["ros__parameters"] == content
     assert "nothing to change" in ic("param", "load", "talker", str(file))[1]
     file.write_text(file.read_text().replace("share: 0.5", "share: 0.25"))
     assert ic("param", "load", "talker", str(file))[:2] == (0, "inner.share: 0.25\n")
@@ -95,15 +93,15 @@ def test_dump_and_load(ic, tmp_path):
     assert status == 2 and "has no parameters for talker" in error
     assert ic("param", "set", "talker", "inner.share", "0.5")[0] == 0
     # What was dumped starts a node with the same parameters.
-    assert ic("param", "dump", "talker", "-o", str(file))[0] == 0
+    file.write_text(ic("param", "dump", "talker")[1])
     run_dir = tmp_path / "r"
     with talking(run_dir, "--params-file", str(file)):
         assert NodeControl(run_dir, "talker").get() == NodeControl(registry_dir(), "talker").get()
 
 
 def test_node_list_and_info(ic, talker):
-    assert ic("node", "list")[:2] == (0, "talker\n") and ic("node", "list", "-c")[1] == "1\n"
-    assert re.match(r"talker  pid \d+ +up +\d+ s  ", ic("node", "list", "-v")[1])
+    assert ic("node", "list")[:2] == (0, "talker\n")
+    assert re.search(r"\ntalker +\d+ +\d+  \S", ic("node", "list", "-v")[1])
     wait_until(lambda: re.search(r"/scan: .*, [\d.]+ Hz\n", ic("node", "info", "talker")[1]), "a heartbeat with rates")
     status, out, _ = ic("node", "info", "talker")
     assert status == 0 and "state: running\n" in out and re.search(r"process: \d+ % of a core, \d+ MB\n", out)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,8 +19,8 @@ from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.message_input import build, parse
-from instant_ic.cli.messages import Style, csv_line, describe, json_line
-from instant_ic.cli.window import Rate, losses, size_words
+from instant_ic.cli.messages import describe, json_line
+from instant_ic.cli.topic_watch import Rate, losses, size_text
 from instant_ic.msg import Bool, Clock, deserialize, message_type, serialize, stamp_ns, to_time, typestore
 
 
@@ -32,10 +33,9 @@ def test_list(ic):
     topics = ic("topic", "list")[1].split()
     assert {"/scan", "/flag", "/heartbeat", "/order"} <= set(topics) and topics == sorted(topics)
     assert "/scan [sensor_msgs/msg/LaserScan]\n" in ic("topic", "list", "-t")[1]
-    assert ic("topic", "list", "-c")[1] == f"{len(topics)}\n"
     out = ic("topic", "list", "-v")[1]
-    assert re.search(r"/scan +sensor_msgs/msg/LaserScan  talker \(sensor\) → -\n", out)
-    assert re.search(r"/order +geometry_msgs/msg/TwistStamped  - → talker\n", out)
+    assert re.search(r"/scan +sensor_msgs/msg/LaserScan +talker \(sensor\) +- *\n", out)
+    assert re.search(r"/order +geometry_msgs/msg/TwistStamped +- +talker *\n", out)
 
 
 def test_run_dir_as_an_option(ic, tmp_path, monkeypatch, talker):
@@ -64,13 +64,10 @@ def test_info(ic):
 
 
 def test_info_verbose_tells_rates_of_the_heartbeat(ic):
-    publisher = (
-        r"Publisher count: 1 \(nominal 10 Hz\)\n\nNode name: talker\n  Endpoint type: PUBLISHER\n  PID: \d+\n"
-        r"  Type: sensor_msgs/msg/LaserScan\n  QoS: sensor\n  Rate: ([\d.]+) Hz, newest ([\d.]+) s ago\n"
-    )
+    publisher = r"Nominal rate: 10 Hz\n(?:.*\n)*talker +publishes +([\d.]+) Hz, newest ([\d.]+) s ago"
     found = wait_until(lambda: re.search(publisher, ic("topic", "info", "-v", "/scan")[1]), "a heartbeat in time")
     assert 0 < float(found[1]) < 60
-    reader = r"Endpoint type: SUBSCRIPTION\n(  .*\n)*  Rate: no message yet\n  Lost: 0\n"
+    reader = r"talker +subscribes +no message yet"
     wait_until(lambda: re.search(reader, ic("topic", "info", "-v", "/order")[1]), "a heartbeat in time")
 
 
@@ -82,8 +79,7 @@ def test_echo(ic):
     out = ic("topic", "echo", "/scan", "--once", "--field", "ranges.3")[1]
     assert out == "3\n---\n"
     assert "39]" in ic("topic", "echo", "/scan", "--once", "--full")[1]
-    assert "ranges: <40 values>" in ic("topic", "echo", "/scan", "--once", "--no-arr", "--no-str")[1]
-    assert ic("topic", "echo", "/scan", "--once", "--csv", "--field", "ranges")[1].startswith("0,1,2,3,")
+    assert "ranges: [0, 1, 2, 3, 4, 5, ... 40 values]" in ic("topic", "echo", "/scan", "--once")[1]
     message = json.loads(ic("topic", "echo", "/scan", "--once", "--json")[1])
     assert message["header"]["frame_id"] == "hello" and message["ranges"][39] == 39.0
     status, _, error = ic("topic", "echo", "/scan", "--once", "--field", "range")
@@ -203,19 +199,18 @@ def test_pub_beside_the_writer_of_cmd_vel_is_refused(ic, tmp_path_factory, monke
 def test_rate_of_known_arrivals():
     """Arrivals at 0, 100, 200, 400 ms: mean gap 133.3 ms, so 7.5 Hz; standard deviation 47.14 ms."""
     rate = Rate(100)
-    assert rate.line({}) == "no message yet  lost: 0"
+    assert rate.line() == ""
     for ms in (0, 100, 200, 400):
-        rate.add(ms * 1_000_000)
-    words = "average rate: 7.500  min: 0.1000s max: 0.2000s std dev: 0.04714s window: 3"
-    assert rate.line({"b": 1, "a": 2}) == f"{words}  lost: 3 (a 2, b 1)"
-    rate.add(1_000_000)  # back in time: a bag that begins anew
-    rate.add(51_000_000)
-    assert rate.line({}).startswith("average rate: 20.000")
+        rate.add(SimpleNamespace(received_ns=ms * 1_000_000))
+    assert rate.line() == "average rate: 7.500  min: 0.1000s max: 0.2000s std dev: 0.04714s window: 3"
+    for ms in (1, 51):  # back in time: a bag that begins anew
+        rate.add(SimpleNamespace(received_ns=ms * 1_000_000))
+    assert rate.line().startswith("average rate: 20.000")
 
 
-def test_words_of_sizes_and_losses():
-    assert [size_words(n) for n in (12, 1500, 2_500_000, 3e9)] == ["12 B", "1.50 kB", "2.50 MB", "3.00 GB"]
-    assert losses({}) == "0"
+def test_texts_of_sizes_and_losses():
+    assert [size_text(n) for n in (12, 1500, 2_500_000, 3e9)] == ["12 B", "1.50 kB", "2.50 MB", "3.00 GB"]
+    assert losses({}) == "0" and losses({"b": 1, "a": 2}) == "3 (a 2, b 1)"
 
 
 def test_every_type_can_be_built_empty_and_sent():
@@ -262,12 +257,11 @@ def test_any_text_as_values_gives_a_message_or_words(text):
         assert str(error)
 
 
-def test_json_and_csv_of_a_message():
+def test_messages_as_text():
     assert json_line(Bool(data=True)) == '{"data": true}'
     path = build("Path", {"header": {"frame_id": 'a,"b'}, "poses": [{}]}, 0)
     assert json.loads(json_line(path))["poses"][0]["pose"]["orientation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-    assert csv_line(path) == '0,0,"a,""b",0,0,,0,0,0,0,0,0,1'
-    assert describe(build("String", {"data": "x" * 30}, 0), Style(length=2)) == f"data: {'x' * 20!r}... 30 characters"
+    assert describe(build("String", {"data": "x" * 30}, 0), most=2) == f"data: {'x' * 20!r}... 30 characters"
 
 
 def test_dora_515_3428_losses_are_told_by_publisher(ic, tmp_path_factory, monkeypatch):
@@ -299,9 +293,7 @@ def test_dora_515_3428_losses_are_told_by_publisher(ic, tmp_path_factory, monkey
 
             def info() -> bool:
                 publisher.send(payload)
-                return bool(
-                    re.search(r"  Lost: (\d+)\n    flood → talker: \1\n", ic("topic", "info", "-v", "/order")[1])
-                )
+                return bool(re.search(r"talker +subscribes .* \d+ of flood", ic("topic", "info", "-v", "/order")[1]))
 
             wait_until(info, "the losses in ic topic info")
             assert re.search(r"/order: .* Hz, lost \d+ of flood\n", ic("node", "info", "talker")[1])

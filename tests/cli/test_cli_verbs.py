@@ -1,6 +1,5 @@
 """Every verb of ``ic`` against a node in a process of its own."""
 
-import json
 import os
 import signal
 import subprocess
@@ -12,9 +11,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
-from rosbags.rosbag2 import Reader
 
-from instant_ic.bag import BagReader
 from instant_ic.bus import registry
 from instant_ic.cli.main import build_parser, main
 
@@ -153,13 +150,6 @@ def test_help_loads_nothing_heavy() -> None:
     assert result.stdout.strip() == "[]"
 
 
-def record_scan(capsys: pytest.CaptureFixture[str]) -> Path:
-    words = ("bag", "record", "-o", "probe", "/scan", "/flag", "--duration", "0.8")
-    status, _, error = ic_process(*words)
-    assert status == 0, error
-    return Path("probe")
-
-
 def ic_process(*words: str, interrupt_after: object = None) -> tuple[int, str, str]:
     """Runs ``ic`` in a process: what installs signal handlers must have the main thread."""
     process = subprocess.Popen(
@@ -177,67 +167,6 @@ def ic_process(*words: str, interrupt_after: object = None) -> tuple[int, str, s
 def _interrupt(process: subprocess.Popen[str], condition: object) -> None:
     wait_for(condition, "the moment to interrupt")
     process.send_signal(signal.SIGINT)
-
-
-def test_bag_record_play_info_diff_recover(capsys: pytest.CaptureFixture[str], run_dir: Path, tmp_path: Path) -> None:
-    def recording() -> bool:
-        return any(node.name.startswith("bag_recorder") for node in registry.list_nodes(run_dir)) and bool(
-            list(tmp_path.glob("drive/*.mcap"))
-        )
-
-    def enough() -> bool:
-        return recording() and sum(f.stat().st_size for f in tmp_path.glob("drive/*.mcap")) > 10_000
-
-    status, _, error = ic_process("bag", "record", "-o", "drive", "-x", "/rosout", interrupt_after=enough)
-    assert status == 0, error
-    with Reader(tmp_path / "drive") as reader:
-        topics = {c.topic: (c.msgtype, c.msgcount) for c in reader.connections}
-        custom = reader.storage.metadata.custom
-    assert {"/scan", "/flag", "/heartbeat"} <= set(topics) and "/rosout" not in topics
-    assert topics["/flag"] == ("std_msgs/msg/Bool", 1)  # latched: published long before the recording
-    assert topics["/scan"][1] >= 10
-    assert custom is not None and json.loads(custom["instant_ic.lost"]) == {}
-    assert json.loads(custom["instant_ic.parameters"])["talker"]["params"]["label"] == "hello"
-
-    status, out, _ = ic(capsys, "bag", "info", "drive")
-    assert status == 0 and "sensor_msgs/msg/LaserScan" in out and f"messages: {reader_count(tmp_path / 'drive')}" in out
-    status, _, error = ic(capsys, "bag", "record", "-o", "drive")
-    assert status == 1 and "drive exists already" in error
-
-    (tmp_path / "drive" / "metadata.yaml").unlink()
-    status, _, error = ic(capsys, "bag", "info", "drive")
-    assert status == 1 and "ic bag recover drive" in error
-    status, out, _ = ic(capsys, "bag", "recover", "drive", "-o", "saved")
-    assert status == 0 and out.startswith("saved: ")
-    status, out, _ = ic(capsys, "bag", "diff", "drive/drive.mcap", "saved")
-    assert status == 0 and " topics are the same" in out
-    status, out, _ = ic(capsys, "bag", "diff", "saved", str(record_scan(capsys)), "--common")
-    assert status == 1 and "/scan" in out and "/heartbeat" not in out
-
-    # Played on another topic, the bytes come back as they were recorded; the player ends with the bag.
-    heard = subprocess.Popen(
-        [sys.executable, "-m", "instant_ic.cli.main", "bag", "record", "-o", "again", "/replayed", "--use-sim-time"],
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    wait_for(lambda: list(tmp_path.glob("again/*.mcap")), "the second recorder")
-    recorder = f"bag_recorder_{heard.pid}"
-    words = ("bag", "play", "saved", "/scan", "--remap", "/scan:=/replayed", "--rate", "3", "--wait-for", recorder)
-    status, _, error = ic_process(*words)
-    assert status == 0 and "played to the end" in error, error
-    heard.send_signal(signal.SIGINT)
-    assert heard.wait(timeout=30) == 0, heard.stderr and heard.stderr.read()
-    assert heard.stderr is not None
-    heard.stderr.close()
-    with BagReader(tmp_path / "saved") as saved, BagReader(tmp_path / "again") as again:
-        sent = [(m.stamp_ns, m.payload) for m in saved.messages({"/scan"})]
-        came = [(m.stamp_ns, m.payload) for m in again.messages({"/replayed"})]
-    assert came == sent  # the stamps are the bag's: recorder and player follow its clock
-
-
-def reader_count(path: Path) -> int:
-    with BagReader(path) as reader:
-        return reader.count
 
 
 def test_launch_in_a_process_ends_in_time_and_leaves_nothing(

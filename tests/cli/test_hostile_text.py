@@ -11,10 +11,9 @@ from rich.console import Console
 from instant_ic.bag import BagWriter
 from instant_ic.bus import SENSOR
 from instant_ic.bus.process import SafeFormatter
-from instant_ic.cli.logs import LogLine, show
+from instant_ic.cli.logs import LogLine
 from instant_ic.cli.main import main
-from instant_ic.cli.top import NodeRow
-from instant_ic.cli.top_screen import table
+from instant_ic.cli.top import NodeRow, table
 from instant_ic.launch.screen import ScreenRow, StackScreen, StackView
 from instant_ic.msg import Bool, message_type, serialize
 
@@ -67,7 +66,7 @@ def test_a_log_line_shows_escapes_and_hides_passwords():
     text = SafeFormatter("%(message)s").format(record)
     assert RAW.findall(text) == [] and "secret" not in text and r"\x1b]0;owned" in text
     for colour in (False, True):
-        line = show(LogLine(0.0, "ERROR", f"n{EVIL}", f"{EVIL} rtsp://me:secret@h/"), colour)
+        line = LogLine(0.0, "ERROR", f"n{EVIL}", f"{EVIL} rtsp://me:secret@h/").show(colour)
         assert "secret" not in line
         assert RAW.findall(re.sub(r"\x1b\[[\d;]*m", "", line)) == []
 

@@ -25,7 +25,7 @@ def wait(args):
 
 parser = cli.build_parser()
 cli.build_parser = lambda: parser
-namespace = parser.parse_args(["interface", "list"])
+namespace = parser.parse_args(["node", "list"])
 namespace.func = wait
 parser.parse_args = lambda argv: namespace
 sys.exit(cli.main())

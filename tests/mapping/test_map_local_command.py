@@ -13,7 +13,7 @@ from instant_ic.bag.writer import BagWriter
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.bus.node import Publisher
 from instant_ic.cli.main import main
-from instant_ic.cli.observer import Observer
+from instant_ic.cli.observer import TopicObserver
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.msg import (
@@ -82,7 +82,7 @@ def test_the_running_stack_is_asked(run_dir: Path, tmp_path: Path, capsys: pytes
     end = threading.Event()
 
     def serve() -> None:
-        with Observer(["/nothing"], run_dir=run_dir) as observer:
+        with TopicObserver(["/nothing"], run_dir=run_dir) as observer:
             out = Publisher(observer.transport.advertise("/map/local", type_name(PointCloud2), RELIABLE))
             while not end.wait(0.05):
                 if out.subscriber_count:

@@ -13,7 +13,7 @@ import pytest
 from instant_ic.bus import RELIABLE
 from instant_ic.bus.node import Publisher
 from instant_ic.cli.main import main
-from instant_ic.cli.observer import Observer
+from instant_ic.cli.observer import TopicObserver
 from instant_ic.msg import String, deserialize, type_name
 
 
@@ -31,7 +31,7 @@ def stand_in(run_dir: Path, answer: Callable[[str], str]) -> Iterator[list[str]]
     ready, end = threading.Event(), threading.Event()
 
     def serve() -> None:
-        with Observer(["/slam/save"], run_dir=run_dir) as observer:
+        with TopicObserver(["/slam/save"], run_dir=run_dir) as observer:
             out = Publisher(observer.transport.advertise("/slam/saved", type_name(String), RELIABLE))
             ready.set()
             while not end.is_set():

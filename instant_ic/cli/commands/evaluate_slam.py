@@ -8,8 +8,6 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from instant_ic.cli.arguments import check_files, positive_int, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user, print_figures
@@ -99,6 +97,8 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         )  # fmt: skip
     for line in bad.errors:
         print(f"left out: {line}", file=sys.stderr)
+    import numpy as np
+
     np.savetxt(folder / "trajectory.txt", run.trajectory, fmt=("%.6f", "%.5f", "%.5f", "%.6f"))
     save_map(folder / "map.png", run.slam.grid(), paths={"trajectory": run.trajectory[:, 1:]})
     report = {"log": args.log.name, **report, "bad_lines": bad.count, "output": str(folder)}

@@ -44,7 +44,7 @@ def add_parser(subparsers: Any) -> None:
 def save_map(args: argparse.Namespace) -> int:
     from instant_ic.bus import RELIABLE
     from instant_ic.bus.node import Publisher
-    from instant_ic.cli.observer import Observer
+    from instant_ic.cli.observer import TopicObserver
     from instant_ic.msg import deserialize, message_type, type_name
 
     name = args.name.expanduser().absolute()
@@ -52,7 +52,7 @@ def save_map(args: argparse.Namespace) -> int:
         raise UserError(f"NAME must have no suffix: {name.with_suffix('')}", 2)
     string = message_type("String")
     deadline = time.monotonic() + args.timeout
-    with Observer([SAVED]) as observer:
+    with TopicObserver([SAVED]) as observer:
         request = Publisher(observer.transport.advertise(SAVE, type_name(string), RELIABLE))
         while request.subscriber_count == 0:
             if time.monotonic() > deadline:

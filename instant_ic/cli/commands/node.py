@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
 from instant_ic.cli.arguments import group, verb
 
+if TYPE_CHECKING:
+    from instant_ic.bus.heartbeat import Flow
+
 
 def add_parser(subparsers: Any) -> None:
+    """Add the command with its verbs."""
     verbs = group(subparsers, "node", "list running nodes", "List and describe running nodes.", "ic node list")
     add = verb(verbs, "list", "names of the running nodes", list_nodes, "ic node list -v").add_argument
-    add("-c", "--count-nodes", action="store_true", help="print only their number")
     add("-v", "--verbose", action="store_true", help="also process id, uptime, executable")
     info = verb(
         verbs, "info", "state, process and topics of a node", show, "ic node info grid_slam",
@@ -22,35 +26,30 @@ def add_parser(subparsers: Any) -> None:
 
 
 def list_nodes(args: argparse.Namespace) -> int:
+    """Print the running nodes."""
     import sys
     import time
 
     from instant_ic.bus import registry
     from instant_ic.cli.names import nobody_runs
+    from instant_ic.cli.tables import print_table
     from instant_ic.util import paths
 
     nodes = registry.list_nodes(paths.run_dir())
-    if args.count_nodes:
-        print(len(nodes))
-        return 0
-    width = max([len(node.name) for node in nodes], default=0)
-    for node in nodes:
-        up_s = max(0.0, time.time() - node.started_ns / 1e9)
-        print(
-            f"{node.name:<{width}}  pid {node.pid:<7}  up {up_s:6.0f} s  {node.executable}"
-            if args.verbose
-            else node.name
-        )
     if not nodes:
         print(f"ic: {nobody_runs()}", file=sys.stderr)
+    elif args.verbose:
+        now_s = time.time()
+        rows = [(n.name, n.pid, f"{max(0.0, now_s - n.started_ns / 1e9):.0f}", n.executable) for n in nodes]
+        print_table(rows, ("NODE", "PID", "UP S", "EXECUTABLE"), right=(1, 2))
+    else:
+        print("\n".join(node.name for node in nodes))
     return 0
 
 
 def show(args: argparse.Namespace) -> int:
-    import math
-
+    """Print a node's state, process and topics."""
     from instant_ic.bus.control import ControlError, NodeControl
-    from instant_ic.bus.heartbeat import Flow
     from instant_ic.cli.heartbeats import hear
     from instant_ic.cli.names import find_node
     from instant_ic.util import paths
@@ -69,18 +68,20 @@ def show(args: argparse.Namespace) -> int:
         print(f"threads: {status['threads']}{doing}")
     except ControlError as error:
         print(f"control: {error}")
-
-    def line(topic: str, kind: str, flow: Flow | None) -> str:
-        if flow is None:
-            return f"  {topic}: {kind}"
-        return f"  {topic}: {kind}" + (", no message yet" if math.isinf(flow.age_s) else f", {flow.rate_hz:.2f} Hz")
-
-    print("Publishers:")
-    for topic, kind in sorted(node.publishes.items()):
-        print(line(topic, kind, beat.outputs.get(topic) if beat else None))
-    print("Subscribers:")
-    for topic, kind in sorted(node.subscribes.items()):
-        lost = {p: count for (name, p), count in beat.lost.items() if name == topic} if beat else {}
-        words = f", lost {', '.join(f'{count} of {p}' for p, count in lost.items())}" if lost else ""
-        print(line(topic, kind, beat.inputs.get(topic) if beat else None) + words)
+    _show_topics("Publishers", node.publishes, beat.outputs if beat else {}, {})
+    _show_topics("Subscribers", node.subscribes, beat.inputs if beat else {}, beat.lost if beat else {})
     return 0
+
+
+def _show_topics(
+    title: str, topics: Mapping[str, str], flows: Mapping[str, Flow], lost: Mapping[tuple[str, str], int]
+) -> None:
+    import math
+
+    print(f"{title}:")
+    for topic, kind in sorted(topics.items()):
+        text = f"  {topic}: {kind}"
+        if flow := flows.get(topic):
+            text += ", no message yet" if math.isinf(flow.age_s) else f", {flow.rate_hz:.2f} Hz"
+        losses = [f"{count} of {publisher}" for (name, publisher), count in lost.items() if name == topic]
+        print(text + (f", lost {', '.join(losses)}" if losses else ""))

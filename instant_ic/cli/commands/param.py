@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +13,10 @@ from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
     from instant_ic.bus.control import NodeControl
-    from instant_ic.config.parameter_info import ParameterInfo
 
 
 def add_parser(subparsers: Any) -> None:
+    """Add the command with its verbs."""
     text = "read and change parameters of running nodes"
     verbs = group(subparsers, "param", text, f"{text.capitalize()}.", "ic param set arbiter switch.yaw_deg 12")
     of = {"metavar": "NODE", "completer": completion.nodes}
@@ -39,7 +39,6 @@ def add_parser(subparsers: Any) -> None:
     add = with_node("describe", "type, range, default and meaning", describe, "describe arbiter switch.yaw_deg")
     add("keys", metavar="KEY", nargs="*", help="default: all", completer=completion.parameters)
     add = with_node("dump", "all parameters of a node as a parameter file", dump, "dump arbiter > arbiter.yaml")
-    add("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
     add = with_node("load", "set parameters from a file", load, "load arbiter arbiter.yaml")
     add("file", metavar="FILE", type=Path, help="file in the format of ic param dump")
 
@@ -53,7 +52,7 @@ def _control(node: str) -> NodeControl:
 
 
 def list_parameters(args: argparse.Namespace) -> int:
-    """Print parameters from the registry: this also works for a hanging node."""
+    """Print parameters from the registry, which also works for a hanging node."""
     from instant_ic.bus import registry
     from instant_ic.cli.names import find_node, nobody_runs
     from instant_ic.config import params
@@ -62,47 +61,44 @@ def list_parameters(args: argparse.Namespace) -> int:
     nodes = [find_node(args.node)] if args.node else registry.list_nodes(paths.run_dir())
     if not nodes:
         raise UserError(nobody_runs())
-    if args.changed:
-        return _list_changed([node.name for node in nodes])
     for node in nodes:
         print(f"{node.name}:")
+        if args.changed:  # only the running node knows its defaults
+            for info in _control(node.name).describe():
+                if info.value != info.default:
+                    print(f"  {info.name}: {_show(info.value)} (default {_show(info.default)})")
+            continue
         for key, value in sorted(params.flatten(node.params).items()):
             print(f"  {key}: {_show(value)}" if args.values else f"  {key}")
     return 0
 
 
-def _list_changed(nodes: Sequence[str]) -> int:
-    """Print the values that differ from the default; only the running node knows its defaults."""
-    for name in nodes:
-        print(f"{name}:")
-        for info in _control(name).describe():
-            if info.value != info.default:
-                print(f"  {info.name}: {_show(info.value)} (default {_show(info.default)})")
-    return 0
-
-
 def get_parameter(args: argparse.Namespace) -> int:
+    """Print a value, or those of a group."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 
     values = params.flatten(find_node(args.node).params)
-    group = {key: value for key, value in values.items() if key.startswith(f"{args.key}.")}
-    if args.key not in values and not group:
-        raise _no_parameter(args.node, args.key, values)
     if args.key in values:
         print(_show(values[args.key]))
-    for key, value in group.items():
-        print(f"{key}: {_show(value)}")
+        return 0
+    for key in _matching(args.node, args.key, values):
+        print(f"{key}: {_show(values[key])}")
     return 0
 
 
-def _no_parameter(node: str, key: str, known: Any) -> UserError:
+def _matching(node: str, key: str, known: Iterable[str]) -> list[str]:
+    """Return the parameters of a name: one, or those of a group."""
     from instant_ic.cli.names import near
 
-    return UserError(f"node {node} has no parameter {key!r} ({near(key, known, f'see ic param list {node}')})")
+    found = [name for name in known if name == key or name.startswith(f"{key}.")]
+    if not found:
+        raise UserError(f"node {node} has no parameter {key!r} ({near(key, known, f'see ic param list {node}')})")
+    return found
 
 
 def set_parameters(args: argparse.Namespace) -> int:
+    """Change parameters together."""
     from instant_ic.config import params
 
     words = args.pairs
@@ -122,14 +118,10 @@ def _change(node: str, values: dict[str, Any]) -> int:
 
 
 def describe(args: argparse.Namespace) -> int:
+    """Print type, range, value and meaning of parameters."""
     infos = {info.name: info for info in _control(args.node).describe()}
-    chosen: list[ParameterInfo] = []
-    for key in args.keys or infos:
-        found = [info for name, info in infos.items() if name == key or name.startswith(f"{key}.")]
-        if not found:
-            raise _no_parameter(args.node, key, infos)
-        chosen += found
-    for info in chosen:
+    names = [name for key in args.keys for name in _matching(args.node, key, infos)] if args.keys else list(infos)
+    for info in map(infos.__getitem__, names):
         print(f"Parameter name: {info.name}")
         print(f"  Type: {info.type}{f', {info.range}' if info.range else ''}")
         default = "" if info.value == info.default else f" (default {_show(info.default)})"
@@ -141,6 +133,7 @@ def describe(args: argparse.Namespace) -> int:
 
 
 def dump(args: argparse.Namespace) -> int:
+    """Print all parameters as a parameter file."""
     from instant_ic.cli.names import find_node
     from instant_ic.config.yaml_text import dump_yaml
 
@@ -152,12 +145,7 @@ def dump(args: argparse.Namespace) -> int:
         for key_group in groups:
             place = place.setdefault(key_group, {})
         place[last] = value
-    text = dump_yaml({node.name: {"ros__parameters": nested}}, default_flow_style=None, width=100)
-    if args.output is None:
-        print(text, end="")
-        return 0
-    args.output.write_text(text)
-    print(f"{args.output}: {len(nested)} parameters of {node.name}")
+    print(dump_yaml({node.name: {"ros__parameters": nested}}, default_flow_style=None, width=100), end="")
     return 0
 
 

@@ -11,17 +11,18 @@ from instant_ic.cli.arguments import positive, verb
 if TYPE_CHECKING:
     from instant_ic.cli.top import NodeRow
 
-_SORT = ("cpu", "memory", "name", "lost")
+_PIPE_WIDTH = 300
 
 
 def add_parser(subparsers: Any) -> None:
+    """Add the command."""
     add = verb(
         subparsers, "top", "CPU, memory, rates and losses of every node, live", show, "ic top --once",
         "Show CPU, memory, threads, rates (measured/nominal) and losses of every node, once a second.",
     ).add_argument  # fmt: skip
     add("--once", action="store_true", help="print one table and exit (default without a terminal)")
     add("--json", action="store_true", help="print one table as JSON and exit")
-    add("--sort", choices=_SORT, default="cpu", help="default: %(default)s")
+    add("--sort", choices=("cpu", "memory", "name", "lost"), default="cpu", help="default: %(default)s")
     add("-d", "--delay", type=positive, default=1.0, metavar="S", help="update period (default: 1)")
 
 
@@ -39,16 +40,19 @@ def _ask(row: NodeRow, run_dir: Path) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
+    """Show the table, live or once."""
     import json
     import sys
-    import time
+
+    from rich.console import Console
 
     from instant_ic.bus import registry
     from instant_ic.cli.errors import UserError
     from instant_ic.cli.heartbeats import Heartbeats
     from instant_ic.cli.names import nobody_runs
-    from instant_ic.cli.top import SORT_KEYS, Processes, as_json, expected_rate, make_rows, plain_table
+    from instant_ic.cli.top import SORT_KEYS, Processes, as_json, make_rows, show_live, table
     from instant_ic.util import paths
+    from instant_ic.util.safe_text import direct
 
     run_dir = paths.run_dir()
     processes = Processes()
@@ -58,21 +62,21 @@ def show(args: argparse.Namespace) -> int:
 
         def rows(seconds: float, until_all: bool = False) -> list[NodeRow]:
             infos = registry.list_nodes(run_dir)
-            for info in infos:
-                processes.begin(info.pid)
             beats = heartbeats.listen(seconds, [info.name for info in infos] if until_all else ())
-            made = make_rows(infos, beats, processes.look, expected_rate, time.time_ns())
+            made = make_rows(infos, beats, processes.look)
             for row in made:
                 if row.state == "silent":
                     _ask(row, run_dir)
             return made
 
-        live = sys.stdin.isatty() and sys.stdout.isatty() and not (args.once or args.json)
-        if live:
-            from instant_ic.cli.top_screen import run
-
-            return run(rows, args.delay, args.sort)
-        rows(0.3)
-        newest = sorted(rows(1.5, until_all=True), key=SORT_KEYS[args.sort])
-        print(json.dumps(as_json(newest)) if args.json else plain_table(newest))
+        if sys.stdin.isatty() and sys.stdout.isatty() and not (args.once or args.json):
+            show_live(rows, args.delay, args.sort)
+            return 0
+        rows(0.3)  # the CPU is measured from here on
+        newest = rows(1.5, until_all=True)
+    if args.json:
+        print(json.dumps(as_json(sorted(newest, key=SORT_KEYS[args.sort]))))
+    else:
+        width = None if sys.stdout.isatty() else _PIPE_WIDTH
+        Console(file=direct(sys.stdout), width=width).print(table(newest, args.sort))
     return 0
