@@ -9,7 +9,8 @@ from typing import Any
 from instant_ic import msg
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node, NodeError, main
 from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
-from instant_ic.bus.node import Subscription, Timer
+from instant_ic.bus.timers import Timer
+from instant_ic.bus.topics import Subscription
 from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.feed import PLAN_PERIOD_S, STATE_PERIOD_S, Inputs, PageFeed, PageServer

@@ -125,7 +125,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             message = estimate_message(state.odometry, self.config.odom_frame, self.config.base_frame)
             self.odometry.publish(message)
             matrix, stamp = matrix_from_pose2(state.odometry.pose), state.odometry.stamp_ns
-            self.tf_broadcast(self.config.odom_frame, self.config.base_frame, matrix, stamp)
+            self.transforms.broadcast(self.config.odom_frame, self.config.base_frame, matrix, stamp)
         changed, self.status = state.status != self.status, state.status
         if state.link or state.fault or changed or state.health is not None:
             self.call_soon(self.on_state, state)

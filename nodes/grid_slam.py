@@ -105,7 +105,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.placed_ns = stamp
         self.integrity_out.publish(slam_messages.integrity_message(slam, result, config.map_frame, stamp))
         for parent, child, matrix in slam_messages.transforms(slam, self.limiter, config, stamp, odometry is not None):
-            self.tf_broadcast(parent, child, matrix, stamp)
+            self.transforms.broadcast(parent, child, matrix, stamp)
         if slam.in_map_frame:
             self.pose_out.publish(slam_messages.pose_message(result, config.map_frame, stamp))
             if self.updates.grid is None:

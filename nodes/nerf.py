@@ -92,7 +92,7 @@ class NerfNode(Node[NerfConfig]):
     def report(self, outcome: JobOutcome) -> None:
         self.diagnose_all(*self.schedule.findings(outcome))
         if outcome.error is not None and outcome.is_bug:
-            self.fault(f"virtual space, {outcome.job.kind.value}", outcome.error)
+            self.callbacks.fault(f"virtual space, {outcome.job.kind.value}", outcome.error)
 
     def publish_view(self, outcome: JobOutcome) -> None:
         assert outcome.job.view is not None and outcome.encoded is not None

@@ -42,7 +42,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         self._open.callback(self._devices.close)
         self.odom = self.publisher("/ground_truth/odom", Odometry, qos=SENSOR)
         self.contact = self.publisher("/ground_truth/contact", Bool, qos=LATCHED)
-        fault = functools.partial(self.call_soon, self.fault, "simulation")
+        fault = functools.partial(self.call_soon, self.callbacks.fault, "simulation")
         self._loop = RealTimeLoop(self.simulation, self._devices.scanner, fault)
         self._open.callback(self._loop.stop)
         self.late = self.publisher("/simulation/late", Float32, qos=SENSOR)

@@ -47,7 +47,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.loop.start()
 
     def broadcast_mount(self) -> None:
-        self.tf_broadcast_static("base_link", self.config.frame_id, pose_matrix(*self.config.camera_mount.pose))
+        self.transforms.broadcast_static("base_link", self.config.frame_id, pose_matrix(*self.config.camera_mount.pose))
 
     def reconfigure(self, config: ThetaCameraConfig) -> None:
         super().reconfigure(config)

@@ -41,7 +41,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             check_level(self.base_from_lidar)
         except ValueError as error:
             raise NodeError(str(error)) from None
-        self.tf_broadcast_static("base_link", config.frame_id, self.base_from_lidar)
+        self.transforms.broadcast_static("base_link", config.frame_id, self.base_from_lidar)
         self.tf.frames()  # listens to odometry from here on
         self.points = self.publisher("/lidar/points", PointCloud2, qos=SENSOR)
         self.scan = self.publisher("/scan", LaserScan, qos=SENSOR)
@@ -63,7 +63,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.thread.start()
 
     def on_fault(self, error: Exception) -> None:
-        self.call_soon(self.fault, "receiver", error)
+        self.call_soon(self.callbacks.fault, "receiver", error)
         self.call_soon(self.stop)
 
     def on_packets(self, message: Any) -> None:

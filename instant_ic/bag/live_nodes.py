@@ -9,8 +9,8 @@ from pathlib import Path
 
 from instant_ic.bag.errors import BagError
 from instant_ic.bus.heartbeat import EVERY_NODES
-from instant_ic.bus.node import Publisher
 from instant_ic.bus.registry import NodeInfo, TopicInfo, TopicWatch, list_nodes
+from instant_ic.bus.topics import Publisher
 
 _NODES_S = 2.0  # period of the search for nodes, which costs more than that for topics
 _WAIT_S = 60.0

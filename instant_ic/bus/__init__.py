@@ -7,14 +7,22 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from instant_ic.bus.node import ERROR, OK, STALE, WARN, Latest, Node, NodeError, Publisher, Subscription, Worker
+    from instant_ic.bus.callbacks import NodeError
+    from instant_ic.bus.diagnostics import ERROR, OK, STALE, WARN
+    from instant_ic.bus.node import Node
     from instant_ic.bus.process import main
     from instant_ic.bus.qos import LATCHED, RECORD, RELIABLE, SENSOR, QoS
     from instant_ic.bus.registry import RegistryError
+    from instant_ic.bus.topics import Latest, Publisher, Subscription
+    from instant_ic.bus.worker import Worker
     from instant_ic.config.params import ParameterError
 
 _NAMES = {
-    "bus.node": "ERROR OK STALE WARN Latest Node NodeError Publisher Subscription Worker",
+    "bus.callbacks": "NodeError",
+    "bus.diagnostics": "ERROR OK STALE WARN",
+    "bus.node": "Node",
+    "bus.topics": "Latest Publisher Subscription",
+    "bus.worker": "Worker",
     "config.params": "ParameterError",
     "bus.process": "main",
     "bus.qos": "LATCHED RECORD RELIABLE SENSOR QoS",

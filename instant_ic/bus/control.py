@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from instant_ic.bus import registry
-from instant_ic.bus.node import NodeError
+from instant_ic.bus.callbacks import NodeError
+from instant_ic.bus.node_report import set_log_level
 from instant_ic.config.parameter_info import ParameterInfo
 from instant_ic.config.params import ParameterError, yaml_value
 from instant_ic.config.yaml_text import one_line
@@ -148,34 +149,34 @@ class ControlServer:
         }
 
     def _describe(self, request: dict[str, Any]) -> dict[str, Any]:
-        return {"parameters": [asdict(info) for info in self._node.parameters()]}
+        return {"parameters": [asdict(info) for info in self._node.parameters.infos()]}
 
     def _get(self, request: dict[str, Any]) -> dict[str, Any]:
-        return {"values": {info.name: info.value for info in self._node.parameters()}}
+        return {"values": {info.name: info.value for info in self._node.parameters.infos()}}
 
     def _set(self, request: dict[str, Any]) -> dict[str, Any]:
         values, texts = request.get("values", {}), request.get("yaml", {})
         if not isinstance(values, dict) or not isinstance(texts, dict) or not (values or texts):
             raise _RequestError('set needs "values": {key: value} or "yaml": {key: text}')
         values |= {key: yaml_value(str(text), key) for key, text in texts.items()}
-        return {"changed": self._on_node(lambda: self._node.set_parameters(values))}
+        return {"changed": self._on_node(lambda: self._node.parameters.set(values))}
 
     def _log_level(self, request: dict[str, Any]) -> dict[str, Any]:
         level = request.get("level")
         if level is not None:
             if level not in LEVELS:
                 raise _RequestError(f"level must be one of {', '.join(LEVELS)} (got {level!r})")
-            self._node.set_log_level(level)
+            set_log_level(self._node.node_name, level)
         return {"level": logging.getLevelName(self._node.log.getEffectiveLevel()).lower()}
 
     def _status(self, request: dict[str, Any]) -> dict[str, Any]:
-        what, busy_s = self._node.activity()
+        what, busy_s = self._node.callbacks.activity()
         return {"pid": os.getpid(), "threads": threading.active_count(), "busy": what, "busy_s": round(busy_s, 3)}
 
     def _call(self, request: dict[str, Any]) -> dict[str, Any]:
         name, arguments = str(request.get("command")), request.get("arguments", {})
         command = self._node.commands.get(name)
-        if command is None and self._node.starting:
+        if command is None and self._node.run_state == "STARTING":
             raise NodeBusyError(f"{self._node.node_name} is still starting; try again")
         if command is None:
             known = ", ".join(self._node.commands) or "none"
@@ -216,7 +217,7 @@ class ControlServer:
                         f"{self._node.node_name} has started the change but not finished it within {_CHANGE_S:g} s; "
                         "it may still take effect: look before you repeat it"
                     ) from None
-            what, busy_s = self._node.activity()
+            what, busy_s = self._node.callbacks.activity()
             doing = f"{what} has been running for {busy_s:.1f} s" if what else "its loop is not running"
             raise NodeBusyError(f"{self._node.node_name} is busy ({doing}); nothing was changed") from None
 

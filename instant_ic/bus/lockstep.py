@@ -186,7 +186,7 @@ class LockstepBus(Closing):
     def advance_to(self, now_ns: int) -> None:
         """Advance the clock, firing every timer at its own time; a time in the past changes nothing."""
         while True:
-            due = [t for node in self.nodes if (t := node.next_timer_ns()) is not None]
+            due = [t for node in self.nodes if (t := node.timers.next_ns()) is not None]
             if not due or min(due) > now_ns:
                 break
             self.clock.set(max(min(due), self.clock.now_ns()))
@@ -276,8 +276,13 @@ class LockstepBus(Closing):
             ran = False
             for node in list(self.nodes):
                 # Check first: most nodes have nothing to do most of the time, and polling all queues is slow.
-                if (self._transports[node].waiting or node.due()) and node.spin_once():
+                if (self._transports[node].waiting or self._due(node)) and node.spin_once():
                     ran = True
             if not ran:
                 return
         raise RuntimeError("the nodes answer each other without end at one time")
+
+    def _due(self, node: Node[Any]) -> bool:
+        """Return whether results of workers or timers are due."""
+        timer_ns = node.timers.next_ns()
+        return node.callbacks.waiting or (timer_ns is not None and timer_ns <= self.clock.steady_ns())

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from instant_ic.bus import registry
+from instant_ic.bus.callbacks import NodeError
 from instant_ic.bus.clock import Clock, ManualClock, SystemClock
 from instant_ic.bus.control import ControlServer
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.bus.node import Node, NodeError
+from instant_ic.bus.node import Node
 from instant_ic.config import params
 from instant_ic.msg import MessageError
 from instant_ic.util import pace, paths
@@ -86,7 +87,7 @@ def _stop_on_signals(node: Node[Any]) -> None:
         os.read(heard, 1)
         node.stop()
         time.sleep(_SETUP_ENDS_S)
-        if node.starting:  # in a compiler, or waiting for a device: no motor, bag or robot is in use yet
+        if node.run_state == "STARTING":  # in a compiler, or waiting for a device: no motor, bag or robot is in use yet
             leave(0)
 
     threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()

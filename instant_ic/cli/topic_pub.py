@@ -8,7 +8,7 @@ import sys
 import time
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, registry
-from instant_ic.bus.node import Publisher
+from instant_ic.bus.topics import Publisher
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.message_input import build, fields, parse
 from instant_ic.cli.messages import describe

@@ -58,8 +58,8 @@ class Observer(Node[_NoParameters]):
 
     def rest(self, timeout_s: float) -> None:
         """Sleep until a message or timer is due; for a program that calls :meth:`spin_once` itself."""
-        if self._timers:
-            timeout_s = min(timeout_s, (self._timers[0][0] - self.clock.steady_ns()) / 1e9)
+        if (timer_ns := self.timers.next_ns()) is not None:
+            timeout_s = min(timeout_s, (timer_ns - self.clock.steady_ns()) / 1e9)
         self._transport.wait(max(0.0, timeout_s))
         self._transport.clear()
 

@@ -235,7 +235,7 @@ class SimulatedStack:
             self._depth_hz = float(images_to.config.max_rate_hz)
         camera = make_node("theta_camera", None, self._words).config
         self._preview = camera.theta
-        self.nodes["console"].tf_broadcast_static("base_link", "camera", pose_matrix(*camera.camera_mount.pose))
+        self.nodes["console"].transforms.broadcast_static("base_link", "camera", pose_matrix(*camera.camera_mount.pose))
 
     def start_node(self, name: str) -> None:
         """Start a node, also in place of one that was taken off the bus."""

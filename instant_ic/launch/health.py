@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.bus import RELIABLE, SENSOR, registry
+from instant_ic.bus.diagnostics import ERROR, OK, WARN
 from instant_ic.bus.heartbeat import EVERY_NODES, TYPE, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.bus.node import ERROR, OK, WARN
 from instant_ic.launch.topics import nominal_rate
 from instant_ic.msg import MessageError, deserialize, header, message_type, serialize
 from instant_ic.util.paths import sign_in_file

@@ -54,7 +54,7 @@ class MeanNode(Node[MeanConfig]):
                 self.seen.append(f"{parent}->{child} {matrix[0, 3]:g}")
             except TransformError:
                 pass
-        self.tf_broadcast("map", "odom", np.eye(4), stamp_ns(message))
+        self.transforms.broadcast("map", "odom", np.eye(4), stamp_ns(message))
         self.worker.submit(message)
 
     def on_result(self, mean: float) -> None:
@@ -167,7 +167,7 @@ def test_frame_that_a_slam_broadcasts_in_anothers_place_is_still_fed(bag: Path, 
 
         def on_scan(self, message: LaserScan) -> None:
             if not self.seen:
-                self.tf_broadcast("odom", "base_link", shift(50.0), stamp_ns(message))
+                self.transforms.broadcast("odom", "base_link", shift(50.0), stamp_ns(message))
             super().on_scan(message)
 
     replay(bag, [ReplayNode("grid_slam", StandIn, MeanConfig())], tmp_path / "out")

@@ -567,7 +567,7 @@ def test_fault_a_robots_diagnostics_and_log_do_not_reach_the_station(hosts):
 def test_driver_is_handed_over_by_a_live_parameter(hosts):
     a, _ = pair(hosts)
     wait_for(lambda: a.node.link.driver == "station", "driver")
-    a.node.call_soon(a.node.set_parameters, {"driver": "tablet"})
+    a.node.call_soon(a.node.parameters.set, {"driver": "tablet"})
     wait_for(lambda: a.node.link.driver == "", "nobody drives until the tablet comes")
     hosts.host("tablet")
     hosts.bridge("tablet")

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic.bus import ERROR, OK, WARN
-from instant_ic.bus import node as node_module
+from instant_ic.bus import ERROR, OK, WARN, diagnostics
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import Node
@@ -25,7 +24,7 @@ class Driver(Node[DriverConfig]):
 @pytest.fixture
 def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     now = [100.0]
-    monkeypatch.setattr(node_module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(diagnostics.time, "monotonic", lambda: now[0])
     return now
 
 
@@ -47,13 +46,13 @@ def test_waiting_at_the_start_is_information_once_and_a_fault_when_it_lasts(
 ) -> None:
     driver.diagnose("camera", WARN, "connecting")
     driver.diagnose("camera", ERROR, "connection refused")
-    assert driver.level == ERROR  # diagnostics and heartbeat say what is
+    assert driver.diagnostics.worst[0] == ERROR  # diagnostics and heartbeat say what is
     now[0] += 14.0
-    driver._end_start_grace()
+    driver.diagnostics.end_start_grace()
     assert told(caplog) == [("INFO", "camera: connecting")]
     now[0] += 1.0
-    driver._end_start_grace()
-    driver._end_start_grace()
+    driver.diagnostics.end_start_grace()
+    driver.diagnostics.end_start_grace()
     assert told(caplog)[1:] == [("ERROR", "camera: connection refused")]
 
 
@@ -69,7 +68,7 @@ def test_what_becomes_well_in_time_is_never_a_fault(
     driver.diagnose("scan", WARN, "none has come yet")
     driver.diagnose("scan", OK, "fresh")
     now[0] += 60.0
-    driver._end_start_grace()
+    driver.diagnostics.end_start_grace()
     driver.diagnose("new", WARN, "late trouble")
     assert told(caplog) == [
         ("INFO", "scan: none has come yet"),

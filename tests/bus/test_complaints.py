@@ -164,10 +164,10 @@ def test_losses_stand_in_heartbeat_and_diagnostics_by_publisher(bus: Bus, monkey
     out.send(numbered(5))
     wait_for(lambda: subscription.raw.stats.count == 2)
     told: list = []
-    for publisher in (node._heartbeat, node._diagnostics):
+    for publisher in (node.node_report.heartbeat, node.node_report.diagnostics):
         monkeypatch.setattr(publisher, "publish", told.append)
-    node._beat()
-    node._publish_diagnostics()
+    node.node_report.beat()
+    node.node_report.publish_diagnostics()
     beat, diagnostics = told
     assert (beat.lost_topics, beat.lost_publishers, list(beat.lost_counts)) == (["/x"], ["sender"], [3])
     (entry,) = [status for status in diagnostics.status if status.name == "reader: input /x"]
@@ -389,8 +389,8 @@ def test_full_memory_is_told_in_diagnostics(bus: Bus, monkeypatch: pytest.Monkey
     out.publish_bytes(numbered(1, LARGE))
     wait_for(lambda: reader.numbers() == [1])
     told: list = []
-    monkeypatch.setattr(node._diagnostics, "publish", told.append)
-    node._publish_diagnostics()
+    monkeypatch.setattr(node.node_report.diagnostics, "publish", told.append)
+    node.node_report.publish_diagnostics()
     (entry,) = [status for status in told[0].status if status.name == "sender: output /x"]
     assert entry.message == (
         f"in the last 10 s 1 large messages without shared memory: no shared memory for {LARGE} bytes: "
@@ -557,7 +557,7 @@ def test_full_disk_under_the_run_directory_is_told(bus: Bus, monkeypatch: pytest
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(registry, "open_file", full)
+    monkeypatch.setattr(registry, "replacing", full)
     with pytest.raises(
         RegistryError, match=r"publisher of /x by node sender cannot be registered: .*No space left on device"
     ):

@@ -23,6 +23,7 @@ from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.control import ControlError, ControlServer, NodeBusyError, NodeControl
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.bus.node_report import set_log_level
 from instant_ic.config.params import yaml_value
 from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.msg import deserialize
@@ -120,7 +121,7 @@ def test_set_is_taken_on_the_nodes_thread_and_told(tuned):
     node.subscribe_received("/parameter_events", heard.append)
     node.on_registry_change = lambda: heard.append(node.describe()["params"]["inner"]["gain"])
     deadline = time.monotonic() + 20
-    while not node._parameter_events.subscriber_count and time.monotonic() < deadline:
+    while not node.node_report.parameter_events.subscriber_count and time.monotonic() < deadline:
         time.sleep(0.01)
     changed = client.set({"inner.gain": 1, "places": [4, 5, 6], "label": "a"})
     assert changed == {"inner.gain": 1.0, "places": [4.0, 5.0, 6.0]}  # label is as before
@@ -223,10 +224,10 @@ def test_log_level(tuned):
     heard = []
     node.subscribe_received("/rosout", lambda m: heard.append(deserialize(m.payload, m.type_name)))
     deadline = time.monotonic() + 20
-    while not node._rosout.subscriber_count and time.monotonic() < deadline:
+    while not node.node_report.rosout.subscriber_count and time.monotonic() < deadline:
         time.sleep(0.01)
     try:
-        node.set_log_level("info")
+        set_log_level(node.node_name, "info")
         node.log.debug("unheard")
         assert client.log_level() == "info" and client.log_level("debug") == "debug"
         node.log.debug("heard")
@@ -237,7 +238,7 @@ def test_log_level(tuned):
         with pytest.raises(ControlError, match="level must be one of debug, info, warning, error"):
             client.log_level("loud")
     finally:
-        node.set_log_level("notset")
+        set_log_level(node.node_name, "notset")
 
 
 def test_bad_log_line_ends_no_callback(tuned, capsys):
@@ -246,7 +247,7 @@ def test_bad_log_line_ends_no_callback(tuned, capsys):
     heard = []
     node.subscribe_received("/rosout", lambda m: heard.append(deserialize(m.payload, m.type_name).msg))
     deadline = time.monotonic() + 20
-    while not node._rosout.subscriber_count and time.monotonic() < deadline:
+    while not node.node_report.rosout.subscriber_count and time.monotonic() < deadline:
         time.sleep(0.01)
     (handler,) = [h for h in node.log.handlers if type(h).__name__ == "_RosoutHandler"]  # pytest's own would raise
     for text, arguments in (("%d", ("x",)), ("file \udc80", ())):
@@ -301,9 +302,9 @@ def test_rerun_logging_does_not_block_the_control_loop(tuned):
     reader = subprocess.Popen([sys.executable, "-c", code, str(client.run_dir)])
     try:
         deadline = time.monotonic() + 40
-        while not node._rosout.subscriber_count and time.monotonic() < deadline:
+        while not node.node_report.rosout.subscriber_count and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert node._rosout.subscriber_count == 1
+        assert node.node_report.rosout.subscriber_count == 1
         reader.send_signal(signal.SIGSTOP)
         done = threading.Event()
         (handler,) = [h for h in node.log.handlers if type(h).__name__ == "_RosoutHandler"]
@@ -412,5 +413,5 @@ def test_stopped_process_is_told(tmp_path_factory):
 def test_lockstep_node_takes_parameters_too():
     with LockstepBus() as bus:
         node = bus.add(Tuned)
-        assert node.set_parameters({"inner": {"gain": 0.25}}) == {"inner.gain": 0.25}
-        assert node.config.inner.gain == 0.25 and node.parameters()[4].value == 0.25
+        assert node.parameters.set({"inner": {"gain": 0.25}}) == {"inner.gain": 0.25}
+        assert node.config.inner.gain == 0.25 and node.parameters.infos()[4].value == 0.25

@@ -103,7 +103,7 @@ def test_an_exception_of_the_start_up_is_no_error_once_the_callback_has_worked_f
     assert node.diagnoses()[name][:2] == (ERROR, "ValueError: the first one")
     node.broken = False
     send()
-    assert node.level == ERROR  # it has worked only now
-    monkeypatch.setattr("instant_ic.bus.node.RECENT_S", 0.0)
+    assert node.diagnostics.worst[0] == ERROR  # it has worked only now
+    monkeypatch.setattr("instant_ic.bus.callbacks.RECENT_S", 0.0)
     send()
     assert node.diagnoses()[name] == (OK, "no exception in the last 0 s", {"faults": 1})

@@ -30,19 +30,19 @@ def bus():
 def test_arbiter(bus):
     node = bus.add(node_class("arbiter"))
     arbiter = node.arbiter
-    node.set_parameters({"switch.yaw_deg": 12.0, "prediction.latency_s": 0.3, "timeouts.scan": 0.4})
+    node.parameters.set({"switch.yaw_deg": 12.0, "prediction.latency_s": 0.3, "timeouts.scan": 0.4})
     assert node.arbiter is arbiter  # its mode and history stay
     assert arbiter.config.switch.yaw_deg == 12.0 and arbiter.config.timeouts.scan == 0.4
     assert arbiter.predictor.config.latency_s == 0.3
     with pytest.raises(ParameterError, match=r"footprint\.length_m takes effect at start"):
-        node.set_parameters({"footprint.length_m": 0.7})
+        node.parameters.set({"footprint.length_m": 0.7})
     with pytest.raises(ParameterError, match=r"timeouts\.scan must lie in 0.05..2 \(got 60\)"):
-        node.set_parameters({"timeouts.scan": 60})  # a watchdog is not switched off by a parameter
+        node.parameters.set({"timeouts.scan": 60})  # a watchdog is not switched off by a parameter
 
 
 def test_virtual_robot_is_slower_at_once(bus):
     node = bus.add(node_class("virtual_robot"))
-    node.set_parameters({"limits": {"max_linear_m_s": 0.1}, "state_timeout_s": 0.2})
+    node.parameters.set({"limits": {"max_linear_m_s": 0.1}, "state_timeout_s": 0.2})
     assert node.robot.limits.max_linear_m_s == 0.1 and node.state.max_age_s == 0.2
     node.robot.place(np.zeros(3), (5.0, 0.0))
     assert node.robot.velocity[0] == pytest.approx(0.1)
@@ -50,19 +50,19 @@ def test_virtual_robot_is_slower_at_once(bus):
 
 def test_navigator(bus):
     node = bus.add(node_class("navigator"))
-    node.set_parameters({"replan_period_s": 0.4, "follower.desired_linear_vel": 0.2})
+    node.parameters.set({"replan_period_s": 0.4, "follower.desired_linear_vel": 0.2})
     assert node.navigator.replan_period_s == 0.4 and node.navigator.follower.config.desired_linear_vel == 0.2
 
 
 def test_depth_scaler(bus):
     node = bus.add(node_class("depth_scaler"))
-    node.set_parameters({"scaler.min_points": 400, "keyframes.distance_m": 1.5})
+    node.parameters.set({"scaler.min_points": 400, "keyframes.distance_m": 1.5})
     assert node.chain.metric.source.config.scaler.min_points == 400 and node.chain.selector.config.distance_m == 1.5
 
 
 def test_grid_slam(bus):
     node = bus.add(node_class("grid_slam"))
-    node.set_parameters({"odom_wait_s": 0.3})
+    node.parameters.set({"odom_wait_s": 0.3})
     assert node.queue.config.odom_wait_s == 0.3
 
 
@@ -72,7 +72,7 @@ def test_mount_of_the_camera_is_told_anew(bus, tmp_path):
     cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((64, 128, 3), np.uint8))
     cls = node_class("theta_camera")
     node = bus.add(cls, cls.config_class()(source="files", url=str(tmp_path)))
-    node.set_parameters({"camera_mount.xyz": [0.1, 0.0, 1.3]})
+    node.parameters.set({"camera_mount.xyz": [0.1, 0.0, 1.3]})
     (transform,) = bus.last("/tf_static").transforms
     assert transform_matrix(transform)[:3, 3].tolist() == pytest.approx([0.1, 0.0, 1.3])
 
@@ -80,14 +80,14 @@ def test_mount_of_the_camera_is_told_anew(bus, tmp_path):
 def test_lidar_driver(bus):
     cls = node_class("vlp16_driver")
     node = bus.add(cls, cls.config_class()(source="topic"))
-    node.set_parameters({"silence_s": 0.5})
+    node.parameters.set({"silence_s": 0.5})
     bus.advance(1.2)
     assert "no /lidar/packets for" in node.diagnoses()["packets"][1]
 
 
 def test_console(bus):
     node = bus.add(node_class("console"))
-    node.set_parameters({"view.width": 640})
+    node.parameters.set({"view.width": 640})
     assert node.feed.requests.config.width == 640
 
 
@@ -98,7 +98,7 @@ def test_depth_estimator_takes_fewer_pictures(bus):
     for index in range(10):  # 10 Hz
         node.on_image(image_message(np.zeros((2, 2), np.float32), "32FC1", "camera", 10**9 + index * 10**8))
     assert len(seen) == 2  # 2 Hz: at 0 and at 0.5 s
-    node.set_parameters({"max_rate_hz": 5.0})
+    node.parameters.set({"max_rate_hz": 5.0})
     for index in range(10, 20):
         node.on_image(image_message(np.zeros((2, 2), np.float32), "32FC1", "camera", 10**9 + index * 10**8))
     assert len(seen) == 2 + 5

@@ -15,7 +15,8 @@ from local_bus import BYTES
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, RegistryError, local_subscription, registry
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.bus.node import Node, Publisher
+from instant_ic.bus.node import Node
+from instant_ic.bus.topics import Publisher
 from instant_ic.msg import String, deserialize, serialize
 
 TALKER = Path(__file__).with_name("talker_node.py")

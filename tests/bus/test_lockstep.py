@@ -63,8 +63,8 @@ def test_transforms_and_remaps():
         name = "broadcaster"
 
         def setup(self):
-            self.tf_broadcast_static("base_link", "camera", pose_matrix(z=1.2))
-            self.tf_broadcast("odom", "base_link", pose_matrix(x=1.0), 2 * S)
+            self.transforms.broadcast_static("base_link", "camera", pose_matrix(z=1.2))
+            self.transforms.broadcast("odom", "base_link", pose_matrix(x=1.0), 2 * S)
             self.publisher("/a", String).publish(String(data="x"))
 
     class Asker(Node[DoublerConfig]):

@@ -33,7 +33,7 @@ def test_fault_the_password_of_an_address_goes_to_registry_bag_diagnostics_and_l
     infos = {info.name: info.value for info in parameter_infos(StreamConfig, StreamConfig())}
     assert infos == {"url": SHOWN, "others": [SHOWN]}
     node.diagnose("stream", WARN, f"{URL}: no frames")
-    node.fault("stream reader", ValueError(f"{URL} is gone"))
+    node.callbacks.fault("stream reader", ValueError(f"{URL} is gone"))
     assert "secret" not in str(node.diagnoses()) and SHOWN in str(node.diagnoses())
     wait_for(lambda: node.publishers[0].subscriber_count)
     node.log.warning("cannot open %s", URL)

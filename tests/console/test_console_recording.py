@@ -121,7 +121,7 @@ def test_the_recorder_is_asked_over_its_control_channel(node, tmp_path, monkeypa
 
     class Recorder:
         def __init__(self):
-            self.node_name, self.starting = "operator_recorder", False
+            self.node_name, self.run_state = "operator_recorder", "RUNNING"
             self.commands = {"status": lambda: {"path": "/d"}, "stop": lambda: int("nothing is being recorded")}
 
         def call_soon(self, function):

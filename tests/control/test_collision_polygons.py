@@ -170,7 +170,7 @@ def test_every_command_of_every_mode_passes_the_monitor(mode: Mode) -> None:
     assert stack.bus.last("/ic/state").mode == mode
     limit = "collision_monitor.limit."
     changes = {limit + "enabled": True, limit + "padding_m": 1.0, limit + "linear_limit": 0.1}
-    stack.arbiter.set_parameters(changes)
+    stack.arbiter.parameters.set(changes)
     before = len(stack.bus.records("/cmd_vel"))
     stack.drive(0.5, KEY)
     speeds = [abs(twist_values(message)[0]) for message in stack.bus.messages("/cmd_vel")[before:]]

@@ -64,9 +64,9 @@ def test_parameters_that_cannot_be_used_change_nothing(monkeypatch: pytest.Monke
 
     with monkeypatch.context() as patched, pytest.raises(MemoryError):
         patched.setattr("instant_ic.control.arbiter.Predictor", too_large)
-        arbiter.set_parameters({"limits.max_linear_m_s": 0.4, "prediction.padding_m": 0.1})
+        arbiter.parameters.set({"limits.max_linear_m_s": 0.4, "prediction.padding_m": 0.1})
     assert arbiter.config is before and arbiter.arbiter.config is before
-    assert arbiter.set_parameters({"switch.min_real_s": 2.0}) == {"switch.min_real_s": 2.0}
+    assert arbiter.parameters.set({"switch.min_real_s": 2.0}) == {"switch.min_real_s": 2.0}
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
-from instant_ic.bus.node import Publisher
+from instant_ic.bus.topics import Publisher
 from instant_ic.cli.main import main
 from instant_ic.cli.observer import TopicObserver
 from instant_ic.geometry.poses import pose_matrix

@@ -149,16 +149,16 @@ def test_protection_that_is_off_warns_as_long_as_it_is_off() -> None:
             bus.advance(60.0)
             level, text = state_of(arbiter, "protection")
             assert level == WARN and "Protection is off (collision_monitor.stop)" in text
-        arbiter.set_parameters({"collision_monitor.stop.enabled": True})
+        arbiter.parameters.set({"collision_monitor.stop.enabled": True})
         assert state_of(arbiter, "protection")[0] == OK
-        arbiter.set_parameters({"collision_monitor.stop.enabled": False})
+        arbiter.parameters.set({"collision_monitor.stop.enabled": False})
         assert state_of(arbiter, "protection")[0] == WARN
     with LockstepBus() as bus:
         arbiter = bus.add(node_class("arbiter"), ArbiterConfig())
         with pytest.raises(ParameterError, match="protection is off"):
-            arbiter.set_parameters({"collision_monitor.stop.enabled": False})
+            arbiter.parameters.set({"collision_monitor.stop.enabled": False})
         with pytest.raises(ParameterError, match=r"did you mean 0.3\?"):
-            arbiter.set_parameters({"timeouts.scan": 300})
+            arbiter.parameters.set({"timeouts.scan": 300})
 
 
 def test_a_base_that_obeys_anybody_warns_and_needs_a_word() -> None:

@@ -24,7 +24,7 @@ def test_described_defaults_of_the_collision_monitor_are_those_that_hold():
 
 def test_a_running_arbiter_describes_the_defaults_and_values_that_hold():
     node = LockstepBus().add(ArbiterNode)
-    described = {info.name: info for info in node.parameters()}
+    described = {info.name: info for info in node.parameters.infos()}
     assert {key: described[key].default for key in EXPECTED} == EXPECTED
     assert {key: described[key].value for key in EXPECTED} == EXPECTED
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from instant_ic.bus import RELIABLE
-from instant_ic.bus.node import Publisher
+from instant_ic.bus.topics import Publisher
 from instant_ic.cli.main import main
 from instant_ic.cli.observer import TopicObserver
 from instant_ic.msg import String, deserialize, type_name

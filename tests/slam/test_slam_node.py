@@ -116,7 +116,7 @@ def test_pose_map_and_transform_of_a_drive_on_slipping_tracks() -> None:
     assert resolution == pytest.approx(0.05)
     assert {int(v) for v in np.unique(grid)} <= set(range(-1, 101))
     assert (grid > 65).sum() > 200 and (grid == -1).sum() > 1000
-    assert rig.node.level == OK
+    assert rig.node.diagnostics.worst[0] == OK
 
 
 def test_the_map_is_not_sent_again_while_nothing_changes() -> None:
@@ -138,7 +138,7 @@ def test_without_wheels_the_node_completes_the_transforms() -> None:
             buffer.set(parent, child, stamp, matrix_from_pose2(pose))
     found = pose2_from_matrix(buffer.lookup("map", "base_link", rig.now_ns))
     assert np.hypot(*relative2(rig.true, found)[:2]) < 0.02
-    assert rig.node.level == OK
+    assert rig.node.diagnostics.worst[0] == OK
 
 
 def test_no_wheel_odometry_at_all_is_told_and_bridged() -> None:

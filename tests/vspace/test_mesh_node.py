@@ -104,11 +104,11 @@ def test_a_keyframe_fits_the_colours_and_tells_a_wrong_place(cube):
         status = bus.last("/vspace/status")
         assert status.keyframe_id == 5
         assert status.expected_psnr_db > 25
-        assert "device" not in bus.node._diagnoses
+        assert "device" not in bus.node.diagnoses()
         bus.publish("/keyframe", keyframe(depth_factor=2.0))
         bus.advance(1.0)
         assert "mesh_pose" in bus.node.schedule.status.warning
-        assert bus.node._diagnoses["device"][0] == 1
+        assert bus.node.diagnoses()["device"][0] == 1
 
 
 def test_a_mesh_that_is_not_there_is_told(tmp_path):

@@ -67,7 +67,7 @@ def bus():
 
 
 def diagnosis(bus, name):
-    return bus.node._diagnoses[name]
+    return bus.node.diagnoses()[name]
 
 
 def test_empty_until_a_keyframe_comes(bus):

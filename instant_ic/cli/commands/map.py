@@ -43,7 +43,7 @@ def add_parser(subparsers: Any) -> None:
 
 def save_map(args: argparse.Namespace) -> int:
     from instant_ic.bus import RELIABLE
-    from instant_ic.bus.node import Publisher
+    from instant_ic.bus.topics import Publisher
     from instant_ic.cli.observer import TopicObserver
     from instant_ic.msg import deserialize, message_type, type_name
 

@@ -1,0 +1,76 @@
+"""The diagnoses of a node, and when a change of one is logged."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import Any
+
+from instant_ic.util.safe_text import masked
+
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
+"""Levels of a diagnosis, as in diagnostic_msgs/DiagnosticStatus."""
+
+_START_GRACE_S = 15.0  # how long after its start a node may wait for others without a warning in the log
+
+
+class Diagnostics:
+    """Named states of one node.
+
+    Args:
+        log: the node's log.
+        lockstep: log each diagnosis at its own level from the start; nothing else is starting.
+    """
+
+    def __init__(self, log: logging.Logger, lockstep: bool) -> None:
+        self.present: dict[str, tuple[int, str, dict[str, Any]]] = {}
+        """Level, text and values by name."""
+        self._log = log
+        self._calm_until_s = 0.0 if lockstep else time.monotonic() + _START_GRACE_S
+        self._well: set[str] = set()  # diagnoses that have been OK before
+        self._waiting: set[str] = set()  # diagnoses never OK so far, logged as information only
+
+    @property
+    def worst(self) -> tuple[int, str, dict[str, Any]]:
+        """The diagnosis of the highest level."""
+        return max(self.present.values(), default=(OK, "", {}), key=lambda diagnosis: diagnosis[0])
+
+    def set(self, name: str, level: int, text: str, **values: Any) -> None:
+        """Set a named diagnosis and log it when its level changes."""
+        before = self.present.get(name)
+        text = masked(text)
+        self.present[name] = (level, text, values)
+        if level >= WARN and (before is None or before[0] != level):
+            self._log_problem(name, level, text)
+        elif level == OK:
+            self._well.add(name)
+            self._waiting.discard(name)
+            if before is not None and before[0] >= WARN:
+                self._log.info("%s: %s", name, text or "fine again")
+
+    def fault(self, name: str, error: Exception, count: int) -> None:
+        """Log an exception with its traceback and set it as a diagnosis.
+
+        Args:
+            name: name of the diagnosis.
+            error: the exception.
+            count: exceptions of the node so far.
+        """
+        self._log.error("%s: %s: %s", name, type(error).__name__, error, exc_info=error)
+        self.present[name] = (ERROR, masked(f"{type(error).__name__}: {error}"), {"faults": count})
+
+    def end_start_grace(self) -> None:
+        """Log what is still wrong at the end of the start-up grace period, at its own level."""
+        for name in sorted(self._waiting) if time.monotonic() >= self._calm_until_s else ():
+            self._waiting.discard(name)
+            level, text, _ = self.present[name]
+            self._log_problem(name, level, text)
+
+    def _log_problem(self, name: str, level: int, text: str) -> None:
+        """Log a diagnosis; one that was never OK is logged once, as information, while other nodes still start."""
+        if name not in self._well and time.monotonic() < self._calm_until_s:
+            if name not in self._waiting:
+                self._waiting.add(name)
+                self._log.info("%s: %s", name, text)
+            return
+        self._log.log(logging.WARNING if level == WARN else logging.ERROR, "%s: %s", name, text)
