@@ -36,9 +36,9 @@ def topics(source: str) -> dict[str, dict[str, str]]:
                 if name == "subscribe_received":  # raw bytes, passed on or decoded by the callback
                     kind = next((k.value for k in call.keywords if k.arg == "message_class"), ast.Name("bytes"))
                 found[CALLS[name]][topic] = re.sub(r"^msg\.|^message_type\('(\w+)'\)$", r"\1", ast.unparse(kind))
-        elif name == "tf_broadcast":
+        elif name == "broadcast":
             found["gives"]["/tf"] = "TFMessage"
-        elif name == "tf_broadcast_static":
+        elif name == "broadcast_static":
             found["gives"]["/tf_static"] = "TFMessage"
     if re.search(r"self\.tf\b", source):
         found["takes"].setdefault("/tf", "TFMessage")
