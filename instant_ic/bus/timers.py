@@ -51,7 +51,7 @@ class Timers:
             yield timer
 
     def restart(self, now_ns: int) -> None:
-        """Begin every period anew."""
+        """Start every period again from now."""
         timers = [timer for _, _, timer in sorted(self._heap, key=lambda entry: entry[1])]
         self._heap.clear()
         for timer in timers:
