@@ -29,7 +29,6 @@ from instant_ic.experiments.stack import free_port
 
 PEER = Path(__file__).with_name("bus_peer.py")
 SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_500_000}
-LABELS = {"b100": "100 B", "k20": "20 kB", "k200": "200 kB", "m1": "1.2 MB", "m5": "5.5 MB"}
 PERIOD_S = {"b100": 0.01, "k20": 0.01, "k200": 0.02, "m1": 0.035, "m5": 0.07}
 FANOUT = 4
 QUIET_S = 0.5  # no more messages are expected after this time without one
@@ -231,35 +230,12 @@ def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
     return cells
 
 
-def table(result: dict[str, Any]) -> str:
-    """Format the figures as Markdown."""
-    lines = ["| p50 / p99 in µs | " + " | ".join(LABELS.values()) + " | 5.5 MB to four |", "|---" * 7 + "|"]
-    for transport, name in NAMES.items():
-        if transport not in result["latency"]:
-            if transport in result["not_measured"]:
-                lines.append(f"| {name} | " + " | ".join(["not measured"] * 6) + " |")
-            continue
-        cells = [result["latency"][transport][t] for t in SIZES] + [result["fanout"].get(transport, {})]
-        words = [f"{c['p50_us']:.0f} / {c['p99_us']:.0f}" if c.get("p50_us") else "not measured" for c in cells]
-        lines.append(f"| {name} | " + " | ".join(words) + " |")
-    lines += ["", "| Flat out, MB/s (share delivered) | " + " | ".join(LABELS.values()) + " |", "|---" * 6 + "|"]
-    for transport, cells in result["throughput"].items():
-        words = [f"{c['mb_per_s']:.0f} ({c['delivered']:.0%})" for c in cells.values()]
-        lines.append(f"| {NAMES[transport]} | " + " | ".join(words) + " |")
-    return "\n".join(lines)
-
-
 def main() -> int:
     parser = parser_for(__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer messages")
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        choices=list(NAMES),
-        default=list(NAMES),
-        metavar="TRANSPORT",
-        help=", ".join(NAMES),
-    )
+    everything = list(NAMES)
+    text = "; ".join(f"{key}: {name}" for key, name in NAMES.items())
+    parser.add_argument("--only", nargs="+", choices=everything, default=everything, metavar="TRANSPORT", help=text)
     args = parser.parse_args()
     rounds, count, flood_s = (2, 40, 0.5) if args.quick else (6, 100, 2.0)
     result = {
@@ -269,7 +245,6 @@ def main() -> int:
         "load_after": os.getloadavg()[0],
     }
     report(result, args.json)
-    print(table(result), file=sys.stderr)
     return 0
 
 

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+
 from instant_ic.experiments.stack import processes_of
 
 _LOOPS = 100_000
@@ -64,9 +66,7 @@ class Usage:
 
 
 def usage(run_dir: Path) -> Usage:
-    """The usage of all processes that were started with this run directory."""
-    import psutil
-
+    """Return the usage of all processes that were started with this run directory."""
     cpu_s: dict[str, float] = {}
     rss_mb: dict[str, float] = {}
     now = time.monotonic()
@@ -84,9 +84,12 @@ def usage(run_dir: Path) -> Usage:
 
 
 def cpu_percent(before: Usage, after: Usage, stack_s: float) -> dict[str, float]:
-    """CPU of each process between two samples, ``stack_s`` of the stack's time apart, in percent of one core.
+    """Return the CPU of each process between two samples, in percent of one core at the stack's pace.
 
-    The core is of a machine that runs at the stack's pace.
+    Args:
+        before: first sample.
+        after: second sample.
+        stack_s: the stack's time between them, in seconds.
     """
     return {
         name: round(100.0 * (seconds - before.cpu_s.get(name, 0.0)) / stack_s, 1)

@@ -1,4 +1,5 @@
-"""Compares the expected PSNR of the virtual space with the one on the operator's page; prints JSON.
+#!/usr/bin/env python3
+"""The expected PSNR of the virtual space against the one on the operator's page; prints JSON.
 
     python benchmarks/readiness.py [--world W[,W]] [--seed S] [--episodes N] [--fit] [--plot OUT.png]
 
@@ -32,7 +33,7 @@ COLUMNS = 64
 
 
 class _JudgedStack(FilmedStack):
-    """Keeps the terms of each live view."""
+    """A filmed stack that keeps the terms of each live view."""
 
     terms: tuple[float, float] = (0.0, 0.0)
 
@@ -50,7 +51,7 @@ class _JudgedStack(FilmedStack):
 
 
 def samples(world: str, seed: int, episodes: int) -> list[dict[str, Any]]:
-    """Terms, expected and measured PSNR of the frames of a world that show the view alone."""
+    """Return terms, expected and measured PSNR of the frames of a world that show the view alone."""
     settings, rows = TeleopSettings(episodes, seed, world, ("ic",), pictures=False), []
     stacks: list[_JudgedStack] = []
 
@@ -71,7 +72,7 @@ def samples(world: str, seed: int, episodes: int) -> list[dict[str, Any]]:
 
 
 def fit(rows: list[dict[str, Any]]) -> list[float]:
-    """Base and non-negative gains with the least relative error of the squared error; unbiased in dB."""
+    """Return base and non-negative gains with the least relative error of the squared error, unbiased in dB."""
     from scipy.optimize import nnls
 
     mse = np.array([10 ** (-row["psnr_db"] / 10) for row in rows])

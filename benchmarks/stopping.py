@@ -394,13 +394,13 @@ def second_console_fault() -> Fault:
     return Fault("second console idle, the driver's frozen", frozen.breaks, mend, open_page)
 
 
-def attribute_fault(name: str, part: str, attribute: str, broken: Any, whole: Any) -> Fault:
-    """Return the fault of a relay that ``attribute`` switches on and off."""
-    return Fault(
-        name,
-        lambda rig, page: setattr(getattr(rig, part), attribute, broken),
-        lambda rig, page: setattr(getattr(rig, part), attribute, whole),
-    )
+def relay_fault(name: str, relay: str, attribute: str, broken: Any, whole: Any) -> Fault:
+    """Return the fault of a relay whose ``attribute`` is ``broken``, and ``whole`` after it."""
+
+    def put(value: Any) -> Act:
+        return lambda rig, page: setattr(getattr(rig, relay), attribute, value)
+
+    return Fault(name, put(broken), put(whole))
 
 
 async def release_estop(rig: Rig, page: ConsoleClient) -> None:
@@ -445,10 +445,10 @@ FAULTS = [
     Fault("page silent", silence_page),
     Fault("page link cut", lambda rig, page: rig.page_link.cut(), lambda rig, page: rig.page_link.mend()),
     Fault("camera link cut", lambda rig, page: rig.camera_link.cut(), lambda rig, page: rig.camera_link.mend()),
-    attribute_fault("LiDAR packets cease", "packets", "cut", True, False),
-    attribute_fault("LiDAR repeats a revolution", "packets", "repeats", "copies", ""),
-    attribute_fault("contradiction (tracks turn, LiDAR sees no motion)", "packets", "repeats", "noise", ""),
-    attribute_fault("serial replies lost", "serial", "mute", True, False),
+    relay_fault("LiDAR packets cease", "packets", "cut", True, False),
+    relay_fault("LiDAR repeats a revolution", "packets", "repeats", "copies", ""),
+    relay_fault("contradiction (tracks turn, LiDAR sees no motion)", "packets", "repeats", "noise", ""),
+    relay_fault("serial replies lost", "serial", "mute", True, False),
     Fault("serial cable pulled", lambda rig, page: rig.serial.pull(), lambda rig, page: rig.serial.plug()),
 ]
 
