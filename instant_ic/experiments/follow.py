@@ -37,6 +37,7 @@ from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import follow_worlds as worlds
+from instant_ic.experiments.plots import new_figure, save_figure
 from instant_ic.experiments.processes import run_all
 from instant_ic.experiments.results import finite
 from instant_ic.geometry.poses import matrix_from_pose2, relative2, wrap_angle
@@ -106,7 +107,7 @@ class _TimedPlanner(HybridPlanner):
         return plan
 
 
-class _Drive:
+class FollowDrive:
     """One running episode."""
 
     def __init__(self, seed: int, index: int) -> None:
@@ -164,7 +165,7 @@ class _Drive:
         turning, before = 0.0, self.robot.pose.copy()
         for k in range(round(limit_s / DT_S)):
             episode.seconds = k * DT_S
-            self._step(k)
+            self.step(k)
             pose = self.robot.pose
             episode.driven_m += float(np.linalg.norm(pose[:2] - before[:2]))
             before = pose.copy()
@@ -193,7 +194,7 @@ class _Drive:
         gap = self.vbot.pose - self.robot.pose
         return float(np.hypot(gap[0], gap[1])) <= REACHED_M and abs(wrap_angle(float(gap[2]))) <= REACHED_RAD
 
-    def _step(self, k: int) -> None:
+    def step(self, k: int) -> None:
         """Advance by a twentieth of a second: people, sensors, the nodes in their order, and the robot."""
         for person in self.people:
             worlds.walk(self.room, person, self.robot.pose, DT_S, self.rng)
@@ -223,7 +224,7 @@ class _Drive:
             self.plan_reason = "no free place near the v-bot"
         self.nav = wanted
         velocity = (float(self.robot.twist[0]), float(self.robot.twist[2]))
-        self._move(
+        self.move(
             self.monitor.limit(
                 wanted, self._close_points(estimate), velocity=velocity, moving=self._moving_points(estimate, k * DT_S)
             )
@@ -277,7 +278,7 @@ class _Drive:
         turn, found = np.array([[c, -s], [s, c]]), self.moving.moving(time_s)
         return MovingPoints((found.points - estimate[:2]) @ turn, found.velocities @ turn)
 
-    def _move(self, command: MonitoredCommand) -> None:
+    def move(self, command: MonitoredCommand) -> None:
         self.late.append(command)
         asked = self.late.popleft()
         limits = MotionLimits()
@@ -313,15 +314,15 @@ class _Drive:
 
 def run_episode(seed: int, index: int) -> Episode:
     """Run one drive; the same seed and index give the same result, except for times."""
-    return _Drive(seed, index).run()
+    return FollowDrive(seed, index).run()
 
 
 def prepare() -> None:
     """Compile the kernels, so that no episode includes the compile time."""
     warm_up()
-    drive = _Drive(0, 0)
+    drive = FollowDrive(0, 0)
     for k in range(8):
-        drive._step(k)
+        drive.step(k)
 
 
 def evaluate(
@@ -346,10 +347,8 @@ def summary(episodes: list[Episode]) -> dict[str, Any]:
     reachable = [e for e in episodes if e.reachable]
     reached = [e for e in reachable if e.reached]
     ratios = np.array([e.ratio for e in reached])
-    still = np.array([e.ratio for e in reached if not e.people])
     slowness = np.array([e.seconds * OPERATOR_M_S / e.optimum_m for e in reached])
     metres = sum(e.driven_m for e in episodes)
-    seconds = sum(e.seconds for e in episodes)
     changes = sum(e.yaw_rate_changes for e in episodes)
     contacts = sum(e.contacts + e.people_contacts for e in episodes)
     share = len(reached) / len(reachable) if reachable else math.nan
@@ -364,22 +363,16 @@ def summary(episodes: list[Episode]) -> dict[str, Any]:
         "contacts_with_people": sum(e.people_contacts for e in episodes),
         "people_walked_into_robot": sum(e.people_into_robot for e in episodes),
         "clearance_min_m": min(e.clearance_m for e in episodes),
-        "path_ratio_mean": _of(np.mean, ratios),
-        "path_ratio_median": _of(np.median, ratios),
-        "path_ratio_p95": _of(lambda r: np.percentile(r, 95), ratios),
-        "path_ratio_max": _of(np.max, ratios),
-        "path_ratio_mean_without_people": _of(np.mean, still),
-        "time_ratio_max": _of(np.max, slowness),
+        "path_ratio_mean": _reduced(np.mean, ratios),
+        "path_ratio_max": _reduced(np.max, ratios),
+        "time_ratio_max": _reduced(np.max, slowness),
         "yaw_rate_changes_per_m": changes / max(metres, 1e-9),
-        "yaw_rate_changes_per_s": changes / max(seconds, 1e-9),
         "metres": metres,
-        "simulated_s": seconds,
     }
     for name in ("planner", "controller", "costmap"):
         spent = np.concatenate([np.array(getattr(e, f"{name}_ms")) for e in episodes])
-        figures[f"{name}_ms_p50"] = _of(np.median, spent)
-        figures[f"{name}_ms_p99"] = _of(lambda r: np.percentile(r, 99), spent)
-        figures[f"{name}_ms_max"] = _of(np.max, spent)
+        figures[f"{name}_ms_p50"] = _reduced(np.median, spent)
+        figures[f"{name}_ms_p99"] = _reduced(lambda r: np.percentile(r, 99), spent)
     figures["targets"] = {
         "contacts == 0": contacts == 0,
         "reached_share >= 0.97": bool(share >= 0.97),
@@ -392,7 +385,7 @@ def summary(episodes: list[Episode]) -> dict[str, Any]:
     return figures
 
 
-def _of(measure: Callable[[FloatArray], Any], values: FloatArray) -> float:
+def _reduced(measure: Callable[[FloatArray], Any], values: FloatArray) -> float:
     return float(measure(values)) if len(values) else math.nan
 
 
@@ -403,7 +396,6 @@ def report(episodes: list[Episode], seed: int) -> dict[str, Any]:
     for episode in episodes:
         row = {key: value for key, value in asdict(episode).items() if key not in left_out}
         row["path_ratio"] = episode.ratio if episode.reached and episode.reachable else None
-        row["planner_ms_max"] = max(episode.planner_ms, default=None)
         rows.append(row)
     figures: dict[str, Any] = finite({"seed": seed, **summary(episodes), "each": rows})
     return figures
@@ -411,9 +403,6 @@ def report(episodes: list[Episode], seed: int) -> dict[str, Any]:
 
 def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None:
     """Write a PNG overview of episodes, the worst first: contacts, goals not reached, long paths."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Circle, Rectangle
 
     def badness(e: Episode) -> tuple[float, ...]:
         missed = e.reachable and not e.reached
@@ -422,41 +411,36 @@ def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None
     shown = sorted(episodes, key=badness, reverse=True)[:most]
     columns = min(4, len(shown))
     rows = math.ceil(len(shown) / columns)
-    figure = Figure(figsize=(4.4 * columns, 4.0 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    colours = {0: "0.25", 1: "0.55", 2: "tab:olive", 3: "tab:purple"}
-    for n, episode in enumerate(shown):
-        axes = figure.add_subplot(rows, columns, n + 1)
-        drive = _Drive(seed, episode.index)
-        for shape, kind in zip(drive.room.shapes, drive.room.kinds, strict=True):
-            cx, cy, half_x, half_y, yaw = shape[:5]
-            corner, size = (cx - half_x, cy - half_y), (2 * half_x, 2 * half_y)
-            box = Rectangle(corner, *size, angle=math.degrees(yaw), rotation_point="center", lw=0)
-            box.set_color(colours[int(kind)])
-            axes.add_patch(box)
-        if drive.optimum is not None:
-            axes.plot(*drive.optimum[:, :2].T, "k--", lw=0.8)
-        for name, track in episode.tracks.items():
-            line = np.array(track)
-            if len(line) == 0:
-                continue
-            style = {"robot": ("tab:red", 1.6), "vbot": ("tab:blue", 1.0)}.get(name, ("tab:green", 0.6))
-            axes.plot(line[:, 0], line[:, 1], color=style[0], lw=style[1])
-            if name.startswith("person"):
-                axes.add_patch(Circle(tuple(line[-1, :2]), worlds.PERSON_M, color="tab:green", alpha=0.5))
-        end = np.array(episode.tracks["robot"][-1])
-        for pose, colour in ((drive.room.start, "tab:orange"), (end, "tab:red")):
-            corners = Footprint().corners() @ matrix_from_pose2(pose)[:2, :2].T + pose[:2]
-            axes.plot(*np.concatenate([corners, corners[:1]]).T, color=colour, lw=1.0)
-        axes.plot(*drive.room.goal, "k*", ms=8)
-        verdict = "reached" if episode.reached else ("not reached" if episode.reachable else "unreachable")
-        ratio = f", {episode.ratio:.2f} × optimum" if episode.reachable and episode.reached else ""
-        touched = f", {episode.contacts + episode.people_contacts} contacts"
-        axes.set_title(f"{episode.index}: {verdict}{ratio}{touched}, {episode.seconds:.0f} s", fontsize=8)
-        width, height = drive.room.size
-        axes.set(aspect="equal", xlim=(-0.3, width + 0.3), ylim=(-0.3, height + 0.3))
-        axes.tick_params(labelsize=6)
+    figure, grid = new_figure(rows, columns, (4.4 * columns, 4.0 * rows))
+    for axes, episode in zip(grid.flat, shown, strict=False):
+        _plot_episode(axes, episode, FollowDrive(seed, episode.index))
+    for axes in grid.flat[len(shown) :]:
+        axes.set_axis_off()
     figure.suptitle(
         "red: robot, blue: v-bot, dashed: shortest way; olive: low things, purple: hanging, green: people", fontsize=9
     )
-    figure.savefig(path, dpi=80)
+    save_figure(figure, path)
+
+
+def _plot_episode(axes: Any, episode: Episode, drive: FollowDrive) -> None:
+    from matplotlib.patches import Rectangle
+
+    for shape, kind in zip(drive.room.shapes, drive.room.kinds, strict=True):
+        cx, cy, half_x, half_y, yaw = shape[:5]
+        corner, size = (cx - half_x, cy - half_y), (2 * half_x, 2 * half_y)
+        colour = ("0.25", "0.55", "tab:olive", "tab:purple")[int(kind)]
+        axes.add_patch(Rectangle(corner, *size, angle=math.degrees(yaw), rotation_point="center", lw=0, color=colour))
+    if drive.optimum is not None:
+        axes.plot(*drive.optimum[:, :2].T, "k--", lw=0.8)
+    for name, track in episode.tracks.items():
+        colour, width = {"robot": ("tab:red", 1.6), "vbot": ("tab:blue", 1.0)}.get(name, ("tab:green", 0.6))
+        axes.plot(*np.array(track).reshape(len(track), -1)[:, :2].T, color=colour, lw=width)
+    axes.plot(*drive.room.start[:2], "o", color="tab:orange", ms=6)
+    axes.plot(*drive.room.goal, "k*", ms=8)
+    verdict = "reached" if episode.reached else ("not reached" if episode.reachable else "unreachable")
+    ratio = f", {episode.ratio:.2f} × optimum" if episode.reachable and episode.reached else ""
+    touched = f", {episode.contacts + episode.people_contacts} contacts"
+    axes.set_title(f"{episode.index}: {verdict}{ratio}{touched}, {episode.seconds:.0f} s", fontsize=8)
+    width, height = drive.room.size
+    axes.set(aspect="equal", xlim=(-0.3, width + 0.3), ylim=(-0.3, height + 0.3))
+    axes.tick_params(labelsize=6)

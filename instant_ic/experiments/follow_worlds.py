@@ -122,7 +122,7 @@ def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> R
         # no beam reaches them, so no planner could avoid them.
         clear = np.array(
             [
-                k == 0 or (_away(s, start[:2]) > max(0.6, _blind_m(s, KINDS[k])) and _away(s, goal) > 0.6)
+                k == 0 or (_away(s, start[:2]) > max(0.6, blind_distance_m(s, KINDS[k])) and _away(s, goal) > 0.6)
                 for s, k in zip(every, kinds, strict=True)
             ]
         )
@@ -170,7 +170,7 @@ def _thing(rng: np.random.Generator, size: FloatArray, kind: int) -> Sequence[fl
     return (x, y, half_x, half_y, rng.uniform(-math.pi, math.pi), low, high)
 
 
-def _blind_m(shape: Sequence[float] | FloatArray, kind: str) -> float:
+def blind_distance_m(shape: Sequence[float] | FloatArray, kind: str) -> float:
     """Distance within which a standing VLP-16 may not hit a low or a hanging object, metres; 0 for others."""
     if kind == "hanging":
         return (float(shape[5]) - LIDAR_HEIGHT_M) / STEEPEST

@@ -14,9 +14,10 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.experiments.plots import (
@@ -28,10 +29,29 @@ from instant_ic.experiments.plots import (
 )
 from instant_ic.experiments.stack import Stack, StackError, free_ports
 from instant_ic.geometry.image_quality import psnr_db
-from instant_ic.geometry.poses import inverse, pose_matrix, yaw_of
-from instant_ic.msg import grid_array, image_array, matrix_from_pose, message_type, pose_message, stamp_ns, to_time
+from instant_ic.geometry.poses import pose_matrix, yaw_of
+from instant_ic.msg import (
+    DiagnosticArray,
+    Keyframe,
+    LaserScan,
+    PoseWithCovarianceStamped,
+    RenderedView,
+    ViewRequest,
+    VspaceStatus,
+    grid_array,
+    header,
+    image_array,
+    matrix_from_pose,
+    pose_message,
+    stamp_ns,
+)
+from instant_ic.msg import OccupancyGrid as OccupancyGridMessage
 from instant_ic.slam.occupancy import OccupancyGrid
 from instant_ic.util.pace import read as read_pace
+from instant_ic.vspace.jobs import decode_panorama
+
+FloatArray: TypeAlias = NDArray[np.float64]
+T = TypeVar("T")
 
 _YAWS_DEG = (0, 90, 180, -90)
 _AHEAD_M = 0.4
@@ -44,7 +64,7 @@ def evaluate_recordings(
     panorama: Path,
     out: Path,
     timeout_s: float = 240.0,
-    tell: Callable[[str], None] = lambda text: None,
+    report: Callable[[str], None] = lambda text: None,
     same_place: bool = False,
     pace: float = 1.0,
 ) -> dict[str, Any]:
@@ -54,10 +74,13 @@ def evaluate_recordings(
     ``launch.log`` and ``summary.json``, whose content is returned.
 
     Args:
+        pcap: capture of VLP-16 data packets.
+        panorama: equirectangular photo.
+        out: output folder.
         timeout_s: total time limit, in seconds of the stack.
-        tell: called with a description of each wait.
+        report: called with a description of each wait.
         same_place: photo and capture are from the same place and time: the LiDAR scales the depth, as on the robot.
-        pace: of the stack's time, see :mod:`instant_ic.util.pace`.
+        pace: pace of the stack's time, see :mod:`instant_ic.util.pace`.
 
     Raises:
         FileNotFoundError: a recording is missing.
@@ -82,8 +105,8 @@ def evaluate_recordings(
     }
     try:
         with Stack("sim.yaml", run_dir, arguments, out / "launch.log", pace=pace) as stack:
-            summary = _watch(stack, out, timeout_s, tell)
-            tell("stopping the stack")
+            summary = _results(_Run(stack, timeout_s, report), out)
+            report("stopping the stack")
             status = stack.stop()
         if status != 0:
             raise StackError(f"the stack ended with status {status}; see {out}/launch.log")
@@ -94,120 +117,135 @@ def evaluate_recordings(
     return summary
 
 
-def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None]) -> dict[str, Any]:
-    import cv2
+class _Run:
+    """One run of the stack on recordings.
 
-    started = time.monotonic()
-    scans = stack.collect("/scan", message_type("LaserScan"))
-    poses = stack.collect("/pose", message_type("PoseWithCovarianceStamped"))
-    points: list[None] = []
-    clouds = stack.observer.subscribe(
-        "/lidar/points", message_type("PointCloud2"), lambda cloud: points.append(None), SENSOR
-    )
-    faults = stack.collect("/diagnostics", message_type("DiagnosticArray"), RELIABLE)
-    maps = stack.collect("/map", message_type("OccupancyGrid"), LATCHED)
-    keyframes = stack.collect("/keyframe", message_type("Keyframe"), LATCHED)
-    statuses = stack.collect("/vspace/status", message_type("VspaceStatus"), LATCHED)
-    views = stack.collect("/vspace/view", message_type("RenderedView"))
-    requests = stack.observer.publisher("/view/request", message_type("ViewRequest"), SENSOR)
-    ready, failed = message_type("VspaceStatus").READY, message_type("VspaceStatus").FAILED
+    Args:
+        stack: running stack.
+        timeout_s: time limit for all steps, in seconds of the stack.
+        report: called with a description of each wait.
+    """
 
-    def wait(condition: Callable[[], Any], what: str) -> Any:
-        tell(f"waiting for {what}")
-        return stack.wait_for(condition, max(1.0, timeout_s - (time.monotonic() - started) * stack.pace), what)
+    def __init__(self, stack: Stack, timeout_s: float, report: Callable[[str], None]) -> None:
+        self.stack, self.timeout_s, self.report = stack, timeout_s, report
+        self.started = time.monotonic()
+        self.scans = stack.collect("/scan", LaserScan)
+        self.poses = stack.collect("/pose", PoseWithCovarianceStamped)
+        self.faults = stack.collect("/diagnostics", DiagnosticArray, RELIABLE)
+        self.maps = stack.collect("/map", OccupancyGridMessage, LATCHED)
+        self.keyframes = stack.collect("/keyframe", Keyframe, LATCHED)
+        self.statuses = stack.collect("/vspace/status", VspaceStatus, LATCHED)
+        self.views = stack.collect("/vspace/view", RenderedView)
+        self.requests = stack.observer.publisher("/view/request", ViewRequest, SENSOR)
 
-    try:
-        wait(lambda: len(scans) >= 5, "laser scans of the capture")
-    except StackError:
-        stack.check_alive("laser scans of the capture")
-        raise StackError(
-            f"the capture gives {len(points)} point clouds and {len(scans)} scans{_reasons(faults)}"
-        ) from None
-    stack.observer.drop(clouds)
-    wait(lambda: maps and poses, "a map")
-    keyframe = wait(lambda: keyframes and keyframes[-1], "a keyframe of the photo")
+    def wait(self, condition: Callable[[], T], what: str) -> T:
+        """Wait until a condition is true, and return its value; StackError if the time limit is over."""
+        self.report(f"waiting for {what}")
+        passed_s = (time.monotonic() - self.started) * self.stack.pace
+        return self.stack.wait_for(condition, max(1.0, self.timeout_s - passed_s), what)
 
-    def is_ready() -> bool:
-        if statuses and statuses[-1].state == failed:
-            raise StackError(f"the virtual space failed: {statuses[-1].message}")
-        return bool(statuses) and statuses[-1].state == ready
+    def reach_ready(self) -> float:
+        """Wait for map, keyframe and virtual space; return the seconds from the keyframe to a space fit to show."""
+        try:
+            self.wait(lambda: len(self.scans) >= 5, "laser scans of the capture")
+        except StackError:
+            self.stack.check_alive("laser scans of the capture")
+            raise StackError(f"the capture gives {len(self.scans)} scans{_reasons(self.faults)}") from None
+        self.wait(lambda: self.maps and self.poses, "a map")
+        self.wait(lambda: self.keyframes, "a keyframe of the photo")
 
-    wait(is_ready, "a virtual space that is fit to show")
-    time_to_ready_s = float(statuses[-1].ready_seconds)
-    # Slightly later than ready: the quality an operator sees after the first moments.
-    settled = time.monotonic() + 10.0 / stack.pace
-    wait(lambda: time.monotonic() > settled, "ten more seconds of training")
-    keyframe = keyframes[-1]
+        def is_ready() -> bool:
+            newest = self.statuses[-1] if self.statuses else None
+            if newest is not None and newest.state == newest.FAILED:
+                raise StackError(f"the virtual space failed: {newest.message}")
+            return newest is not None and newest.state == newest.READY
 
-    encoded = np.asarray(keyframe.panorama.data)
-    photo = cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    map_from_camera = matrix_from_pose(keyframe.pose)
-    rows = []
-    scores, likeness = {}, {}
-    places = [(yaw, 0.0) for yaw in _YAWS_DEG] + [(yaw, _AHEAD_M) for yaw in (0, -90)]
-    for number, (yaw_deg, ahead_m) in enumerate(places, start=1):
-        map_from_view = map_from_camera @ pose_matrix(yaw=math.radians(yaw_deg)) @ pose_matrix(x=ahead_m)
-        request = _request(number, map_from_view, read_pace(stack.run_dir).now_ns())
+        self.wait(is_ready, "a virtual space that is fit to show")
+        ready_s = float(self.statuses[-1].ready_seconds)
+        # Slightly later than ready: the quality an operator sees after the first moments.
+        settled = time.monotonic() + 10.0 / self.stack.pace
+        self.wait(lambda: time.monotonic() > settled, "ten more seconds of training")
+        return ready_s
+
+    def view(self, number: int, map_from_view: FloatArray) -> NDArray[np.uint8]:
+        """Return the rendered view of a pose (4, 4) as RGB."""
+        request = ViewRequest(
+            header=header("map", read_pace(self.stack.run_dir).now_ns()),
+            id=number,
+            pose=pose_message(map_from_view),
+            fov_rad=_FOV,
+            width=_WIDTH,
+            height=_HEIGHT,
+        )
         next_try = 0.0
 
-        def view_of(number: int = number, request: Any = request) -> Any:
+        def answer() -> Any:
             nonlocal next_try
             if time.monotonic() > next_try:  # repeat the request: only the newest one is served
                 next_try = time.monotonic() + 2.0
-                requests.publish(request)
-            return next((v for v in views if v.request_id == number), None)
+                self.requests.publish(request)
+            return next((view for view in self.views if view.request_id == number), None)
 
-        view = wait(view_of, f"the view at {yaw_deg}°")
-        data = np.asarray(view.image.data)
-        rendered = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-        camera_from_view = (inverse(map_from_camera) @ map_from_view)[:3, :3]
-        crop = perspective_crop(photo, camera_from_view, rendered.shape[1], rendered.shape[0], _FOV)
-        if ahead_m:
-            # No reference image: the photo was taken elsewhere.
-            rows.append((f"{yaw_deg}°, {ahead_m} m ahead of the photo's place", rendered, crop))
-            continue
-        scores[str(yaw_deg)] = round(psnr_db(rendered, crop), 2)
-        likeness[str(yaw_deg)] = round(correlation(rendered, crop), 3)
-        rows.append((f"{yaw_deg}°  ({scores[str(yaw_deg)]} dB)", rendered, crop))
+        return decode_panorama(np.asarray(self.wait(answer, f"view {number}").image.data, np.uint8))
+
+
+def _results(run: _Run, out: Path) -> dict[str, Any]:
+    """Wait for the results of a run, write the images, and return the summary."""
+    ready_s = run.reach_ready()
+    keyframe = run.keyframes[-1]
+    photo = decode_panorama(np.asarray(keyframe.panorama.data, np.uint8))
+    scores, likeness, rows = _compare_views(run, photo, matrix_from_pose(keyframe.pose))
     save_view_strip(out / "view.png", rows)
-    depth = image_array(keyframe.depth)
-    save_depth(out / "depth.png", photo, depth, f"depth: {keyframe.message}")
-    grid, resolution, origin = grid_array(maps[-1])
-    robot = matrix_from_pose(poses[-1])
+    save_depth(out / "depth.png", photo, image_array(keyframe.depth), f"depth: {keyframe.message}")
+    grid, resolution, origin = grid_array(run.maps[-1])
+    robot = matrix_from_pose(run.poses[-1])
     shown = OccupancyGrid(grid, resolution, np.array(origin))
     save_map(out / "map.png", shown, (robot[0, 3], robot[1, 3], yaw_of(robot)))
-    span_s = (stamp_ns(scans[-1]) - stamp_ns(scans[0])) / 1e9
+    span_s = (stamp_ns(run.scans[-1]) - stamp_ns(run.scans[0])) / 1e9
+    status = run.statuses[-1]
     return {
-        "scans": len(scans),
-        "scan_rate_hz": round((len(scans) - 1) / span_s, 2) if span_s > 0 else 0.0,
+        "scans": len(run.scans),
+        "scan_rate_hz": round((len(run.scans) - 1) / span_s, 2) if span_s > 0 else 0.0,
         "map_cells_known": int((grid >= 0).sum()),
         "map_cells_occupied": int((grid > 50).sum()),
-        "keyframe_to_ready_s": round(time_to_ready_s, 2),
-        "training_psnr_db": round(float(statuses[-1].psnr_db), 2),
+        "keyframe_to_ready_s": round(ready_s, 2),
+        "training_psnr_db": round(float(status.psnr_db), 2),
         "view_psnr_db": scores,
         "view_correlation": likeness,
         "depth_scale": round(float(keyframe.scale), 4),
         "depth_quality": round(float(keyframe.quality), 3),
         "depth_fit": bool(keyframe.fit),
         "depth_message": str(keyframe.message),
-        "device": str(statuses[-1].device),
+        "device": str(status.device),
     }
 
 
+def _compare_views(
+    run: _Run, photo: NDArray[np.uint8], map_from_camera: FloatArray
+) -> tuple[dict[str, float], dict[str, float], list[tuple[str, NDArray[np.uint8], NDArray[np.uint8]]]]:
+    """Compare views with the photo's own crops.
+
+    Returns:
+        PSNR in dB and correlation by yaw in degrees, and rows of label, view and crop. Views ahead of the photo's
+        position have no score, because the photo was taken elsewhere.
+    """
+    scores, likeness, rows = {}, {}, []
+    places = [(yaw, 0.0) for yaw in _YAWS_DEG] + [(yaw, _AHEAD_M) for yaw in (0, -90)]
+    for number, (yaw_deg, ahead_m) in enumerate(places, start=1):
+        camera_from_view = pose_matrix(yaw=math.radians(yaw_deg)) @ pose_matrix(x=ahead_m)
+        rendered = run.view(number, map_from_camera @ camera_from_view)
+        crop = perspective_crop(photo, camera_from_view[:3, :3], rendered.shape[1], rendered.shape[0], _FOV)
+        label = f"{yaw_deg}°, {ahead_m} m ahead of the photo's place"
+        if not ahead_m:
+            scores[str(yaw_deg)] = round(psnr_db(rendered, crop), 2)
+            likeness[str(yaw_deg)] = round(correlation(rendered, crop), 3)
+            label = f"{yaw_deg}°  ({scores[str(yaw_deg)]} dB)"
+        rows.append((label, rendered, crop))
+    return scores, likeness, rows
+
+
 def _reasons(diagnostics: Sequence[Any]) -> str:
-    """The newest texts of the LiDAR's driver about the packets, to be appended to an error."""
+    """Return the newest texts of the LiDAR's driver about the packets, to be appended to an error."""
     newest = {status.name: status.message for array in diagnostics for status in array.status}
     texts = [newest[name] for name in ("vlp16_driver: packets", "vlp16_driver: source") if newest.get(name)]
     return f" ({'; '.join(texts)})" if texts else ""
-
-
-def _request(number: int, map_from_view: Any, now_ns: int) -> Any:
-    request, head = message_type("ViewRequest"), message_type("Header")
-    return request(
-        header=head(stamp=to_time(now_ns), frame_id="map"),
-        id=number,
-        pose=pose_message(map_from_view),
-        fov_rad=_FOV,
-        width=_WIDTH,
-        height=_HEIGHT,
-    )

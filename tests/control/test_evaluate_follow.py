@@ -105,27 +105,27 @@ class TestPeople:
         def sent(speed: float) -> MonitoredCommand:
             return MonitoredCommand((speed, 0.0), "free", math.inf)
 
-        drive = follow._Drive(0, 0)
+        drive = follow.FollowDrive(0, 0)
         drive.late.clear()
         drive.late.append(sent(0.0))
         x, y, yaw = drive.robot.pose
         inside = np.array([x + 0.45 * math.cos(yaw), y + 0.45 * math.sin(yaw)])  # 0.15 m before the nose
         drive.people = [Person(inside, inside, 0.0, True)]
-        drive._move(sent(0.0))
-        drive._move(sent(0.0))
+        drive.move(sent(0.0))
+        drive.move(sent(0.0))
         assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 0)
         drive.touching.clear()
         drive.velocity, drive.robot.tracks[:] = (0.4, 0.0), 0.4
         drive.late[0] = sent(0.4)
-        drive._move(sent(0.4))
+        drive.move(sent(0.4))
         assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 1)
 
 
 def test_a_hanging_thing_that_no_ring_reaches_from_the_start_counts_as_blind() -> None:
     # Its lower edge is 0.375 m above the LiDAR; a ring of 15 degrees is that high at 0.375 / 0.268 = 1.40 m.
     hanging = (0.0, 0.0, 0.05, 0.05, 0.0, 0.975, 2.0)
-    assert worlds._blind_m(hanging, "hanging") == pytest.approx(1.40, abs=0.005)
-    assert worlds._blind_m(hanging, "box") == 0.0
+    assert worlds.blind_distance_m(hanging, "hanging") == pytest.approx(1.40, abs=0.005)
+    assert worlds.blind_distance_m(hanging, "box") == 0.0
 
 
 class TestShortestWay:
@@ -215,7 +215,6 @@ def test_figures_of_episodes_by_hand() -> None:
     assert (figures["reachable"], figures["reached"], figures["contacts"]) == (3, 2, 1)
     assert figures["people_walked_into_robot"] == 1
     assert figures["path_ratio_mean"] == pytest.approx((1.1 + 1.2) / 2)
-    assert figures["path_ratio_mean_without_people"] == pytest.approx(1.1)
     assert figures["time_ratio_max"] == pytest.approx(30.0 * 0.4 / 5.0)
     assert figures["yaw_rate_changes_per_m"] == pytest.approx(6 / 20.0)
     assert figures["planner_ms_p50"] == 3.0
