@@ -28,7 +28,7 @@ from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bus import SENSOR
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.experiments.stack import Observer, _NoParameters, free_port
+from instant_ic.experiments.stack import StackObserver, _NoParameters, free_port
 from instant_ic.msg import (
     CompressedImage,
     Odometry,
@@ -55,7 +55,7 @@ class BusHost:
     """A node that publishes and subscribes, spinning on its own thread."""
 
     def __init__(self, run_dir: Path, name: str) -> None:
-        self.node = Observer(_NoParameters(), LocalTransport(run_dir, name, time.time_ns), SystemClock(), name)
+        self.node = StackObserver(_NoParameters(), LocalTransport(run_dir, name, time.time_ns), SystemClock(), name)
         self.ages_ms: dict[str, list[float]] = {}
         self.thread = threading.Thread(target=self._spin, daemon=True)
         self.stop = threading.Event()

@@ -1,4 +1,4 @@
-"""Opens a recording for an experiment, or says what it lacks."""
+"""Opens a recording for an experiment, or names its missing topics."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def opened(
     Args:
         bag: folder or file.
         kinds: types that each topic may have, without their package.
-        remedy: end of the message where one is missing: what to do.
+        remedy: advice at the end of the error if a topic is missing.
         optional: topic that may be missing.
 
     Raises:

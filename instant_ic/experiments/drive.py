@@ -84,7 +84,7 @@ class DriveRecorder:
 
     @property
     def ready(self) -> bool:
-        """Whether the virtual space is ready to be shown."""
+        """True when the virtual space is ready to be shown."""
         return self.vspace is not None and self.vspace.state == self.vspace.READY
 
 

@@ -149,7 +149,7 @@ class FollowDrive:
         self.plan_reason = ""
 
     def _map(self) -> StaticMap:
-        """Map as SLAM would build it: walls, free inside, unknown outside; without the objects in the room."""
+        """Return the map that SLAM would build of the empty room: walls, free inside, unknown outside."""
         walls = worlds.filled(self.room.shapes[self.room.kinds == 0], self.room.size, 0.05, worlds.IN_THE_WAY_M)
         occupancy = np.full(walls.cells.shape, -1, dtype=np.int8)
         centres = [walls.origin[i] + (np.arange(walls.cells.shape[1 - i]) + 0.5) * 0.05 for i in (0, 1)]
@@ -265,7 +265,7 @@ class FollowDrive:
         self.seen = np.concatenate([hits, sweep.nearest])
 
     def _close_points(self, estimate: FloatArray) -> FloatArray:
-        """Points for the collision monitor (``Arbiter`` selects the same ones)."""
+        """Return the points for the collision monitor, selected as ``Arbiter`` does."""
         assert self.costmap is not None
         c, s = math.cos(estimate[2]), math.sin(estimate[2])
         seen = (self.seen - estimate[:2]) @ np.array([[c, -s], [s, c]])
@@ -304,7 +304,7 @@ class FollowDrive:
                     self.episode.people_into_robot += 1
 
     def _clearance(self, pose: FloatArray) -> float:
-        """Distance in metres from the footprint's outline to the nearest static object."""
+        """Return the distance in metres from the footprint's outline to the nearest static object."""
         outline = Footprint(worlds.LENGTH_M, worlds.WIDTH_M).points(0.05)
         c, s = math.cos(pose[2]), math.sin(pose[2])
         index = self.mask.index(outline @ np.array([[c, s], [-s, c]]) + pose[:2])
@@ -343,7 +343,7 @@ def evaluate(
 
 
 def summary(episodes: list[Episode]) -> dict[str, Any]:
-    """Figures over all episodes, and whether the targets are met."""
+    """Return figures over all episodes, and whether the targets are met."""
     reachable = [e for e in episodes if e.reachable]
     reached = [e for e in reachable if e.reached]
     ratios = np.array([e.ratio for e in reached])
@@ -390,7 +390,7 @@ def _reduced(measure: Callable[[FloatArray], Any], values: FloatArray) -> float:
 
 
 def report(episodes: list[Episode], seed: int) -> dict[str, Any]:
-    """The summary and each episode without its tracks and times, ready for JSON."""
+    """Return the summary and each episode without its tracks and times, ready for JSON."""
     left_out = {"tracks", "planner_ms", "controller_ms", "costmap_ms"}
     rows = []
     for episode in episodes:

@@ -78,7 +78,7 @@ class Person:
 
 
 def filled(shapes: FloatArray, size: FloatArray, cell_m: float, band: tuple[float, float]) -> OccupancyMask:
-    """Cells whose centre lies in a shape that overlaps the height range ``band``."""
+    """Return the cells whose centre lies in a shape that overlaps the height range ``band``."""
     margin = 0.5
     columns, rows = np.ceil((size + 2 * margin) / cell_m).astype(int)
     x = -margin + (np.arange(columns) + 0.5) * cell_m
@@ -171,14 +171,14 @@ def _thing(rng: np.random.Generator, size: FloatArray, kind: int) -> Sequence[fl
 
 
 def blind_distance_m(shape: Sequence[float] | FloatArray, kind: str) -> float:
-    """Distance within which a standing VLP-16 may not hit a low or a hanging object, metres; 0 for others."""
+    """Return the distance in metres within which a standing VLP-16 may miss a low or hanging object; else 0."""
     if kind == "hanging":
         return (float(shape[5]) - LIDAR_HEIGHT_M) / STEEPEST
     return LIDAR_HEIGHT_M / STEEPEST if kind == "low" else 0.0
 
 
 def _away(shape: Sequence[float] | FloatArray, point: FloatArray) -> float:
-    """Distance from a point to a shape's outline; 0 inside."""
+    """Return the distance from a point to a shape's outline; 0 inside."""
     cx, cy, half_x, half_y, yaw = (float(v) for v in shape[:5])
     dx, dy = float(point[0]) - cx, float(point[1]) - cy
     c, s = math.cos(yaw), math.sin(yaw)
@@ -193,7 +193,10 @@ def _length(path: FloatArray) -> float:
 
 
 def look(room: Room, people: Sequence[Person], pose: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Points (N, 3) of one revolution in the LiDAR's frame: z up, x along the robot's heading; 1.5 cm of noise."""
+    """Return the points (N, 3) of one revolution in the LiDAR's frame, with 1.5 cm of noise.
+
+    z points up and x along the robot's heading.
+    """
     circles = np.array([[*p.place, PERSON_M] for p in people]).reshape(-1, 3)
     angles = -math.pi + 2 * math.pi * (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS
     slopes = np.tan(np.radians(RINGS_DEG))
@@ -207,7 +210,7 @@ def look(room: Room, people: Sequence[Person], pose: FloatArray, rng: np.random.
 
 
 def flat_ranges(points: FloatArray) -> FloatArray:
-    """Equivalent of the driver's ``/scan``: (BEAMS,) nearest point within ``SCAN_BAND_M``; +inf if there is none."""
+    """Return the driver's ``/scan``: (BEAMS,) nearest point within ``SCAN_BAND_M``; +inf if there is none."""
     z = points[:, 2] + LIDAR_HEIGHT_M
     band = points[(z >= SCAN_BAND_M[0]) & (z <= SCAN_BAND_M[1])]
     beams = np.floor((np.arctan2(band[:, 1], band[:, 0]) + math.pi) * BEAMS / (2 * math.pi)).astype(int) % BEAMS
@@ -219,7 +222,7 @@ def flat_ranges(points: FloatArray) -> FloatArray:
 
 @njit(cache=True)
 def _cast(shapes, circles, x, y, yaw, angles, slopes):  # type: ignore[no-untyped-def]
-    """Horizontal distance (A, R) to the first object along each azimuth and ring; inf for none."""
+    """Return the horizontal distance (A, R) to the first object along each azimuth and ring; inf for none."""
     out = np.full((angles.shape[0], slopes.shape[0]), np.inf)
     for a in range(angles.shape[0]):
         dx, dy = math.cos(yaw + angles[a]), math.sin(yaw + angles[a])
@@ -282,7 +285,7 @@ def add_people(room: Room, rng: np.random.Generator, count: int) -> list[Person]
 
 
 def free_place(room: Room, rng: np.random.Generator) -> FloatArray:
-    """Random position (2,) at least 0.4 m from every shape that stands on the ground or hangs low."""
+    """Return a random position (2,) at least 0.4 m from every shape."""
     while True:
         place = rng.uniform([0.5, 0.5], room.size - 0.5)
         if min(_away(s, place) for s in room.shapes) > 0.4:
@@ -312,7 +315,7 @@ def walk(room: Room, person: Person, robot: FloatArray, dt_s: float, rng: np.ran
 
 
 def gap_to_robot(place: FloatArray, robot: FloatArray) -> tuple[float, FloatArray]:
-    """Metres between a person and the robot's outline (negative: overlap); unit vector (2,) towards the robot."""
+    """Return metres from a person to the robot's outline (overlap: negative), and the unit vector (2,) towards it."""
     c, s = math.cos(robot[2]), math.sin(robot[2])
     dx, dy = place[0] - robot[0], place[1] - robot[1]
     local = np.array([c * dx + s * dy, c * dy - s * dx])
@@ -335,7 +338,7 @@ _STEPS = np.array(
 
 
 def shortest_way(mask: OccupancyMask, start: FloatArray, goal: FloatArray, margin_m: float) -> FloatArray | None:
-    """Shortest path (N, 3) of the true footprint with ``margin_m`` on every side; None if there is none.
+    """Return the shortest path (N, 3) of the true footprint with ``margin_m`` on every side; None if there is none.
 
     Search over 5 cm cells and 16 headings, with steps along the heading in both directions and turns on the spot at
     nearly no cost. With 16 directions, a straight path is at most 1.4 % too long.
@@ -377,7 +380,7 @@ def shortest_way(mask: OccupancyMask, start: FloatArray, goal: FloatArray, margi
 
 @njit(cache=True)
 def _dijkstra(free, steps, turn, row, column, goal_row, goal_column):  # type: ignore[no-untyped-def]
-    """Path cells (N, 3) heading, row, column from the start to the goal at any heading; (0, 3) if there is none."""
+    """Return path cells (N, 3) heading, row, column to the goal at any heading; (0, 3) if there is none."""
     headings, height, width = free.shape
     best = np.full(free.size, np.inf)
     parent = np.full(free.size, -1, dtype=np.int64)

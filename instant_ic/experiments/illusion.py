@@ -94,7 +94,7 @@ def evaluate(
 
 
 def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
-    """Figures of all frames, the same with the oracles, readiness, and each frame; ready for JSON.
+    """Return the figures of all frames by source, readiness, and each frame; ready for JSON.
 
     Raises:
         ValueError: the virtual space was never shown.
@@ -123,7 +123,7 @@ def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
 
 
 def figures(frames: Sequence[IllusionFrame], source: str) -> dict[str, Any]:
-    """Mean figures of frames for a source; NaN where there is nothing to average."""
+    """Return the mean figures of frames for a source; NaN where there is nothing to average."""
     scores = [frame.scores[source] for frame in frames]
     psnr = np.array([one.psnr_db for one in scores])
     floor = sum(one.floor for one in scores)
@@ -138,7 +138,7 @@ def figures(frames: Sequence[IllusionFrame], source: str) -> dict[str, Any]:
 
 
 def by_distance(frames: Sequence[IllusionFrame], source: str) -> list[dict[str, Any]]:
-    """``figures`` by distance behind the near face, in rows of ``STEP_M`` around their distance."""
+    """Return ``figures`` by distance behind the near face, in rows of ``STEP_M`` around their distance."""
     rows: dict[float, list[IllusionFrame]] = {}
     for frame in frames:
         if frame.distance_m is not None:
@@ -147,7 +147,7 @@ def by_distance(frames: Sequence[IllusionFrame], source: str) -> list[dict[str, 
 
 
 def readiness(frames: Sequence[IllusionFrame]) -> dict[str, Any]:
-    """Error of the expected PSNR over the live frames that show the view alone, dB; empty without such frames."""
+    """Return the error in dB of the expected PSNR over the live frames that show the view alone."""
     error = np.array([frame.expected_psnr_db - frame.scores[LIVE].psnr_db for frame in frames if frame.blend == 1])
     if not error.size:
         return {}

@@ -34,7 +34,7 @@ _BLUR = 9
 
 
 def corners(obstacle: Obstacle) -> FloatArray:
-    """Corners (4, 2) of an obstacle's outline."""
+    """Return the corners (4, 2) of an obstacle's outline."""
     along = np.array([math.cos(obstacle.yaw), math.sin(obstacle.yaw)])
     across = np.array([-along[1], along[0]])
     signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
@@ -55,7 +55,7 @@ class Passage:
 
     @classmethod
     def of(cls, pose: FloatArray, obstacles: Sequence[Obstacle]) -> Passage:
-        """The passage that begins at pose (3,)."""
+        """Return the passage that begins at pose (3,)."""
         start, heading = np.asarray(pose[:2], np.float64), np.array([math.cos(pose[2]), math.sin(pose[2])])
         left = np.array([-heading[1], heading[0]])
         ahead = []
@@ -67,7 +67,7 @@ class Passage:
         return cls(start, heading, tuple(sorted(ahead, key=lambda each: each[0])))
 
     def obstacle_at(self, place: FloatArray) -> tuple[float, Obstacle] | None:
-        """Distance of a position (2,) behind the near face of the obstacle that is passed, and that obstacle.
+        """Return how far a position (2,) lies behind the near face of the passed obstacle, and that obstacle.
 
         The obstacle is the last one whose near face lies behind the position, else the first one; None without any.
         """
@@ -80,10 +80,13 @@ class Passage:
 
 
 def things(world: World) -> tuple[NDArray[np.int32], OccupancyMask, NDArray[np.int32]]:
-    """Number of the free-standing object that each surface belongs to, (S,), 0 for none; the floor plan; its numbers.
+    """Find the free-standing objects of a world.
 
     An object is what is connected in the floor plan of ``OBJECT_M`` without the walls. Its surfaces lie in its cells
-    completely, above the floor and below ``OBJECT_M``. What lies on a wall is no object: posters and skirting boards.
+    completely, above the floor and below ``OBJECT_M``. Posters and skirting boards lie on a wall and are no objects.
+
+    Returns:
+        Number of the object of each surface, (S,), 0 for none; the floor plan; the number of the object of each cell.
     """
     plan, walls = (world.occupied(low, high, _CELL_M) for low, high in (OBJECT_M, WALL_M))
     beside_walls = cv2.dilate(walls.cells.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -102,7 +105,7 @@ def things(world: World) -> tuple[NDArray[np.int32], OccupancyMask, NDArray[np.i
 
 
 def moved_by(world: World, surfaces: NDArray[np.bool_], shift_m: FloatArray) -> World:
-    """The world with surfaces (S,) displaced by (3,) metres; their texture and light go with them."""
+    """Return the world with surfaces (S,) displaced by (3,) metres, together with their texture and light."""
     changed = {name: getattr(world, name).copy() for name in ("vertices", "offset", "uv", "light_uv", "light_linear")}
     by = shift_m.astype(np.float32)
     changed["vertices"].reshape(len(world.normal), -1, 3)[surfaces] += by
@@ -113,7 +116,7 @@ def moved_by(world: World, surfaces: NDArray[np.bool_], shift_m: FloatArray) -> 
 
 
 def without(world: World, obstacle: Obstacle) -> World:
-    """The world without the object that stands at an obstacle's place; its shadow remains."""
+    """Return the world without the object that stands at an obstacle's place; its shadow remains."""
     owner, plan, labels = things(world)
     outline = np.fliplr(plan.index(corners(obstacle))).astype(np.int32)
     place = cv2.dilate(cv2.fillConvexPoly(np.zeros(labels.shape, np.uint8), outline, 1), np.ones((3, 3), np.uint8))
@@ -150,7 +153,7 @@ def score(
 def surfaces(
     truth: Frame, world_from_camera: FloatArray, fov_rad: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Pixels of the floor and of what stands on it up to 2 m, (H, W) each, by their height over the floor."""
+    """Return the pixels of the floor, and of walls and objects up to 2 m, (H, W) each, by their height."""
     height, width = truth.depth_m.shape
     directions = perspective_directions(width, height, fov_rad)
     up = directions @ world_from_camera[2, :3].astype(np.float32) / np.linalg.norm(directions, axis=2)
@@ -162,7 +165,7 @@ def surfaces(
 def fog_pixels(
     shown: NDArray[np.uint8], true: NDArray[np.uint8], floor: NDArray[np.bool_], wall: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Floor pixels whose shown colour is further from the floor's than from the wall's, (H, W).
+    """Return the floor pixels whose shown colour is further from the floor's than from the wall's, (H, W).
 
     The floor's colour is the truth's around the pixel (mean of 9 × 9 floor pixels, so that texture does not count), the
     wall's is the median of the truth's wall pixels.

@@ -55,7 +55,7 @@ _SETUP = """async ([width, height, full]) => {
 
 
 def launch_chromium(playwright: Any) -> Any:
-    """The machine's Chromium, which renders WebGL on the CPU."""
+    """Launch the machine's Chromium, which renders WebGL on the CPU."""
     return playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
 
 
@@ -75,7 +75,7 @@ class PageRenderer:
         self._page.evaluate(_SETUP, [width, height, full])
 
     def load(self, layers: PageLayers) -> None:
-        """Show these layers, as the server sends them."""
+        """Show layers, encoded as the server sends them."""
         layers.check()
         self._frame = encode_frame(PageFrame(FrameKind.LAYERS, 1, *layers.frame(frozenset())))
         self._page.evaluate("load()")
@@ -95,8 +95,11 @@ class PageRenderer:
         """Return the camera's image (JPEG) as the page shows it in REAL, (height, width, 3).
 
         Args:
-            taken, map_from_camera: map_from_camera of the image, and of the pose from which it is shown.
-            moved: by the depth of the layers; else as it was taken.
+            jpeg: the camera's image.
+            taken: map_from_camera of the image, (4, 4).
+            map_from_camera: pose from which it is shown, (4, 4).
+            fov_rad: horizontal field of view.
+            moved: move the image by the depth of the layers; else show it as it was taken.
         """
         self._photo = jpeg
         camera = self._camera(map_from_camera, fov_rad)

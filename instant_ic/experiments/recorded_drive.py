@@ -27,7 +27,7 @@ AROUND_S, MOST_S = 2.0, 60.0
 
 @dataclass(frozen=True)
 class Moment:
-    """What the operator saw: seconds from the first state, whether of the virtual space, and the image."""
+    """An image on the operator's screen: seconds from the first state, whether it is a view, and the image."""
 
     time_s: float
     virtual: bool
@@ -90,7 +90,7 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
 
 
 def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> DriveLog:
-    """States (seconds, ControlState), which come at uneven times, in the steps of a log.
+    """Resample states (seconds, ControlState), which come at uneven times, in the steps of a log.
 
     Poses are interpolated, as their differences are speeds; all else is held until the next state.
     """
@@ -122,7 +122,7 @@ def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> DriveLog:
 
 
 def film_times(log: DriveLog, frame_s: float) -> NDArray[np.float64]:
-    """Times around the first passage through the virtual space; of the first minute without one."""
+    """Return times around the first passage through the virtual space, or of the first minute without one."""
     times, virtual = np.array(log.time_s), np.array(log.virtual)
     begin, end = times[0], times[-1]
     if virtual.any():
@@ -175,7 +175,7 @@ def _moments(
 
 
 def _plot(drive: TeleopDrive, grid: Any) -> bytes:
-    """PNG of both tracks on the recorded map, on white without one."""
+    """Return a PNG of both tracks on the recorded map, or on white without one."""
     from instant_ic.msg import grid_array
 
     tracks = {

@@ -29,7 +29,7 @@ class StackError(RuntimeError):
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A free port of 127.0.0.1."""
+    """Return a free port of 127.0.0.1."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -37,7 +37,7 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
 
 
 def free_ports() -> dict[str, int]:
-    """Free ports by argument name of ``launch/sim.yaml``, so that several stacks can run in parallel."""
+    """Return free ports by argument name of ``launch/sim.yaml``, so that several stacks can run in parallel."""
     return {
         "camera_port": free_port(),
         "lidar_port": free_port(socket.SOCK_DGRAM),
@@ -51,7 +51,7 @@ class _NoParameters:
     """No parameters."""
 
 
-class Observer(Node[_NoParameters]):
+class StackObserver(Node[_NoParameters]):
     """Node inside the controlling program; its callbacks run while the program waits in :meth:`Stack.wait_for`."""
 
     name = "observer"
@@ -64,14 +64,14 @@ class Observer(Node[_NoParameters]):
         self._transport.clear()
 
 
-def _observer(run_dir: Path) -> Observer:
+def _observer(run_dir: Path) -> StackObserver:
     clock = SystemClock()
-    return Observer(_NoParameters(), LocalTransport(run_dir, Observer.name, clock.now_ns), clock)
+    return StackObserver(_NoParameters(), LocalTransport(run_dir, StackObserver.name, clock.now_ns), clock)
 
 
 @contextlib.contextmanager
-def observer(run_dir: Path) -> Iterator[Observer]:
-    """Observer of another run directory, as used by the robots of a fleet."""
+def observer(run_dir: Path) -> Iterator[StackObserver]:
+    """Observe another run directory, such as that of a fleet's robot."""
     watching = _observer(run_dir)
     try:
         yield watching
@@ -87,7 +87,7 @@ class Stack:
         run_dir: its path must be short (sockets).
         log_path: file for the launcher's output (default: ``RUN_DIR/launch.log``).
         prefix: command that starts the launcher, such as ``ip netns exec NAME``.
-        pace: of the stack's time, see :mod:`instant_ic.util.pace`; None: what the machine can do.
+        pace: pace of the stack's time, see :mod:`instant_ic.util.pace`; None: as fast as the machine can.
 
     Example::
 
@@ -112,7 +112,7 @@ class Stack:
         self.prefix = list(prefix)
         self._pace = pace
         self.process: subprocess.Popen[bytes] | None = None
-        self.observer: Observer
+        self.observer: StackObserver
 
     @property
     def pace(self) -> float:
@@ -208,7 +208,7 @@ class Stack:
 
 
 def processes_of(run_dir: Path) -> Sequence[Any]:
-    """Psutil processes that were started with this run directory in their environment."""
+    """Return the psutil processes that were started with this run directory in their environment."""
     import psutil
 
     wanted = str(run_dir)

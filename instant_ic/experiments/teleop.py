@@ -179,7 +179,7 @@ class _Episode:
 
 
 def photograph(stack: SimulatedStack, shown: Shown, width: int, height: int, fov_rad: float) -> NDArray[np.uint8]:
-    """The camera's image as the page shows it: taken from its own position, rotated to the heading."""
+    """Render the camera's image as the page shows it: taken from its own position, rotated to the heading."""
     pose = pose_matrix(shown.pose[0], shown.pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, shown.heading)
     return stack.simulation.renderer.render_perspective(pose, width, height, fov_rad).rgb
 

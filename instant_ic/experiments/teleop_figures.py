@@ -135,13 +135,13 @@ class TeleopDrive:
 
 
 def shown_poses(log: DriveLog) -> FloatArray:
-    """(N, 3) poses of the robot that is shown."""
+    """Return the poses (N, 3) of the robot that is shown."""
     virtual = np.array(log.virtual)[:, None]
     return np.where(virtual, np.array(log.vbot), np.array(log.robot))
 
 
 def shown_speeds(log: DriveLog) -> FloatArray:
-    """(N, 2) forward m/s and rad/s of the shown robot, over 0.1 s; NaN across a switch and at the ends."""
+    """Return forward m/s and rad/s (N, 2) of the shown robot, over 0.1 s; NaN across a switch and at the ends."""
     poses, virtual = shown_poses(log), np.array(log.virtual)
     speeds = np.full((len(poses), 2), math.nan)
     for k in range(1, len(poses) - 1):
@@ -152,7 +152,7 @@ def shown_speeds(log: DriveLog) -> FloatArray:
 
 
 def ramped(commands: FloatArray) -> FloatArray:
-    """(N, 2) speeds of a robot that follows its commands at once, within its acceleration limits."""
+    """Return speeds (N, 2) of a robot that follows its commands at once, within its acceleration limits."""
     speed, out, limits = (0.0, 0.0), np.zeros((len(commands), 2)), MotionLimits()
     for k, (linear, angular) in enumerate(commands):
         speed = accelerate(speed, (float(linear), float(angular)), limits, STEP_S)
@@ -161,7 +161,7 @@ def ramped(commands: FloatArray) -> FloatArray:
 
 
 def obeys(log: DriveLog) -> FloatArray:
-    """(N,) 1 where the shown robot obeyed the command, 0 where it did not, NaN without a command.
+    """Return (N,) 1 where the shown robot obeyed the command, 0 where it did not, NaN without a command.
 
     It obeyed if its forward speed and yaw rate lie between the minimum and maximum of the ramped command within the
     last ``LATENCY_S``, within ``TOLERANCE_*``. A robot that stands, is slowed down, or turns differently did not.
@@ -180,13 +180,13 @@ def obeys(log: DriveLog) -> FloatArray:
 
 
 def obedience(log: DriveLog) -> float:
-    """Share of the commanded time in which the shown robot obeyed; NaN without commands."""
+    """Return the share of the commanded time in which the shown robot obeyed; NaN without commands."""
     done = obeys(log)
     return math.nan if np.isnan(done).all() else float(np.nanmean(done))
 
 
 def longest_stall_s(log: DriveLog) -> float:
-    """Longest time that the shown robot stood still under a command."""
+    """Return the longest time that the shown robot stood still under a command."""
     commands, speeds = np.array(log.command).reshape(-1, 2), shown_speeds(log)
     standing = (np.abs(speeds[:, 0]) < 0.01) & (np.abs(speeds[:, 1]) < 0.02) & commands.any(axis=1)
     longest = run = 0
@@ -197,7 +197,7 @@ def longest_stall_s(log: DriveLog) -> float:
 
 
 def longest_freeze_s(pictures: list[Shown], until_s: float) -> float:
-    """Longest time that one image stayed on the screen, up to ``until_s``."""
+    """Return the longest time that one image stayed on the screen, up to ``until_s``."""
     times = [shown.time_s for shown in pictures if shown.time_s <= until_s]
     if not times:
         return 0.0
@@ -205,7 +205,7 @@ def longest_freeze_s(pictures: list[Shown], until_s: float) -> float:
 
 
 def find_switches(log: DriveLog) -> list[Switch]:
-    """All changes of the shown view; position errors are NaN if one of the images is missing."""
+    """Return all switches; position errors are NaN if one of the images is missing."""
     found = []
     for k in range(1, len(log.virtual)):
         if log.virtual[k] == log.virtual[k - 1]:
@@ -218,12 +218,12 @@ def find_switches(log: DriveLog) -> list[Switch]:
 
 
 def count_flicker(switches: list[Switch]) -> int:
-    """Number of switches reversed within ``FLICKER_S``."""
+    """Count the switches that are reversed within ``FLICKER_S``."""
     return sum(after.time_s - before.time_s < FLICKER_S for before, after in pairwise(switches))
 
 
 def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple[Shown, Shown] | None:
-    """Last image before a switch and first after it; None if one of them is missing."""
+    """Return the last image before a switch and the first after it; None if one of them is missing."""
     for before, after in pairwise(pictures):
         near = abs(after.time_s - time_s) < 1.0
         if near and before.virtual != after.virtual == to_virtual:
@@ -232,7 +232,7 @@ def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple
 
 
 def picture_errors_m(before: Shown, after: Shown, log: DriveLog) -> tuple[float, float]:
-    """Return the distances between the positions of two images that should coincide: as known, and as the eye sees it.
+    """Return how far two images that should coincide are apart: as the stack knows it, and as the eye sees it.
 
     The shown robot moves between the two images; its mean speed around the switch gives that distance.
     """
@@ -248,7 +248,7 @@ def picture_errors_m(before: Shown, after: Shown, log: DriveLog) -> tuple[float,
 
 
 def obstacles_met(log: DriveLog, centres: FloatArray) -> int:
-    """Number of obstacles (N, 2) that the shown robot came near."""
+    """Count the obstacles (N, 2) that the shown robot came near."""
     if len(centres) == 0 or not log.time_s:
         return 0
     away = np.linalg.norm(shown_poses(log)[:, None, :2] - np.asarray(centres)[None], axis=2)
@@ -321,7 +321,7 @@ def summary(drives: list[TeleopDrive], stop: list[TeleopDrive] | None = None) ->
 
 
 def targets(figures: dict[str, Any]) -> dict[str, bool | None]:
-    """Whether each target of illusory control is met; None without data for it."""
+    """Check each target of illusory control; None without data for it."""
 
     def holds(key: str, least: float = -math.inf, most: float = math.inf) -> bool | None:
         value = figures[key]

@@ -63,14 +63,14 @@ def _quality(drives: Sequence[TeleopDrive]) -> tuple[float, ...]:
 
 
 def _tracks(drives: Sequence[TeleopDrive]) -> FloatArray:
-    """(N, 2) all positions of the robots of these drives."""
+    """Return all positions (N, 2) of the robots of these drives."""
     return np.concatenate(
         [np.array(t).reshape(-1, 3)[:, :2] for d in drives for n, t in d.tracks.items() if n != "modes"]
     )
 
 
 def _extent(course: Course, drives: Sequence[TeleopDrive]) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest corner (2,) of the map of these drives."""
+    """Return the lowest and the highest corner (2,) of the map of these drives."""
     things = [(one.x, one.y) for one in course.obstacles]
     places = np.concatenate([_tracks(drives), course.goals, np.array(things).reshape(-1, 2), [course.world.spawn[:2]]])
     return places.min(axis=0) - _MARGIN_M, places.max(axis=0) + _MARGIN_M
@@ -109,7 +109,7 @@ def _plot_course(axis: Any, course: Course, drives: Sequence[TeleopDrive]) -> No
 
 
 def _where(drive: TeleopDrive, time_s: float) -> FloatArray:
-    """Position (2,) of the r-bot at a time."""
+    """Return the position (2,) of the r-bot at a time."""
     track, modes = drive.tracks["robot"], drive.tracks["modes"]
     return np.array(track[min(max(0, round((time_s - modes[0][0]) / TRACK_S)), len(track) - 1)])[:2]
 
@@ -176,7 +176,7 @@ class Video:
 
 
 def screen_frames(period_s: float) -> Callable[[SimulatedStack], NDArray[np.uint8] | None]:
-    """Function that returns what the operator sees beside the map, (360, 1000, 3) BGR, if a frame is due, else None."""
+    """Return a function that renders screen and map, (360, 1000, 3) BGR, if a frame is due, else returns None."""
     plan: PlanImage | None = None
     next_s = 0.0
 
@@ -192,7 +192,7 @@ def screen_frames(period_s: float) -> Callable[[SimulatedStack], NDArray[np.uint
 
 
 def operator_image(stack: SimulatedStack) -> NDArray[np.uint8]:
-    """What the operator sees, with mode and reason, (360, 640, 3) BGR."""
+    """Render the operator's screen, with mode and reason, (360, 640, 3) BGR."""
     import cv2
 
     shown = stack.log.pictures[-1]
@@ -226,7 +226,7 @@ class PlanImage:
         self.base[at[:, 1].clip(0, _MAP - 1), at[:, 0].clip(0, _MAP - 1)] = 140
 
     def pixels(self, points: FloatArray) -> NDArray[np.int32]:
-        """(N, 2) column, row of positions (N, 2)."""
+        """Return column and row (N, 2) of positions (N, 2)."""
         offset = (np.asarray(points) - self.middle) * self.scale * [1, -1] + _MAP / 2
         return np.asarray(np.rint(offset), np.int32)
 

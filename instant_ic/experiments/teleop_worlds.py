@@ -77,7 +77,8 @@ def make_course(name: str, seed: int, index: int) -> Course:
 
     Args:
         name: ``corridors``, or any name of ``sim.worlds.make_world``.
-        seed, index: which course; the same values give the same course.
+        seed: seed of the courses.
+        index: number of the course; the same values give the same course.
 
     Raises:
         ValueError: no such world, or no possible drive in it.
@@ -91,14 +92,14 @@ def make_course(name: str, seed: int, index: int) -> Course:
 
 @functools.lru_cache(maxsize=1)
 def _world(name: str) -> World:
-    """Cached for the next course: a mesh with its textures takes seconds to load."""
+    """Make a world; cached, because a mesh with its textures takes seconds to load."""
     from instant_ic.sim.worlds import make_world
 
     return make_world(name)
 
 
 def random_corridor(rng: np.random.Generator, name: str, attempts: int = 50) -> Course:
-    """A straight or bent corridor, 2.0 to 2.6 m wide, with one to three boxes, posts or low objects in the middle.
+    """Make a corridor, straight or bent, 2.0 to 2.6 m wide, with one to three objects in the middle.
 
     Raises:
         ValueError: no passable corridor found within ``attempts``.
@@ -153,7 +154,7 @@ def _corridor(rng: np.random.Generator, name: str) -> Course | None:
 
 
 def _obstacle(rng: np.random.Generator, start: FloatArray, heading: FloatArray, at: float) -> Obstacle:
-    """A box, a post or a low object across the operator's line, ``at`` metres along it."""
+    """Return a box, a post or a low object across the operator's line, ``at`` metres along it."""
     kind = str(rng.choice(["box", "box", "post", "low"]))
     aside = float(rng.uniform(-0.2, 0.2))
     x, y = start + at * heading + aside * np.array([-heading[1], heading[0]])
@@ -167,12 +168,12 @@ def _obstacle(rng: np.random.Generator, start: FloatArray, heading: FloatArray, 
 
 
 def floor_plan(world: World, cell_m: float = 0.025) -> OccupancyMask:
-    """Cells in which the robot's body would touch something."""
+    """Return the cells in which the robot's body would touch something."""
     return world.occupied(*BODY_M, cell_m)
 
 
 def route(mask: OccupancyMask, start: FloatArray, goals: FloatArray, spare_m: float) -> FloatArray | None:
-    """Shortest path (N, 3) of the true footprint over all goals (M, 2); None if there is none."""
+    """Return the shortest path (N, 3) of the true footprint over all goals (M, 2); None if there is none."""
     way, pose = [np.asarray(start, np.float64)[None]], np.asarray(start, np.float64)
     for goal in goals:
         leg = shortest_way(mask, pose, np.array([*goal, 0.0]), spare_m)
@@ -184,7 +185,7 @@ def route(mask: OccupancyMask, start: FloatArray, goals: FloatArray, spare_m: fl
 
 
 def straight_ahead(world: World) -> Course:
-    """Course in any world: the operator drives straight ahead from the start, as far as the walls allow.
+    """Make a course in any world: straight ahead from the start, as far as the walls allow.
 
     Objects taller than 1.9 m count as walls; the others on the path count as obstacles.
 
@@ -207,7 +208,7 @@ def straight_ahead(world: World) -> Course:
 
 
 def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> tuple[Obstacle, ...]:
-    """Objects on the straight path from (2,) to (2,) of a robot 0.5 m wide, as boxes across it."""
+    """Return the objects on the straight path from (2,) to (2,) of a robot 0.5 m wide, as boxes across it."""
     length = float(np.linalg.norm(goal - start))
     heading = (goal - start) / length
     yaw = math.atan2(heading[1], heading[0])
@@ -232,7 +233,7 @@ def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> 
 
 
 def across(world: World, rng: np.random.Generator, attempts: int = 3000) -> Course:
-    """A straight drive between two free positions of a furnished world, preferably through objects.
+    """Make a straight drive between two free positions of a furnished world, preferably through objects.
 
     No wall and nothing taller than ``_TALL_M`` stands between. The goal can be reached around everything with a margin
     of ``SPARE_M``. Objects on the line leave the robot as much room before and behind them as in a corridor.
@@ -272,7 +273,7 @@ def across(world: World, rng: np.random.Generator, attempts: int = 3000) -> Cour
 
 
 def _passable(thing: Obstacle, start: FloatArray, goal: FloatArray) -> bool:
-    """Whether there is room before and behind an object, and it is no longer than a v-bot can pass."""
+    """Return whether there is room before and behind an object, and a v-bot can pass its length."""
     at, half = np.array([thing.x, thing.y]), 0.5 * thing.length
     before, behind = (float(np.linalg.norm(end - at)) - half for end in (start, goal))
     return thing.length <= _LONGEST_THING_M and before >= FIRST_M - 1.0 and behind >= LAST_M - 1.0

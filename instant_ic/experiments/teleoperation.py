@@ -39,7 +39,7 @@ class _Recorded(FilmedStack):
         self._frame = screen_frames(_FRAME_S)
 
     def step(self, operate: Callable[[], tuple[float, float]] | None = None) -> None:
-        """As ``FilmedStack.step``; then keep a frame if one is due."""
+        """Advance the stack, then keep a frame if one is due."""
         super().step(operate)
         frame = self._frame(self)
         if frame is not None:
@@ -51,7 +51,7 @@ _COST_S = 60.0
 
 
 def units(options: Options) -> list[Unit]:
-    """A drive through the corridor's obstacle for each seed, the first of which is shown; or a recorded drive."""
+    """Return a drive through the corridor's obstacle for each seed, or a recorded drive; images are of the first."""
     if options.bag is not None:
         return [Unit("teleoperation", {"bag": str(options.bag)}, 10.0)]
     cases = options.cases()[: 1 if options.quick else None]
@@ -62,7 +62,7 @@ def units(options: Options) -> list[Unit]:
 
 
 def measure(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Drive one course and compare what the operator sees with the truth; or show a recorded drive."""
+    """Drive one course and compare the operator's views with the truth, or show a recorded drive."""
     if "bag" in arguments:
         return _recorded(Path(arguments["bag"]))
     settings = TeleopSettings(1, arguments["seed"], arguments["world"], ("ic",))
@@ -97,7 +97,7 @@ def _recorded(bag: Path) -> dict[str, Any]:
 
 
 def _shown(frames: Sequence[Moment], frame_s: float) -> dict[str, str]:
-    """Numbered stills and a film."""
+    """Return numbered stills and a film."""
     images = {}
     for number, frame in enumerate(stills(frames), 1):
         what = "virtual" if frame.virtual else "real"
@@ -107,7 +107,7 @@ def _shown(frames: Sequence[Moment], frame_s: float) -> dict[str, str]:
 
 
 def stills(frames: Sequence[Moment]) -> list[Moment]:
-    """Five frames as in the paper's Fig. 9: before, first, middle and last in the virtual space, and after it."""
+    """Choose five frames as in Fig. 9: before, first, middle and last in the virtual space, and after it."""
     shown = [frame for frame in frames if frame.virtual]
     if not shown:
         return list(frames[:1])
@@ -120,7 +120,7 @@ def stills(frames: Sequence[Moment]) -> list[Moment]:
 
 
 def section(results: Sequence[Result], options: Options) -> Section:
-    """Figures of the shown drive, and a table over all drives."""
+    """Return the figures of the shown drive, and a table over all drives."""
     command = command_of(options, "teleoperation")
     text = "All nodes in one process in simulated time; the operator drives straight on. Poses are those of its SLAM."
     if options.bag is not None:

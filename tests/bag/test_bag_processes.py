@@ -25,7 +25,7 @@ from instant_ic.bag.recover import recover
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Publisher, registry
 from instant_ic.bus.control import NodeControl
 from instant_ic.cli.main import main
-from instant_ic.experiments.stack import Observer, observer
+from instant_ic.experiments.stack import StackObserver, observer
 from instant_ic.msg import Bool, Clock, Float32, NodeStatus, deserialize, serialize
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
@@ -45,7 +45,7 @@ class Talker:
     """Publishes ``/count`` at 100 Hz and ``/operator/estop`` on demand, in a run directory of its own."""
 
     run_dir: Path
-    node: Observer
+    node: StackObserver
     count: Publisher
     estop: Publisher
     stop: threading.Event = field(default_factory=threading.Event)

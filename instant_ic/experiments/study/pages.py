@@ -123,8 +123,8 @@ class StudyPages:
         return ""
 
 
-async def serve(pages: StudyPages, port: int, tell: Callable[[str], None]) -> None:
-    """Serve the pages until the participant has answered; report their address to ``tell``.
+async def serve(pages: StudyPages, port: int, report: Callable[[str], None]) -> None:
+    """Serve the pages until the participant has answered; report their address.
 
     Raises:
         OSError: the port is taken.
@@ -133,7 +133,7 @@ async def serve(pages: StudyPages, port: int, tell: Callable[[str], None]) -> No
     await runner.setup()
     try:
         await web.TCPSite(runner, "127.0.0.1", port).start()
-        tell(f"http://127.0.0.1:{runner.addresses[0][1]}/")
+        report(f"http://127.0.0.1:{runner.addresses[0][1]}/")
         await pages.finished.wait()
         await asyncio.sleep(1.0)  # for the last page to be fetched
     finally:
