@@ -79,7 +79,6 @@ KNOWN: dict[str, str] = {
         _functions
         _normal_equations
         _project
-        _search
         _sort
         _watch
         adapt
