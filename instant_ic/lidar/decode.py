@@ -104,18 +104,12 @@ def decode_packets(
     azimuth = np.empty(firings, np.float32)
     time = np.empty(firings, np.float32)
     too_close = np.empty(firings, np.bool_)
-    n_points, n_firings, start_us, end_us = _decode(
-        packets,
-        time_us,
-        first_block,
-        end_block,
-        pair,
+    limits = (
         int(np.ceil(min_range / DISTANCE_UNIT_M - 1e-6)),
         int(np.floor(max_range / DISTANCE_UNIT_M + 1e-6)),
-        points,
-        azimuth,
-        time,
-        too_close,
+    )
+    n_points, n_firings, start_us, end_us = _decode(
+        packets, time_us, first_block, end_block, pair, limits, points, (azimuth, time, too_close)
     )
     return DecodedPackets(
         points[:n_points],
@@ -195,24 +189,25 @@ def _column_times(steps, columns, count, limit, per_us, sent_us, column_us):  # 
 
 
 @njit(nogil=True, cache=True, boundscheck=False)
-def _decode(  # type: ignore[no-untyped-def]
-    packets,
-    time_us,
-    first_block,
-    end_block,
-    pair,
-    min_units,
-    max_units,
-    points,
-    firing_azimuth,
-    firing_time,
-    firing_too_close,
-):
-    """Kernel of `decode_packets`; returns the number of points, the number of firings, start and end time in us."""
+def _decode(packets, time_us, first_block, end_block, pair, limits, points, firings):  # type: ignore[no-untyped-def]
+    """Decode packets (kernel of `decode_packets`).
+
+    Args:
+        packets: as in `decode_packets`.
+        time_us: as in `decode_packets`.
+        first_block: as in `decode_packets`.
+        end_block: as in `decode_packets`.
+        pair: blocks of one azimuth: 2 in dual return mode, else 1.
+        limits: smallest and largest range, 2 mm.
+        points: output, `POINT_DTYPE`.
+        firings: output: azimuth (rad), time (s) and too-close flag of each firing sequence.
+
+    Returns:
+        Number of points, number of firing sequences, start and end time in microseconds.
+    """
     n_points = 0
     n_firings = 0
     n_packets = packets.shape[0]
-    columns = BLOCKS // pair
     steps = np.zeros(BLOCKS, np.int64)
     column_us = np.zeros(BLOCKS)
     per_us = np.float32(0.0)
@@ -225,50 +220,98 @@ def _decode(  # type: ignore[no-untyped-def]
             # Single precision and order of additions as in the C++ drivers, so that ties round the same way.
             per_us = np.float32(turned) / np.float32(count) / np.float32(BLOCK_PERIOD_US)
         sent_us = time_us[p + 1] - time_us[p] if p + 1 < n_packets else np.inf
-        _column_times(steps, columns, count, limit, per_us, sent_us, column_us)
+        _column_times(steps, BLOCKS // pair, count, limit, per_us, sent_us, column_us)
         if p == 0:
             start_us = column_us[first_block // pair]
         start = first_block if p == 0 else 0
         stop = end_block if p == n_packets - 1 else BLOCKS
         for block in range(start, stop, pair):
-            at = 100 * block
-            block_azimuth = np.float32(packet[at + 2] | np.int32(packet[at + 3]) << 8)
             block_us = time_us[p] - time_us[0] - start_us + column_us[block // pair]
-            for firing in range(FIRINGS):
-                too_close = False
-                for laser in range(LASERS):
-                    ray_us = _RAY_TIME_US[firing, laser]
-                    index = -1
-                    offset = at + 4 + 48 * firing + 3 * laser
-                    before = -1
-                    for _ in range(pair):
-                        units = packet[offset] | np.int32(packet[offset + 1]) << 8
-                        reflectivity = packet[offset + 2]
-                        offset += 100
-                        if units == 0 or units == before or units > max_units:
-                            continue
-                        if units < min_units:
-                            too_close = True
-                            continue
-                        before = units
-                        if index < 0:
-                            azimuth = block_azimuth + per_us * np.float32(ray_us)
-                            index = int(azimuth + np.float32(0.5) + np.float32(36000.0)) % 36000
-                        distance = units * DISTANCE_UNIT_M
-                        across = distance * _COS_ELEVATION[laser]
-                        point = points[n_points]
-                        point.x = np.float32(across * _COS_AZIMUTH[index])
-                        point.y = np.float32(-across * _SIN_AZIMUTH[index])
-                        point.z = np.float32(distance * _SIN_ELEVATION[laser] + LASER_VERTICAL_OFFSET_M[laser])
-                        point.intensity = np.float32(reflectivity)
-                        point.ring = LASER_RING[laser]
-                        point.time = np.float32((block_us + ray_us) * 1e-6)
-                        n_points += 1
-                firing_us = FIRING_PERIOD_US * firing
-                turn = (block_azimuth + per_us * np.float32(firing_us)) * np.float32(0.01)
-                firing_azimuth[n_firings] = np.radians(turn % np.float32(360.0))
-                firing_time[n_firings] = np.float32((block_us + firing_us) * 1e-6)
-                firing_too_close[n_firings] = too_close
-                n_firings += 1
-                end_us = block_us + firing_us + FIRING_PERIOD_US
+            n_points = _decode_block(
+                packet, block, pair, per_us, block_us, limits, points, n_points, firings, n_firings
+            )
+            n_firings += FIRINGS
+            end_us = block_us + FIRING_PERIOD_US * (FIRINGS - 1) + FIRING_PERIOD_US
     return n_points, n_firings, start_us, end_us
+
+
+@njit(nogil=True, cache=True, boundscheck=False)
+def _decode_block(  # type: ignore[no-untyped-def]
+    packet, block, pair, per_us, block_us, limits, points, n_points, firings, n_firings
+):
+    """Decode a block, or a pair of dual returns; return the new number of points.
+
+    Args:
+        packet: payload, (1206,).
+        block: number of the block.
+        pair: as in `_decode`.
+        per_us: turn rate, 0.01 degrees per microsecond.
+        block_us: time of the block's first ray after the revolution's first firing.
+        limits: as in `_decode`.
+        points: as in `_decode`.
+        n_points: number of points so far.
+        firings: as in `_decode`.
+        n_firings: number of firing sequences so far.
+    """
+    firing_azimuth, firing_time, firing_too_close = firings
+    at = 100 * block
+    block_azimuth = np.float32(packet[at + 2] | np.int32(packet[at + 3]) << 8)
+    for firing in range(FIRINGS):
+        too_close = False
+        for laser in range(LASERS):
+            ray_us = _RAY_TIME_US[firing, laser]
+            azimuth = block_azimuth + per_us * np.float32(ray_us)
+            offset = at + 4 + 48 * firing + 3 * laser
+            n_points, near = _decode_ray(
+                packet, offset, laser, pair, azimuth, block_us + ray_us, limits, points, n_points
+            )
+            too_close |= near
+        firing_us = FIRING_PERIOD_US * firing
+        turn = (block_azimuth + per_us * np.float32(firing_us)) * np.float32(0.01)
+        firing_azimuth[n_firings + firing] = np.radians(turn % np.float32(360.0))
+        firing_time[n_firings + firing] = np.float32((block_us + firing_us) * 1e-6)
+        firing_too_close[n_firings + firing] = too_close
+    return n_points
+
+
+@njit(inline="always")
+def _decode_ray(  # type: ignore[no-untyped-def]
+    packet, offset, laser, pair, azimuth, time_us, limits, points, n_points
+):
+    """Decode the one or two returns of a ray; return the new number of points, and whether a return was too close.
+
+    Args:
+        packet: payload, (1206,).
+        offset: first byte of the ray's first return; the second follows a block later.
+        laser: laser id.
+        pair: number of returns.
+        azimuth: azimuth of the ray, 0.01 degrees.
+        time_us: time of the ray after the revolution's first firing.
+        limits: as in `_decode`.
+        points: as in `_decode`.
+        n_points: number of points so far.
+    """
+    min_units, max_units = limits
+    index = int(azimuth + np.float32(0.5) + np.float32(36000.0)) % 36000
+    too_close = False
+    before = -1
+    for number in range(pair):
+        at = offset + 100 * number
+        units = packet[at] | np.int32(packet[at + 1]) << 8
+        if units == 0 or units == before or units > max_units:
+            continue
+        if units < min_units:
+            too_close = True
+            continue
+        before = units
+        distance = units * DISTANCE_UNIT_M
+        across = distance * _COS_ELEVATION[laser]
+        point = points[n_points]
+        point.x = np.float32(across * _COS_AZIMUTH[index])
+        point.y = np.float32(-across * _SIN_AZIMUTH[index])
+        point.z = np.float32(distance * _SIN_ELEVATION[laser] + LASER_VERTICAL_OFFSET_M[laser])
+        point.intensity = np.float32(packet[at + 2])
+        point.ring = LASER_RING[laser]
+        point.time = np.float32(time_us * 1e-6)
+        n_points += 1
+    return n_points, too_close

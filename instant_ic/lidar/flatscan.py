@@ -48,21 +48,13 @@ def flat_scan(
         times_ns = revolution.stamp_ns + np.linspace(0.0, duration_s * 1e9, _MOTION_SAMPLES).astype(np.int64)
         shifts = motion.end_from_time(revolution.end_ns, times_ns)
     ranges = np.empty(config.beams, np.float32)
-    _project(
-        revolution.points,
-        revolution.firing_azimuth,
-        revolution.firing_time,
-        revolution.firing_too_close,
-        np.ascontiguousarray(base_from_lidar[:3, :3], np.float64),
-        np.ascontiguousarray(base_from_lidar[:3, 3], np.float64),
-        shifts,
-        duration_s,
-        config.min_height,
-        config.max_height,
-        config.range_min,
-        config.range_max,
-        ranges,
-    )
+    per_sample = (_MOTION_SAMPLES - 1) / duration_s
+    firings = revolution.firing_azimuth, revolution.firing_time, revolution.firing_too_close
+    _mark_firings(firings, shifts, per_sample, ranges)
+    rotation = np.ascontiguousarray(base_from_lidar[:3, :3], np.float64)
+    translation = np.ascontiguousarray(base_from_lidar[:3, 3], np.float64)
+    heights, limits = (config.min_height, config.max_height), (config.range_min, config.range_max)
+    _project(revolution.points, rotation, translation, shifts, per_sample, heights, limits, ranges)
     return ranges
 
 
@@ -109,51 +101,64 @@ def warm_up() -> None:
 
 
 @njit(nogil=True, cache=True)
-def _project(  # type: ignore[no-untyped-def]
-    points,
-    firing_azimuth,
-    firing_time,
-    firing_too_close,
-    rotation,
-    translation,
-    shifts,
-    duration_s,
-    min_height,
-    max_height,
-    range_min,
-    range_max,
-    ranges,
-):
-    """Kernel of `flat_scan`; ``shifts`` are the base's poses over the revolution relative to its end."""
+def _sample(time_s, per_sample, last):  # type: ignore[no-untyped-def]
+    """Return the sample of the motion before a time, and the share of the way to the next one."""
+    at = min(max(time_s * per_sample, 0.0), float(last))
+    k = min(int(at), last - 1)
+    return k, at - k
+
+
+@njit(nogil=True, cache=True)
+def _mark_firings(firings, shifts, per_sample, ranges):  # type: ignore[no-untyped-def]
+    """Set each beam to +inf where a firing measured, to -inf where a return was too close, else to nan.
+
+    Args:
+        firings: azimuth (rad), time (s) and too-close flag of each firing sequence, (F,) each.
+        shifts: poses of the base over the revolution relative to its end, (S, 3).
+        per_sample: samples of ``shifts`` per second.
+        ranges: output, (beams,).
+    """
+    azimuth, time_s, too_close = firings
     beams = ranges.shape[0]
     per_beam = 2.0 * np.pi / beams
-    last = shifts.shape[0] - 1
-    per_sample = last / duration_s
     ranges[:] = np.nan
-
-    # Measured directions, and those with a return closer than the minimum range.
-    for i in range(firing_azimuth.shape[0]):
-        at = min(max(firing_time[i] * per_sample, 0.0), float(last))
-        k = min(int(at), last - 1)
-        yaw = shifts[k, 2] + (at - k) * (shifts[k + 1, 2] - shifts[k, 2])
+    for i in range(azimuth.shape[0]):
+        k, alpha = _sample(time_s[i], per_sample, shifts.shape[0] - 1)
+        yaw = shifts[k, 2] + alpha * (shifts[k + 1, 2] - shifts[k, 2])
         # The mount's rotation drops out: a yaw of the base turns the sensor by the same angle.
-        direction = yaw - firing_azimuth[i]
-        beam = int(np.floor((direction + np.pi) / per_beam + 0.5)) % beams
-        if firing_too_close[i]:
+        beam = int(np.floor((yaw - azimuth[i] + np.pi) / per_beam + 0.5)) % beams
+        if too_close[i]:
             ranges[beam] = -np.inf
         elif np.isnan(ranges[beam]):
             ranges[beam] = np.inf
 
+
+@njit(nogil=True, cache=True)
+def _project(  # type: ignore[no-untyped-def]
+    points, rotation, translation, shifts, per_sample, heights, limits, ranges
+):
+    """Lower the range of each beam to its nearest point.
+
+    Args:
+        points: points in the sensor's frame, `POINT_DTYPE`, (N,).
+        rotation: mount of the sensor, (3, 3).
+        translation: mount of the sensor, metres, (3,).
+        shifts: as in `_mark_firings`.
+        per_sample: as in `_mark_firings`.
+        heights: smallest and largest height of an obstacle, metres.
+        limits: smallest and largest range of the scan, metres.
+        ranges: updated in place, (beams,).
+    """
+    beams = ranges.shape[0]
+    per_beam = 2.0 * np.pi / beams
     for i in range(points.shape[0]):
         point = points[i]
         x = rotation[0, 0] * point.x + rotation[0, 1] * point.y + rotation[0, 2] * point.z + translation[0]
         y = rotation[1, 0] * point.x + rotation[1, 1] * point.y + rotation[1, 2] * point.z + translation[1]
         z = rotation[2, 0] * point.x + rotation[2, 1] * point.y + rotation[2, 2] * point.z + translation[2]
-        if z < min_height or z > max_height:
+        if z < heights[0] or z > heights[1]:
             continue
-        at = min(max(point.time * per_sample, 0.0), float(last))
-        k = min(int(at), last - 1)
-        alpha = at - k
+        k, alpha = _sample(point.time, per_sample, shifts.shape[0] - 1)
         yaw = shifts[k, 2] + alpha * (shifts[k + 1, 2] - shifts[k, 2])
         c = np.cos(yaw)
         s = np.sin(yaw)
@@ -164,12 +169,11 @@ def _project(  # type: ignore[no-untyped-def]
         scan_x = rotation[0, 0] * moved_x + rotation[1, 0] * moved_y + rotation[2, 0] * moved_z
         scan_y = rotation[0, 1] * moved_x + rotation[1, 1] * moved_y + rotation[2, 1] * moved_z
         distance = np.hypot(scan_x, scan_y)
-        if distance > range_max:
+        if distance > limits[1]:
             continue
         beam = int(np.floor((np.arctan2(scan_y, scan_x) + np.pi) / per_beam + 0.5)) % beams
-        found = ranges[beam]
-        if distance < range_min:
+        if distance < limits[0]:
             ranges[beam] = -np.inf
-        elif not distance >= found:
+        elif not distance >= ranges[beam]:
             # This also fills beams that no firing marked as measured (nan compares false).
             ranges[beam] = distance
