@@ -130,7 +130,7 @@ class ConsoleClient:
 
     @property
     def closed(self) -> bool:
-        """Whether the socket is closed."""
+        """True if the socket is closed."""
         return self._socket is None or self._socket.closed
 
     async def acquire(self, *, take: bool = False, timeout_s: float = 5.0) -> None:

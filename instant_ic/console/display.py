@@ -37,7 +37,7 @@ class Display:
 
     @property
     def with_vbot(self) -> bool:
-        """Whether the v-bot's view is shown or soon will be."""
+        """True if the v-bot's view is shown or soon will be."""
         return self.mode in ("entering", "virtual", "returning")
 
     @property
@@ -48,7 +48,7 @@ class Display:
         return (FrameKind.VIEW if self.shown == "virtual" else FrameKind.PANORAMA,)
 
     def changes_mode(self, control: ControlState) -> bool:
-        """Whether a new state of the arbiter changes the mode that the page shows."""
+        """Return whether a new state of the arbiter changes the mode that the page shows."""
         return self.mode not in ("none", MODES.get(int(control.mode)))
 
     def step(self, control: ControlState | None) -> None:

@@ -110,7 +110,7 @@ class DriveGate:
 
     @property
     def moving(self) -> bool:
-        """Whether the command is not zero."""
+        """True if the command is not zero."""
         return self._command != (0.0, 0.0)
 
     def request(self, client: int, now: float, *, take: bool = False) -> bool:
@@ -152,7 +152,7 @@ class DriveGate:
         return was_there == away
 
     def driver_alive(self, now: float) -> bool:
-        """Whether there is a driver whose page reported him present within ``beat_timeout_s``."""
+        """Return whether there is a driver whose page reported him present within ``beat_timeout_s``."""
         return self.driver is not None and now - self._driver_beat < self.config.beat_timeout_s
 
     def receive(self, client: int, sequence: int, age_s: float, linear: float, angular: float, now: float) -> Verdict:

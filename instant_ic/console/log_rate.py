@@ -25,7 +25,7 @@ class LogRate(logging.Filter):
         self._left_out: dict[tuple[str, int], int] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether the record is logged."""
+        """Return whether the record is logged."""
         place, now = (record.pathname, record.lineno), self._clock()
         if now - self._last.get(place, -math.inf) < PERIOD_S:
             self._left_out[place] = self._left_out.get(place, 0) + 1

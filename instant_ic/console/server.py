@@ -140,7 +140,7 @@ class ConsoleServer:
 
     @property
     def plain_http(self) -> bool:
-        """Whether token, cookie and commands go over the network unencrypted."""
+        """True if token, cookie and commands go over the network unencrypted."""
         return self._tls is None and not is_loopback(self.config.host)
 
     @property
@@ -309,7 +309,7 @@ class ConsoleServer:
         if request.path == "/" and request.method == "GET":
             if token := request.query.get("token", ""):
                 return await self._enter(request, token)
-            return self._sign_in_page("Sign in to see the robot.")
+            return _sign_in_page("Sign in to see the robot.", self.plain_http)
         if _bearer(request.headers.get("Authorization", "")):
             await self._slow_down(request)
         return web.Response(
@@ -323,7 +323,7 @@ class ConsoleServer:
         if role is None:
             await _pace(request, self._requests)
             await self._slow_down(request)
-            return self._sign_in_page("Wrong token.")
+            return _sign_in_page("Wrong token.", self.plain_http)
         now = time.monotonic()
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
@@ -333,12 +333,6 @@ class ConsoleServer:
         self.pages.end_signed_out()  # pages whose sign-in the new one displaced
         logger.info("%s has signed in to %s", request.remote, role.value)
         return response
-
-    def _sign_in_page(self, text: str) -> web.Response:
-        page = (STATIC / "sign-in.html").read_text(encoding="utf-8")
-        warning = PLAIN_HTTP if self.plain_http else ""
-        page = page.replace("{text}", html.escape(text)).replace("{warning}", html.escape(warning))
-        return web.Response(status=401, text=page, content_type="text/html")
 
     async def _sign_in(self, request: web.Request) -> web.StreamResponse:
         if not self.access.required:
@@ -399,6 +393,12 @@ async def _pace(request: web.Request, buckets: AddressBuckets) -> None:
         _end_if_left(request)
 
 
+def _sign_in_page(text: str, plain_http: bool) -> web.Response:
+    page = (STATIC / "sign-in.html").read_text(encoding="utf-8")
+    page = page.replace("{text}", html.escape(text)).replace("{warning}", html.escape(PLAIN_HTTP) if plain_http else "")
+    return web.Response(status=401, text=page, content_type="text/html")
+
+
 def _check_origin(request: web.Request) -> None:
     origin = request.headers.get("Origin")
     if not origin_allowed(origin, request.headers.get("Host", "")):
@@ -425,7 +425,7 @@ async def _secure_headers(request: web.Request, response: web.StreamResponse) ->
 
 
 def origin_allowed(origin: str | None, host: str) -> bool:
-    """Whether a request comes from the page itself; programs send no Origin and are accepted."""
+    """Return whether a request comes from the page itself; programs send no Origin and are accepted."""
     if origin is None:
         return True
     try:

@@ -61,7 +61,7 @@ class ViewRequests:
         )
 
     def _due(self, since_s: float, rate_hz: float) -> bool:
-        """Whether to send a request so long after the last one, if there are to be so many a second."""
+        """Return whether to send a request ``since_s`` after the last one, at a rate of ``rate_hz``."""
         if self._outstanding and since_s < RESPONSE_TIMEOUT_S:
             return False
         return since_s >= 1.0 / rate_hz - 0.001

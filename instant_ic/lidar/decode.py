@@ -274,7 +274,7 @@ def _decode_block(  # type: ignore[no-untyped-def]
     return n_points
 
 
-@njit(inline="always")
+@register_jitable(inline="always")
 def _decode_ray(  # type: ignore[no-untyped-def]
     packet, offset, laser, pair, azimuth, time_us, limits, points, n_points
 ):

@@ -40,12 +40,12 @@ class Sector:
         return turns * self.width + min(rest, self.width)
 
     def resembles(self, other: Sector) -> bool:
-        """Whether both edges agree, as far as blocks of different turns can."""
+        """Return whether both edges agree within the spacing of blocks in different turns."""
         start = (other.start - self.start + _SAME_EDGE_CDEG) % TURN_CDEG
         return start <= 2 * _SAME_EDGE_CDEG and abs(other.width - self.width) <= 2 * _SAME_EDGE_CDEG
 
     def contains(self, azimuth: int) -> bool:
-        """Whether an azimuth is inside, clear of both edges."""
+        """Return whether an azimuth is inside, clear of both edges."""
         inside = (azimuth - self.start) % TURN_CDEG
         return _SAME_EDGE_CDEG < inside < self.width - _SAME_EDGE_CDEG
 
