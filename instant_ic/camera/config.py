@@ -73,7 +73,7 @@ class FilesConfig(Checked):
 
     Attributes:
         rate_hz: images per second.
-        loop: whether to restart after the last image; otherwise the last image is repeated.
+        loop: start again after the last image; otherwise the last image is repeated.
         quality: JPEG quality for files in other formats, 1-100.
     """
 
@@ -89,9 +89,9 @@ class ThetaCameraConfig:
     Attributes:
         source: ``theta`` (Web API), ``video`` (device, RTSP address or video file), ``files``.
         url: address of the Theta; device, address or path for the other sources. It must not hold a password.
-        password_file: file with USER:PASSWORD of the Theta or the stream, mode 0600; empty: none, for the Theta as in
-            INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD. They replace ``{user}`` and ``{password}`` in the
-            stream's address, or stand before its host.
+        password_file: file with USER:PASSWORD of the Theta or the stream, mode 0600. Empty: none for a stream, and
+            INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD for the Theta. User and password replace ``{user}``
+            and ``{password}`` in the stream's address, or are put before its host.
         frame_id: the camera's frame.
         camera_mount: the camera's pose on base_link.
         silence_s: seconds without an image that cause a warning; four times as long is an error.

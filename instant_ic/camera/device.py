@@ -23,7 +23,11 @@ _BOARD_HOT_C = 70.0
 
 
 def open_camera(config: ThetaCameraConfig, now_ns: Callable[[], int]) -> Camera:
-    """The camera of ``config.source``, not connected yet; ``now_ns`` stamps its images.
+    """Return the camera of ``config.source``, not connected yet.
+
+    Args:
+        config: parameters of the node.
+        now_ns: clock of the images' stamps.
 
     Raises:
         CameraError: the password file cannot be used.
@@ -53,14 +57,18 @@ def _credentials(file: str) -> tuple[str, str]:
 
 
 def health(client: ThetaClient) -> Diagnosis:
-    """Battery, temperature and errors of a Theta, or why they are unknown; asks the camera, so it may take seconds."""
+    """Ask a Theta for battery, temperature and errors, which may take seconds; return them as a diagnosis."""
     try:
         state = client.state()
     except CameraError as error:
         return Diagnosis("health", Level.WARN, str(error))
     low = state.battery is not None and state.battery < _BATTERY_LOW
     hot = state.board_temperature_c is not None and state.board_temperature_c >= _BOARD_HOT_C
-    text = [*(["battery is low: charge it"] if low else []), *(["it is getting hot"] if hot else []), *state.errors]
+    text = [
+        *(["battery is low: charge it"] if low else []),
+        *(["the camera is hot: switch it off to cool down"] if hot else []),
+        *state.errors,
+    ]
     values = {
         "battery": state.battery,
         "battery_temperature_c": state.battery_temperature_c,

@@ -14,7 +14,7 @@ SUFFIXES = (*JPEG_SUFFIXES, ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class FileCamera(Camera):
-    """Returns images in the order of their names; JPEG files are passed through unchanged."""
+    """Images of a file or folder, in the order of their names. JPEG files are passed through unchanged."""
 
     def __init__(
         self,
@@ -74,6 +74,7 @@ class FileCamera(Camera):
         return Frame(jpeg, self._stamp_ns(), width, height)
 
     def close(self) -> None:
+        """Forget the images."""
         self._paths = []
         self._loaded.clear()
         self._index = 0

@@ -1,4 +1,4 @@
-"""Decides whether a camera's images show the present: neither copies of earlier ones, nor of one colour."""
+"""Check that a camera's images show the present: no copies of earlier ones, and none of one colour."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _EMPTY_SPREAD = 2.0
 
 
 class LiveImages:
-    """Checks the images of a device, one after the other.
+    """Liveness of a device's images, taken one after the other.
 
     Attributes:
-        fault: what is wrong with the newest image, and what to do; empty while it is live.
+        fault: text that names the fault of the newest image and what to do; empty while the images are live.
         withheld: number of images that were not live.
     """
 
@@ -27,7 +27,7 @@ class LiveImages:
         self._repeats = RepeatWatch()
 
     def is_live(self, frame: Frame) -> bool:
-        """Return whether an image may be shown; otherwise ``fault`` says why not."""
+        """Return whether an image may be shown; if not, set ``fault``."""
         if not self._repeats.is_new(frame.jpeg):
             self.fault = "the camera repeats the same image: restart the camera, or the program that feeds its device"
         elif _empty(frame):

@@ -1,4 +1,4 @@
-"""Runs a camera on its own thread: connects, reads, and reconnects with growing waits."""
+"""Thread that connects to a camera, reads it, and reconnects with growing waits."""
 
 import threading
 import time

@@ -16,7 +16,7 @@ _BOUNDARY = "osclivepreview"
 
 
 class PreviewParser:
-    """Takes the stream in chunks of any size and returns complete JPEGs.
+    """Parser of the preview's stream: takes chunks of any size and returns complete JPEGs.
 
     Attributes:
         bad_frames: number of dropped parts: truncated, not a JPEG, or without a usable length.

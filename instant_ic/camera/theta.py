@@ -23,7 +23,7 @@ from instant_ic.util.pace import current
 NEVER = 65535
 """Value of sleepDelay and offDelay that keeps the camera from sleeping or switching itself off."""
 _NEVER_READ = (0, NEVER)
-"""Values that the camera reports for it."""
+"""Values that the camera reports after `NEVER` was set."""
 
 Format = tuple[int, int, int]
 """Width, height and frame rate of the preview."""
@@ -66,7 +66,7 @@ class ThetaState:
 
 
 class ThetaClient:
-    """Sends commands to the camera over one persistent connection; safe to use from several threads.
+    """Commands to the camera over one persistent connection; safe to use from several threads.
 
     Its methods raise `CameraError` if the camera does not answer, and `ThetaError` if it refuses a command.
 
@@ -102,14 +102,15 @@ class ThetaClient:
         self._session = DeviceSession(user, password)
 
     def close(self) -> None:
+        """Close the connection."""
         self._session.close()
 
     def info(self) -> dict[str, Any]:
-        """``GET /osc/info``: model, serial number, firmware."""
+        """Return model, serial number and firmware (``GET /osc/info``)."""
         return self._call("GET", "/osc/info", None)
 
     def state(self) -> ThetaState:
-        """``POST /osc/state``: battery, temperatures, error codes."""
+        """Return battery, temperatures and error codes (``POST /osc/state``)."""
         state = self._call("POST", "/osc/state", {}).get("state")
         state = state if isinstance(state, dict) else {}
         errors = state.get("_cameraError")
@@ -134,7 +135,7 @@ class ThetaClient:
         return results if isinstance(results, dict) else {}
 
     def options(self, names: Sequence[str]) -> dict[str, Any]:
-        """``camera.getOptions``; empty if the camera refuses the command."""
+        """Return the values of options (``camera.getOptions``); empty if the camera refuses the command."""
         try:
             options = self.execute("camera.getOptions", {"optionNames": list(names)}).get("options")
         except ThetaError:
@@ -142,7 +143,7 @@ class ThetaClient:
         return options if isinstance(options, dict) else {}
 
     def set_options(self, options: Mapping[str, Any]) -> None:
-        """``camera.setOptions``; refused if the camera does not know an option or its value."""
+        """Set options (``camera.setOptions``); the camera refuses an unknown option or value."""
         self.execute("camera.setOptions", {"options": dict(options)})
 
     def open_preview(self) -> tuple[DeviceSession, requests.Response]:
@@ -251,7 +252,7 @@ class ThetaCamera(Camera):
         return choice
 
     def read(self) -> Frame:
-        """Return the newest complete image; the camera ends the preview at its button, shooting or change of mode."""
+        """Return the newest complete image; the camera ends the preview when it shoots or changes its mode."""
         response, session = self._response, self._session
         if response is None or session is None:
             raise CameraError(f"{self.client.url}: not connected; call connect() first")
@@ -333,7 +334,7 @@ def _refusal(where: str, body: Mapping[str, Any] | None, status: int, reply: Map
 
 
 def _cause(error: BaseException) -> str:
-    """Text of the innermost exception, which names the cause; the outer ones only repeat addresses."""
+    """Return the text of the innermost exception, which names the cause; the outer ones only repeat addresses."""
     seen = {id(error)}
     while True:
         inner = error.__cause__ or error.__context__ or getattr(error, "reason", None)

@@ -21,7 +21,7 @@ _CLOSE_S = 1.0
 _MOST_HUNG = 2
 """Readers that may hang in a driver at once; no further one is started until one of them returns."""
 _LOOK_S = 0.1
-"""Period at which a waiting call looks whether it is cancelled."""
+"""Period at which a waiting call checks whether it is cancelled."""
 
 
 class VideoCamera(Camera):
@@ -129,10 +129,10 @@ class VideoCamera(Camera):
 
 
 class _Reader(threading.Thread):
-    """Opens a capture, reads an image each time it is asked, and releases the capture at its end.
+    """Thread that opens a capture, reads an image each time it is asked, and releases the capture at its end.
 
     Args:
-        open_capture: returns the capture and its description, which is the first answer.
+        open_capture: function that returns the capture and its description, which is the first answer.
         stamp_ns: clock of the images.
     """
 
@@ -181,7 +181,7 @@ class _Reader(threading.Thread):
         raise TimeoutError
 
     def end(self, timeout_s: float) -> bool:
-        """Let the thread end; return False if it hangs. One that owes an answer is not waited for."""
+        """Let the thread end; return False if it hangs. A thread that has not answered yet is not waited for."""
         self._asked.put(False)
         if not self._waiting:
             self.join(timeout_s)

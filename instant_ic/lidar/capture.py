@@ -80,7 +80,7 @@ class CaptureReader:
             yield Datagram(stamp_ns, port, self._data[start:end])
 
     def _pcap(self) -> Iterator[tuple[int, int, int, int]]:
-        """(stamp, link type, start, end) of each frame."""
+        """Yield stamp, link type, start and end of each frame."""
         data = self._data
         order, unit_ns = _PCAP_MAGIC[data[:4]]
         if len(data) < 24:
@@ -105,7 +105,7 @@ class CaptureReader:
             self.skipped["cut record"] += 1
 
     def _pcapng(self) -> Iterator[tuple[int, int, int, int]]:
-        """(stamp, link type, start, end) of each frame in the enhanced packet blocks."""
+        """Yield stamp, link type, start and end of each frame in the enhanced packet blocks."""
         data, size = self._data, len(self._data)
         at, order = 0, "<"
         interfaces: list[tuple[int, float]] = []
@@ -140,7 +140,7 @@ class CaptureReader:
 
 
 def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:
-    """Nanoseconds per timestamp unit, from the interface options (if_tsresol, code 9)."""
+    """Return the nanoseconds per timestamp unit, from the interface options (if_tsresol, code 9)."""
     while at + 4 <= end:
         code, length = struct.unpack_from(order + "HH", data, at)
         if code == 0:
@@ -153,7 +153,7 @@ def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:
 
 
 def _udp(data: bytes, start: int, end: int, link: int) -> tuple[int, int, int] | str:
-    """(destination port, start, end) of a frame's UDP payload, or the reason why it has none."""
+    """Return destination port, start and end of a frame's UDP payload, or the reason why it has none."""
     if link == LINK_ETHERNET:
         at = start + 12
         while end - at >= 4 and data[at : at + 2] in (b"\x81\x00", b"\x88\xa8"):

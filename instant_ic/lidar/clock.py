@@ -11,7 +11,7 @@ class DeviceClock:
     was set.
 
     Attributes:
-        resets: how often the offset was re-estimated after a clock was set.
+        resets: number of times the offset was estimated again because a clock was set.
     """
 
     JUMP_NS = 500_000_000
@@ -26,9 +26,9 @@ class DeviceClock:
         self._jumped = 0
 
     def step_us(self, timestamp_us: int) -> int | None:
-        """Microseconds from the last accepted packet to this one, in the shorter direction around the hour.
+        """Return the microseconds from the last accepted packet to this one, in the shorter direction around the hour.
 
-        Negative for an older packet; None before the first packet.
+        They are negative for an older packet. Before the first packet the result is None.
         """
         if self._device_us is None:
             return None
@@ -73,5 +73,5 @@ class DeviceClock:
         self._jumped = 0
 
     def host_ns(self, device_us: float) -> int:
-        """Host time of an instant on the unwrapped device clock."""
+        """Return the host time of an instant on the unwrapped device clock."""
         return round(device_us * 1000.0 + self._offset_ns)

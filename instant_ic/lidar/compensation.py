@@ -20,13 +20,16 @@ _LEAST_NS = 50_000_000
 def compensated_scan(
     revolution: Revolution, base_from_lidar: NDArray[np.float64], config: FlatScanConfig, tf: TransformBuffer
 ) -> tuple[NDArray[np.float32], Diagnosis]:
-    """Ranges (beams,) of a revolution, and whether they are motion-compensated; without odometry the base stands still.
+    """Return the flat scan of a revolution, and a diagnosis of its motion compensation.
 
     Args:
         revolution: decoded points.
         base_from_lidar: mount of the sensor, (4, 4).
         config: height interval and beams.
-        tf: holds ``odom`` to ``base_link``, if anybody publishes it.
+        tf: holds ``odom`` to ``base_link``; without it the base is assumed to stand still.
+
+    Returns:
+        Ranges as in `flat_scan`, (beams,), and the diagnosis ``motion``.
     """
     try:
         motion = base_motion(tf, revolution.stamp_ns, revolution.end_ns)
@@ -38,7 +41,7 @@ def compensated_scan(
 
 
 def base_pose(tf: TransformBuffer) -> NDArray[np.float64]:
-    """Newest pose (3,) of the base in ``odom``; the origin where it is not known."""
+    """Return the newest pose of the base in ``odom``, (3,); the origin if it is unknown."""
     try:
         return pose2_from_matrix(tf.lookup("odom", "base_link"))
     except TransformError:
@@ -46,7 +49,7 @@ def base_pose(tf: TransformBuffer) -> NDArray[np.float64]:
 
 
 def base_motion(tf: TransformBuffer, start_ns: int, end_ns: int) -> PlanarMotion | None:
-    """Poses of the base around a revolution; None where they are not published.
+    """Return the poses of the base around a revolution; None if they are not published.
 
     Raises:
         TransformError: the poses of this time are missing.

@@ -75,7 +75,7 @@ class Vlp16DriverConfig(ReceiverConfig):
         source: ``udp``, ``pcap``, or ``topic`` (packets of a bag from /lidar/packets).
         pcap: capture file, for source pcap.
         rate: playback rate of the capture; 1 is the recorded rate.
-        loop: restart the capture at its end.
+        loop: start the capture again at its end.
         frame_id: the sensor's frame.
         lidar_mount: the sensor's pose on base_link.
         silence_s: seconds without a packet that are an error.

@@ -1,8 +1,8 @@
-"""Finds sectors of the sensor that something covers: they return nothing where there were returns just before.
+"""Sectors of the sensor that something covers: they return nothing, although there were returns just before.
 
-1. Each revolution gives, per sector, the share of rays with a return; ground and ceiling count too.
-2. The largest share seen in a direction of the world, by odometry, is remembered. It fades with time and distance.
-3. A sector with hardly a return is covered if many are remembered there and beside it, until returns are back.
+1. Compute the share of rays with a return per sector of a revolution. Ground and ceiling count too.
+2. Remember the largest share seen in each direction of the world, by odometry. The memory fades with time and distance.
+3. Mark a sector with hardly a return as covered if many are remembered there and beside it, until returns are back.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _WIDTH_RAD = 2.0 * math.pi / SECTORS
 
 
 class CoverWatch:
-    """Follows the sectors from revolution to revolution.
+    """The covered sectors, updated with each revolution.
 
     Attributes:
-        covered: whether each sector is covered; sector i begins at azimuth i * 5 degrees, clockwise, (72,).
+        covered: True for a covered sector; sector i begins at azimuth i * 5 degrees, clockwise, (72,).
     """
 
     def __init__(self) -> None:
@@ -58,21 +58,21 @@ class CoverWatch:
         self._held[world] = np.maximum(held, np.where(measured, share, 0.0))
 
     def withhold(self, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Ranges (beams,) of a flat scan without the free, or too close, beams of covered sectors: they become NaN."""
+        """Return the ranges of a flat scan, (beams,), with NaN for infinite ones in covered sectors."""
         direction = -math.pi + 2.0 * math.pi / len(ranges) * np.arange(len(ranges))
         return np.where(self.covered[_sector(-direction)] & np.isinf(ranges), np.float32(np.nan), ranges)
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """Which directions are covered, in degrees clockwise from ahead."""
+        """Diagnosis of the covered directions, in degrees clockwise from ahead."""
         if not self.covered.any():
             return Diagnosis("cover", Level.OK, "no sector is covered")
         width, starts = 360 // SECTORS, np.flatnonzero(self.covered & ~np.roll(self.covered, 1))
         first = int(starts[0]) if len(starts) else 0
         text = (
-            f"nothing returns any more from {int(self.covered.sum()) * width}° of the circle, from {first * width}° on "
-            "(clockwise from ahead): uncover the sensor, or keep away from what is nearer than it sees. The robot does "
-            "not drive that way"
+            f"LiDAR covered: no more returns from {int(self.covered.sum()) * width}° of the circle, from "
+            f"{first * width}° on (clockwise from ahead). The robot does not drive that way. Uncover the sensor, or "
+            "drive away from objects that are too near for it."
         )
         return Diagnosis("cover", Level.ERROR, text)
 

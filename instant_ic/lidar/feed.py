@@ -1,4 +1,4 @@
-"""Packets in, trusted revolutions out."""
+"""Revolutions from packets, with the check of their sender."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from instant_ic.lidar.sources import SourceGuard
 from instant_ic.lidar.stream import PacketStream, Revolution
 
 _SET_NS, _SET_BACK_NS = 20_000_000, -500_000_000
-"""Changes of the host's clock relative to its steady one, at a packet, that mean that it was set."""
+"""Changes of the host's clock relative to its steady clock, between packets, from which on it counts as set."""
 
 Packets = list[tuple[bytes, int]]
 """Payloads with their stamps."""
 
 
 class PacketFeed:
-    """Assembles revolutions with the packets they consist of, and restarts after a doubtful sender.
+    """Revolutions and the packets they consist of. The current revolution is dropped after a doubtful sender.
 
     Attributes:
         stream: decodes the packets.
-        sources: decides whether the packets can be trusted.
+        sources: check of the packets' sender.
         last_ns: steady time of the newest packet, or of the start.
     """
 
@@ -49,7 +49,7 @@ class PacketFeed:
         return self._with_packets(revolution)
 
     def _follow_host(self, ahead_ns: int) -> None:
-        """Notice a host's clock that was set forward; waits on the way only lower ``ahead_ns``."""
+        """Follow a host's clock that was set forward. Delays of transport only lower ``ahead_ns``."""
         raised_ns = 0 if self._ahead_ns is None else ahead_ns - self._ahead_ns
         if raised_ns > _SET_NS:
             self.stream.clock.shift(raised_ns)
@@ -57,6 +57,7 @@ class PacketFeed:
             self._ahead_ns = ahead_ns
 
     def finish(self) -> tuple[Revolution, Packets] | None:
+        """Return the rest as the last revolution, with its packets."""
         return self._with_packets(self.stream.finish())
 
     def _with_packets(self, revolution: Revolution | None) -> tuple[Revolution, Packets] | None:

@@ -73,9 +73,9 @@ def check_level(base_from_lidar: NDArray[np.float64]) -> None:
 
 
 def coverage(revolution: Revolution, blocked: Sector | None = None) -> float:
-    """Share of the configured field of view that a revolution measured, counted in whole degrees, 0-1.
+    """Return the share of the configured field of view that a revolution measured, counted in whole degrees, 0-1.
 
-    Below 1 for a partial revolution: after the start, at a jump of the sensor's clock, or with missing packets.
+    It is below 1 for a partial revolution: after the start, at a jump of the sensor's clock, or with missing packets.
 
     Args:
         revolution: decoded points.

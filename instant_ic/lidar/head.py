@@ -51,7 +51,7 @@ class Sector:
 
 
 class Head:
-    """Follows the head through the azimuths of the packets' blocks.
+    """Turn of the head, followed through the azimuths of the packets' blocks.
 
     Attributes:
         blocked: sector without blocks; None if there is none, or not yet known.

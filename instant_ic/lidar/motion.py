@@ -32,7 +32,7 @@ class PlanarMotion:
             raise MotionError("stamps must increase, and at least one is required")
 
     def at(self, stamps_ns: ArrayLike) -> NDArray[np.float64]:
-        """Poses at the given times, (..., 3); yaw is not wrapped.
+        """Return the poses at the given times, (..., 3); yaw is not wrapped.
 
         Raises:
             MotionError: a time is too far before the first or after the last pose.
@@ -56,7 +56,7 @@ class PlanarMotion:
         return np.asarray(poses[at] + alpha[..., None] * (poses[at + 1] - poses[at]))
 
     def end_from_time(self, end_ns: int, stamps_ns: ArrayLike) -> NDArray[np.float64]:
-        """Poses of the base at the given times relative to the base at ``end_ns``: (x, y, yaw), (..., 3)."""
+        """Return the poses of the base at the given times relative to the base at ``end_ns``: (x, y, yaw), (..., 3)."""
         end = self.at(end_ns)
         relative = self.at(stamps_ns) - end
         c, s = np.cos(end[2]), np.sin(end[2])

@@ -1,4 +1,4 @@
-"""VLP-16 wire format: encodes and decodes data packets (1206 bytes) and position packets (512 bytes).
+"""VLP-16 wire format of data packets (1206 bytes) and position packets (512 bytes).
 
 Source: Velodyne VLP-16 User Manual (63-9243), chapters 9 and 12.
 """
@@ -62,7 +62,7 @@ def encode_data_packet(
     return_mode: int = RETURN_STRONGEST,
     product: int = PRODUCT_VLP16,
 ) -> bytes:
-    """Bytes of one data packet.
+    """Return the bytes of one data packet.
 
     In dual return mode (0x39) blocks come in pairs of equal azimuth: even blocks hold the last return, odd blocks the
     strongest, or the second strongest if the strongest is also the last (manual, page 57).
@@ -127,7 +127,7 @@ _POSITION_NMEA = 0xCE
 
 
 def encode_position_packet(timestamp_us: int, pps: int = 0, nmea: str = "") -> bytes:
-    """Bytes of one position packet (512); see `PositionPacket` for the fields.
+    """Return the bytes of one position packet (512); see `PositionPacket` for the fields.
 
     Raises:
         PacketError: a value does not fit the format.

@@ -1,4 +1,4 @@
-"""Plays a capture at its recorded rate, or faster or slower."""
+"""Playback of a capture at its recorded rate, or faster or slower."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from instant_ic.util.diagnosis import Diagnosis, Level
 
 
 class CapturePlayer:
-    """Returns the datagrams of a capture when they are due.
+    """The datagrams of a capture, each when it is due.
 
     Args:
         path: capture file.
@@ -34,10 +34,11 @@ class CapturePlayer:
 
     @property
     def ended(self) -> bool:
+        """True after the last datagram."""
         return self._next is None
 
     def due(self, steady_ns: int) -> Iterator[Datagram]:
-        """Datagrams that are due at a steady time, stamped as from the start on.
+        """Yield the datagrams that are due at a steady time, with stamps relative to the start of the playback.
 
         Stamps keep the sensor's own rate at any playback rate; otherwise its clock would seem to drift.
         """
@@ -48,6 +49,7 @@ class CapturePlayer:
 
     @property
     def diagnosis(self) -> Diagnosis:
+        """Number of played and of skipped datagrams."""
         skipped = ", ".join(f"{count} x {reason}" for reason, count in self._reader.skipped.items())
         text = f"{self._reader.datagrams} datagrams played" + (f"; left out: {skipped}" if skipped else "")
         return Diagnosis("capture", Level.WARN if skipped else Level.OK, text)

@@ -66,14 +66,14 @@ class SensorDatagram(NamedTuple):
 
 
 class PacketReceiver(Closing):
-    """Receives on both ports of the sensor.
+    """Sockets on both ports of the sensor.
 
     Example:
         >>> with PacketReceiver(ReceiverConfig()) as receiver:      # doctest: +SKIP
         ...     for received in receiver.read(timeout_s=0.1): ...
 
     Attributes:
-        sources: decides which senders' packets are accepted.
+        sources: check of the senders.
         port, position_port: the bound UDP ports; -1 for none.
 
     Raises:
@@ -138,7 +138,7 @@ class PacketReceiver(Closing):
 
 
 class ReceiverThread(threading.Thread):
-    """Reads a receiver on a thread of its own.
+    """Thread that reads a receiver.
 
     Args:
         receiver: closed at the end.

@@ -12,14 +12,15 @@ from instant_ic.util.diagnosis import Diagnosis, Level
 from instant_ic.util.repeats import RepeatWatch
 
 _SILENT = {
-    "topic": "no /lidar/packets for {silent_s:.1f} s",
+    "topic": "no /lidar/packets for {silent_s:.1f} s. Check the bag player.",
     "pcap": "{where} has ended",
-    "udp": "no packet on UDP {where} for {silent_s:.1f} s: is the sensor on, does its destination address fit, is this "
-    "host in its network (factory: 192.168.1.201), does a firewall block it, is net.ipv4.conf.*.rp_filter 0?",
+    "udp": "no packet on UDP {where} for {silent_s:.1f} s. Check that the sensor is on and sends to this host, that "
+    "this host is in its network (factory: 192.168.1.201), that no firewall blocks it, and that "
+    "net.ipv4.conf.*.rp_filter is 0.",
 }
-"""What to check when no packets arrive, by source."""
+"""Messages to the operator when no packets arrive, by source."""
 _LEAST_RETURNS = 0.01
-"""Share of the rays with a return below which the sensor is covered or broken: the ground alone gives more."""
+"""Share of rays with a return below which the sensor counts as covered. The ground alone gives more."""
 _PAST_HOUR = (
     "The sensor counts its time of the hour beyond 3600 s; it is taken modulo the hour. Check the sensor's GPS "
     "receiver and pulse per second."
@@ -27,23 +28,23 @@ _PAST_HOUR = (
 _LEAST_BLOCKED_DEG = 5.0
 """A smaller sector without blocks is not reported; two blocks at 1200 rpm take 1.6 degrees."""
 _VIEW = "The sensor measures {view} degrees only, clockwise from ahead"
-_UNSEEN = _VIEW + ". The robot does not see what is elsewhere: do not turn or reverse towards it."
+_UNSEEN = _VIEW + ". Other directions are unseen: do not turn or reverse towards them."
 _TOO_SMALL = (
     _VIEW
-    + ", of the {wanted} that the driver expects. No scan, the robot stands. Set the sensor's field of view to 0 to "
-    "359 on its web page. If the rest may stay unseen, set vlp16_driver decoder.fov_start_deg and decoder.fov_end_deg."
+    + ", of the {wanted} that the driver expects. No scan: the robot has stopped. Set the sensor's field of view to 0 "
+    "to 359 on its web page. If the rest may stay unseen, set vlp16_driver decoder.fov_start_deg and fov_end_deg."
 )
 _PPS = ("absent", "synchronising", "locked", "error")
 
 
 class LidarReport:
-    """Reports losses, silence and doubtful senders.
+    """Counters and diagnoses of losses, silence and doubtful senders.
 
     Attributes:
         skipped: revolutions that the node had no time for.
         partial: incomplete revolutions, which gave no scan.
         withheld: revolutions that could not be trusted.
-        blind: whether the newest revolution measured almost nothing.
+        blind: True if the newest revolution measured almost nothing.
     """
 
     def __init__(self, feed: PacketFeed) -> None:
@@ -57,7 +58,7 @@ class LidarReport:
         self._partial_reported = 0
 
     def trusts(self, revolution: Revolution, steady_ns: int) -> bool:
-        """Whether a revolution that ends now may be published; a copy, or one of a doubtful sender, is withheld."""
+        """Return whether a revolution may be published; a copy, or one of a doubtful sender, is withheld."""
         # Without a scan the robot stops; a forged or an old one could drive it into a wall.
         points = revolution.points
         new = self._repeats.is_new(*(points[name].tobytes() for name in ("x", "y", "z", "intensity")))
@@ -66,12 +67,12 @@ class LidarReport:
         return trusted
 
     def capture_restarts(self) -> None:
-        """Take a capture for new data when it is played again."""
+        """Accept the data of a capture again when it is played again."""
         self._repeats.forget()
 
     def covers(self, revolution: Revolution, min_coverage: float) -> bool:
-        """Whether a revolution gives a scan: not an incomplete one, which counts as partial, nor a blind one."""
-        # Half blind: it would mislead map matching, and the scan itself does not show the fault to other nodes.
+        """Return whether a revolution gives a scan. An incomplete one counts as partial, and a blind one gives none."""
+        # A half-blind scan would mislead map matching, and does not itself show the fault to other nodes.
         covered = coverage(revolution, self._feed.stream.config.blocked) >= min_coverage
         if covered or revolution.complete:
             self._covered = covered
@@ -81,7 +82,7 @@ class LidarReport:
         return covered and not self.blind
 
     def position(self, payload: bytes) -> Diagnosis:
-        """State of the sensor's clock from a position packet."""
+        """Return a diagnosis of the sensor's clock from a position packet."""
         try:
             position = decode_position_packet(payload)
         except PacketError as error:
@@ -90,15 +91,15 @@ class LidarReport:
         return Diagnosis("position", Level.OK, f"pulse per second {pps}", {"nmea": position.nmea})
 
     def source(self, steady_ns: int) -> Diagnosis:
-        """Whether the packets come from one sender, in order, and each revolution is a new one."""
+        """Return a diagnosis of the sender: one sender, packets in order, each revolution a new one."""
         doubt, sources = self._feed.sources.doubt(steady_ns), self._feed.sources
         if doubt is None and self._repeats.copies and not self.blind:
-            doubt = "the sensor repeats the same revolution: restart the sensor. No scan, the robot stands"
+            doubt = "the sensor repeats the same revolution. No scan: the robot has stopped. Restart the sensor."
         values = {"foreign": sources.foreign, "withheld": self.withheld}
         return Diagnosis("source", Level.ERROR if doubt else Level.OK, doubt or "one sender, in order", values)
 
     def check(self, steady_ns: int, silence_s: float, source: str, where: str) -> Iterator[Diagnosis]:
-        """State of the sender and of the packets since the last call.
+        """Yield the diagnoses of sender, clock, view and packets since the last call.
 
         Args:
             steady_ns: steady time.
@@ -132,7 +133,10 @@ class LidarReport:
         elif not counters.packets:
             level, text = Level.WARN, "no packet yet"
         elif self.blind:
-            level, text = Level.ERROR, "the sensor measures almost nothing: is it covered? No scan, the robot stands"
+            level, text = (
+                Level.ERROR,
+                "the sensor measures almost nothing. No scan: the robot has stopped. Uncover the sensor.",
+            )
         elif any(new):
             level = Level.WARN
             text = (
@@ -145,13 +149,13 @@ class LidarReport:
         yield Diagnosis("packets", level, text, values)
 
     def _clock(self) -> Iterator[Diagnosis]:
-        """Warn once of a sensor whose time of the hour does not wrap; its packets are used all the same."""
+        """Warn once of a sensor whose time of the hour does not wrap. Its packets are used all the same."""
         if self._feed.stream.counters.past_hour:
             yield Diagnosis("clock", Level.OK if self._past_hour_reported else Level.WARN, _PAST_HOUR)
             self._past_hour_reported = True
 
     def _view(self) -> Diagnosis:
-        """Whether the sensor measures all around, or why there is no scan although every packet arrives."""
+        """Return a diagnosis of the field of view, which may be why there is no scan although every packet arrives."""
         stream = self._feed.stream
         blocked = stream.head.blocked
         if blocked is None or blocked.width < 100.0 * _LEAST_BLOCKED_DEG:

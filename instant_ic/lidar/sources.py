@@ -1,8 +1,8 @@
-"""Accepts packets of one sensor only, and reports when another sender may interfere.
+"""Check that all packets come from one sensor.
 
 UDP does not authenticate the sender. If a second sender's clock runs ahead, every packet of the sensor counts as late,
-and the second sender's walls replace the real ones. The guard therefore accepts one address and port and reports a
-second sender. It also reports packets out of order, which a sender with a forged address cannot avoid.
+and the second sender's walls replace the real ones. The guard therefore accepts one address and port, and reports any
+other sender. It also reports packets out of order, which a second sender with the sensor's own address cannot avoid.
 """
 
 _LATE_SHARE = 0.03
@@ -12,10 +12,10 @@ _LATE_BURST = 3.0
 
 
 class SourceGuard:
-    """Checks the sender and the packet order of one sensor.
+    """Sender and packet order of one sensor.
 
     Attributes:
-        foreign: datagrams rejected because another sender sent them.
+        foreign: number of datagrams that were rejected because another sender sent them.
     """
 
     QUIET_S = 3.0
@@ -25,7 +25,7 @@ class SourceGuard:
         """Start without a sender.
 
         Args:
-            sensor: address of the sensor; empty locks onto the first sender until the process ends.
+            sensor: address of the sensor; empty accepts the first sender, and no other until the process ends.
         """
         self.foreign = 0
         self._configured = bool(sensor)
@@ -38,33 +38,27 @@ class SourceGuard:
         self._late_ns: int | None = None
 
     def admit(self, sender: tuple[str, int], is_data: bool, well_formed: bool, now_ns: int) -> bool:
-        """Whether a datagram is from the sensor.
+        """Return whether a datagram is from the sensor.
 
         Another port of the same address is accepted as a restarted sensor once the old port has been silent.
 
         Args:
             sender: address and port.
             is_data: True from the data port, False from the position port.
-            well_formed: whether the payload can be the sensor's; otherwise it neither locks nor counts as a fault.
+            well_formed: False if the payload cannot be the sensor's; then it neither selects a sender nor is a fault.
             now_ns: steady time.
         """
         address, port = sender
-        if not self._address:
-            if not well_formed:
-                return True  # may be another product: the stream reports which one
-            self._address = address
-        if address != self._address:
-            self.foreign += 1
-            if well_formed and not self._configured:
-                self._doubt_sender(sender, now_ns)
-            return False
         if not well_formed:
-            return True
+            foreign = bool(self._address) and address != self._address
+            self.foreign += foreign
+            return not foreign  # may be another product: the stream reports which one
+        self._address = self._address or address
+        if address != self._address:
+            return self._reject(sender, now_ns, doubtful=not self._configured)
         before = self._ports.get(is_data)
         if before is not None and before[0] != port and now_ns - before[1] < self.QUIET_S * 1e9:
-            self.foreign += 1
-            self._doubt_sender(sender, now_ns)
-            return False
+            return self._reject(sender, now_ns, doubtful=True)
         self._ports[is_data] = (port, now_ns)
         return True
 
@@ -94,6 +88,8 @@ class SourceGuard:
     def _recent(self, then_ns: int | None, now_ns: int) -> bool:
         return then_ns is not None and now_ns - then_ns < self.QUIET_S * 1e9
 
-    def _doubt_sender(self, sender: tuple[str, int], now_ns: int) -> None:
-        self._rival = f"{sender[0]}:{sender[1]}"
-        self._rival_ns = now_ns
+    def _reject(self, sender: tuple[str, int], now_ns: int, doubtful: bool) -> bool:
+        self.foreign += 1
+        if doubtful:
+            self._rival, self._rival_ns = f"{sender[0]}:{sender[1]}", now_ns
+        return False

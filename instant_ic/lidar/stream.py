@@ -1,4 +1,4 @@
-"""Splits the stream of data packets into revolutions and counts missing packets."""
+"""Revolutions from the stream of data packets, with a count of the missing ones."""
 
 import struct
 from collections.abc import Iterator
@@ -47,7 +47,7 @@ class Revolution(DecodedPackets):
     Attributes:
         stamp_ns: host time of the first firing.
         end_ns: host time of the end of the last firing.
-        complete: whether both ends are at the cut angle and no packet is missing.
+        complete: True if both ends are at the cut angle and no packet is missing.
     """
 
     stamp_ns: int
@@ -85,7 +85,7 @@ class StreamCounters:
 
 
 class PacketStream:
-    """Takes data packets one by one and returns each revolution as soon as it ends."""
+    """Assembler of revolutions: takes data packets one by one, and returns each revolution as soon as it ends."""
 
     def __init__(self, config: DecoderConfig | None = None) -> None:
         self.config = config or DecoderConfig()
@@ -158,7 +158,7 @@ class PacketStream:
             step_us: time since the last packet on the sensor's clock; None before the first one.
             sent_us: part of it in which the sensor sent packets.
             elapsed_us: time since the last packet on the host's clock.
-            dual: whether the new packet has two returns.
+            dual: True if the new packet has two returns.
         """
         period_us = PACKET_PERIOD_US / 2 if dual else PACKET_PERIOD_US
         done = None
