@@ -37,11 +37,36 @@ def prior_inverse_depth(inverse, depth_edge, u, v):  # type: ignore[no-untyped-d
 
 
 @njit(**_OPTIONS)
+def _bilinear_colour(rgb, gain, turn, fall, target, surface, near):  # type: ignore[no-untyped-def]
+    """Write a panorama's colour, in the newest's exposure and minus 0.5, to two samples.
+
+    Args:
+        rgb: panorama, (H, W, 3); gain: (3,).
+        turn, fall: place in it as shares of its width and height.
+        target: (2 N, 4), rows ``surface`` and ``near`` are written.
+    """
+    height, width = rgb.shape[:2]
+    one, half = np.float32(1), np.float32(0.5)
+    u, v = turn * np.float32(width) - half, fall * np.float32(height) - half
+    v = min(max(v, np.float32(0)), np.float32(height - 1))
+    u0, v0 = math.floor(u), math.floor(v)
+    fu, fv = u - np.float32(u0), v - np.float32(v0)
+    v1 = min(v0 + 1, height - 1)
+    left, right = u0 % width, (u0 + 1) % width
+    for c in range(3):
+        top = np.float32(rgb[v0, left, c]) * (one - fu) + np.float32(rgb[v0, right, c]) * fu
+        bottom = np.float32(rgb[v1, left, c]) * (one - fu) + np.float32(rgb[v1, right, c]) * fu
+        value = (top * (one - fv) + bottom * fv) * gain[c]
+        target[surface, c] = min(value * np.float32(1 / 255), one) - half
+        target[near, c] = target[surface, c]
+
+
+@njit(**_OPTIONS)
 def sample_rays(  # type: ignore[no-untyped-def]
     uniform, columns, rows, sources, rgb, inverse, depth_edge, usable, trust, map_from_camera, gains, band,
     points, target, weight
 ):  # fmt: skip
-    """One ray in each of ``columns × rows`` strata of equal solid angle; two samples a ray.
+    """Sample one ray in each of ``columns × rows`` strata of equal solid angle, with two samples a ray.
 
     Args:
         uniform: (N, 3) in [0, 1): place in the stratum (azimuth, height) and in the band; N = columns · rows.
@@ -54,7 +79,6 @@ def sample_rays(  # type: ignore[no-untyped-def]
             front positive).
         weight: out, (2 N, 2): of the colour and of the distance, 0 where no ray may be sampled.
     """
-    height, width = rgb.shape[1:3]
     h, w = inverse.shape[1:]
     tiles = columns // 8
     one, half = np.float32(1), np.float32(0.5)
@@ -67,20 +91,9 @@ def sample_rays(  # type: ignore[no-untyped-def]
         z = one - np.float32(2) * (np.float32(row) + uniform[n, 1]) / np.float32(rows)
         azimuth = np.float32(math.pi) * (one - np.float32(2) * turn)
         fall = half - np.float32(math.asin(z)) / np.float32(math.pi)
-        u, v = turn * np.float32(width) - half, fall * np.float32(height) - half
-        v = min(max(v, np.float32(0)), np.float32(height - 1))
-        u0, v0 = math.floor(u), math.floor(v)
-        fu, fv = u - np.float32(u0), v - np.float32(v0)
-        v1 = min(v0 + 1, height - 1)
-        left, right = u0 % width, (u0 + 1) % width
         surface = tile * 128 + inside
         near = surface + 64
-        for c in range(3):
-            top = np.float32(rgb[k, v0, left, c]) * (one - fu) + np.float32(rgb[k, v0, right, c]) * fu
-            bottom = np.float32(rgb[k, v1, left, c]) * (one - fu) + np.float32(rgb[k, v1, right, c]) * fu
-            value = (top * (one - fv) + bottom * fv) * gains[k, c]
-            target[surface, c] = min(value * np.float32(1 / 255), one) - half
-            target[near, c] = target[surface, c]
+        _bilinear_colour(rgb[k], gains[k], turn, fall, target, surface, near)
         depth = one / prior_inverse_depth(
             inverse[k], depth_edge[k], turn * np.float32(w) - half, fall * np.float32(h) - half
         )
@@ -236,11 +249,84 @@ def transformed(target_from_source, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
+def _enter_grid(origin, directions, pixels, grid, low, cell, state, active):  # type: ignore[no-untyped-def]
+    """Start the rays of ``pixels`` that cross the grid; return their number and write their indices to ``active``."""
+    t, leave = state[0], state[1]
+    size = 0
+    for n in range(pixels.shape[0]):
+        enter, out = grid_span(origin, directions[pixels[n]], low, cell, grid.shape)
+        if enter < out:
+            t[n], leave[n] = enter, out
+            active[size] = n
+            size += 1
+    return size
+
+
+@njit(**_OPTIONS)
+def _skip_empty_cells(  # type: ignore[no-untyped-def]
+    origin, directions, pixels, grid, low, cell, state, active, size, depth, confidence
+):
+    """Move each active ray to its next occupied cell; return how many have one. The others end."""
+    t, leave, _, _, spare, _ = state
+    queries = 0
+    for k in range(size):
+        n = active[k]
+        found = next_occupied(origin, directions[pixels[n]], t[n], leave[n], grid, low, cell)
+        if found >= 0:
+            t[n] = found
+            active[queries] = n
+            queries += 1
+        elif spare[n] > 0:
+            depth[pixels[n]] = spare[n]
+            confidence[pixels[n]] = 1
+    return queries
+
+
+@njit(**_OPTIONS)
+def _ends_here(n, value, cell, keyframes, share, origin, direction, state, pixel, depth, confidence):  # type: ignore[no-untyped-def]
+    """Test a ray at its present sample, and move it on; return True if it ends on a surface.
+
+    Args:
+        n: index of the ray; value: the field's signed distance there, in bands.
+        keyframes: arrays ``inverse``, ``depth_edge``, ``known``, ``camera_from_map`` and ``band`` of ``trace``.
+        state: arrays of ``trace``, by ray.
+        pixel: place of the ray in ``depth`` and ``confidence``, which are written if it ends.
+    """
+    t, _, last_t, last_s, spare, spare_s = state
+    inverse, depth_edge, known, camera_from_map, band = keyframes
+    before = last_s[n]
+    if share > 0:
+        px, py, pz = at_length(origin, direction, t[n])
+        seen, _ = nearest_prior(px, py, pz, inverse, depth_edge, known, camera_from_map, band, False)
+        value += share * (seen - value)
+    if t[n] - last_t[n] > 3 * cell:
+        before = NOT_SEEN
+    hit = t[n]
+    crossed = before != NOT_SEEN and (before > 0) != (value > 0)
+    if crossed:
+        hit = last_t[n] + (t[n] - last_t[n]) * before / (before - value)
+    px, py, pz = at_length(origin, direction, hit)
+    _, agrees = nearest_prior(px, py, pz, inverse, depth_edge, known, camera_from_map, band, True)
+    if agrees > 0:
+        if value <= 0 or crossed:
+            depth[pixel] = hit
+            confidence[pixel] = 0.5 * agrees if before > 0 and value <= 0 else 0.0
+            return True
+        if agrees == 2 and value < spare_s[n]:
+            spare[n], spare_s[n] = hit, value
+    px, py, pz = along(camera_from_map[0], origin, direction, t[n])
+    reach = abs(value) * band[0] * math.sqrt(px * px + py * py + pz * pz)
+    last_t[n], last_s[n] = t[n], value
+    t[n] += min(max(np.float32(0.9) * reach, np.float32(0.5) * cell), 2 * cell)
+    return False
+
+
+@njit(**_OPTIONS)
 def trace(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, grid, low, cell,
     inverse, depth_edge, known, camera_from_map, band, share, origin, directions, pixels, depth, confidence
 ):  # fmt: skip
-    """Marches rays to the first zero of the signed distance that agrees with a keyframe's depth.
+    """March rays to the first zero of the signed distance that agrees with a keyframe's depth.
 
     The distance is the field's and the prior's own, mixed: a young field's surfaces are rough.
 
@@ -248,19 +334,20 @@ def trace(  # type: ignore[no-untyped-def]
         grid, low, cell: of the ``Occupancy``.
         inverse, depth_edge, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4) float32.
-        share: of the prior in the distance, 0..1; with 1 the field is not asked at all.
+        share: weight of the prior in the distance, 0..1; with 1 the field is not asked at all.
         origin: (3,); directions: (P, 3) unit vectors of all pixels, map frame.
         pixels: (N,) which of them to march.
         depth: out, (P,): metres along the ray, 0 where it meets nothing.
         confidence: out, (P,): 1 on a surface that a keyframe has seen from its front, 0.5 where its depth was filled.
     """
     count = pixels.shape[0]
-    t = np.zeros(count, np.float32)
-    leave = np.zeros(count, np.float32)
-    last_t = np.zeros(count, np.float32)
-    last_s = np.full(count, NOT_SEEN, np.float32)
-    spare = np.zeros(count, np.float32)  # nearest to the surface so far, should the field show no crossing
-    spare_s = np.full(count, NOT_SEEN, np.float32)
+    # By ray: t and where it leaves the grid, last t and distance, and the place nearest to the surface so far with its
+    # distance, should the field show no crossing.
+    state = (
+        np.zeros(count, np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32),
+        np.full(count, NOT_SEEN, np.float32), np.zeros(count, np.float32), np.full(count, NOT_SEEN, np.float32),
+    )  # fmt: skip
+    keyframes = inverse, depth_edge, known, camera_from_map, band
     active = np.zeros(count, np.int32)
     points = np.zeros((BLOCK, 3), np.float32)
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
@@ -268,28 +355,13 @@ def trace(  # type: ignore[no-untyped-def]
     s = np.zeros((1, BLOCK), np.float32)
     entries, weights = np.empty((1, 8, BLOCK), np.uint32), np.empty((1, 8, BLOCK), np.float32)
     head, bias = w2[3:4], b2[3:4]
-    size = 0
     for n in range(count):
-        pixel = pixels[n]
-        depth[pixel] = 0
-        confidence[pixel] = 0
-        enter, out = grid_span(origin, directions[pixel], low, cell, grid.shape)
-        if enter < out:
-            t[n], leave[n] = enter, out
-            active[size] = n
-            size += 1
+        depth[pixels[n]] = confidence[pixels[n]] = 0
+    size = _enter_grid(origin, directions, pixels, grid, low, cell, state, active)
     while size > 0:
-        queries = 0
-        for k in range(size):
-            n = active[k]
-            found = next_occupied(origin, directions[pixels[n]], t[n], leave[n], grid, low, cell)
-            if found >= 0:
-                t[n] = found
-                active[queries] = n
-                queries += 1
-            elif spare[n] > 0:
-                depth[pixels[n]] = spare[n]
-                confidence[pixels[n]] = 1
+        queries = _skip_empty_cells(
+            origin, directions, pixels, grid, low, cell, state, active, size, depth, confidence
+        )  # fmt: skip
         size = 0
         for start in range(0, queries, BLOCK):
             block = min(BLOCK, queries - start)
@@ -297,7 +369,7 @@ def trace(  # type: ignore[no-untyped-def]
                 for i in range(block):
                     n = active[start + i]
                     for c in range(3):
-                        points[i, c] = origin[c] + t[n] * directions[pixels[n], c]
+                        points[i, c] = origin[c] + state[0][n] * directions[pixels[n], c]
                 encode_block(table, cells_per_m, lattice_origin, focus, points, 0, block, entries, weights, x)
                 layer_block(w1, b1, x, h)
                 relu_block(h)
@@ -305,32 +377,11 @@ def trace(  # type: ignore[no-untyped-def]
             for i in range(block):
                 n = active[start + i]
                 pixel = pixels[n]
-                value, before = s[0, i], last_s[n]
-                if share > 0:
-                    px, py, pz = at_length(origin, directions[pixel], t[n])
-                    seen, _ = nearest_prior(px, py, pz, inverse, depth_edge, known, camera_from_map, band, False)
-                    value += share * (seen - value)
-                if t[n] - last_t[n] > 3 * cell:
-                    before = NOT_SEEN
-                hit = t[n]
-                crossed = before != NOT_SEEN and (before > 0) != (value > 0)
-                if crossed:
-                    hit = last_t[n] + (t[n] - last_t[n]) * before / (before - value)
-                px, py, pz = at_length(origin, directions[pixel], hit)
-                _, agrees = nearest_prior(px, py, pz, inverse, depth_edge, known, camera_from_map, band, True)
-                if agrees > 0:
-                    if value <= 0 or crossed:
-                        depth[pixel] = hit
-                        confidence[pixel] = 0.5 * agrees if before > 0 and value <= 0 else 0.0
-                        continue
-                    if agrees == 2 and value < spare_s[n]:
-                        spare[n], spare_s[n] = hit, value
-                px, py, pz = along(camera_from_map[0], origin, directions[pixel], t[n])
-                reach = abs(value) * band[0] * math.sqrt(px * px + py * py + pz * pz)
-                last_t[n], last_s[n] = t[n], value
-                t[n] += min(max(np.float32(0.9) * reach, np.float32(0.5) * cell), 2 * cell)
-                active[size] = n
-                size += 1
+                if not _ends_here(
+                    n, s[0, i], cell, keyframes, share, origin, directions[pixel], state, pixel, depth, confidence
+                ):
+                    active[size] = n
+                    size += 1
 
 
 @njit(**_OPTIONS)

@@ -1,4 +1,4 @@
-"""Table entries as machine vectors, which the compiler does not produce by itself (numba intrinsics in LLVM IR).
+"""Operations on table entries as machine vectors, which numba does not produce by itself (intrinsics in LLVM IR).
 
 ``gather2``, ``gather4`` (rows, entries, weights) → tuple of 2 or 4 float32:
     ``Σ weights[c] · rows[entries[c]]`` over the eight corners of a cell.
@@ -26,67 +26,89 @@ _FAST = ("fast",)
 _LONG, _INT, _FLOAT = ir.IntType(64), ir.IntType(32), ir.FloatType()
 
 
-def _functions(features: int) -> tuple[Any, Any, Any]:
-    vector = ir.VectorType(_FLOAT, features)
+def _vector(features: int) -> ir.VectorType:
+    return ir.VectorType(_FLOAT, features)
 
-    def row(context: Any, builder: Any, kind: Any, rows: Any, entry: Any) -> Any:
-        """Pointer to a table's row."""
-        first = builder.mul(builder.zext(entry, _LONG), _LONG(features))
-        data = context.make_array(kind)(context, builder, rows).data
-        return builder.bitcast(builder.gep(data, [first]), vector.as_pointer())
 
-    def filled(builder: Any, scalars: list[Any]) -> Any:
-        value = ir.Constant(vector, ir.Undefined)
-        for place, scalar in enumerate(scalars):
-            value = builder.insert_element(value, scalar, _INT(place))
-        return value
+def _row(features: int, context: Any, builder: Any, kind: Any, rows: Any, entry: Any) -> Any:
+    """Emit the pointer to a table's row."""
+    first = builder.mul(builder.zext(entry, _LONG), _LONG(features))
+    data = context.make_array(kind)(context, builder, rows).data
+    return builder.bitcast(builder.gep(data, [first]), _vector(features).as_pointer())
 
-    def weighted(builder: Any, weights: Any, corner: int, value: Any) -> Any:
-        weight = filled(builder, [builder.extract_value(weights, corner)] * features)
-        return builder.fmul(value, weight, flags=_FAST)
+
+def _filled(builder: Any, scalars: list[Any]) -> Any:
+    """Emit a vector of scalars."""
+    value = ir.Constant(_vector(len(scalars)), ir.Undefined)
+    for place, scalar in enumerate(scalars):
+        value = builder.insert_element(value, scalar, _INT(place))
+    return value
+
+
+def _weighted(features: int, builder: Any, weights: Any, corner: int, value: Any) -> Any:
+    """Emit ``weights[corner] · value``."""
+    weight = _filled(builder, [builder.extract_value(weights, corner)] * features)
+    return builder.fmul(value, weight, flags=_FAST)
+
+
+def _gather(features: int) -> Any:
+    """Make the intrinsic ``gather`` for tables of ``features``."""
 
     @intrinsic
     def gather(_typing: Any, rows: Any, entries: Any, weights: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            total = ir.Constant(vector, [0.0] * features)
+            total = ir.Constant(_vector(features), [0.0] * features)
             for corner in range(_CORNERS):
-                place = row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], corner))
-                value = weighted(builder, args[2], corner, builder.load(place, align=4))
+                entry = builder.extract_value(args[1], corner)
+                place = _row(features, context, builder, signature.args[0], args[0], entry)
+                value = _weighted(features, builder, args[2], corner, builder.load(place, align=4))
                 total = builder.fadd(total, value, flags=_FAST)
             parts = [builder.extract_element(total, _INT(place)) for place in range(features)]
             return context.make_tuple(builder, signature.return_type, parts)
 
         return types.UniTuple(types.float32, features)(rows, entries, weights), code
 
+    return gather
+
+
+def _scatter(features: int) -> Any:
+    """Make the intrinsic ``scatter`` for tables of ``features``."""
+
     @intrinsic
     def scatter(_typing: Any, rows: Any, entries: Any, weights: Any, upstream: Any) -> Any:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            value = filled(builder, [builder.extract_value(args[3], place) for place in range(features)])
+            value = _filled(builder, [builder.extract_value(args[3], place) for place in range(features)])
             for corner in range(_CORNERS):
-                place = row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], corner))
-                added = weighted(builder, args[2], corner, value)
+                entry = builder.extract_value(args[1], corner)
+                place = _row(features, context, builder, signature.args[0], args[0], entry)
+                added = _weighted(features, builder, args[2], corner, value)
                 builder.store(builder.fadd(builder.load(place, align=4), added, flags=_FAST), place, align=4)
             return context.get_dummy_value()
 
         return types.void(rows, entries, weights, upstream), code
+
+    return scatter
+
+
+def _adam(features: int) -> Any:
+    """Make the intrinsic ``adam`` for tables of ``features``."""
+    vector = _vector(features)
+
+    def mixed(builder: Any, kept: Any, new: Any, share: Any) -> Any:
+        """Emit ``new + share · (kept − new)``."""
+        change = builder.fmul(share, builder.fsub(kept, new, flags=_FAST), flags=_FAST)
+        return builder.fadd(new, change, flags=_FAST)
 
     @intrinsic
     def adam(
         _typing: Any, rows: Any, grad: Any, m: Any, v: Any, entry: Any, step: Any, beta1: Any, beta2: Any, epsilon: Any
     ) -> Any:
         def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            places = [row(context, builder, signature.args[n], args[n], args[4]) for n in range(4)]
+            places = [_row(features, context, builder, signature.args[n], args[n], args[4]) for n in range(4)]
             value, slope, mean, square = (builder.load(place, align=4) for place in places)
-            step, beta1, beta2, epsilon = (filled(builder, [scalar] * features) for scalar in args[5:])
-
-            def mixed(kept: Any, new: Any, share: Any) -> Any:
-                """``new + share · (kept − new)``."""
-                return builder.fadd(
-                    new, builder.fmul(share, builder.fsub(kept, new, flags=_FAST), flags=_FAST), flags=_FAST
-                )
-
-            mean = mixed(mean, slope, beta1)
-            square = mixed(square, builder.fmul(slope, slope, flags=_FAST), beta2)
+            step, beta1, beta2, epsilon = (_filled(builder, [scalar] * features) for scalar in args[5:])
+            mean = mixed(builder, mean, slope, beta1)
+            square = mixed(builder, square, builder.fmul(slope, slope, flags=_FAST), beta2)
             name, kind = f"llvm.sqrt.v{features}f32", ir.FunctionType(vector, [vector])
             root = builder.call(get_or_insert_function(builder.module, kind, name), [square])
             ratio = builder.fdiv(mean, builder.fadd(root, epsilon, flags=_FAST), flags=_FAST)
@@ -98,8 +120,8 @@ def _functions(features: int) -> tuple[Any, Any, Any]:
 
         return types.void(rows, grad, m, v, types.uint32, step, beta1, beta2, epsilon), code
 
-    return gather, scatter, adam
+    return adam
 
 
-gather2, scatter2, adam2 = _functions(2)
-gather4, scatter4, adam4 = _functions(4)
+gather2, scatter2, adam2 = _gather(2), _scatter(2), _adam(2)
+gather4, scatter4, adam4 = _gather(4), _scatter(4), _adam(4)

@@ -68,6 +68,49 @@ def ray_weights(raw, first, span, weight, left):  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
+def _ray_gradient(y, first, target, weight, w, left, offset, span, losses, each, pull, dy):  # type: ignore[no-untyped-def]
+    """Write the gradient of one ray's loss by the network's outputs, and return its colour and depth errors.
+
+    Args:
+        y, dy: outputs of the network and their gradient, (4, BLOCK); the ray's samples begin at ``first``.
+        target: colour of the ray, (3,) and more; weight: of colour and depth, (2,).
+        w, left, offset, span: weights of ``ray_weights`` and places of ``band_samples``, (SAMPLES,).
+        losses, each: weights of the losses and of a ray.
+        pull: scratch, (SAMPLES,).
+    """
+    step = np.float32(2.0 / SAMPLES)
+    by_colour, by_depth = each * weight[0], each * weight[1] * losses[0]
+    red, green, blue = -target[0], -target[1], -target[2]
+    mean, opacity = np.float32(0), np.float32(0)
+    for s in range(SAMPLES):
+        red += w[s] * y[0, first + s]
+        green += w[s] * y[1, first + s]
+        blue += w[s] * y[2, first + s]
+        mean += w[s] * offset[s]
+        opacity += w[s]
+    scale = np.float32(2.0 / 3.0) * by_colour
+    for s in range(SAMPLES):
+        i = first + s
+        spread = np.float32(2.0 / 3.0) * step * w[s]
+        for other in range(SAMPLES):
+            spread += np.float32(2) * w[other] * abs(offset[s] - offset[other])
+        pull[s] = (
+            scale * (red * y[0, i] + green * y[1, i] + blue * y[2, i])
+            + 2 * by_depth * mean * offset[s]
+            + each * weight[0] * (losses[2] * spread - 2 * losses[1] * (np.float32(1) - opacity))
+        )
+        dy[0, i], dy[1, i], dy[2, i] = scale * w[s] * red, scale * w[s] * green, scale * w[s] * blue
+    behind = np.float32(0)
+    for s in range(SAMPLES - 1, -1, -1):
+        raw = y[3, first + s]
+        inside = RAW_LIMITS[0] < raw < RAW_LIMITS[1]
+        thickness = np.float32(math.exp(raw)) * span[s] if inside else np.float32(0)
+        dy[3, first + s] = thickness * (left[s] * pull[s] - behind)
+        behind += w[s] * pull[s]
+    return by_colour * (red * red + green * green + blue * blue) / 3, each * weight[1] * mean * mean
+
+
+@njit(**_OPTIONS)
 def volume_gradient(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, origin, focus, points, target, weight, jitter, sources, cameras, band,
     losses, table_grad, touched, g1, gb1, g2, gb2
@@ -96,7 +139,7 @@ def volume_gradient(  # type: ignore[no-untyped-def]
     offset, span = np.empty((_RAYS, SAMPLES), np.float32), np.empty((_RAYS, SAMPLES), np.float32)
     w, left, pull = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
     rays = jitter.shape[0]
-    each, step = np.float32(1.0 / rays), np.float32(2.0 / SAMPLES)
+    each = np.float32(1.0 / rays)
     colour_error, depth_error = 0.0, 0.0
     for start in range(0, rays, _RAYS):
         tile = start // 64
@@ -114,39 +157,55 @@ def volume_gradient(  # type: ignore[no-untyped-def]
         for r in range(_RAYS):
             n, first = tile * 128 + (start + r) % 64, r * SAMPLES
             ray_weights(y[3], first, span[r], w, left)
-            by_colour, by_depth = each * weight[n, 0], each * weight[n, 1] * losses[0]
-            red, green, blue = -target[n, 0], -target[n, 1], -target[n, 2]
-            mean, opacity = np.float32(0), np.float32(0)
-            for s in range(SAMPLES):
-                red += w[s] * y[0, first + s]
-                green += w[s] * y[1, first + s]
-                blue += w[s] * y[2, first + s]
-                mean += w[s] * offset[r, s]
-                opacity += w[s]
-            colour_error += by_colour * (red * red + green * green + blue * blue) / 3
-            depth_error += each * weight[n, 1] * mean * mean
-            scale = np.float32(2.0 / 3.0) * by_colour
-            for s in range(SAMPLES):
-                i = first + s
-                spread = np.float32(2.0 / 3.0) * step * w[s]
-                for other in range(SAMPLES):
-                    spread += np.float32(2) * w[other] * abs(offset[r, s] - offset[r, other])
-                pull[s] = (
-                    scale * (red * y[0, i] + green * y[1, i] + blue * y[2, i])
-                    + 2 * by_depth * mean * offset[r, s]
-                    + each * weight[n, 0] * (losses[2] * spread - 2 * losses[1] * (np.float32(1) - opacity))
-                )
-                dy[0, i], dy[1, i], dy[2, i] = scale * w[s] * red, scale * w[s] * green, scale * w[s] * blue
-            behind = np.float32(0)
-            for s in range(SAMPLES - 1, -1, -1):
-                raw = y[3, first + s]
-                inside = RAW_LIMITS[0] < raw < RAW_LIMITS[1]
-                thickness = np.float32(math.exp(raw)) * span[r, s] if inside else np.float32(0)
-                dy[3, first + s] = thickness * (left[s] * pull[s] - behind)
-                behind += w[s] * pull[s]
+            colour, squared_depth = _ray_gradient(
+                y, first, target[n], weight[n], w, left, offset[r], span[r], losses, each, pull, dy
+            )
+            colour_error += colour
+            depth_error += squared_depth
         network_backward_block(w1, w2, x, h, dy, g1, gb1, g2, gb2, dh, dx)
         encode_backward_block(table_grad, touched, entries, corner_weights, BLOCK, dx)
     return colour_error, depth_error
+
+
+@njit(**_OPTIONS)
+def _guided_samples(origin, direction, depth, newest, band, points, first, offset, span):  # type: ignore[no-untyped-def]
+    """Place a view's samples around the depth of one ray, and return the half width of their band.
+
+    Args:
+        origin, direction: (3,); depth: metres along the ray.
+        newest, band, points, first, offset, span: as in ``band_samples``.
+    """
+    half, away = np.float32(0.5), np.float32(0)
+    surface = np.empty(3, np.float32)
+    for c in range(3):
+        surface[c] = origin[c] + depth * direction[c]
+        away += (surface[c] - newest[c]) ** 2
+    share = min(band * np.float32(math.sqrt(away)) / depth, half)
+    band_samples(origin, surface, half, share, newest, band, points, first, offset, span)
+    return share
+
+
+@njit(**_OPTIONS)
+def _composited(y, first, w, offset, colour):  # type: ignore[no-untyped-def]
+    """Write the colour of a ray (3,), and return the mean place of its samples in the band.
+
+    Args:
+        y: outputs of the network, (4, BLOCK); the ray's samples begin at ``first``.
+        w, offset: weights and places of the samples, (SAMPLES,).
+        colour: out, 0..1, (3,).
+    """
+    opacity, mean, half = np.float32(1e-6), np.float32(0), np.float32(0.5)
+    red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+    for s in range(SAMPLES):
+        red += w[s] * y[0, first + s]
+        green += w[s] * y[1, first + s]
+        blue += w[s] * y[2, first + s]
+        mean += w[s] * offset[s]
+        opacity += w[s]
+    colour[0] = min(max(red + half, np.float32(0)), np.float32(1))
+    colour[1] = min(max(green + half, np.float32(0)), np.float32(1))
+    colour[2] = min(max(blue + half, np.float32(0)), np.float32(1))
+    return mean / opacity
 
 
 @njit(**_OPTIONS)
@@ -170,9 +229,8 @@ def composite(  # type: ignore[no-untyped-def]
     offset, span = np.empty((_RAYS, SAMPLES), np.float32), np.empty((_RAYS, SAMPLES), np.float32)
     share = np.empty(_RAYS, np.float32)
     w, left = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
-    surface = np.empty(3, np.float32)
     pixels = np.empty(_RAYS, np.int64)
-    half, newest = np.float32(0.5), focus[0, :3]
+    newest = focus[0, :3]
     place, count = 0, depth.shape[0]
     while place < count:
         filled = 0
@@ -182,14 +240,8 @@ def composite(  # type: ignore[no-untyped-def]
                 filled += 1
             place += 1
         for r in range(filled):
-            pixel = pixels[r]
-            away = np.float32(0)
-            for c in range(3):
-                surface[c] = origin[c] + depth[pixel] * directions[pixel, c]
-                away += (surface[c] - newest[c]) ** 2
-            share[r] = min(band * np.float32(math.sqrt(away)) / depth[pixel], half)
-            band_samples(
-                origin, surface, half, share[r], newest, band, samples, r * SAMPLES, offset[r], span[r]
+            share[r] = _guided_samples(
+                origin, directions[pixels[r]], depth[pixels[r]], newest, band, samples, r * SAMPLES, offset[r], span[r]
             )  # fmt: skip
         encode_block(
             table, cells_per_m, lattice_origin, focus, samples, 0, filled * SAMPLES, entries, corner_weights, x
@@ -199,17 +251,5 @@ def composite(  # type: ignore[no-untyped-def]
         layer_block(w2, b2, h, y)
         for r in range(filled):
             ray_weights(y[3], r * SAMPLES, span[r], w, left)
-            opacity, mean = np.float32(1e-6), np.float32(0)
-            red, green, blue = np.float32(0), np.float32(0), np.float32(0)
-            for s in range(SAMPLES):
-                i = r * SAMPLES + s
-                red += w[s] * y[0, i]
-                green += w[s] * y[1, i]
-                blue += w[s] * y[2, i]
-                mean += w[s] * offset[r, s]
-                opacity += w[s]
-            pixel = pixels[r]
-            colour[pixel, 0] = min(max(red + half, np.float32(0)), np.float32(1))
-            colour[pixel, 1] = min(max(green + half, np.float32(0)), np.float32(1))
-            colour[pixel, 2] = min(max(blue + half, np.float32(0)), np.float32(1))
-            depth[pixel] *= np.float32(1) + (np.float32(1) - depth_share) * share[r] * mean / opacity
+            mean = _composited(y, r * SAMPLES, w, offset[r], colour[pixels[r]])
+            depth[pixels[r]] *= np.float32(1) + (np.float32(1) - depth_share) * share[r] * mean
