@@ -142,77 +142,107 @@ def wall_colours(rgb, source, upright, far, same, colours):  # type: ignore[no-u
 
 
 @njit(**_OPTIONS)
+def _colour_above(rgb, source, upright, found, v, u, same, some, total):  # type: ignore[no-untyped-def]
+    """Write the median colour of what is seen of the wall above a pixel; return False if nothing is.
+
+    Args:
+        rgb, source, upright, found, same: as in ``continue_walls``; v, u: the pixel.
+        some: scratch, (most, 3); total: out, (3,).
+    """
+    count, first = 0, 0
+    for n in range(v - 1, -1, -1):
+        if source[n, u] and _alike(upright[n, u], found[v, u], same):
+            first = first if count else v - n
+            for c in range(3):
+                some[count, c] = rgb[n, u, c]
+            count += 1
+            if count >= min(some.shape[0], 2 + first):
+                break
+    for c in range(3):
+        total[c] = np.median(some[:count, c]) if count else np.float32(0)
+    return count > 0
+
+
+@njit(**_OPTIONS)
+def _colour_beside(  # type: ignore[no-untyped-def]
+    rgb, source, slope, upright, far, found, column_colour, v, u, side, same, fade, reach, some, total
+):
+    """Add the colour of the wall at one side of a pixel to ``total`` (3,).
+
+    Args:
+        side: −1 left, 1 right; v, u: the pixel; some: scratch, (most, 3).
+        rgb, source, slope, upright, far, found, column_colour, same, fade, reach: as in ``continue_walls``.
+
+    Returns:
+        Its weight and its distance in columns; weight 0 if no wall is seen there.
+    """
+    height, width = source.shape
+    rows = np.float32(height / math.pi)
+    count, first, q, anchor = 0, 0, found[v, u], 0
+    for gap in range(1, reach):
+        m = (u + side * gap) % width
+        if column_colour[m, 0] < 0 or not _alike(far[m], q, same):
+            if count > 0:
+                break
+            continue
+        q = far[m]
+        if count == 0:
+            first, anchor = gap, m
+        for c in range(3):
+            some[count, c] = column_colour[m, c]
+        count += 1
+        if count >= some.shape[0]:
+            break
+    if count == 0:
+        return np.float32(0), reach
+    q = far[anchor]
+    n = int((np.float32(math.pi / 2) - math.atan(slope[v, u] * q / found[v, u])) * rows)
+    here, weight = 0.0, np.float32(0.05) / np.float32(first * first)
+    if 0 <= n < height and source[n, anchor] and _alike(upright[n, anchor], q, same):
+        here = math.exp(-np.float32(first) / fade)
+        weight *= 20
+    for c in range(3):
+        common = np.median(some[:count, c])
+        total[c] += weight * (common + here * (np.float32(rgb[n, anchor, c]) - common) if here > 0 else common)
+    return weight, first
+
+
+@njit(**_OPTIONS)
 def continue_walls(  # type: ignore[no-untyped-def]
     rgb, source, hole, coverage, slope, upright, far, found, column_colour, same, fade, reach, most, sure_share,
     sure_fade, colour, sure,
 ):  # fmt: skip
-    """Continue the colours of walls into holes: of what is seen of the wall above, else of both sides, close by as they
-    are there at the same height, farther on in the wall's common colour.
+    """Continue the colours of walls into holes.
+
+    The colour of what is seen of the wall above counts first, else those of both sides: near them as they are at the
+    same height, farther on in the wall's common colour.
 
     Args:
-        rgb: (h, w, 3); source: (h, w) pixels of walls.
-        hole: (h, w); coverage: (h, w) share of the wall in each pixel; colours are computed where that is over 0.
+        rgb: panorama, (h, w, 3); source: pixels of walls, (h, w).
+        hole: pixels to fill, (h, w); coverage: share of the wall in each of them; those above 0 are coloured, (h, w).
         slope: tangent of each pixel's elevation, (h, w); upright, far, found, same: as in ``walls_behind``.
-        column_colour: of ``wall_colours``; fade: pixels; reach: columns that are searched at most.
-        most: pixels that a common colour is the median of.
-        sure_share, sure_fade: beside what is seen a colour is this sure, less by e after this many columns.
+        column_colour: colours of ``wall_colours``; fade: pixels; reach: largest number of columns that are searched.
+        most: number of pixels that a common colour is the median of.
+        sure_share, sure_fade: opacity beside what is seen, and columns over which it falls by e.
         colour: out, (h, w, 3) float32, −1 where nothing was found; sure: out, (h, w), 1 below what is seen of the wall.
     """
     height, width = hole.shape
-    rows = np.float32(height / math.pi)
     some = np.empty((most, 3), np.float32)
-    total, common = np.zeros(3, np.float32), np.zeros(3, np.float32)
+    total = np.zeros(3, np.float32)
     for v in range(height):
         for u in range(width):
             if not hole[v, u] or coverage[v, u] <= 0:
                 continue
-            total[:] = 0
-            weights, nearest = np.float32(0), reach
-            count, first = 0, 0
-            for n in range(v - 1, -1, -1):
-                if source[n, u] and _alike(upright[n, u], found[v, u], same):
-                    first = first if count else v - n
-                    for c in range(3):
-                        some[count, c] = rgb[n, u, c]
-                    count += 1
-                    if count >= min(most, 2 + first):
-                        break
-            if count:
-                weights, nearest = np.float32(1), 0
-                for c in range(3):
-                    total[c] = np.median(some[:count, c])
-            for side in (-1, 1):
-                if nearest == 0:
-                    break  # it was seen above
-                count, first, q, anchor = 0, 0, found[v, u], 0
-                for gap in range(1, reach):
-                    m = (u + side * gap) % width
-                    if column_colour[m, 0] < 0 or not _alike(far[m], q, same):
-                        if count > 0:
-                            break
-                        continue
-                    q = far[m]
-                    if count == 0:
-                        first, anchor = gap, m
-                    for c in range(3):
-                        some[count, c] = column_colour[m, c]
-                    count += 1
-                    if count >= most:
-                        break
-                if count == 0:
-                    continue
-                for c in range(3):
-                    common[c] = np.median(some[:count, c])
-                q = far[anchor]
-                n = int((np.float32(math.pi / 2) - math.atan(slope[v, u] * q / found[v, u])) * rows)
-                here, weight = 0.0, np.float32(0.05) / np.float32(first * first)
-                if 0 <= n < height and source[n, anchor] and _alike(upright[n, anchor], q, same):
-                    here = math.exp(-np.float32(first) / fade)
-                    weight *= 20
-                weights += weight
-                nearest = min(nearest, first)
-                for c in range(3):
-                    total[c] += weight * (common[c] + here * (np.float32(rgb[n, anchor, c]) - common[c]))
+            weights, nearest = np.float32(1), 0
+            if not _colour_above(rgb, source, upright, found, v, u, same, some, total):
+                weights, nearest = np.float32(0), reach
+                for side in (-1, 1):
+                    weight, first = _colour_beside(
+                        rgb, source, slope, upright, far, found, column_colour, v, u, side, same, fade, reach, some,
+                        total,
+                    )  # fmt: skip
+                    weights += weight
+                    nearest = min(nearest, first)
             sure[v, u] = np.float32(1) if nearest == 0 else sure_share * math.exp(-np.float32(nearest) / sure_fade)
             for c in range(3):
                 colour[v, u, c] = total[c] / weights if weights > 0 else np.float32(-1)

@@ -223,52 +223,65 @@ def _bilinear(texels, start, height, width, u, v, weight, out):  # type: ignore[
 
 
 @njit(**_OPTIONS)
+def _footprint(places, row, column, height, width, sizes, blur):  # type: ignore[no-untyped-def]
+    """Return the ellipse that a pixel of the view covers in the panorama, for ``look_up``.
+
+    Returns:
+        Its longer axis (u, v), the number of samples along it, and the pyramid's level.
+    """
+    full = np.float32(sizes[0, 1])
+    n = row * width + column
+    left = n - 1 if column > 0 and places[n - 1, 0] > -1e8 else -1
+    right = n + 1 if column + 1 < width and places[n + 1, 0] > -1e8 else -1
+    above = n - width if row > 0 and places[n - width, 0] > -1e8 else -1
+    below = n + width if row + 1 < height and places[n + width, 0] > -1e8 else -1
+    ux, vx = _shorter_step(places, n, left, right, full)
+    uy, vy = _shorter_step(places, n, above, below, full)
+    if left < 0 and right < 0:
+        ux, vx = np.float32(1), np.float32(0)
+    if above < 0 and below < 0:
+        uy, vy = np.float32(0), np.float32(1)
+    # Half axes of the ellipse: eigenvalues of J Jᵀ.
+    p, q, r = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
+    mean, half = np.float32(0.5) * (p + r), math.sqrt(np.float32(0.25) * (p - r) * (p - r) + q * q)
+    major = blur * math.sqrt(mean + half)
+    minor = blur * math.sqrt(max(mean - half, np.float32(0)))
+    taps = min(max(math.ceil(major / max(minor, np.float32(1)) - np.float32(0.25)), 1), MAX_TAPS)
+    level = math.log2(max(minor, major / np.float32(taps), np.float32(1)))
+    level = min(float(level), float(sizes.shape[0] - 1))
+    # Direction of the longer axis.
+    along_u, along_v = (q, mean + half - p) if p < r else (mean + half - r, q)
+    length = math.sqrt(along_u * along_u + along_v * along_v)
+    if length > 0:
+        along_u, along_v = along_u / length * major, along_v / length * major
+    return along_u, along_v, taps, level
+
+
+@njit(**_OPTIONS)
 def look_up(texels, level_start, sizes, places, height, width, blur, wanted, share, colour):  # type: ignore[no-untyped-def]
-    """Panorama colours under the pixels of a view, averaged over each pixel's footprint.
+    """Blend in the panorama's colours under the pixels of a view, averaged over each pixel's footprint.
 
     The footprint follows from the places of neighbouring pixels; a stretched one gets up to ``MAX_TAPS`` samples along
     its longer side (anisotropic filtering).
 
     Args:
-        texels, level_start, sizes: of the ``Pyramid``.
-        places: of ``panorama_places``, for all pixels of the view, (P, 2), P = height · width.
+        texels, level_start, sizes: arrays of the ``Pyramid``.
+        places: index coordinates of ``panorama_places`` for all pixels of the view, (P, 2), P = height · width.
+        height, width: size of the view.
         blur: share of a pixel that is averaged over; trilinear look-up blurs by itself.
-        wanted: (P,) > 0 where a colour is asked for.
-        share: of the panorama in the result, 0..1.
-        colour: in and out, (P, 3) in 0..1.
+        wanted: over 0 where a colour is wanted, (P,).
+        share: weight of the panorama in the result, 0..1.
+        colour: in and out, 0..1, (P, 3).
     """
-    full = np.float32(sizes[0, 1])
     out = np.zeros(3, np.float32)
     for row in range(height):
         for column in range(width):
             n = row * width + column
             if wanted[n] <= 0 or places[n, 0] < -1e8:
                 continue
-            left = n - 1 if column > 0 and places[n - 1, 0] > -1e8 else -1
-            right = n + 1 if column + 1 < width and places[n + 1, 0] > -1e8 else -1
-            above = n - width if row > 0 and places[n - width, 0] > -1e8 else -1
-            below = n + width if row + 1 < height and places[n + width, 0] > -1e8 else -1
-            ux, vx = _shorter_step(places, n, left, right, full)
-            uy, vy = _shorter_step(places, n, above, below, full)
-            if left < 0 and right < 0:
-                ux, vx = np.float32(1), np.float32(0)
-            if above < 0 and below < 0:
-                uy, vy = np.float32(0), np.float32(1)
-            # Half axes of the ellipse that a pixel covers: eigenvalues of J Jᵀ.
-            p, q, r = ux * ux + uy * uy, ux * vx + uy * vy, vx * vx + vy * vy
-            mean, half = np.float32(0.5) * (p + r), math.sqrt(np.float32(0.25) * (p - r) * (p - r) + q * q)
-            major = blur * math.sqrt(mean + half)
-            minor = blur * math.sqrt(max(mean - half, np.float32(0)))
-            taps = min(max(math.ceil(major / max(minor, np.float32(1)) - np.float32(0.25)), 1), MAX_TAPS)
-            level = math.log2(max(minor, major / np.float32(taps), np.float32(1)))
-            level = min(float(level), float(sizes.shape[0] - 1))
+            along_u, along_v, taps, level = _footprint(places, row, column, height, width, sizes, blur)
             low = int(level)
             mix = level - np.float32(low)
-            # Direction of the longer axis.
-            along_u, along_v = (q, mean + half - p) if p < r else (mean + half - r, q)
-            length = math.sqrt(along_u * along_u + along_v * along_v)
-            if length > 0:
-                along_u, along_v = along_u / length * major, along_v / length * major
             out[:] = 0
             for tap in range(taps):
                 offset = (np.float32(tap) + np.float32(0.5)) / np.float32(taps) - np.float32(0.5)

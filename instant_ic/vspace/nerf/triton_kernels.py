@@ -361,40 +361,108 @@ def _cell(o, t, d, low, cell, count):
     return tl.minimum(tl.maximum(place, 0), count - 1)
 
 
-@triton.jit(do_not_specialize=["size", "keyframes", "columns", "rows", "width", "height", "w", "h", "nx", "ny", "nz"])
-def draw(
-    table, size, network, cells_per_m, origin, focus, grid, grid_low, rgb, inverse, depth_edge, known, poses, camera,
-    band, gain, keyframes, eye, turn, directions, columns, rows, width, height, w, h, nx, ny, nz, cell,
-    panorama_share, depth_share, colour, depth, confidence,
-    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
-    HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
-):  # fmt: skip
-    """An image: march to the surface, the field's colour there, the panorama's share; one program 8 × 8 pixels.
-
-    ``reference.trace``, ``reference.query`` and ``reference.mix_panorama`` in one.
-
-    Args:
-        camera: place of the newest keyframe's camera, (3,).
-        eye: place of the view, (3,); turn: map_from_view rotation (3, 3); directions: of the view, (rows · columns, 3).
-        colour (P, 3), depth (P,), confidence (P,): out.
-    """
-    IN: tl.constexpr = LEVELS * F
-    lane = tl.arange(0, B)
-    across = (columns + 7) // 8
-    column = (tl.program_id(0) % across) * 8 + lane % 8
-    row = (tl.program_id(0) // across) * 8 + lane // 8
-    inside = (column < columns) & (row < rows)
-    at = row * columns + column
+@triton.jit
+def _turned_ray(directions, turn, at, inside):
+    """Load the directions of pixels and turn them into the map."""
     vx = tl.load(directions + 3 * at, mask=inside, other=1.0)
     vy = tl.load(directions + 3 * at + 1, mask=inside, other=0.0)
     vz = tl.load(directions + 3 * at + 2, mask=inside, other=0.0)
     dx = tl.load(turn) * vx + tl.load(turn + 1) * vy + tl.load(turn + 2) * vz
     dy = tl.load(turn + 3) * vx + tl.load(turn + 4) * vy + tl.load(turn + 5) * vz
     dz = tl.load(turn + 6) * vx + tl.load(turn + 7) * vy + tl.load(turn + 8) * vz
-    ox, oy, oz = tl.load(eye), tl.load(eye + 1), tl.load(eye + 2)
-    gx, gy, gz = tl.load(grid_low), tl.load(grid_low + 1), tl.load(grid_low + 2)
+    return dx, dy, dz
+
+
+@triton.jit
+def _skip_free(grid, ox, oy, oz, dx, dy, dz, gx, gy, gz, nx, ny, nz, cell, t, leave, active):
+    """Move active rays to their next occupied cell; those that leave the grid end."""
+    seeking = active
+    while tl.max(seeking.to(tl.int32), axis=0) > 0:
+        seeking = seeking & (t < leave)
+        active = active & (t < leave)
+        cx, cy, cz = _cell(ox, t, dx, gx, cell, nx), _cell(oy, t, dy, gy, cell, ny), _cell(oz, t, dz, gz, cell, nz)
+        free = tl.load(grid + (cx * ny + cy) * nz + cz, mask=seeking, other=0).to(tl.float32)
+        seeking = seeking & (free > 0)
+        t = tl.where(seeking, t + cell * tl.maximum(_FIRST_STEP, 0.577 * (free - 1)), t)
+    return t, active
+
+
+@triton.jit
+def _distance(
+    table, size, network, w1, b1, cells_per_m, origin, focus, inverse, depth_edge, known, poses, band, keyframes,
+    px, py, pz, w, h, active, depth_share,
+    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
+    HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
+):  # fmt: skip
+    """Signed distance of points: the keyframes' and the field's, mixed by ``depth_share``."""
+    value = px * 0
+    if depth_share > 0:
+        of_prior, _ = _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, px, py, pz, w, h, active)
+        value = depth_share * of_prior
+    if depth_share < 1:
+        x = _encode(table, size, cells_per_m, origin, focus, keyframes, px, py, pz, active, LEVELS, LP, F, B)
+        hidden = tl.maximum(tl.dot(x, tl.trans(w1)) + b1[None, :], 0.0)
+        of_field, _ = _output(network, hidden, 3, LEVELS * F, HIDDEN, HP)
+        value += (1 - depth_share) * of_field
+    return value
+
+
+@triton.jit
+def _channel(network, hidden, shown, c: tl.constexpr, IN: tl.constexpr, HIDDEN: tl.constexpr, HP: tl.constexpr):
+    """One colour channel of the field, 0..1, where ``shown``."""
+    value, _ = _output(network, hidden, c, IN, HIDDEN, HP)
+    return tl.where(shown, tl.minimum(tl.maximum(value + 0.5, 0.0), 1.0), 0.0)
+
+
+@triton.jit
+def _mix_panorama(
+    red,
+    green,
+    blue,
+    rgb,
+    gain,
+    inverse,
+    depth_edge,
+    known,
+    poses,
+    band,
+    keyframes,
+    px,
+    py,
+    pz,
+    width,
+    height,
+    w,
+    h,
+    waiting,
+    panorama_share,
+):
+    """Mix in the panorama's colour: of the newest keyframe that has seen a point."""
+    for k in range(keyframes):
+        m = poses + 16 * k
+        x0 = tl.load(m) * px + tl.load(m + 1) * py + tl.load(m + 2) * pz + tl.load(m + 3)
+        y0 = tl.load(m + 4) * px + tl.load(m + 5) * py + tl.load(m + 6) * pz + tl.load(m + 7)
+        z0 = tl.load(m + 8) * px + tl.load(m + 9) * py + tl.load(m + 10) * pz + tl.load(m + 11)
+        _, agrees, _, _ = _against(inverse, depth_edge, known, poses, band, k, px, py, pz, w, h, waiting)
+        mine = waiting & (tl.where(k == keyframes - 1, 1, agrees) > 0)
+        waiting = waiting & ~mine
+        u, v = _panorama_pixel(x0, y0, z0, width, height)
+        share = tl.where(mine, panorama_share, 0.0)
+        red += share * (_panorama_colour(rgb, gain, k, u, v, width, height, mine, 0) - red)
+        green += share * (_panorama_colour(rgb, gain, k, u, v, width, height, mine, 1) - green)
+        blue += share * (_panorama_colour(rgb, gain, k, u, v, width, height, mine, 2) - blue)
+    return red, green, blue
+
+
+@triton.jit
+def _march(
+    table, size, network, w1, b1, cells_per_m, origin, focus, grid, inverse, depth_edge, known, poses, camera, band,
+    keyframes, ox, oy, oz, dx, dy, dz, gx, gy, gz, nx, ny, nz, cell, w, h, inside, depth_share,
+    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
+    HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
+):  # fmt: skip
+    """March rays to the surface; depth and confidence as of ``reference.trace``."""
     near_band = tl.load(band)
-    w1, b1 = _first_layer(network, IN, HIDDEN, LP, F, HP)
     t, leave = _span(ox, dx, gx, nx * cell, dx * 0, dx * 0 + 1e9)
     t, leave = _span(oy, dy, gy, ny * cell, t, leave)
     t, leave = _span(oz, dz, gz, nz * cell, t, leave)
@@ -403,24 +471,12 @@ def draw(
     spare, spare_s = t * 0, t * 0 + _NOT_SEEN
     met, trust = t * 0, t * 0
     while tl.max(active.to(tl.int32), axis=0) > 0:
-        seeking = active
-        while tl.max(seeking.to(tl.int32), axis=0) > 0:
-            seeking = seeking & (t < leave)
-            active = active & (t < leave)
-            cx, cy, cz = _cell(ox, t, dx, gx, cell, nx), _cell(oy, t, dy, gy, cell, ny), _cell(oz, t, dz, gz, cell, nz)
-            free = tl.load(grid + (cx * ny + cy) * nz + cz, mask=seeking, other=0).to(tl.float32)
-            seeking = seeking & (free > 0)
-            t = tl.where(seeking, t + cell * tl.maximum(_FIRST_STEP, 0.577 * (free - 1)), t)
+        t, active = _skip_free(grid, ox, oy, oz, dx, dy, dz, gx, gy, gz, nx, ny, nz, cell, t, leave, active)
         px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
-        value = t * 0
-        if depth_share > 0:
-            of_prior, _ = _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, px, py, pz, w, h, active)
-            value = depth_share * of_prior
-        if depth_share < 1:
-            x = _encode(table, size, cells_per_m, origin, focus, keyframes, px, py, pz, active, LEVELS, LP, F, B)
-            hidden = tl.maximum(tl.dot(x, tl.trans(w1)) + b1[None, :], 0.0)
-            of_field, _ = _output(network, hidden, 3, IN, HIDDEN, HP)
-            value += (1 - depth_share) * of_field
+        value = _distance(
+            table, size, network, w1, b1, cells_per_m, origin, focus, inverse, depth_edge, known, poses, band,
+            keyframes, px, py, pz, w, h, active, depth_share, LEVELS, LP, F, HIDDEN, HP, B,
+        )  # fmt: skip
         before = tl.where(t - last_t > 3 * cell, _NOT_SEEN, last_s)
         crossed = (before != _NOT_SEEN) & ((before > 0) != (value > 0))
         step = tl.where(crossed, before - value, 1.0)
@@ -438,37 +494,58 @@ def draw(
         t = tl.where(active, t + tl.minimum(tl.maximum(reach, 0.5 * cell), 2 * cell), t)
         active = active & ~found
     without = (met == 0) & (spare > 0)
-    met, trust = tl.where(without, spare, met), tl.where(without, 1.0, trust)
+    return tl.where(without, spare, met), tl.where(without, 1.0, trust)
+
+
+@triton.jit(do_not_specialize=["size", "keyframes", "columns", "rows", "width", "height", "w", "h", "nx", "ny", "nz"])
+def draw(
+    table, size, network, cells_per_m, origin, focus, grid, grid_low, rgb, inverse, depth_edge, known, poses, camera,
+    band, gain, keyframes, eye, turn, directions, columns, rows, width, height, w, h, nx, ny, nz, cell,
+    panorama_share, depth_share, colour, depth, confidence,
+    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
+    HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
+):  # fmt: skip
+    """Render an image: march to the surface, the field's colour there, the panorama's share; 8 × 8 pixels a program.
+
+    ``reference.trace``, ``reference.query`` and ``reference.mix_panorama`` in one.
+
+    Args:
+        camera: position of the newest keyframe's camera, (3,).
+        eye: position of the view, (3,); turn: map_from_view rotation (3, 3); directions: rays in it, (P, 3).
+        colour (P, 3), depth (P,), confidence (P,): out.
+    """
+    IN: tl.constexpr = LEVELS * F
+    lane = tl.arange(0, B)
+    across = (columns + 7) // 8
+    column = (tl.program_id(0) % across) * 8 + lane % 8
+    row = (tl.program_id(0) // across) * 8 + lane // 8
+    inside = (column < columns) & (row < rows)
+    at = row * columns + column
+    dx, dy, dz = _turned_ray(directions, turn, at, inside)
+    ox, oy, oz = tl.load(eye), tl.load(eye + 1), tl.load(eye + 2)
+    gx, gy, gz = tl.load(grid_low), tl.load(grid_low + 1), tl.load(grid_low + 2)
+    w1, b1 = _first_layer(network, IN, HIDDEN, LP, F, HP)
+    met, trust = _march(
+        table, size, network, w1, b1, cells_per_m, origin, focus, grid, inverse, depth_edge, known, poses, camera, band,
+        keyframes, ox, oy, oz, dx, dy, dz, gx, gy, gz, nx, ny, nz, cell, w, h, inside, depth_share,
+        LEVELS, LP, F, HIDDEN, HP, B,
+    )  # fmt: skip
     tl.store(depth + at, met, mask=inside)
     tl.store(confidence + at, trust, mask=inside)
-
     shown = inside & (met > 0)
     px, py, pz = ox + met * dx, oy + met * dy, oz + met * dz
     red, green, blue = met * 0, met * 0, met * 0
     if panorama_share < 1:
         x = _encode(table, size, cells_per_m, origin, focus, keyframes, px, py, pz, shown, LEVELS, LP, F, B)
         hidden = tl.maximum(tl.dot(x, tl.trans(w1)) + b1[None, :], 0.0)
-        red, _ = _output(network, hidden, 0, IN, HIDDEN, HP)
-        green, _ = _output(network, hidden, 1, IN, HIDDEN, HP)
-        blue, _ = _output(network, hidden, 2, IN, HIDDEN, HP)
-        red = tl.where(shown, tl.minimum(tl.maximum(red + 0.5, 0.0), 1.0), 0.0)
-        green = tl.where(shown, tl.minimum(tl.maximum(green + 0.5, 0.0), 1.0), 0.0)
-        blue = tl.where(shown, tl.minimum(tl.maximum(blue + 0.5, 0.0), 1.0), 0.0)
+        red = _channel(network, hidden, shown, 0, IN, HIDDEN, HP)
+        green = _channel(network, hidden, shown, 1, IN, HIDDEN, HP)
+        blue = _channel(network, hidden, shown, 2, IN, HIDDEN, HP)
     if panorama_share > 0:
-        waiting = shown & (trust > 0)
-        for k in range(keyframes):
-            m = poses + 16 * k
-            x0 = tl.load(m) * px + tl.load(m + 1) * py + tl.load(m + 2) * pz + tl.load(m + 3)
-            y0 = tl.load(m + 4) * px + tl.load(m + 5) * py + tl.load(m + 6) * pz + tl.load(m + 7)
-            z0 = tl.load(m + 8) * px + tl.load(m + 9) * py + tl.load(m + 10) * pz + tl.load(m + 11)
-            _, agrees, _, _ = _against(inverse, depth_edge, known, poses, band, k, px, py, pz, w, h, waiting)
-            mine = waiting & (tl.where(k == keyframes - 1, 1, agrees) > 0)
-            waiting = waiting & ~mine
-            u, v = _panorama_pixel(x0, y0, z0, width, height)
-            share = tl.where(mine, panorama_share, 0.0)
-            red += share * (_panorama_colour(rgb, gain, k, u, v, width, height, mine, 0) - red)
-            green += share * (_panorama_colour(rgb, gain, k, u, v, width, height, mine, 1) - green)
-            blue += share * (_panorama_colour(rgb, gain, k, u, v, width, height, mine, 2) - blue)
+        red, green, blue = _mix_panorama(
+            red, green, blue, rgb, gain, inverse, depth_edge, known, poses, band, keyframes, px, py, pz, width, height,
+            w, h, shown & (trust > 0), panorama_share,
+        )  # fmt: skip
     tl.store(colour + 3 * at, red, mask=inside)
     tl.store(colour + 3 * at + 1, green, mask=inside)
     tl.store(colour + 3 * at + 2, blue, mask=inside)
