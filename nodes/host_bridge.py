@@ -11,7 +11,7 @@ from instant_ic.bridge.host_bus import ExportedTopics, ImportedTopics
 from instant_ic.bridge.host_config import HostBridgeConfig
 from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyFileError, KeyStore
-from instant_ic.bridge.host_link import Failed, HostLink, LinkError, LinkEvent, Problem, Stranger
+from instant_ic.bridge.host_link import Failed, HostLink, HostLinkError, LinkEvent, LinkProblem, Stranger
 from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_report import LinkReport
 from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, Ended, Refused, Side, Up
@@ -51,7 +51,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 robot = store.peer(config.peer)
                 self.link = ConnectingLink(config.connect, robot, side, exports, store, self.on_event, config.link)
                 self.log.info("connects to %s at %s as %s", robot.name, config.connect, identity.name)
-        except (KeyFileError, LinkError) as error:
+        except (KeyFileError, HostLinkError) as error:
             raise NodeError(str(error)) from None
         self.report = LinkReport(self.link, self.diagnose, {*to_station, *to_robot})
         self.outgoing = ExportedTopics(self, exports, self.link, self.report.trouble)
@@ -114,7 +114,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             case Failed():
                 self.log.error("%s", event.text)
                 self.stop()  # the launcher restarts it
-            case Problem():
+            case LinkProblem():
                 self.report.problem = event.text
                 self.update()
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.recorder import Recorder, dated, on_disk
+from instant_ic.bag.recorder import Recorder, dated
+from instant_ic.bag.recorder_thread import on_disk
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 
 IDLE, ENDING = "idle", "ending"

@@ -165,16 +165,7 @@ def replay(
                 result.bag_s, result.setup_s = span_ns / 1e9, time.monotonic() - began_s
                 messages = stack.enter_context(ReadAhead(reader.current_messages(), threading.Event()))
                 for message in messages:
-                    made_topics = {p.topic for node in running for p in node.publishers}
-                    payload = _what_to_feed(message, made_topics, made_frames)
-                    if payload is None:
-                        result.left_out[message.topic] += 1
-                        bus.advance_to(message.stamp_ns)
-                    else:
-                        result.fed[message.topic] += 1
-                        bus.publish_bytes(
-                            message.topic, message.type_name, payload, message.stamp_ns, message.qos.latched
-                        )
+                    _feed(message, bus, running, made_frames, result)
                     if on_progress is not None:
                         on_progress((message.stamp_ns - reader.start_ns) / span_ns)
                 result.wall_s = time.monotonic() - began_s - result.setup_s
@@ -191,6 +182,20 @@ def _check_types(reader: BagReader, bus: LockstepBus) -> None:
             raise ReplayError(
                 f"bag {reader.path}: {topic.topic} has type {topic.type_name} defined differently than here"
             )
+
+
+def _feed(
+    message: BagMessage, bus: LockstepBus, running: Sequence[Node[Any]], made_frames: set[str], result: ReplayResult
+) -> None:
+    """Publish a message of the bag, or only advance the clock where a replayed node publishes it."""
+    made_topics = {publisher.topic for node in running for publisher in node.publishers}
+    payload = _what_to_feed(message, made_topics, made_frames)
+    if payload is None:
+        result.left_out[message.topic] += 1
+        bus.advance_to(message.stamp_ns)
+    else:
+        result.fed[message.topic] += 1
+        bus.publish_bytes(message.topic, message.type_name, payload, message.stamp_ns, message.qos.latched)
 
 
 def _what_to_feed(message: BagMessage, made_topics: set[str], made_frames: set[str]) -> bytes | None:

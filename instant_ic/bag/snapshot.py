@@ -2,11 +2,34 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+from instant_ic.bag.errors import BagError
 from instant_ic.bag.latched import LatchedValues
 from instant_ic.bag.message import BagMessage
+from instant_ic.bag.writer import BagWriter
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class BagSnapshot:
+    """One snapshot.
+
+    Attributes:
+        state: ``waiting``, ``writing``, ``done`` or ``failed``.
+        words: content of the bag, or why it failed.
+        due_s: time at which it is written, by the monotonic clock.
+    """
+
+    path: Path
+    state: str = "waiting"
+    words: str = ""
+    due_s: float = 0.0
 
 
 class SnapshotCache:
@@ -46,3 +69,24 @@ class SnapshotCache:
             return []
         begin_ns = min(entry.stamp_ns for entry in entries)
         return [replace(value, stamp_ns=begin_ns) for value in self._before.values()] + entries
+
+
+def save_snapshot(
+    snapshot: BagSnapshot, content: list[BagMessage], compressed: bool, set_custom: Callable[[BagWriter], None]
+) -> bool:
+    """Write a snapshot; return whether it was written. An error concerns this snapshot only; the next may succeed."""
+    try:
+        if not content:
+            raise BagError(f"snapshot {snapshot.path}: no message has been received yet")
+        with BagWriter(snapshot.path, compressed) as writer:
+            for entry in content:
+                writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
+            set_custom(writer)
+    except BagError as error:
+        snapshot.words, snapshot.state = str(error), "failed"
+        log.error("%s", error)
+        return False
+    span_s = (max(e.stamp_ns for e in content) - min(e.stamp_ns for e in content)) / 1e9
+    snapshot.words, snapshot.state = f"{len(content)} messages, {span_s:.1f} s", "done"
+    log.info("snapshot %s: %s", snapshot.path, snapshot.words)
+    return True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from instant_ic.bridge.host_link import LinkError, check_endpoint
+from instant_ic.bridge.host_link import HostLinkError, check_endpoint
 from instant_ic.bridge.host_session import LinkTimes
 from instant_ic.bridge.host_topics import parse_rules
 from instant_ic.config.ranges import Positive, check_ranges
@@ -41,7 +41,7 @@ class HostBridgeConfig:
             raise ValueError("one of listen (on the robot) and connect (at the station) must be given, not both")
         try:
             check_endpoint(self.listen or self.connect, listening=bool(self.listen))
-        except LinkError as error:
+        except HostLinkError as error:
             raise ValueError(f"{'listen' if self.listen else 'connect'}: {error}") from None
         for key in ("to_station", "to_robot"):
             try:

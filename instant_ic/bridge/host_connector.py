@@ -15,8 +15,8 @@ from instant_ic.bridge.host_link import (
     RECEIVE_MOST,
     Connection,
     HostLink,
+    LinkProblem,
     OnEvent,
-    Problem,
     check_endpoint,
 )
 from instant_ic.bridge.host_session import Ended, Event, LinkTimes, Side, Up
@@ -192,4 +192,4 @@ class ConnectingLink(HostLink):
     def _say(self, problem: str) -> None:
         if problem != self._problem:
             self._problem = problem
-            self._emit("", Problem(problem))
+            self._emit("", LinkProblem(problem))

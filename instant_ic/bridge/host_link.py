@@ -18,7 +18,7 @@ from zmq.utils import z85
 from instant_ic.bridge.host_flow import Channel, Item
 from instant_ic.bridge.host_keys import AllowList, KeyFileError, KeyStore, Peer
 from instant_ic.bridge.host_protocol import MAX_FRAME
-from instant_ic.bridge.host_session import Event, LinkTimes, Memory, Session, Side
+from instant_ic.bridge.host_session import Event, LinkTimes, PeerMemory, Session, Side
 from instant_ic.bridge.host_topics import TopicCounts, TopicRule
 
 _ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+(%\w+)?\]|[A-Za-z0-9_.*-]+):(\d{1,5})\Z")
@@ -29,7 +29,7 @@ RECEIVE_MOST = 200
 log = logging.getLogger(__name__)
 
 
-class LinkError(RuntimeError):
+class HostLinkError(RuntimeError):
     """The link cannot be set up as configured; the message says what to change."""
 
 
@@ -43,7 +43,7 @@ class Stranger:
 
 
 @dataclass(frozen=True)
-class Problem:
+class LinkProblem:
     """Why there is no link; empty once there is one again."""
 
     text: str
@@ -56,7 +56,7 @@ class Failed:
     text: str
 
 
-LinkEvent = Event | Stranger | Problem | Failed
+LinkEvent = Event | Stranger | LinkProblem | Failed
 OnEvent = Callable[[str, LinkEvent], None]
 """Takes the other host's name in this host's allow-list (empty for the link as a whole), and the event."""
 
@@ -100,7 +100,7 @@ class HostLink(ABC):
         times: ping period and timeouts.
 
     Raises:
-        LinkError: the keys or the address cannot be used.
+        HostLinkError: the keys or the address cannot be used.
     """
 
     def __init__(
@@ -116,12 +116,12 @@ class HostLink(ABC):
         try:
             self.identity = store.identity()
         except KeyFileError as error:
-            raise LinkError(str(error)) from None
+            raise HostLinkError(str(error)) from None
         self.allowed = AllowList(store)
         self.strangers = 0
         self._channels: dict[tuple[str, str], Channel] = {}
         self._numbers = itertools.count(1)
-        self._memories: dict[bytes, Memory] = {}
+        self._memories: dict[bytes, PeerMemory] = {}
         self._lock = threading.RLock()
         self._stop = threading.Event()
         self._context = zmq.Context()
@@ -211,7 +211,7 @@ class HostLink(ABC):
         if channel is not None and (channel.type_name, channel.qos) == (type_name, name):
             return channel
         if len(self._channels) >= 4000 and channel is None:
-            raise LinkError(f"{topic}: more than 4000 publishers over one link")
+            raise HostLinkError(f"{topic}: more than 4000 publishers over one link")
         digest = self.side.digest(type_name)
         queued = reliable and not latched and not rule.rate_hz
         channel = Channel(next(self._numbers), rule, origin, type_name, digest, name, latched, queued)
@@ -300,7 +300,7 @@ class HostLink(ABC):
             self._wake_out.send(b"", zmq.NOBLOCK)
 
     def _new_session(self, peer: Peer, connecting: bool, may_send: bool = True) -> Session:
-        memory = self._memories.setdefault(peer.public_key, Memory())
+        memory = self._memories.setdefault(peer.public_key, PeerMemory())
         return Session(self.side, connecting, memory, None, self.times, may_send)
 
     def _give_latched(self, session: Session) -> None:
@@ -333,11 +333,11 @@ def check_endpoint(endpoint: str, listening: bool) -> tuple[str, int]:
     """Return host and port of ``tcp://HOST:PORT``.
 
     Raises:
-        LinkError: the endpoint has another form.
+        HostLinkError: the endpoint has another form.
     """
     match = _ENDPOINT.match(endpoint)
     port = int(match[3]) if match else -1
     if match is None or not (0 if listening else 1) <= port <= 65535 or (match[1] == "*" and not listening):
         example = "tcp://0.0.0.0:7450" if listening else "tcp://192.168.1.20:7450"
-        raise LinkError(f"{endpoint!r} is not an address: it must look like {example}")
+        raise HostLinkError(f"{endpoint!r} is not an address: it must look like {example}")
     return match[1], port

@@ -16,13 +16,13 @@ from instant_ic.bridge.host_link import (
     RECEIVE_MOST,
     Connection,
     HostLink,
-    LinkError,
+    HostLinkError,
+    LinkProblem,
     OnEvent,
-    Problem,
     Stranger,
     check_endpoint,
 )
-from instant_ic.bridge.host_protocol import Bye, Hello, ProtocolError, decode
+from instant_ic.bridge.host_protocol import Bye, Hello, HostProtocolError, decode
 from instant_ic.bridge.host_session import Event, LinkTimes, Side, Up
 from instant_ic.bridge.host_topics import TopicRule
 
@@ -70,7 +70,7 @@ class ListeningLink(HostLink):
             self._router.bind(f"tcp://{host}:{port if port else '*'}")
         except zmq.ZMQError as error:
             self._context.destroy(linger=0)
-            raise LinkError(f"cannot listen on {endpoint}: {error}; is another bridge running?") from None
+            raise HostLinkError(f"cannot listen on {endpoint}: {error}; is another bridge running?") from None
         self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
         self.port = int(self.endpoint.rpartition(":")[2])
 
@@ -159,7 +159,7 @@ class ListeningLink(HostLink):
             problem = "no host is allowed yet: run `ic keys list` there, and `ic keys allow NAME KEY` here"
         if problem != self._list_problem:
             self._list_problem = problem
-            self._emit("", Problem(problem))
+            self._emit("", LinkProblem(problem))
 
     # -- bytes -------------------------------------------------------------------------------------
 
@@ -182,7 +182,7 @@ class ListeningLink(HostLink):
         peer = self.allowed.get(z85.decode(str(frame.get("User-Id")).encode()))
         try:
             hello = isinstance(decode(frame.buffer), Hello)
-        except ProtocolError:
+        except HostProtocolError:
             hello = False
         if peer is None or not hello:
             word = Bye("unknown", f"{self.side.name} does not know this link: reconnect")

@@ -24,7 +24,7 @@ LANES = ("command", "state", "bulk")
 _DATA = struct.Struct("<BBHIIQqqq")
 
 
-class ProtocolError(ValueError):
+class HostProtocolError(ValueError):
     """Bytes that violate this protocol."""
 
 
@@ -36,7 +36,7 @@ class _Json:
     def encode(self) -> bytes:
         body = json.dumps(asdict(self), separators=(",", ":")).encode()  # type: ignore[call-overload]
         if len(body) > MAX_JSON:
-            raise ProtocolError(f"{type(self).__name__} of {len(body)} bytes is longer than {MAX_JSON}")
+            raise HostProtocolError(f"{type(self).__name__} of {len(body)} bytes is longer than {MAX_JSON}")
         return bytes([self.KIND]) + body
 
     @classmethod
@@ -44,7 +44,7 @@ class _Json:
         try:
             content = json.loads(bytes(data[1:]))
         except (ValueError, RecursionError) as error:
-            raise ProtocolError(f"{cls.__name__}: not JSON: {error}") from None
+            raise HostProtocolError(f"{cls.__name__}: not JSON: {error}") from None
         hints = get_type_hints(cls)
         names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
         if isinstance(content, dict) and "version" in names and content.get("version") != VERSION:
@@ -53,12 +53,12 @@ class _Json:
             kinds = {name: get_origin(hints[name]) or hints[name] for name in names}
             content = {n: value if isinstance(value, kinds[n]) else kinds[n]() for n, value in content.items()}
         if not isinstance(content, dict) or set(content) != set(names):
-            raise ProtocolError(f"{cls.__name__}: expected the fields {', '.join(names)}")
+            raise HostProtocolError(f"{cls.__name__}: expected the fields {', '.join(names)}")
         for name in names:
             kind = get_origin(hints[name]) or hints[name]
             value = content[name]
             if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-                raise ProtocolError(f"{cls.__name__}: {name} must be {kind.__name__} (got {value!r:.60})")
+                raise HostProtocolError(f"{cls.__name__}: {name} must be {kind.__name__} (got {value!r:.60})")
         return cls(**content)
 
 
@@ -142,7 +142,7 @@ class Refuse(_Json):
 
 
 @dataclass(frozen=True)
-class Notice(_Json):
+class HostNotice(_Json):
     """Information for the other host's user; an empty text withdraws it.
 
     Attributes:
@@ -170,7 +170,7 @@ class _Fixed:
     @classmethod
     def _numbers(cls, data: memoryview) -> tuple[int, ...]:
         if len(data) != cls.FORM.size:
-            raise ProtocolError(f"message of kind {data[0]} has {len(data)} bytes, {cls.FORM.size} expected")
+            raise HostProtocolError(f"message of kind {data[0]} has {len(data)} bytes, {cls.FORM.size} expected")
         return cls.FORM.unpack(data)[1:]
 
 
@@ -262,20 +262,20 @@ class Data:
     @classmethod
     def decode(cls, data: memoryview) -> Data:
         if len(data) < _DATA.size:
-            raise ProtocolError(f"Data of {len(data)} bytes is too short")
+            raise HostProtocolError(f"Data of {len(data)} bytes is too short")
         _, flags, channel, total, offset, sequence, publish, born, sent = _DATA.unpack(data[: _DATA.size])
         chunk = data[_DATA.size :]
         if len(chunk) > MAX_CHUNK or offset + len(chunk) > total or (len(chunk) == 0 and total > 0):
-            raise ProtocolError(f"Data: {len(chunk)} bytes at {offset} of {total} are impossible")
+            raise HostProtocolError(f"Data: {len(chunk)} bytes at {offset} of {total} are impossible")
         if flags >> 1 >= len(LANES):
-            raise ProtocolError(f"Data: unknown lane {flags >> 1}")
+            raise HostProtocolError(f"Data: unknown lane {flags >> 1}")
         return cls(channel, sequence, publish, born, sent, total, offset, chunk, flags >> 1, bool(flags & 1))
 
 
-Message = Hello | Welcome | Bye | Announce | Refuse | Notice | Ping | Pong | Ack | Data
+Message = Hello | Welcome | Bye | Announce | Refuse | HostNotice | Ping | Pong | Ack | Data
 
 _KINDS: dict[int, Any] = {
-    kind.KIND: kind for kind in (Hello, Welcome, Bye, Announce, Refuse, Notice, Ping, Pong, Ack, Data)
+    kind.KIND: kind for kind in (Hello, Welcome, Bye, Announce, Refuse, HostNotice, Ping, Pong, Ack, Data)
 }
 DATA_OVERHEAD = _DATA.size
 
@@ -284,11 +284,11 @@ def decode(data: bytes | memoryview) -> Message:
     """Decode a message; the chunk of a ``Data`` is a view of ``data``.
 
     Raises:
-        ProtocolError: the bytes are not a message.
+        HostProtocolError: the bytes are not a message.
     """
     view = memoryview(data)
     kind = _KINDS.get(view[0]) if len(view) else None
     if kind is None:
-        raise ProtocolError(f"unknown message ({bytes(view[:8]).hex() or 'empty'})")
+        raise HostProtocolError(f"unknown message ({bytes(view[:8]).hex() or 'empty'})")
     message: Message = kind.decode(view)
     return message

@@ -22,11 +22,11 @@ from instant_ic.bridge.host_protocol import (
     Data,
     Greeting,
     Hello,
+    HostNotice,
+    HostProtocolError,
     Message,
-    Notice,
     Ping,
     Pong,
-    ProtocolError,
     Refuse,
     Welcome,
     decode,
@@ -168,7 +168,7 @@ Event = Up | Ended | Announced | Arrived | Refused | ClockStepped
 
 
 @dataclass
-class Memory:
+class PeerMemory:
     """State kept for each host across links, so that lost messages are detected after a reconnect.
 
     Attributes:
@@ -213,7 +213,7 @@ class Session:
         self,
         side: Side,
         connecting: bool,
-        memory: Memory | None = None,
+        memory: PeerMemory | None = None,
         clocks: Clocks | None = None,
         times: LinkTimes | None = None,
         may_send: bool = True,
@@ -221,7 +221,7 @@ class Session:
         self.side = side
         self.clocks = clocks or Clocks()
         self.times = times or LinkTimes()
-        self.memory = memory or Memory()
+        self.memory = memory or PeerMemory()
         self.may_send = may_send
         self.drives = connecting  # the connecting side accepts all topics; the robot's link decides who drives
         self.up = False
@@ -316,7 +316,7 @@ class Session:
 
     def notify(self, name: str, text: str) -> None:
         """Send a notice to the other host's user; an empty text withdraws it."""
-        self._replies.append(Notice(name, text))
+        self._replies.append(HostNotice(name, text))
 
     def set_drives(self, drives: bool) -> list[Event]:
         """Set whether the other host's commands are accepted; if so, return its topics and latched values so far."""
@@ -355,7 +355,7 @@ class Session:
         self.heard_ns = self.clocks.mono_ns()
         try:
             return self._take(decode(data))
-        except ProtocolError as error:
+        except HostProtocolError as error:
             return self.end("protocol", str(error), inform=True)
 
     def _take(self, message: Message) -> list[Event]:
@@ -366,7 +366,7 @@ class Session:
             case Greeting() if isinstance(message, Welcome) == self._connecting and not self.up:
                 return self._begin(message)
             case _ if not self.up:
-                raise ProtocolError(f"{type(message).__name__} before the greeting")
+                raise HostProtocolError(f"{type(message).__name__} before the greeting")
             case Ping():
                 self._replies.append(
                     Pong(message.number, message.mono_ns, now, self.clocks.mono_ns(), self.clocks.epoch_ns())
@@ -381,12 +381,12 @@ class Session:
                 return events
             case Ack():
                 if not self.outbox.acked(message.taken, now - message.echo_ns, now):
-                    raise ProtocolError(f"{message} acknowledges data that were not sent")
+                    raise HostProtocolError(f"{message} acknowledges data that were not sent")
                 return []
-            case Notice():
+            case HostNotice():
                 if message.name not in self.notices and len(self.notices) >= MAX_NOTICES:
-                    raise ProtocolError(f"more than {MAX_NOTICES} notices of different names")
-                self.notices[_checked("Notice: name", message.name)] = _text(message.text)
+                    raise HostProtocolError(f"more than {MAX_NOTICES} notices of different names")
+                self.notices[_checked("HostNotice: name", message.name)] = _text(message.text)
                 return []
             case Refuse():
                 channel = self.outbox.refuse(message.channel, message.reason)
@@ -395,7 +395,7 @@ class Session:
                 return self._announced(message)
             case Data():
                 return self._data(message, now)
-        raise ProtocolError(f"{type(message).__name__} is not expected here")
+        raise HostProtocolError(f"{type(message).__name__} is not expected here")
 
     def _begin(self, message: Greeting) -> list[Event]:
         if message.version != VERSION:
@@ -411,7 +411,9 @@ class Session:
         for topic, rate in wants.items():
             # The period of a tiny rate is no number of nanoseconds.
             if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not (rate == 0 or 1e-6 < rate < 1e6):
-                raise ProtocolError(f"{type(message).__name__}: rate of {topic} must be a number >= 0 (got {rate!r})")
+                raise HostProtocolError(
+                    f"{type(message).__name__}: rate of {topic} must be a number >= 0 (got {rate!r})"
+                )
         self.peer_name, self.peer_instance = _text(message.name)[:64], message.instance[:64]
         self.outbox.wants = {topic: float(rate) for topic, rate in wants.items()}
         self.up, self.up_ns = True, self.clocks.mono_ns()
@@ -428,7 +430,7 @@ class Session:
         for key in ("topic", "origin", "type_name", "digest", "qos"):
             _checked(f"Announce: {key}", getattr(announce, key))
         if len(self._incoming) >= MAX_CHANNELS and announce.channel not in self._incoming:
-            raise ProtocolError(f"more than {MAX_CHANNELS} channels are announced on one link")
+            raise HostProtocolError(f"more than {MAX_CHANNELS} channels are announced on one link")
         rule = self.side.imports.get(announce.topic)
         reason = ""
         if rule is None:
@@ -464,7 +466,7 @@ class Session:
     def _data(self, data: Data, now: int) -> list[Event]:
         incoming = self._incoming.get(data.channel)
         if incoming is None:
-            raise ProtocolError(f"data of channel {data.channel}, which was not announced")
+            raise HostProtocolError(f"data of channel {data.channel}, which was not announced")
         lane = data.lane  # the sender's lane: its list may assign another one
         self._taken[lane] += len(data.chunk) + DATA_OVERHEAD
         self._ack = data.sent_ns
@@ -478,7 +480,7 @@ class Session:
         self._early.append((incoming, data, payload))  # its age is unknown until our ping is answered
         self._early_bytes += len(payload) + DATA_OVERHEAD
         if self._early_bytes > MAX_MESSAGE:
-            raise ProtocolError(f"{self._early_bytes} bytes received before the answer to a ping")
+            raise HostProtocolError(f"{self._early_bytes} bytes received before the answer to a ping")
         return []
 
     def _release_early(self, now: int) -> list[Event]:
@@ -491,7 +493,7 @@ class Session:
             if len(data.chunk) == data.total:
                 return bytes(data.chunk)
             if data.total > MAX_MESSAGE:
-                raise ProtocolError(f"message of {data.total} bytes; {MAX_MESSAGE} at most")
+                raise HostProtocolError(f"message of {data.total} bytes; {MAX_MESSAGE} at most")
             self._partial[lane] = (data, bytearray(data.chunk))
             return None
         first, payload = self._partial.get(lane, (None, bytearray()))
@@ -500,7 +502,7 @@ class Session:
             or (first.channel, first.sequence, first.total) != (data.channel, data.sequence, data.total)
             or len(payload) != data.offset
         ):
-            raise ProtocolError(f"chunk at {data.offset} of channel {data.channel} does not continue its message")
+            raise HostProtocolError(f"chunk at {data.offset} of channel {data.channel} does not continue its message")
         payload += data.chunk
         if len(payload) < data.total:
             return None
@@ -525,7 +527,7 @@ class Session:
         if data.wall_time and (offset := self.wall_offset_ns) is not None:
             publish_ns -= offset
         if not 0 <= publish_ns < 1 << 63:
-            raise ProtocolError(f"{announce.topic}: time of publication {publish_ns} ns is impossible")
+            raise HostProtocolError(f"{announce.topic}: time of publication {publish_ns} ns is impossible")
         arrived = Arrived(announce, payload, publish_ns, born_ns)
         if held or (not self.drives and not self._shares(arrived, rule, now)):
             counts.not_driving += 1
@@ -534,7 +536,7 @@ class Session:
                 incoming.kept = arrived, data.born_ns
                 kept = sum(len(each.kept[0].payload) for each in self._incoming.values() if each.kept is not None)
                 if kept > MAX_MESSAGE:
-                    raise ProtocolError(f"{kept} bytes of latched values before this host drives")
+                    raise HostProtocolError(f"{kept} bytes of latched values before this host drives")
             return []
         return self._deliver(incoming, arrived, data.born_ns)
 
@@ -582,10 +584,10 @@ def _checked(what: str, name: str) -> str:
     """Return a name received from the other host, if it is valid.
 
     Raises:
-        ProtocolError: the name is too long, or has characters that names may not contain.
+        HostProtocolError: the name is too long, or has characters that names may not contain.
     """
     if not _NAME.match(name):
-        raise ProtocolError(
+        raise HostProtocolError(
             f"{what} {name[:40]!r} of {len(name)} characters must have 1 to {MAX_NAME} letters, digits or _ / . : -"
         )
     return name

@@ -9,7 +9,8 @@ import pytest
 from instant_ic.bag import BagError, BagReader
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.on_demand import OnDemand
-from instant_ic.bag.recorder import DISK_FULL, BagRecorderConfig, Recorder, TakeMessage
+from instant_ic.bag.recorder import BagRecorderConfig, Recorder, TakeMessage
+from instant_ic.bag.recorder_thread import DISK_FULL
 from instant_ic.bus import SENSOR
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
 from instant_ic.msg import Bool, serialize

@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 
 from instant_ic.bag import BagError, BagMessage, BagReader, BagWriter
-from instant_ic.bag import recorder as recording
+from instant_ic.bag import recorder_thread as recording
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.mcap_scan import McapScan
-from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, RECORDING, BagRecorderConfig, Recorder
+from instant_ic.bag.recorder import BagRecorderConfig, Recorder
+from instant_ic.bag.recorder_thread import DISK_FULL, FAILED, PAUSED, RECORDING
 from instant_ic.bag.snapshot import SnapshotCache
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.qos import QoS

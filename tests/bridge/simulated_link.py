@@ -6,7 +6,7 @@ import random
 
 from instant_ic.bridge.commands import COMMANDS
 from instant_ic.bridge.host_flow import Channel, Item
-from instant_ic.bridge.host_session import Arrived, LinkTimes, Memory, Session, Side
+from instant_ic.bridge.host_session import Arrived, LinkTimes, PeerMemory, Session, Side
 from instant_ic.bridge.host_topics import TopicRule
 
 DIGEST = "0011223344556677"
@@ -57,7 +57,7 @@ class World:
             "station": SimulatedClocks(self, mono_ahead_ns, 1_700_000_000_000_000_000 + station_ahead_ns),
         }
         self.rules = {"robot": {r.topic: r for r in to_station}, "station": {r.topic: r for r in to_robot}}
-        self.memories = {"robot": Memory(), "station": Memory()}
+        self.memories = {"robot": PeerMemory(), "station": PeerMemory()}
         self.times = times or LinkTimes()
         self.numbers = itertools.count(1)
         self.channels = {}

@@ -13,7 +13,7 @@ import zmq
 from instant_ic.bridge.commands import COMMANDS
 from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyStore, Peer
-from instant_ic.bridge.host_link import Failed, LinkError, Problem, Stranger, check_endpoint
+from instant_ic.bridge.host_link import Failed, HostLinkError, LinkProblem, Stranger, check_endpoint
 from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_protocol import VERSION, Hello
 from instant_ic.bridge.host_session import Arrived, Ended, LinkTimes, Side, Up
@@ -63,7 +63,7 @@ class End:
         self.link.offer(topic, origin, COMMANDS.get(topic, "std_msgs/msg/String"), qos, payload, time.time_ns())
 
     def said(self, words):
-        return any(words in problem.text for problem in self.of(Problem))
+        return any(words in problem.text for problem in self.of(LinkProblem))
 
 
 @pytest.fixture
@@ -234,7 +234,7 @@ def test_nobody_at_the_address_is_told_and_waited_for(ends, keys):
     wait_for(lambda: b.said("cannot be reached"), "words")
     a = robot(ends, keys, port)
     linked(a, b)
-    assert b.of(Problem)[-1].text == ""
+    assert b.of(LinkProblem)[-1].text == ""
 
 
 def test_link_over_ipv6(ends, keys):
@@ -422,7 +422,7 @@ def test_damaged_list_keeps_who_was_allowed_and_is_told(ends, keys):
     wait_for(lambda: a.said("allowed:3"), "words")
     assert a.link.peers()
     path.write_text(text)
-    wait_for(lambda: a.of(Problem)[-1].text == "", "words taken back")
+    wait_for(lambda: a.of(LinkProblem)[-1].text == "", "words taken back")
     path.unlink()
     wait_for(lambda: a.said("no host is allowed"), "words")
     wait_for(lambda: not a.link.peers(), "cut")
@@ -437,12 +437,12 @@ def test_thread_that_fails_is_told(ends, keys, monkeypatch):
 
 def test_port_that_is_taken_is_told(ends, keys):
     a = robot(ends, keys)
-    with pytest.raises(LinkError, match="another bridge"):
+    with pytest.raises(HostLinkError, match="another bridge"):
         robot(ends, keys, a.link.port)
 
 
 def test_host_without_a_key_is_told(tmp_path):
-    with pytest.raises(LinkError, match="ic keys new"):
+    with pytest.raises(HostLinkError, match="ic keys new"):
         ListeningLink("tcp://127.0.0.1:0", Side("x", "x", {}, str), {}, KeyStore(tmp_path / "none"), print)
 
 
@@ -459,7 +459,7 @@ def test_host_without_a_key_is_told(tmp_path):
     ],
 )
 def test_addresses_that_are_none(endpoint, listening):
-    with pytest.raises(LinkError, match="must look like tcp://"):
+    with pytest.raises(HostLinkError, match="must look like tcp://"):
         check_endpoint(endpoint, listening)
 
 

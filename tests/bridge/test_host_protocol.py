@@ -17,10 +17,10 @@ from instant_ic.bridge.host_protocol import (
     Bye,
     Data,
     Hello,
-    Notice,
+    HostNotice,
+    HostProtocolError,
     Ping,
     Pong,
-    ProtocolError,
     Refuse,
     Welcome,
     decode,
@@ -50,7 +50,7 @@ MESSAGES = st.one_of(
     st.builds(Bye, TEXT, TEXT),
     st.builds(Announce, INT, TEXT, TEXT, TEXT, TEXT, TEXT),
     st.builds(Refuse, INT, TEXT),
-    st.builds(Notice, TEXT, TEXT),
+    st.builds(HostNotice, TEXT, TEXT),
     st.builds(Ping, U32, I64, I64),
     st.builds(Pong, U32, I64, I64, I64, I64),
     st.builds(Ack, I64, st.tuples(U64, U64, U64)),
@@ -67,7 +67,7 @@ def test_what_is_encoded_is_decoded(message):
 def test_any_bytes_are_a_message_or_an_error(data):
     try:
         message = decode(data)
-    except ProtocolError:
+    except HostProtocolError:
         return
     assert data[0] == message.KIND
 
@@ -79,7 +79,7 @@ def test_a_cut_or_changed_message_is_a_message_or_an_error(message, data):
     if cut < len(frame):
         frame[cut] ^= data.draw(st.integers(1, 255))
     for damaged in (frame, frame[:cut]):
-        with contextlib.suppress(ProtocolError):
+        with contextlib.suppress(HostProtocolError):
             decode(bytes(damaged))
 
 
@@ -106,7 +106,7 @@ def test_bytes_of_a_data_message_by_hand():
     ],
 )
 def test_damaged_frames_say_what_is_wrong(frame, words):
-    with pytest.raises(ProtocolError, match=words):
+    with pytest.raises(HostProtocolError, match=words):
         decode(frame)
 
 

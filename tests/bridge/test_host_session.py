@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from simulated_link import DIGEST, MS, Way, World
 
-from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Notice, Ping, decode
+from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, HostNotice, Ping, decode
 from instant_ic.bridge.host_session import SHARED_BURST, Announced, Arrived, ClockStepped, Ended, LinkTimes, Refused, Up
 from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.msg import Bool, deserialize, serialize, twist_stamped, twist_values
@@ -693,16 +693,16 @@ def test_fault_a_viewers_rate_ends_the_thread_of_the_link(rate):
 def test_fault_a_viewers_long_words_end_the_thread_of_the_link(hello):
     robot = World([STATE]).sessions["robot"]
     (ended,) = robot.receive(bytes([Hello.KIND]) + json.dumps(vars(hello), ensure_ascii=False).encode())
-    (goodbye,) = robot.outgoing()  # raised ProtocolError: quoted in full, and longer in ASCII
+    (goodbye,) = robot.outgoing()  # raised HostProtocolError: quoted in full, and longer in ASCII
     assert decode(goodbye).reason == ended.reason and len(ended.reason) <= 300
 
 
 def test_notices_are_limited_in_number_and_length():
     _, robot = linked()
     for number in range(16):
-        robot.receive(Notice(f"n{number}", "x" * 10_000 + "\n").encode())
+        robot.receive(HostNotice(f"n{number}", "x" * 10_000 + "\n").encode())
     assert robot.ended is None and max(map(len, robot.notices.values())) <= 300
-    (ended,) = robot.receive(Notice("one more", "x").encode())
+    (ended,) = robot.receive(HostNotice("one more", "x").encode())
     assert "more than 16 notices" in ended.reason and len(robot.notices) == 16
 
 

@@ -597,9 +597,9 @@ def _parse_bridge() -> Callable[[bytes], object]:
 
 
 def _bridge_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.bridge.host_protocol import ProtocolError
+    from instant_ic.bridge.host_protocol import HostProtocolError
 
-    return (ProtocolError,)
+    return (HostProtocolError,)
 
 
 # -- bags --------------------------------------------------------------------------------------------------------------

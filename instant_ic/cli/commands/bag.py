@@ -18,15 +18,21 @@ def add_parser(subparsers: Any) -> None:
         subparsers, "bag", "record, play, inspect, compare, convert and recover bags",
         "Work with bags: rosbag2 folders (MCAP) that ROS 2, Foxglove and rosbags can open.", "ic bag record -o drive",
     )  # fmt: skip
-    span: dict[str, Any] = {"type": _seconds, "metavar": "S"}
-    many: dict[str, Any] = {"action": "append", "default": []}
+    _add_record(verbs)
+    _add_play(verbs)
+    _add_inspection(verbs)
+    _add_conversion(verbs)
+    _add_control(verbs)
 
+
+def _add_record(verbs: Any) -> None:
+    """Add ``ic bag record``."""
     example = "ic bag record -o drive /scan '/camera/*' -x /camera/raw --max-bag-size 2GB"
     recording = verb(verbs, "record", "record topics until Ctrl-C; space pauses", "bag_run.record", example)
     _topics(recording)
     add = recording.add_argument
     add("-o", "--output", default="", metavar="DIR", help="default: runs/bag_DATE_TIME")
-    add("--duration", **span, default=0.0, help="stop after this time")
+    add("--duration", **_SPAN, default=0.0, help="stop after this time")
     _files(recording)
     text = "size of the queue for the disk (default: 256MB); messages beyond it are dropped and counted"
     add("--max-queue", type=size, default=256_000_000, metavar="SIZE", help=text)
@@ -34,30 +40,36 @@ def add_parser(subparsers: Any) -> None:
     add("--min-free", type=size, default=100_000_000, metavar="SIZE", help=text)
     text = "keep the last seconds in memory and write them on ic bag snapshot or an emergency stop"
     add("--snapshot", action="store_true", help=text)
-    add("--snapshot-seconds", **span, default=30.0, help="seconds kept in memory (default: 30)")
-    add("--snapshot-after", **span, default=2.0, help="seconds to include after the snapshot (default: 2)")
+    add("--snapshot-seconds", **_SPAN, default=30.0, help="seconds kept in memory (default: 30)")
+    add("--snapshot-after", **_SPAN, default=2.0, help="seconds to include after the snapshot (default: 2)")
     text = "memory limit for a snapshot (default: 256MB)"
     add("--max-cache-size", type=size, default=256_000_000, metavar="SIZE", help=text)
     add("--start-paused", action="store_true", help="wait for resume before recording")
     add("--use-sim-time", action="store_true", help="stamp messages with /clock, for example from a playing bag")
 
+
+def _add_play(verbs: Any) -> None:
+    """Add ``ic bag play``."""
     text, example = "play a bag with /clock; space pauses, → steps, ↑ ↓ change the rate", "ic bag play drive --rate 2"
     playing = verb(verbs, "play", text, "bag_run.play", f"{example} --start 10")
     add = playing.add_argument
     add("bag", metavar="BAG", help="folder, .mcap or .db3 file", completer=completion.bags)
     _topics(playing)
     add("-r", "--rate", type=float, default=1.0, help="speed factor (default: %(default)s)")
-    add("--start", **span, default=0.0, help="start at this offset")
-    add("--duration", **span, default=0.0, help="play this many seconds")
+    add("--start", **_SPAN, default=0.0, help="start at this offset")
+    add("--duration", **_SPAN, default=0.0, help="play this many seconds")
     add("--loop", action="store_true", help="restart at the end")
     add("--start-paused", action="store_true", help="wait for space, → or ic bag control resume")
-    add("--remap", **many, metavar="FROM:=TO", help="rename a topic; repeatable")
+    add("--remap", **_MANY, metavar="FROM:=TO", help="rename a topic; repeatable")
     text = "publish commands and states even though a base is running: the robot may move"
     add("--force", action="store_true", help=text)
     add("--no-clock", action="store_true", help="do not publish /clock")
-    add("--delay", **span, default=0.5, help="wait for subscribers to connect (default: 0.5)")
-    add("--wait-for", **many, metavar="NODE", help="start once this node subscribes; repeatable")
+    add("--delay", **_SPAN, default=0.5, help="wait for subscribers to connect (default: 0.5)")
+    add("--wait-for", **_MANY, metavar="NODE", help="start once this node subscribes; repeatable")
 
+
+def _add_inspection(verbs: Any) -> None:
+    """Add ``ic bag info`` and ``diff``."""
     looking = verb(
         verbs, "info", "topics, types, counts, files and losses of a bag", "bag_look.info", "ic bag info drive"
     )
@@ -72,16 +84,19 @@ def add_parser(subparsers: Any) -> None:
     tolerances(comparing)
     comparing.add_argument("--json", action="store_true", help="print JSON")
 
+
+def _add_conversion(verbs: Any) -> None:
+    """Add ``ic bag convert``, ``recover`` and ``reindex``."""
     text = "convert SQLite bags and bare files to a bag; filter, cut, merge, compress"
     converting = verb(verbs, "convert", text, "bag_look.convert", "ic bag convert old.bag -o drive")
     add = converting.add_argument
     add("bags", nargs="+", metavar="BAG", help="several bags are merged by stamp")
     add("-o", "--output", required=True, metavar="DIR")
     text = "name or pattern; repeatable; default: everything"
-    add("-t", "--topic", dest="topics", **many, metavar="TOPIC", help=text)
-    add("-x", "--exclude", **many, metavar="TOPIC", help="topics to leave out")
-    add("--start", **span, default=0.0, help="start at this offset")
-    add("--end", **span, default=0.0, help="end at this offset")
+    add("-t", "--topic", dest="topics", **_MANY, metavar="TOPIC", help=text)
+    add("-x", "--exclude", **_MANY, metavar="TOPIC", help="topics to leave out")
+    add("--start", **_SPAN, default=0.0, help="start at this offset")
+    add("--end", **_SPAN, default=0.0, help="end at this offset")
     add("--compression", action="store_true", help="compress with zstd")
 
     text, example = "recover a readable bag from one that was cut short or damaged", "ic bag recover broken -o saved"
@@ -93,11 +108,14 @@ def add_parser(subparsers: Any) -> None:
     indexing = verb(verbs, "reindex", text, "bag_look.reindex", "ic bag reindex drive")
     indexing.add_argument("bag", metavar="BAG", completer=completion.bags)
 
+
+def _add_control(verbs: Any) -> None:
+    """Add ``ic bag snapshot`` and ``control``."""
     text = "make a recorder write the last seconds (ic bag record --snapshot)"
     snapping = verb(verbs, "snapshot", text, "bag_run.snapshot", "ic bag snapshot 'door stuck'")
     snapping.add_argument("reason", nargs="?", default="", help="added to the folder's name")
     snapping.add_argument("--node", default="", help="recorder to use if several are running")
-    snapping.add_argument("--timeout", **span, default=60.0, help="wait at most this long (default: 60)")
+    snapping.add_argument("--timeout", **_SPAN, default=60.0, help="wait at most this long (default: 60)")
 
     steering = verb(
         verbs, "control", "control a running recorder or player", "bag_run.control", "ic bag control rate 0.5"
@@ -189,3 +207,7 @@ def argument_of(command: str, value: float | None) -> dict[str, Any]:
     if value is not None:
         raise UserError(f"ic bag control {command} takes no value", 2)
     return {}
+
+
+_SPAN: dict[str, Any] = {"type": _seconds, "metavar": "S"}
+_MANY: dict[str, Any] = {"action": "append", "default": []}
