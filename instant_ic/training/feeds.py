@@ -54,8 +54,7 @@ class FileFeed:
 
     Args:
         indices: of the samples to use.
-        batch_size: of this process.
-        rank, ranks: this process among those that train together; each gets its own part of a pass.
+        batch_size: panoramas per batch.
         info: recipe.
         threads: number of reader threads (decoding images takes longer than a training step of a small network).
     """
@@ -66,15 +65,13 @@ class FileFeed:
         indices: NDArray[np.intp],
         batch_size: int,
         seed: int = 0,
-        rank: int = 0,
-        ranks: int = 1,
         info: dict[str, Any] | None = None,
         threads: int = 4,
     ) -> None:
         if len(indices) == 0:
             raise FeedError("no panoramas for training")
         self.samples, self.indices, self.batch_size = samples, indices, batch_size
-        self.seed, self.rank, self.ranks = seed, rank, ranks
+        self.seed = seed
         self._info = info or {}
         self._readers = ThreadPoolExecutor(threads)
 
@@ -86,14 +83,14 @@ class FileFeed:
     @property
     def steps_an_epoch(self) -> int:
         """Number of batches that cover all panoramas once."""
-        return max(1, len(self.indices) // (self.batch_size * self.ranks))
+        return max(1, len(self.indices) // self.batch_size)
 
     def batch(self, step: int) -> Batch:
         epoch, place = divmod(step, self.steps_an_epoch)
         order = np.random.default_rng((self.seed, epoch)).permutation(self.indices)
-        first = (place * self.ranks + self.rank) * self.batch_size
+        first = place * self.batch_size
         picked = np.sort(np.take(order, np.arange(first, first + self.batch_size), mode="wrap"))
-        rng = np.random.default_rng((self.seed, step, self.rank))
+        rng = np.random.default_rng((self.seed, step))
         return stack(list(self._readers.map(lambda index: self.samples[int(index)], picked)), rng)
 
     def close(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,11 +25,11 @@ class RoomsConfig:
     """Recipe of generated panoramas.
 
     Attributes:
-        worlds, poses: number of worlds, and panoramas in each.
-        priors: fused depth images of each panorama, with other faults and another number of revolutions each.
+        worlds: number of worlds.
+        poses: number of panoramas in each world.
+        priors: number of fused depth images of each panorama, each with its own faults and number of revolutions.
         first_world: seed of the first world; the others follow.
         height: rows of a panorama.
-        interiors: ``wide``: ``interiors.interior_world``; ``random``: only ``sim.worlds.random_world``.
         textures: folder of photographs that replace most procedural textures; empty: none.
     """
 
@@ -38,7 +38,6 @@ class RoomsConfig:
     priors: int = 2
     first_world: int = 1000
     height: int = 256
-    interiors: str = "wide"
     textures: str = ""
 
     def __post_init__(self) -> None:
@@ -50,23 +49,20 @@ class RoomsConfig:
 
 
 def render_rooms(config: RoomsConfig, folder: Path, worlds: Iterable[int]) -> Iterator[Path]:
-    """Render worlds of the recipe into a folder, one file a panorama (``dataset.save_sample``); the same recipe gives
-    the same files.
+    """Render worlds of the recipe into a folder, one file a panorama, and yield the files.
 
-    Worlds of which the folder has panoramas are left out, so that an interrupted run continues.
+    The same recipe gives the same files. Worlds that the folder has are skipped, so that an interrupted run continues.
     """
     from instant_ic.sim.render import EquirectRenderer
-    from instant_ic.sim.worlds import World, random_world
     from instant_ic.training.interiors import interior_world
     from instant_ic.training.photographs import with_photographs
     from instant_ic.training.sparse import sample_prior
 
-    make: Callable[[int], World] = interior_world if config.interiors == "wide" else random_world
     for seed in worlds:
         if (folder / f"{seed}-{config.poses - 1}.npz").exists():
             continue
         rng, prior_rng = np.random.default_rng((7, seed)), np.random.default_rng((8, seed))
-        world = make(seed)
+        world = interior_world(seed)
         if config.textures:
             world = with_photographs(world, config.textures, rng)
         renderer = EquirectRenderer(world)

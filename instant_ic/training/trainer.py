@@ -1,4 +1,4 @@
-"""Trains the completion network. Training can be stopped and resumed, and runs on several GPUs under ``torchrun``.
+"""Training of the completion network, which can be stopped and resumed.
 
 The schedule runs over wall time or epochs, whichever ends first: on a shared machine only the time is known beforehand.
 The evaluated and saved weights are an exponential moving average of the trained ones.
@@ -13,15 +13,13 @@ import platform
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, distributed, nn
-from torch.nn.parallel import DistributedDataParallel
+from torch import Tensor, nn
 
 from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
 from instant_ic.training.augment import photograph, to_brightness, turn_and_mirror, without_lidar
@@ -41,8 +39,6 @@ HEAD_RATE = 0.1
 """Learning rate of the last layer over that of the decoder. Adam moves each of the some 400 weights behind an output by
 the rate in a step: together they would leave the prior in a few steps, before they have learnt anything.
 """
-TEAM_TIMEOUT = timedelta(minutes=20)
-"""A process that waits longer for the others exits with an error."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,7 @@ class TrainingConfig:
     Attributes:
         minutes: wall time of the learning rate schedule, after which training ends.
         epochs: passes over the data after which training ends, if that comes first.
-        batch_size: panoramas per step and process.
+        batch_size: panoramas per step.
         learning_rate: maximum, of AdamW.
         encoder_rate: learning rate of the pretrained encoder over that of the decoder; 0: the encoder is fixed, and a
             step costs half.
@@ -93,58 +89,31 @@ class TrainingConfig:
     seed: int = 0
 
 
-@dataclass(frozen=True)
-class Team:
-    """The processes that train together, and this one's device.
+def select_device(name: str = "auto") -> torch.device:
+    """Return the device of a training.
 
-    Attributes:
-        device: this process's.
-        rank: index of this process among ``ranks``; process 0 evaluates, reports and saves.
+    Args:
+        name: ``auto`` (a GPU if there is one, else the CPU) or a torch device.
+
+    Raises:
+        ValueError: there is no such device.
     """
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ValueError(f"device {name!r}: {str(error).splitlines()[0]}") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device {name!r}: torch {torch.__version__} finds no CUDA GPU")
+    return device
 
-    device: torch.device
-    rank: int = 0
-    ranks: int = 1
 
-    @classmethod
-    def join(cls, device: str = "auto") -> Team:
-        """Join the process group if ``torchrun`` started one, and select the device.
-
-        Args:
-            device: ``auto`` (a GPU for this process if there is one, else the CPU) or a torch device.
-
-        Raises:
-            ValueError: there is no such device.
-        """
-        ranks, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        try:
-            chosen = torch.device(device)
-        except RuntimeError as error:
-            raise ValueError(f"device {device!r}: {str(error).splitlines()[0]}") from error
-        if chosen.type == "cuda":
-            if not torch.cuda.is_available():
-                raise ValueError(f"device {device!r}: torch {torch.__version__} finds no CUDA GPU")
-            chosen = torch.device("cuda", local if chosen.index is None else chosen.index)
-            if chosen.index >= torch.cuda.device_count():
-                raise ValueError(f"device {chosen}: there are {torch.cuda.device_count()} GPUs for process {local}")
-            torch.cuda.set_device(chosen)
-        if ranks > 1:
-            distributed.init_process_group("nccl" if chosen.type == "cuda" else "gloo", timeout=TEAM_TIMEOUT)
-            return cls(chosen, distributed.get_rank(), ranks)
-        return cls(chosen)
-
-    def leave(self) -> None:
-        if self.ranks > 1:
-            distributed.destroy_process_group()
-
-    @property
-    def name(self) -> str:
-        """Description of the machine for the training record."""
-        if self.device.type == "cuda":
-            return f"{self.ranks} x {torch.cuda.get_device_name(self.device)}"
-        return f"{self.ranks} x CPU ({platform.machine()}, {os.cpu_count()} cores)"
+def describe_device(device: torch.device) -> str:
+    """Return the name of a device for the training record."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU ({platform.machine()}, {os.cpu_count()} cores)"
 
 
 def schedule(progress: float, warmup: float) -> float:
@@ -216,7 +185,7 @@ class Trainer:
     model: CompletionNet
     config: TrainingConfig
     output: Path
-    team: Team = field(default_factory=lambda: Team(torch.device("cpu")))
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     origin: dict[str, Any] = field(default_factory=dict)
     command: str = ""
     report: Callable[[str], None] = print
@@ -232,18 +201,14 @@ class Trainer:
         self._ahead = Ahead(self.feed)
         self.network = self.model.config
         rows = np.maximum(solid_angle_weights(self.network.height), POLE_WEIGHT)
-        self.row_weights = torch.from_numpy(rows).to(self.team.device)
+        self.row_weights = torch.from_numpy(rows).to(self.device)
         rgb = self.feed.batch(0)[0]
         if rgb.shape[1:3] != (self.network.height, self.network.width):
             raise ValueError(f"the panoramas are {rgb.shape[1]} x {rgb.shape[2]}, the network takes "
                              f"{self.network.height} x {self.network.width}")  # fmt: skip
-        self.model = self.model.to(self.team.device)
+        self.model = self.model.to(self.device)
         self.model.encoder.requires_grad_(self.config.encoder_rate > 0)
         self.average = copy.deepcopy(self.model).eval()
-        self._parallel: nn.Module = self.model
-        if self.team.ranks > 1:
-            ids = [self.team.device.index] if self.team.device.type == "cuda" else None
-            self._parallel = DistributedDataParallel(self.model, device_ids=ids)
         groups = []
         rates = {"encoder.": self.config.encoder_rate, "head.": HEAD_RATE}
         for decay, matrices in ((self.config.weight_decay, True), (0.0, False)):
@@ -252,10 +217,10 @@ class Trainer:
                     rate = next((rate for start, rate in rates.items() if name.startswith(start)), 1.0)
                     groups.append({"params": [parameter], "weight_decay": decay, "rate": rate})
         self.optimizer = torch.optim.AdamW(groups, lr=self.config.learning_rate)
-        cuda = self.team.device.type == "cuda"
+        cuda = self.device.type == "cuda"
         self._half = torch.float16 if cuda and not torch.cuda.is_bf16_supported() else torch.bfloat16
         scales = self.config.mixed_precision and self._half == torch.float16
-        self.scaler = torch.amp.GradScaler(self.team.device.type, enabled=scales)
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=scales)
 
     @property
     def progress(self) -> float:
@@ -264,28 +229,28 @@ class Trainer:
         return min(1.0, max(by_time, self.step / (self.config.epochs * self.feed.steps_an_epoch)))
 
     def _augmented(self, rgb: Tensor, depth: Tensor, prior: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Augment with a generator seeded by step and process, so that a resumed run repeats the same augmentation."""
-        generator = torch.Generator().manual_seed((self.config.seed << 40) + (self.step << 8) + self.team.rank)
+        """Augment with a generator seeded by the step, so that a resumed run repeats the same augmentation."""
+        generator = torch.Generator().manual_seed((self.config.seed << 40) + (self.step << 8))
         rgb, depth, prior = turn_and_mirror(generator, rgb, depth, prior)
         if self.config.photograph:
             rgb = photograph(rgb, depth, generator)
         prior = without_lidar(prior, self.config.no_lidar, generator)
         return to_brightness(rgb, self.config.brightness), depth, prior
 
-    def train_step(self, progress: float | None = None) -> float:
+    def train_step(self) -> float:
         """Run one optimiser step and return the loss.
 
         Raises:
             RuntimeError: the loss is not finite.
         """
-        factor = schedule(self.progress if progress is None else progress, self.config.warmup)
+        factor = schedule(self.progress, self.config.warmup)
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate * factor * group["rate"]
-        batch = to_tensors(self._ahead.batch(self.step), self.config.max_range_m, self.team.device)
+        batch = to_tensors(self._ahead.batch(self.step), self.config.max_range_m, self.device)
         rgb, truth, prior = self._augmented(*batch)
         self.model.train()
-        with torch.autocast(self.team.device.type, self._half, enabled=self.config.mixed_precision):
-            predicted, sigma = self._parallel(rgb, prior)
+        with torch.autocast(self.device.type, self._half, enabled=self.config.mixed_precision):
+            predicted, sigma = self.model(rgb, prior)
         loss = depth_loss(predicted, truth, self.row_weights)
         loss = loss + self.config.edge_share * edge_loss(predicted, truth, self.row_weights)
         guessed = truth * (prior[:, 2] == 0)
@@ -303,29 +268,17 @@ class Trainer:
         update_average(self.average, self.model, min(self.config.average, (1 + self.step) / (10 + self.step)))
         return float(loss.item())
 
-    def _agreed(self) -> tuple[float, bool]:
-        """Progress and stop flag of process 0, so that all processes end at the same step."""
-        values = torch.tensor([self.progress, float(self.stop)], dtype=torch.float64, device=self.team.device)
-        if self.team.ranks > 1:
-            distributed.broadcast(values, 0)
-        return float(values[0]), bool(values[1])
-
-    def run(self) -> DepthMetrics | None:
-        """Train to the end of the schedule; return the metrics over all held-out panoramas (process 0 only)."""
-        log = TrainingLog(self.output, self.step, self.report) if self.team.rank == 0 else None
+    def run(self) -> DepthMetrics:
+        """Train to the end of the schedule; return the metrics over all held-out panoramas."""
+        log = TrainingLog(self.output, self.step, self.report)
         begin = time.monotonic() - self.elapsed_s
         last_checkpoint, last_row, losses = time.monotonic(), (time.monotonic(), self.step), []
         try:
-            if log is not None and not self.history:
+            if not self.history:
                 self._checkpoint(log, self._evaluate(self._picked()), [])  # the prior
-            while True:
-                progress, stop = self._agreed()
-                if progress >= 1.0 or stop:
-                    break
-                losses.append(self.train_step(progress))
+            while self.progress < 1.0 and not self.stop:
+                losses.append(self.train_step())
                 self.elapsed_s = time.monotonic() - begin
-                if log is None:
-                    continue
                 self.bar(self.progress)
                 now = time.monotonic()
                 if self.step % 50 == 0 or now - last_row[0] > 60:
@@ -334,15 +287,12 @@ class Trainer:
                     self._checkpoint(log, self._evaluate(self._picked()), losses)
                     self.elapsed_s = time.monotonic() - begin
                     last_checkpoint, last_row = time.monotonic(), (time.monotonic(), self.step)
-            if log is None:
-                return None
             self._row(log, losses, *last_row)
             final = self._evaluate(self.held_out)
             self._checkpoint(log, final, losses)
             return final
         finally:
-            if log is not None:
-                log.close()
+            log.close()
 
     def close(self) -> None:
         """Close the feed and its processes."""
@@ -352,7 +302,7 @@ class Trainer:
         """Write loss and speed since a time and step; return the current ones."""
         now, count = time.monotonic(), self.step - since_step
         if count:
-            rate = count * self.config.batch_size * self.team.ranks / (now - since)
+            rate = count * self.config.batch_size / (now - since)
             row = {
                 "step": self.step, "minutes": round(self.elapsed_s / 60, 2),
                 "loss": round(float(np.mean(losses[-count:])), 5),
@@ -400,7 +350,7 @@ class Trainer:
             "training": asdict(self.config),
             "data": self.feed.info,
             "held_out": len(self.held_out),
-            "device": self.team.name,
+            "device": describe_device(self.device),
             "steps": self.step,
             "epochs": round(self.step / self.feed.steps_an_epoch, 2),
             "wall_minutes": round(self.elapsed_s / 60, 1),

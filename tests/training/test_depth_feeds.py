@@ -36,13 +36,6 @@ def test_a_pass_shows_each_panorama_once_and_each_pass_another_order() -> None:
     feed.close()
 
 
-def test_processes_share_a_pass() -> None:
-    samples = [marked(i) for i in range(12)]
-    both = [FileFeed(samples, np.arange(12), 2, rank=rank, ranks=2) for rank in (0, 1)]
-    assert [feed.steps_an_epoch for feed in both] == [3, 3]
-    assert sorted(n for feed in both for step in range(3) for n in numbers(feed.batch(step))) == list(range(12))
-
-
 def test_nothing_to_draw_from_is_an_error() -> None:
     with pytest.raises(FeedError, match="no panorama"):
         FileFeed([], np.arange(0), 2)

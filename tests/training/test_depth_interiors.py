@@ -1,5 +1,6 @@
 """Generated interiors: every kind can be stood in and repeats; seeds of the evaluations are refused."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
+from instant_ic.sim.worlds import random_world
 from instant_ic.training.dataset import DatasetError, save_sample
 from instant_ic.training.folders import open_folder
 from instant_ic.training.interiors import KINDS, interior_world
@@ -30,11 +32,19 @@ def test_kinds_are_drawn_by_their_shares_and_unknown_ones_refused() -> None:
         interior_world(1, "cave")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def plain_rooms() -> Iterator[None]:
+    """Render plain random rooms, whose light takes less time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("instant_ic.training.interiors.interior_world", random_world)
+        yield
+
+
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[RoomsConfig, Path]:
     """Two panoramas of a world for training and of a held-out one, whose seed is a multiple of twelve."""
     folder = tmp_path_factory.mktemp("p")
-    recipe = RoomsConfig(worlds=2, poses=2, height=64, first_world=300_000, interiors="random")
+    recipe = RoomsConfig(worlds=2, poses=2, height=64, first_world=300_000)
     paths = list(render_rooms(recipe, folder, [300_000, 300_001]))
     assert [path.name for path in paths] == ["300000-0.npz", "300000-1.npz", "300001-0.npz", "300001-1.npz"]
     return recipe, folder
