@@ -17,7 +17,7 @@ from instant_ic.geometry.projections import perspective_directions
 
 if TYPE_CHECKING:
     from instant_ic.sim.contact import OccupancyMask
-    from instant_ic.sim.render import Frame
+    from instant_ic.sim.render import RenderedFrame
     from instant_ic.sim.world import World
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -141,7 +141,11 @@ class Score:
 
 
 def score(
-    shown: NDArray[np.uint8], truth: Frame, world_from_camera: FloatArray, fov_rad: float, with_ssim: bool = True
+    shown: NDArray[np.uint8],
+    truth: RenderedFrame,
+    world_from_camera: FloatArray,
+    fov_rad: float,
+    with_ssim: bool = True,
 ) -> Score:
     """Compare a shown image (H, W, 3) with the true one, perspective along the camera's x."""
     floor, wall = surfaces(truth, world_from_camera, fov_rad)
@@ -151,7 +155,7 @@ def score(
 
 
 def surfaces(
-    truth: Frame, world_from_camera: FloatArray, fov_rad: float
+    truth: RenderedFrame, world_from_camera: FloatArray, fov_rad: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the pixels of the floor, and of walls and objects up to 2 m, (H, W) each, by their height."""
     height, width = truth.depth_m.shape

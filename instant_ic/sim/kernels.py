@@ -84,6 +84,9 @@ _jit = numba.njit(**_FLAGS)
 #: Without reference counts of arrays, which cost more than the lookups; such a function cannot make arrays.
 _bare = numba.njit(_nrt=False, **_FLAGS)
 
+#: For functions with one caller, which are separate only to be read.
+_inlined = numba.njit(_nrt=False, inline="always", **_FLAGS)
+
 
 @_bare
 def _along(forms: F32, s: int, k: int, d: tuple[Scalar, Scalar, Scalar]) -> Scalar:
@@ -600,6 +603,34 @@ def _cover(
             shown[n] = np.int32(m) if hit else shown[n]
 
 
+class Work(NamedTuple):
+    """Buffers of ``compose``: for a row of N shaded pixels, and for an edge pixel.
+
+    Attributes:
+        ray: directions of the row's pixels, (3, N).
+        root: tone indices of the row's pixels, (3, N).
+        values: buffer of ``_shade``.
+        line: surface of each pixel of the row, (N,).
+        differs: whether a neighbour shows another surface, (N,).
+        near: surfaces in and around the edge pixel.
+        weight: number of samples of each of ``near``.
+        shift: sum of the samples' rows and columns, for each of ``near``.
+        inverse: inverse range of each sample.
+        shown: index in ``near`` of each sample's surface.
+    """
+
+    ray: F32
+    root: F32
+    values: F32
+    line: I32
+    differs: U8
+    near: I32
+    weight: F32
+    shift: F32
+    inverse: F32
+    shown: I32
+
+
 @_jit
 def compose(
     surface: I32, projection: Projection, subpixels: F32, sampled: I32, adjoining: I32, footprint: Scalar,
@@ -608,21 +639,11 @@ def compose(
     """Shade the image (H, W, 3), sRGB, with anti-aliased edges.
 
     In a row with a stride only every stride-th pixel is shaded; the pixels in between are interpolated. A sample of an
-    edge pixel shows its surface in ``sampled`` (N,), or if that is empty the nearest of those that the pixels around
-    it show, and of those ``adjoining`` (S, 4) them.
+    edge pixel shows its surface in ``sampled`` (N,), or if that is empty the nearest of the surfaces that the pixels
+    around it show and of those that adjoin them (``adjoining``, (S, 4)).
     """
     width = surface.shape[1]
-    _compose(
-        surface,
-        projection,
-        subpixels,
-        sampled,
-        adjoining,
-        footprint,
-        edge_footprint,
-        scene,
-        tone,
-        out,
+    work = Work(
         np.empty((3, width), np.float32),
         np.empty((3, width), np.float32),
         np.empty(6 * _SPAN, np.float32),
@@ -634,112 +655,148 @@ def compose(
         np.empty(_SAMPLES, np.float32),
         np.empty(_SAMPLES, np.int32),
     )
+    _compose(surface, projection, (subpixels, sampled, adjoining, edge_footprint), footprint, scene, tone, out, work)
 
 
 @_bare
 def _compose(
-    surface: I32, projection: Projection, subpixels: F32, sampled: I32, adjoining: I32, footprint: Scalar,
-    edge_footprint: Scalar, scene: Scene, tone: U8, out: U8, ray: F32, root: F32, work: F32, line: I32, differs: U8,
-    near: I32, weight: F32, shift: F32, inverse: F32, shown: I32,
+    surface: I32, projection: Projection, edges: tuple[F32, I32, I32, Scalar], footprint: Scalar, scene: Scene,
+    tone: U8, out: U8, work: Work,
 ) -> None:  # fmt: skip
-    across, down, scale, strides, wraps = projection
-    forms, owns = scene.forms, scene.owns
-    height, width = surface.shape
-    samples = subpixels.shape[0]
-    one = np.float32(1)
     taken = 0
-    for row in range(height):
-        stride = strides[row]
-        count = (width + stride - 1) // stride
-        above, under = surface[max(row - 1, 0)], surface[min(row + 1, height - 1)]
-        here = surface[row]
-        c, bx, by, bz = scale[row + 1], down[0, row + 1], down[1, row + 1], down[2, row + 1]
-        if stride == 1:
-            for i in range(count):
-                line[i] = here[i]
-                differs[i] = (above[i] != here[i]) | (under[i] != here[i])
-                ray[0, i] = c * across[0, i + 1] + bx
-                ray[1, i] = c * across[1, i + 1] + by
-                ray[2, i] = c * across[2, i + 1] + bz
-        else:
-            for i in range(count):
-                k = i * stride
-                line[i] = here[k]
-                differs[i] = (above[k] != here[k]) | (under[k] != here[k])
-                ray[0, i] = c * across[0, k + 1] + bx
-                ray[1, i] = c * across[1, k + 1] + by
-                ray[2, i] = c * across[2, k + 1] + bz
-        if not wraps:
-            for i in range(count):
-                part = one / np.sqrt(ray[0, i] * ray[0, i] + ray[1, i] * ray[1, i] + ray[2, i] * ray[2, i])
-                ray[0, i] *= part
-                ray[1, i] *= part
-                ray[2, i] *= part
-        for i in range(1, count):
-            differs[i] |= line[i] != line[i - 1]
-        for i in range(count - 1):
-            differs[i] |= line[i] != line[i + 1]
-        if wraps and line[0] != line[count - 1]:
-            differs[0] = differs[count - 1] = 1
+    for row in range(surface.shape[0]):
+        _read_row(surface, row, projection, work)
+        taken = _shade_row(surface, row, projection, edges, footprint, scene, work, taken)
+        _write_row(out[row], projection.strides[row], work.root, tone)
 
-        first = 0
-        while first < count:
-            s = line[first]
-            known, edge = 0, False
-            if differs[first]:
-                known, edge = _around(surface, row, first, projection, forms, owns, near)
-            if not edge:
-                end = first + 1
-                while end < count and line[end] == s and not differs[end]:
-                    end += 1
-                _shade(s, first, end, ray, footprint, scene, work, root)
-                first = end
-                continue
-            if sampled.shape[0]:
-                for n in range(samples):
-                    best = 0
-                    while best < known and near[best] != sampled[taken]:
-                        best += 1
-                    near[best] = sampled[taken]
-                    known = max(known, best + 1)
-                    shown[n] = best
-                    taken += 1
-            else:
-                known = _add_adjoining(forms, adjoining, near, known)
-                _cover(row, first, projection, forms, near, known, inverse, shown)
-            for m in range(known):
-                weight[m] = shift[m, 0] = shift[m, 1] = np.float32(0)
-            for n in range(samples):
-                weight[shown[n]] += one
-                shift[shown[n], 0] += subpixels[n, 0]
-                shift[shown[n], 1] += subpixels[n, 1]
-            red = green = blue = np.float32(0)
-            for m in range(known):
-                if weight[m] == 0:
-                    continue
-                part = one / weight[m]
-                x, y, z = _sample(row, first, part * shift[m, 0], part * shift[m, 1], projection)
-                r, g, b = _point(near[m], edge_footprint, x, y, z, scene)
-                r, g, b = min(r, _WHITE), min(g, _WHITE), min(b, _WHITE)
-                part = weight[m] / np.float32(samples)
-                red, green, blue = red + part * r * r, green + part * g * g, blue + part * b * b
-            root[0, first], root[1, first], root[2, first] = np.sqrt(red), np.sqrt(green), np.sqrt(blue)
-            first += 1
 
-        top = np.float32(TONE_SIZE - 1)
-        if stride == 1:
-            for i in range(count):
-                out[row, i, 0] = tone[np.int32(min(root[0, i], top))]
-                out[row, i, 1] = tone[np.int32(min(root[1, i], top))]
-                out[row, i, 2] = tone[np.int32(min(root[2, i], top))]
+@_inlined
+def _read_row(surface: I32, row: int, projection: Projection, work: Work) -> None:
+    """Enter the directions and surfaces of a row's shaded pixels, and mark those with a different neighbour."""
+    across, down, scale, strides, wraps = projection
+    ray, line, differs = work.ray, work.line, work.differs
+    height, width = surface.shape
+    stride = strides[row]
+    count = (width + stride - 1) // stride
+    above, under = surface[max(row - 1, 0)], surface[min(row + 1, height - 1)]
+    here = surface[row]
+    c, bx, by, bz = scale[row + 1], down[0, row + 1], down[1, row + 1], down[2, row + 1]
+    if stride == 1:
+        for i in range(count):
+            line[i] = here[i]
+            differs[i] = (above[i] != here[i]) | (under[i] != here[i])
+            ray[0, i] = c * across[0, i + 1] + bx
+            ray[1, i] = c * across[1, i + 1] + by
+            ray[2, i] = c * across[2, i + 1] + bz
+    else:
+        for i in range(count):
+            k = i * stride
+            line[i] = here[k]
+            differs[i] = (above[k] != here[k]) | (under[k] != here[k])
+            ray[0, i] = c * across[0, k + 1] + bx
+            ray[1, i] = c * across[1, k + 1] + by
+            ray[2, i] = c * across[2, k + 1] + bz
+    if not wraps:
+        for i in range(count):
+            part = np.float32(1) / np.sqrt(ray[0, i] * ray[0, i] + ray[1, i] * ray[1, i] + ray[2, i] * ray[2, i])
+            ray[0, i] *= part
+            ray[1, i] *= part
+            ray[2, i] *= part
+    for i in range(1, count):
+        differs[i] |= line[i] != line[i - 1]
+    for i in range(count - 1):
+        differs[i] |= line[i] != line[i + 1]
+    if wraps and line[0] != line[count - 1]:
+        differs[0] = differs[count - 1] = 1
+
+
+@_inlined
+def _shade_row(
+    surface: I32, row: int, projection: Projection, edges: tuple[F32, I32, I32, Scalar], footprint: Scalar,
+    scene: Scene, work: Work, taken: int,
+) -> int:  # fmt: skip
+    """Shade a row: runs of one surface at once, edge pixels by their samples. Return the samples taken so far."""
+    subpixels, sampled, adjoining, edge_footprint = edges
+    line, differs, near, shown = work.line, work.differs, work.near, work.shown
+    forms, owns = scene.forms, scene.owns
+    stride = projection.strides[row]
+    count = (surface.shape[1] + stride - 1) // stride
+    first = 0
+    while first < count:
+        s = line[first]
+        known, edge = 0, False
+        if differs[first]:
+            known, edge = _around(surface, row, first, projection, forms, owns, near)
+        if not edge:
+            end = first + 1
+            while end < count and line[end] == s and not differs[end]:
+                end += 1
+            _shade(s, first, end, work.ray, footprint, scene, work.values, work.root)
+            first = end
+            continue
+        if sampled.shape[0]:
+            for n in range(subpixels.shape[0]):
+                best = 0
+                while best < known and near[best] != sampled[taken]:
+                    best += 1
+                near[best] = sampled[taken]
+                known = max(known, best + 1)
+                shown[n] = best
+                taken += 1
         else:
-            for i in range(count):
-                j = i + 1 if i + 1 < count else 0
-                for k in range(min(stride, width - i * stride)):
-                    share = np.float32(k) / np.float32(stride)
-                    for m in range(3):
-                        value = root[m, i] + share * (root[m, j] - root[m, i])
-                        out[row, i * stride + k, m] = tone[np.int32(min(value, top))]
+            known = _add_adjoining(forms, adjoining, near, known)
+            _cover(row, first, projection, forms, near, known, work.inverse, shown)
+        _shade_edge(row, first, projection, subpixels, known, edge_footprint, scene, work)
+        first += 1
+    return taken
+
+
+@_inlined
+def _shade_edge(
+    row: int, first: int, projection: Projection, subpixels: F32, known: int, footprint: Scalar, scene: Scene,
+    work: Work,
+) -> None:  # fmt: skip
+    """Shade an edge pixel: the mean of its surfaces, weighted by their samples and taken at the samples' centre."""
+    near, weight, shift, shown, root = work.near, work.weight, work.shift, work.shown, work.root
+    samples, one = subpixels.shape[0], np.float32(1)
+    for m in range(known):
+        weight[m] = shift[m, 0] = shift[m, 1] = np.float32(0)
+    for n in range(samples):
+        weight[shown[n]] += one
+        shift[shown[n], 0] += subpixels[n, 0]
+        shift[shown[n], 1] += subpixels[n, 1]
+    red = green = blue = np.float32(0)
+    for m in range(known):
+        if weight[m] == 0:
+            continue
+        part = one / weight[m]
+        x, y, z = _sample(row, first, part * shift[m, 0], part * shift[m, 1], projection)
+        r, g, b = _point(near[m], footprint, x, y, z, scene)
+        r, g, b = min(r, _WHITE), min(g, _WHITE), min(b, _WHITE)
+        part = weight[m] / np.float32(samples)
+        red, green, blue = red + part * r * r, green + part * g * g, blue + part * b * b
+    root[0, first], root[1, first], root[2, first] = np.sqrt(red), np.sqrt(green), np.sqrt(blue)
+
+
+@_inlined
+def _write_row(out: U8, stride: int, root: F32, tone: U8) -> None:
+    """Write a row (W, 3) from the tone indices of its shaded pixels."""
+    width = out.shape[0]
+    count = (width + stride - 1) // stride
+    top = np.float32(TONE_SIZE - 1)
+    if stride == 1:
+        for i in range(count):
+            out[i, 0] = tone[np.int32(min(root[0, i], top))]
+            out[i, 1] = tone[np.int32(min(root[1, i], top))]
+            out[i, 2] = tone[np.int32(min(root[2, i], top))]
+        return
+    for i in range(count):
+        j = i + 1 if i + 1 < count else 0
+        for k in range(min(stride, width - i * stride)):
+            share = np.float32(k) / np.float32(stride)
+            for m in range(3):
+                value = root[m, i] + share * (root[m, j] - root[m, i])
+                out[i * stride + k, m] = tone[np.int32(min(value, top))]
 
 
 @_jit

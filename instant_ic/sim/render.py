@@ -26,7 +26,7 @@ _Tables = tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np
 
 
 @dataclass(frozen=True)
-class Frame:
+class RenderedFrame:
     """Image with depth.
 
     Attributes:
@@ -127,7 +127,7 @@ class EquirectRenderer:
             np.asarray(light, np.float32),
         )  # fmt: skip
 
-    def render(self, map_from_camera: FloatArray, width: int, height: int, supersample: int = 1) -> Frame:
+    def render(self, map_from_camera: FloatArray, width: int, height: int, supersample: int = 1) -> RenderedFrame:
         """Render an equirect panorama: centre column along x, rows from +90° to −90°.
 
         Args:
@@ -139,7 +139,7 @@ class EquirectRenderer:
 
     def render_perspective(
         self, map_from_camera: FloatArray, width: int, height: int, hfov_rad: float, supersample: int = 1
-    ) -> Frame:
+    ) -> RenderedFrame:
         """Render a perspective image along the camera's x with square pixels; depth is radial too."""
         if not 0 < hfov_rad < math.pi:
             raise ValueError(f"hfov_rad must be between 0 and pi (got {hfov_rad})")
@@ -151,7 +151,7 @@ class EquirectRenderer:
         """Ranges (N,) in metres (inf = no hit) and faces (N,) (-1 = no hit) of rays in the world's frame."""
         return self._caster.cast(origins, directions)
 
-    def _picture(self, map_from_camera: FloatArray, lens: _Lens, supersample: int) -> Frame:
+    def _picture(self, map_from_camera: FloatArray, lens: _Lens, supersample: int) -> RenderedFrame:
         if supersample < 1:
             raise ValueError(f"supersample must be at least 1 (got {supersample})")
         if supersample == 1:
@@ -162,9 +162,11 @@ class EquirectRenderer:
         table, radiance = _tone_table()
         parts = np.minimum(radiance, 1.5)[fine.rgb].reshape(lens.height, n, lens.width, n, 3)
         index = np.sqrt(parts.mean(axis=(1, 3))) * ((kernels.TONE_SIZE - 1) / kernels.TONE_ROOT)
-        return Frame(table[index.astype(np.int32)], np.ascontiguousarray(fine.depth_m[n // 2 :: n, n // 2 :: n]))
+        return RenderedFrame(
+            table[index.astype(np.int32)], np.ascontiguousarray(fine.depth_m[n // 2 :: n, n // 2 :: n])
+        )
 
-    def _frame(self, map_from_camera: FloatArray, lens: _Lens) -> Frame:
+    def _frame(self, map_from_camera: FloatArray, lens: _Lens) -> RenderedFrame:
         world = self.world
         tables = lens.tables(map_from_camera[:3, :3])
         origin = np.asarray(map_from_camera[:3, 3], np.float32)
@@ -190,7 +192,7 @@ class EquirectRenderer:
             surface, projection, subpixels, sampled, world.adjoining, footprint, edge_footprint,
             kernels.Scene(forms, *self._scene), _tone_table()[0], rgb,
         )  # fmt: skip
-        return Frame(rgb, depth)
+        return RenderedFrame(rgb, depth)
 
     def _visible(
         self,

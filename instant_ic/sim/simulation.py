@@ -12,10 +12,10 @@ from instant_ic.base.config import SkidSteerConfig
 from instant_ic.config.ranges import Checked, NotNegativeInt, Range, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, LIDAR_MOUNT, Mount, Rectangle
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.sim.render import EquirectRenderer, Frame
+from instant_ic.sim.render import EquirectRenderer, RenderedFrame
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
-from instant_ic.sim.theta import ThetaConfig
+from instant_ic.sim.theta import SimThetaConfig
 from instant_ic.sim.vlp16 import Vlp16, Vlp16Config
 from instant_ic.sim.world import World
 from instant_ic.sim.worlds import make_world
@@ -59,7 +59,7 @@ class SimulationConfig:
     start: tuple[Annotated[float, Range(-1000, 1000)], ...] = ()
     seed: NotNegativeInt = 0
     robot: RobotConfig = field(default_factory=RobotConfig)
-    camera: ThetaConfig = field(default_factory=ThetaConfig)
+    camera: SimThetaConfig = field(default_factory=SimThetaConfig)
     lidar: Vlp16Config = field(default_factory=Vlp16Config)
     base: BaseConfig = field(default_factory=BaseConfig)
     footprint: Rectangle = field(default_factory=Rectangle)
@@ -154,7 +154,7 @@ class Simulation:
         x, y, yaw = self.robot.pose if time_s is None else self.poses_at([time_s])[0]
         return pose_matrix(x, y, 0.0, 0.0, 0.0, yaw)
 
-    def panorama(self, width: int, height: int) -> Frame:
+    def panorama(self, width: int, height: int) -> RenderedFrame:
         """Render the camera's current view."""
         base_from_camera = pose_matrix(*self.config.camera_mount.pose)
         return self.renderer.render(self.world_from_base() @ base_from_camera, width, height)

@@ -36,7 +36,7 @@ SETTLE_S = 0.8
 
 
 @dataclass(frozen=True)
-class ThetaConfig:
+class SimThetaConfig:
     """Parameters of the simulated camera.
 
     Attributes:
@@ -113,7 +113,7 @@ class ThetaServer:
         late_s: recent delay of the images behind their plan, in the stack's seconds; 0 without a viewer.
     """
 
-    def __init__(self, config: ThetaConfig, source: PictureSource, seed: int = 0) -> None:
+    def __init__(self, config: SimThetaConfig, source: PictureSource, seed: int = 0) -> None:
         self.config = config
         self._rng = np.random.default_rng([67, seed])
         self._noise: npt.NDArray[np.int8] = np.empty((0, 0, 3), np.int8)

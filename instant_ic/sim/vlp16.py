@@ -97,15 +97,24 @@ def _measure(
     face: npt.NDArray[np.int32],
     directions: F32,
     noise_m: F32,
-    min_m: float,
-    max_m: float,
-    face_surface: npt.NDArray[np.int32],
-    normal: F32,
-    reflectance: F32,
+    limits_m: tuple[float, float],
+    surfaces: tuple[npt.NDArray[np.int32], F32, F32],
     distance: npt.NDArray[np.uint16],
     reflectivity: npt.NDArray[np.uint8],
 ) -> None:
-    """Measured distance (N,), in units of 2 mm, and reflectivity (N,) of beams; both stay 0 without a return."""
+    """Enter distance (N,), in units of 2 mm, and reflectivity (N,) of beams; both stay 0 without a return.
+
+    Args:
+        range_m: true ranges, (N,).
+        face: faces that the beams hit, (N,).
+        directions: unit directions of the beams, (N, 3).
+        noise_m: noise of the ranges, (N,).
+        limits_m: smallest and largest range that is measured.
+        surfaces: surface of each face (F,), normals (S, 3) and reflectances (S,) of the surfaces.
+        distance: result, (N,).
+        reflectivity: result, (N,).
+    """
+    (min_m, max_m), (face_surface, normal, reflectance) = limits_m, surfaces
     for i in range(range_m.shape[0]):
         if range_m[i] < min_m or range_m[i] > max_m:
             continue
@@ -202,8 +211,8 @@ class Vlp16:
         noise_m = np.float32(config.range_noise) * self._rng.standard_normal(size, np.float32)
         distance, reflectivity = np.zeros(size, np.uint16), np.zeros(size, np.uint8)
         _measure(
-            range_m, face, directions, noise_m, MIN_RANGE_M, config.max_range, self._world.face_surface,
-            self._world.normal, self._reflectance, distance, reflectivity,
+            range_m, face, directions, noise_m, (MIN_RANGE_M, config.max_range),
+            (self._world.face_surface, self._world.normal, self._reflectance), distance, reflectivity,
         )  # fmt: skip
 
         out = np.zeros(count, wire.PACKET_DTYPE)

@@ -62,7 +62,23 @@ def corridor_world(seed: int = 0, obstacle: bool = True, light_cell_m: float = 0
     for number, (door, towards, high, angle) in enumerate(doors):
         building.open_leaf(door, towards, high, angle, number % 3)
 
-    # Closed doors along the corridor, windows at its ends, posters in between.
+    _fit_out_corridor(building, arm, turn, rng, seed)
+    for zone in (arm, turn):
+        building.lamps(zone, 2.4)
+    for zone in rooms.values():
+        building.lamps(zone, 2.2, square=True)
+    _radiator(building, arm, "north", 11.1)
+    _bin(building, (-1.6, 0.95))
+    _bin(building, (11.75, -0.9))
+
+    _furnish_corridor_rooms(building, rooms, rng, seed)
+    if obstacle:
+        building.builder.box((4.25, 0.0), (0.5, 0.5, 0.8), side=Material("white", 0.7, (1.0, 0.99, 0.965)))
+    return building.world("corridor", (0.0, 0.0, 0.0), light_cell_m)
+
+
+def _fit_out_corridor(building: Building, arm: Zone, turn: Zone, rng: np.random.Generator, seed: int) -> None:
+    """Add closed doors along the corridor, windows at its ends, and posters in between."""
     building.closed_door(arm, "north", 8.7, 1)
     building.closed_door(arm, "north", 10.2, 2)
     building.closed_door(arm, "south", 2.2, 0)
@@ -81,18 +97,6 @@ def corridor_world(seed: int = 0, obstacle: bool = True, light_cell_m: float = 0
     for side, at in (("east", 2.2), ("west", 3.6), ("west", 5.4), ("east", 6.2)):
         building.picture(turn, side, at, 1.5, (0.6, 0.85), Material(f"poster:{int(rng.integers(0, 24))}"))
     building.picture(turn, "east", 3.4, 1.5, (1.2, 0.7), Material(f"notices:{(seed + 1) % 4}"))
-    for zone in (arm, turn):
-        building.lamps(zone, 2.4)
-    for zone in rooms.values():
-        building.lamps(zone, 2.2, square=True)
-    _radiator(building, arm, "north", 11.1)
-    _bin(building, (-1.6, 0.95))
-    _bin(building, (11.75, -0.9))
-
-    _furnish_corridor_rooms(building, rooms, rng, seed)
-    if obstacle:
-        building.builder.box((4.25, 0.0), (0.5, 0.5, 0.8), side=Material("white", 0.7, (1.0, 0.99, 0.965)))
-    return building.world("corridor", (0.0, 0.0, 0.0), light_cell_m)
 
 
 def _radiator(building: Building, zone: Zone, side: str, at: float) -> None:

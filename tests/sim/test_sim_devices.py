@@ -24,7 +24,7 @@ from instant_ic.sim.real_time import SimulatedDevices, SimulatorConfig
 from instant_ic.sim.roboclaw import RoboClawServer
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 from instant_ic.sim.simulation import BaseConfig, Simulation
-from instant_ic.sim.theta import ThetaConfig, ThetaServer, panorama_file
+from instant_ic.sim.theta import SimThetaConfig, ThetaServer, panorama_file
 from instant_ic.sim.vlp16 import Vlp16Config
 from instant_ic.sim.world import World
 
@@ -39,7 +39,7 @@ def grey_ramp(width: int, height: int) -> np.ndarray:
 
 @pytest.fixture
 def camera() -> Iterator[ThetaServer]:
-    server = ThetaServer(ThetaConfig(port=0, width=640, height=320, rate=30.0, latency_s=0.0), grey_ramp)
+    server = ThetaServer(SimThetaConfig(port=0, width=640, height=320, rate=30.0, latency_s=0.0), grey_ramp)
     yield server
     server.close()
 
@@ -117,7 +117,7 @@ def test_pictures_are_made_only_while_somebody_watches(camera: ThetaServer) -> N
 
 def test_fault_the_image_of_a_standing_robot_comes_again_so_that_its_camera_seems_to_repeat() -> None:
     view = grey_ramp(640, 320)
-    config = ThetaConfig(port=0, width=640, height=320, rate=30.0, latency_s=0.0)
+    config = SimThetaConfig(port=0, width=640, height=320, rate=30.0, latency_s=0.0)
     server = ThetaServer(config, lambda width, height: view)
     try:
         images = [jpeg for _, jpeg in raw_preview(server, 60)[1]]
@@ -130,7 +130,7 @@ def test_fault_the_image_of_a_standing_robot_comes_again_so_that_its_camera_seem
 
 def test_a_standing_robot_sees_the_same_image_until_it_moves(box_room: World, tmp_path: Path) -> None:
     config = SimulatorConfig(
-        camera=ThetaConfig(port=0, width=640, height=320),
+        camera=SimThetaConfig(port=0, width=640, height=320),
         lidar=Vlp16Config(enabled=False),
         base=BaseConfig(enabled=False),
     )
@@ -216,7 +216,7 @@ def test_mistakes_get_the_cameras_error_codes(camera: ThetaServer, request_body:
 
 
 def test_digest_is_asked_for_and_checked() -> None:
-    server = ThetaServer(ThetaConfig(port=0, width=640, height=320, user="THETAYN1", password="1234"), grey_ramp)
+    server = ThetaServer(SimThetaConfig(port=0, width=640, height=320, user="THETAYN1", password="1234"), grey_ramp)
     try:
         address = url(server) + "/osc/info"
         refused = requests.get(address, timeout=TIMEOUT_S)
@@ -229,7 +229,7 @@ def test_digest_is_asked_for_and_checked() -> None:
 
 def test_a_taken_port_is_told(camera: ThetaServer) -> None:
     with pytest.raises(OSError, match=rf"cannot listen on 127.0.0.1:{camera.port}.*camera.port"):
-        ThetaServer(ThetaConfig(port=camera.port), grey_ramp)
+        ThetaServer(SimThetaConfig(port=camera.port), grey_ramp)
 
 
 def test_a_panorama_file_is_area_averaged(tmp_path: Path) -> None:
@@ -250,7 +250,7 @@ def test_a_panorama_file_is_area_averaged(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("key", "value"), [("rate", 0.0), ("width", 800), ("port", 70000)])
 def test_bad_camera_parameters_are_named(key: str, value: float) -> None:
     with pytest.raises(ValueError, match=key):
-        ThetaConfig(**{key: value})
+        SimThetaConfig(**{key: value})
 
 
 # --- RoboClaw ---------------------------------------------------------------------------------------------------------
@@ -296,7 +296,7 @@ def test_a_driver_can_come_back(controller: tuple[RoboclawEmulator, RoboClawServ
     emulator, server = controller
     for count in (5, 7):
         emulator.encoder[:] = count
-        with closing(Roboclaw(RoboclawConfig(port=str(server.link), reply_timeout_s=2.0))) as driver:
+        with closing(Roboclaw(RoboclawConfig(port=str(server.link), reply_timeout_s=0.5))) as driver:
             driver.connect()
             assert driver.encoders().tolist() == [count, count]
             assert "Roboclaw" in driver.version()
