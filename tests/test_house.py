@@ -71,26 +71,21 @@ KNOWN: dict[str, str] = {
     """,
     "function lines": """
         DepthSource.estimate
-        _clear_and_mark
         _compose
         _decode
         _evaluate
         _experiment
         _functions
-        _normal_equations
         _project
-        _sort
         _watch
         adapt
         add_parser
         add_revolution
         blend
-        calibrate
         cast_rays
         composite
         continue_walls
         convert
-        correlate
         corridor_world
         draw
         drive

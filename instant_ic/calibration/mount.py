@@ -154,10 +154,6 @@ def calibrate(
     Raises:
         CalibrationError: no frames, too few edges, or no pose fits better than chance.
     """
-    if not frames:
-        raise CalibrationError("no pair of image and LiDAR revolution")
-    if len({frame.rgb.shape for frame in frames}) != 1:
-        raise CalibrationError(f"images have different sizes: {sorted({frame.rgb.shape for frame in frames})}")
     edges = _edges(frames, camera_from_lidar)
     report(f"{len(frames)} frames, edges: " + ", ".join(f"{count} {cue}" for cue, count in edges.counts.items()))
     start, rival = camera_from_lidar, 0.0
@@ -175,14 +171,7 @@ def calibrate(
         shift = _correction(found, other)
         centimetres = ", ".join(f"{value:+.1f}" for value in shift[:3] * 100)
         report(f"a pose {centimetres} cm away fits as well")
-    chance = float(np.mean([level.score(_turned(found, yaw)) for yaw in np.radians(np.arange(15, 360, 15))]))
-    chance = max(chance, 1e-9)  # an image without any edge
-    before, after = level.score(camera_from_lidar) / chance, level.score(found) / chance
-    if after < 1.05:
-        raise CalibrationError(
-            f"the LiDAR's edges fit the image edges nowhere better than by chance ({after:.2f} times). Record in a "
-            "lit, furnished room, and check that the stamps of images and LiDAR match."
-        )
+    before, after = _above_chance(level, camera_from_lidar, found)
     covariance = _covariance(level, found)
     if len({frame.place for frame in frames}) < _PLACES_FOR_HEIGHT:
         covariance[2, 2] += _UNCHECKED_HEIGHT**2
@@ -207,6 +196,15 @@ def calibrate(
 
 
 def _edges(frames: Sequence[CalibrationFrame], camera_from_lidar: Matrix) -> _Edges:
+    """Find the LiDAR's edges in all frames.
+
+    Raises:
+        CalibrationError: no frames, images of different sizes, or too few edges.
+    """
+    if not frames:
+        raise CalibrationError("no pair of image and LiDAR revolution")
+    if len({frame.rgb.shape for frame in frames}) != 1:
+        raise CalibrationError(f"images have different sizes: {sorted({frame.rgb.shape for frame in frames})}")
     floor = find_floor(np.concatenate([frame.points[::7] for frame in frames]))
     found = [lidar_edges(f.points, f.intensity, f.ring, floor) for f in frames]
     cue = np.concatenate([edges.cue for edges in found])
@@ -233,6 +231,23 @@ def _edges(frames: Sequence[CalibrationFrame], camera_from_lidar: Matrix) -> _Ed
         block=block,
         counts=counts,
     )
+
+
+def _above_chance(level: _EdgeLevel, before: Matrix, after: Matrix) -> tuple[float, float]:
+    """Return the scores of two poses, relative to the mean over wrong yaws.
+
+    Raises:
+        CalibrationError: the second pose fits no better than chance.
+    """
+    chance = float(np.mean([level.score(_turned(after, yaw)) for yaw in np.radians(np.arange(15, 360, 15))]))
+    chance = max(chance, 1e-9)  # an image without any edge
+    ratio = level.score(after) / chance
+    if ratio < 1.05:
+        raise CalibrationError(
+            f"the LiDAR's edges fit the image edges nowhere better than by chance ({ratio:.2f} times). Record in a "
+            "lit, furnished room, and check that the stamps of images and LiDAR match."
+        )
+    return level.score(before) / chance, ratio
 
 
 def _turned(camera_from_lidar: Matrix, yaw_rad: float) -> Matrix:

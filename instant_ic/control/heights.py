@@ -1,5 +1,11 @@
 """Obstacles by height, from 3D points: low and hanging things, without what can be driven over or under.
 
+1. ``sort_points``: place the points of a sweep in a level frame, each from the sensor's pose at its measurement, and
+   sort them by height. Note where the beams of each elevation and azimuth end.
+2. ``_clear``: remove the marks that a beam passes through at their own heights; weigh the others by the beams that end
+   in them against those that end just behind.
+3. ``_mark``: mark the cells of the obstacle points with their lowest and highest point.
+
 A scanner with few rings sees a low or a hanging thing only from afar: at 0.6 m above the ground, a lowest beam of -15°
 meets a thing 0.1 m high no nearer than 1.9 m. A mark therefore stays until a beam passes through the very heights at
 which it was made; a beam of the flat scan that passes over it proves nothing.
@@ -9,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, TypeVar
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -166,20 +172,11 @@ class HeightLayer:
 
         ``origin`` (2,) is the window's outer corner.
         """
-        _clear_and_mark(
-            sweep.obstacles,
-            sweep.ends,
-            sweep.origin,
-            np.asarray(placed, dtype=np.float64),
-            float(origin[0]),
-            float(origin[1]),
-            self.resolution,
-            self.config.obstacle_max_range,
-            self.hits,
-            self.low,
-            self.high,
-            self.evidence,
-        )
+        window = _Window(float(origin[0]), float(origin[1]), self.resolution)
+        marks = _Marks(self.hits, self.low, self.high, self.evidence)
+        pose = np.asarray(placed, dtype=np.float64)
+        _clear(marks, window, sweep.ends, sweep.origin, pose)
+        _mark(marks, window, sweep.obstacles, sweep.ends, sweep.origin, pose, self.config.obstacle_max_range)
 
     def occupied(self) -> NDArray[np.bool_]:
         """Mask (H, W) of the cells that hold an obstacle."""
@@ -234,19 +231,13 @@ def _sort(
     slope: float,
     range_min: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.int64]]:
-    last = poses.shape[0] - 1
-    sensor = poses[last, :3, 3]
-    between = np.empty((INSTANTS, 4, 4))
-    for i in range(INSTANTS):
-        at = last * i / (INSTANTS - 1) if duration_s > 0.0 else float(last)
-        k = min(int(at), max(last - 1, 0))
-        between[i] = poses[k] + (at - k) * (poses[min(k + 1, last)] - poses[k])
+    between = _poses_between(poses, duration_s)
+    sensor = poses[poses.shape[0] - 1, :3, 3]
     obstacles = np.empty((points.shape[0], 3), dtype=np.float32)
     ends = np.full((ROWS, AZIMUTHS), np.inf, dtype=np.float32)
     near_m = np.full(AZIMUTHS, np.inf)
     near_at = np.full(AZIMUTHS, -1, dtype=np.int64)
     counts = np.zeros(4, dtype=np.int64)
-    rows_per_radian = 1.0 / ROW_RAD
     kept = 0
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -267,7 +258,7 @@ def _sort(
         dx, dy, dz = x - sensor[0], y - sensor[1], z - sensor[2]
         distance = math.sqrt(dx * dx + dy * dy)
         column = _bin(dy, dx)
-        row = min(int((_angle(dz, distance) + 0.5 * math.pi) * rows_per_radian), ROWS - 1)
+        row = min(int(_row(dz, distance)), ROWS - 1)
         if distance < ends[row, column]:
             ends[row, column] = distance
         # The robot pitches a little: a tilt raises the ground in proportion to the distance.
@@ -281,51 +272,76 @@ def _sort(
             if distance < near_m[column]:
                 near_m[column], near_at[column] = distance, kept
             kept += 1
-    nearest = np.empty((AZIMUTHS, 2))
-    found = 0
-    for j in near_at:
-        if j >= 0:
-            nearest[found, 0], nearest[found, 1] = obstacles[j, 0], obstacles[j, 1]
-            found += 1
-    return obstacles[:kept].copy(), nearest[:found].copy(), ends, counts
+    nearest = obstacles[near_at[near_at >= 0]][:, :2].astype(np.float64)
+    return obstacles[:kept].copy(), nearest, ends, counts
+
+
+@njit(cache=True, fastmath=FAST)
+def _row(dz: float, distance: float) -> float:
+    """Return the elevation of a point at a height and distance from the sensor, in rows from straight down."""
+    return (_angle(dz, distance) + 0.5 * math.pi) * (1.0 / ROW_RAD)
+
+
+@njit(cache=True, fastmath=FAST)
+def _poses_between(poses: NDArray[np.float64], duration_s: float) -> NDArray[np.float64]:
+    """Return the sensor's poses (INSTANTS, 4, 4) at even instants of a sweep, between those given, (K, 4, 4)."""
+    last = poses.shape[0] - 1
+    between = np.empty((INSTANTS, 4, 4))
+    for i in range(INSTANTS):
+        at = last * i / (INSTANTS - 1) if duration_s > 0.0 else float(last)
+        k = min(int(at), max(last - 1, 0))
+        between[i] = poses[k] + (at - k) * (poses[min(k + 1, last)] - poses[k])
+    return between
+
+
+class _Window(NamedTuple):
+    """Outer corner of the window in metres, and its cell size in metres."""
+
+    origin_x: float
+    origin_y: float
+    resolution: float
+
+
+class _Marks(NamedTuple):
+    """Layers of `HeightLayer`, (H, W)."""
+
+    hits: NDArray[np.uint8]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    evidence: NDArray[np.int16]
 
 
 @njit(cache=True)
-def _clear_and_mark(
-    obstacles: NDArray[np.float32],
+def _clear(
+    marks: _Marks,
+    window: _Window,
     ends: NDArray[np.float32],
     sensor: NDArray[np.float64],
     placed: NDArray[np.float64],
-    origin_x: float,
-    origin_y: float,
-    resolution: float,
-    range_max: float,
-    hits: NDArray[np.uint8],
-    low: NDArray[np.float32],
-    high: NDArray[np.float32],
-    evidence: NDArray[np.int16],
 ) -> None:
-    """Clear the cells that beams pass through, then mark."""
-    size_y, size_x = hits.shape
+    """Clear the marks that beams pass through, and count the beams that end in the others and just behind them.
+
+    A beam above a low thing or below a hanging one proves nothing, and from near no beam ever sees it again. So a mark
+    ends only with a beam well between its heights; a beam that ends there, or nearly so, keeps it.
+    """
+    hits, low, high, evidence = marks
+    resolution = window.resolution
     cos, sin = math.cos(placed[2]), math.sin(placed[2])
     sensor_x = cos * sensor[0] - sin * sensor[1] + placed[0]
     sensor_y = sin * sensor[0] + cos * sensor[1] + placed[1]
-    for r in range(size_y):
-        for c in range(size_x):
+    for r in range(hits.shape[0]):
+        for c in range(hits.shape[1]):
             if hits[r, c] == 0:
                 continue
-            dx = origin_x + (c + 0.5) * resolution - sensor_x
-            dy = origin_y + (r + 0.5) * resolution - sensor_y
+            dx = window.origin_x + (c + 0.5) * resolution - sensor_x
+            dy = window.origin_y + (r + 0.5) * resolution - sensor_y
             distance = math.sqrt(dx * dx + dy * dy)
             if distance < resolution:
                 continue
             column = _bin(cos * dy - sin * dx, cos * dx + sin * dy)
-            # A beam above a low thing or below a hanging one proves nothing, and from near no beam ever sees it again.
-            # So a mark ends only with a beam well between its heights; a beam that ends there, or nearly so, keeps it.
-            first = (_angle(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
-            last = (_angle(high[r, c] + 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
-            least = (_angle(low[r, c] + SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
-            most = (_angle(high[r, c] - SCATTER_M - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD
+            bottom, top = low[r, c] - sensor[2], high[r, c] - sensor[2]
+            first, last = _row(bottom - 0.5 * resolution, distance), _row(top + 0.5 * resolution, distance)
+            least, most = _row(bottom + SCATTER_M, distance), _row(top - SCATTER_M, distance)
             passed, stands = False, False
             for row in range(max(0, int(first)), min(ROWS - 1, int(last)) + 1):
                 end = ends[row, column]
@@ -338,20 +354,46 @@ def _clear_and_mark(
             if passed and not stands:
                 hits[r, c] = 0
                 continue
-            wide = int(0.5 * resolution / distance * AZIMUTHS / (2.0 * math.pi))
-            change = 0
-            for row in range(max(1, int(first)), min(ROWS - 2, int(last)) + 1):
-                for beside in range(column - wide, column + wide + 1):
-                    beam = beside % AZIMUTHS
-                    if abs(ends[row, beam] - distance) <= 0.5 * resolution:
-                        change += INSIDE_WEIGHT
-                        continue
-                    # A single ring may end on the top of a low thing, or under a hanging one, whose edge is the mark.
-                    behind = True
-                    for ring in range(row - 1, row + 2):
-                        behind &= 0.5 * resolution < ends[ring, beam] - distance <= CLEAR_MARGIN_M
-                    change -= behind
+            rows = range(max(1, int(first)), min(ROWS - 2, int(last)) + 1)
+            change = _evidence(ends, rows, column, distance, resolution)
             evidence[r, c] = min(max(evidence[r, c] + change, -MOST_EVIDENCE), MOST_EVIDENCE)
+
+
+@njit(cache=True)
+def _evidence(ends: NDArray[np.float32], rows: range, column: int, distance: float, resolution: float) -> int:
+    """Count the beams that end in a mark, weighted, less those that end just behind it."""
+    wide = int(0.5 * resolution / distance * AZIMUTHS / (2.0 * math.pi))
+    change = 0
+    for row in rows:
+        for beside in range(column - wide, column + wide + 1):
+            beam = beside % AZIMUTHS
+            if abs(ends[row, beam] - distance) <= 0.5 * resolution:
+                change += INSIDE_WEIGHT
+                continue
+            # A single ring may end on the top of a low thing, or under a hanging one, whose edge is the mark.
+            behind = True
+            for ring in range(row - 1, row + 2):
+                behind &= 0.5 * resolution < ends[ring, beam] - distance <= CLEAR_MARGIN_M
+            change -= behind
+    return change
+
+
+@njit(cache=True)
+def _mark(
+    marks: _Marks,
+    window: _Window,
+    obstacles: NDArray[np.float32],
+    ends: NDArray[np.float32],
+    sensor: NDArray[np.float64],
+    placed: NDArray[np.float64],
+    range_max: float,
+) -> None:
+    """Mark the cells of obstacle points, and those before a thing that only the lowest ring meets."""
+    hits, low, high, evidence = marks
+    resolution = window.resolution
+    cos, sin = math.cos(placed[2]), math.sin(placed[2])
+    sensor_x = cos * sensor[0] - sin * sensor[1] + placed[0]
+    sensor_y = sin * sensor[0] + cos * sensor[1] + placed[1]
     lowest = 0
     while lowest < ROWS - 2 and not np.isfinite(ends[lowest].min()):
         lowest += 1
@@ -363,15 +405,15 @@ def _clear_and_mark(
         if distance > range_max:
             continue
         cells = 1
-        if (_angle(z - sensor[2], distance) + 0.5 * math.pi) / ROW_RAD < lowest + 1:
+        if _row(z - sensor[2], distance) < lowest + 1:
             column = _bin(py - sensor[1], px - sensor[0])
             if np.isfinite(ends[lowest + 1, column]) and ends[lowest + 1, column] - distance > FAR_BEHIND_M:
                 cells += int(min(UNSEEN_EDGE_M, 0.5 * distance) / resolution)
         for k in range(cells):
             share = k * resolution / max(distance, resolution)
-            c = math.floor((x - share * dx - origin_x) / resolution)
-            r = math.floor((y - share * dy - origin_y) / resolution)
-            if 0 <= r < size_y and 0 <= c < size_x:
+            c = math.floor((x - share * dx - window.origin_x) / resolution)
+            r = math.floor((y - share * dy - window.origin_y) / resolution)
+            if 0 <= r < hits.shape[0] and 0 <= c < hits.shape[1]:
                 if hits[r, c] == 0:
                     low[r, c], high[r, c], evidence[r, c] = z, z, 0
                 else:

@@ -35,7 +35,7 @@ REFINE_ITERATIONS = 20
 def correlate(  # type: ignore[no-untyped-def]
     field, origin, resolution, points, centre, cells, rotations, rotation_step, guess, information, cutoff, gain
 ):
-    """Best pose of a window of ``(2·cells + 1)² × (2·rotations + 1)`` poses around ``centre``.
+    """Find the best pose of a window of ``(2·cells + 1)² × (2·rotations + 1)`` poses around ``centre``.
 
     The value of a pose is ``gain·mean(field at the points) − ½ c²·ln(1 + e²/c²)``. ``e²`` is its squared distance from
     ``guess`` in the metric of ``information``, with translation in the guess's own axes (along and across the direction
@@ -58,7 +58,6 @@ def correlate(  # type: ignore[no-untyped-def]
     Returns:
         x, y, yaw, value.
     """
-    height, width = field.shape
     n = points.shape[0]
     size = 2 * cells + 1
     sums = np.empty((size, size), dtype=np.float32)
@@ -70,18 +69,7 @@ def correlate(  # type: ignore[no-untyped-def]
     for turn in range(2 * rotations + 1):
         r = (turn + 1) // 2 if turn % 2 == 1 else -(turn // 2)
         yaw = centre[2] + r * rotation_step
-        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-        sums[:] = 0.0
-        for i in range(n):
-            x = centre[0] + cos_yaw * points[i, 0] - sin_yaw * points[i, 1]
-            y = centre[1] + sin_yaw * points[i, 0] + cos_yaw * points[i, 1]
-            ix = round((x - origin[0]) / resolution) - cells
-            iy = round((y - origin[1]) / resolution) - cells
-            if ix < 0 or iy < 0 or ix + size > width or iy + size > height:
-                continue
-            for v in range(size):
-                for u in range(size):
-                    sums[v, u] += field[iy + v, ix + u]
+        _add_field(field, origin, resolution, points, centre[0], centre[1], yaw, sums)
         dyaw = yaw - guess[2]
         turned = information[2] * dyaw * dyaw
         for v in range(size):
@@ -100,10 +88,30 @@ def correlate(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _add_field(field, origin, resolution, points, x0, y0, yaw, sums):  # type: ignore[no-untyped-def]
+    """Set ``sums`` (2·cells + 1, 2·cells + 1) to the field's sums over the points, by translation about x0, y0."""
+    height, width = field.shape
+    size = sums.shape[0]
+    cells = size // 2
+    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    sums[:] = 0.0
+    for i in range(points.shape[0]):
+        x = x0 + cos_yaw * points[i, 0] - sin_yaw * points[i, 1]
+        y = y0 + sin_yaw * points[i, 0] + cos_yaw * points[i, 1]
+        ix = round((x - origin[0]) / resolution) - cells
+        iy = round((y - origin[1]) / resolution) - cells
+        if ix < 0 or iy < 0 or ix + size > width or iy + size > height:
+            continue
+        for v in range(size):
+            for u in range(size):
+                sums[v, u] += field[iy + v, ix + u]
+
+
+@njit(cache=True)
 def _normal_equations(  # type: ignore[no-untyped-def]
     field, origin, resolution, points, pose, guess, information, weight, hessian, gradient
 ):
-    """Gauss-Newton system of the cost at ``pose``; fills ``hessian`` (3, 3) and ``gradient`` (3,).
+    """Set up the Gauss-Newton system of the cost at ``pose``: fills ``hessian`` (3, 3) and ``gradient`` (3,).
 
     Returns:
         The cost, the mean field value over the points, the sum of squared residuals.
@@ -145,7 +153,13 @@ def _normal_equations(  # type: ignore[no-untyped-def]
         hessian[2, 2] += jyaw * jyaw
     hessian *= weight
     gradient *= weight
-    # Rotate the prior from the guess's axes into the field's.
+    prior = _add_prior(pose, guess, information, hessian, gradient)
+    return 0.5 * weight * squares + 0.5 * prior, score / n, squares
+
+
+@njit(cache=True)
+def _add_prior(pose, guess, information, hessian, gradient):  # type: ignore[no-untyped-def]
+    """Add the prior to the Gauss-Newton system, rotated from the guess's axes into the field's; return its cost."""
     cos_guess, sin_guess = math.cos(guess[2]), math.sin(guess[2])
     pxx = information[0] * cos_guess * cos_guess + information[1] * sin_guess * sin_guess
     pyy = information[0] * sin_guess * sin_guess + information[1] * cos_guess * cos_guess
@@ -161,8 +175,7 @@ def _normal_equations(  # type: ignore[no-untyped-def]
     hessian[1, 0] = hessian[0, 1]
     hessian[2, 0] = hessian[0, 2]
     hessian[2, 1] = hessian[1, 2]
-    prior = pxx * dx * dx + 2 * pxy * dx * dy + pyy * dy * dy + information[2] * dyaw * dyaw
-    return 0.5 * weight * squares + 0.5 * prior, score / n, squares
+    return pxx * dx * dx + 2 * pxy * dx * dy + pyy * dy * dy + information[2] * dyaw * dyaw
 
 
 @njit(cache=True)
@@ -186,7 +199,7 @@ def _solve(hessian, gradient, damping):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def refine(field, origin, resolution, points, start, guess, information, weight, iterations, reach, turn):  # type: ignore[no-untyped-def]
-    """Levenberg-Marquardt from ``start`` (3,) on ``½ weight Σ(1 − M)² + ½ eᵀ·diag(information)·e``.
+    """Minimise, by Levenberg-Marquardt from ``start`` (3,), ``½ weight Σ(1 − M)² + ½ eᵀ·diag(information)·e``.
 
     The result stays within ``reach`` metres of ``start`` along x and y and within ``turn`` radians: the search has
     already rejected everything beyond.
