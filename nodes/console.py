@@ -1,4 +1,4 @@
-"""Serves the operator's page: sends it images, state and map; takes its commands, emergency stop and look direction."""
+"""Node of the operator's page: images, state and map go out; commands, emergency stop and look direction come in."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RECORDER_TIMEOUT_S = 3.0
 
 
 class ConsoleNode(Node[ConsoleConfig]):
-    """Connects the page's server to the topics: its feed by ``PageFeed``, the operator's actions as its ``Backend``."""
+    """The page's server with the topics: ``PageFeed`` feeds it, and the node is the backend of the operator's actions."""
 
     name = "console"
     live_parameters = ("view",)

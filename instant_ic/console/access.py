@@ -1,4 +1,4 @@
-"""Access control of the page: sign-in by token, session cookies, TLS. Independent of the HTTP server.
+"""Access control of the page, independent of the HTTP server: sign-in by token, session cookies, TLS.
 
 The caller passes the time, in seconds of one monotonic clock, so that tests need not wait.
 """
@@ -42,15 +42,16 @@ class AccessConfig:
 
     Attributes:
         sign_in: ``auto`` (required unless ``simulated``), ``always`` or ``never``.
-        simulated: the page drives simulated robots only. Then ``auto`` needs no sign-in on this machine, unless there
-            is a token file. The simulator's launch files set it.
-        token_file: file with the token to drive, readable by its owner only. Empty: each start makes a token and
+        simulated: true if the page drives simulated robots only. Then ``auto`` needs no sign-in on this machine, unless
+            there is a token file. The simulator's launch files set it.
+        token_file: file with the token to drive, readable by its owner only. If empty, each start makes a token and
             shows it on the terminal and in a file readable by its owner only, never in the log.
         watch_token_file: file with the token to watch and stop the robot only; empty: there is no such token.
         session_hours: lifetime of a sign-in.
         tries_per_minute: wrong tokens of one address that are answered at once. Each further one doubles the wait for
             the answer, up to ``MAX_WAIT_S``. A right token never waits.
-        tls_certificate, tls_key: PEM files; both empty: plain HTTP.
+        tls_certificate: PEM file of the certificate; empty for plain HTTP.
+        tls_key: PEM file of its key.
     """
 
     sign_in: str = "auto"
@@ -114,6 +115,11 @@ class Access:
     Args:
         config: parameters.
         host: address to which the server is bound.
+
+    Attributes:
+        required: true if a sign-in is required.
+        unguarded: true if the parameters let anyone drive a robot who reaches the server.
+        made_token: token to drive that this start has made; empty with a token file.
 
     Raises:
         AccessError: a token file cannot be used.

@@ -17,7 +17,7 @@ from instant_ic.console.protocol import FrameKind, PageFrame, Parts, decode_fram
 
 
 class ConsoleClient:
-    """Operator without a browser.
+    """An operator without a browser.
 
     Example::
 

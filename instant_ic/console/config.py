@@ -20,29 +20,32 @@ class ConsoleServerConfig(Checked):
         host: listen address; any but loopback (e.g. 0.0.0.0) opens the page to the network.
         port: 0 = any free port; the log states it.
         allowed_hosts: host names by which browsers may reach the page, besides localhost and IP addresses.
-        max_clients: simultaneous pages; two places are reserved for pages that may drive.
-        max_connections: simultaneous connections; at the limit the address with the most idle ones loses its oldest.
+        max_clients: largest number of pages; two places are reserved for pages that may drive.
+        max_connections: largest number of connections; at the limit the address with the most idle ones loses its
+            oldest.
         max_connections_per_address: the same for one address (IPv6: one /64).
         max_messages_per_s: limit for the driver's page, with bursts of twice this number; 0.4 of it for others; above,
             the WebSocket is closed.
         background_picture_hz: rate of images that are not shown (the camera while in the virtual space).
+        access: sign-in and TLS.
+        drive: speed limits and time-outs.
     """
 
     host: str = "127.0.0.1"
-    port: Annotated[int, Range(0, 65535)] = 8080  # 0 = any free port
-    allowed_hosts: tuple[str, ...] = ()  # host names by which browsers may reach the page besides localhost
+    port: Annotated[int, Range(0, 65535)] = 8080
+    allowed_hosts: tuple[str, ...] = ()
     max_clients: PositiveInt = 16
     max_connections: PositiveInt = 128
     max_connections_per_address: PositiveInt = 32
-    max_messages_per_s: Positive = 300.0  # of one page; above, its WebSocket is closed; see BURST_S
-    background_picture_hz: Positive = 2.0  # images that are not shown (camera in the v-space)
+    max_messages_per_s: Positive = 300.0
+    background_picture_hz: Positive = 2.0
     access: AccessConfig = field(default_factory=AccessConfig)
     drive: DriveConfig = field(default_factory=DriveConfig)
 
 
 @dataclass(frozen=True)
 class ConsoleConfig(Checked):
-    """Parameters.
+    """Parameters of the node ``console``.
 
     Attributes:
         map_rate_hz: highest rate at which a changed map or costmap is sent to the page.

@@ -1,4 +1,4 @@
-"""What the page shows: the mode, the newest camera image and rendered view."""
+"""Mode, newest camera image and newest rendered view of the page."""
 
 from __future__ import annotations
 
@@ -81,11 +81,11 @@ class Display:
         self._drawn_ms = drawn_ms
 
     def lose_driver(self, now_ns: int) -> None:
-        """Note the loss of the driver. His return shows in his commands."""
+        """Note the loss of the driver."""
         self._lost_ns = now_ns
 
     def image_age_s(self, now_ns: int) -> float:
-        """Age of the newest camera image since its arrival; infinite without one."""
+        """Return the age of the newest camera image since its arrival; infinite without one."""
         return math.inf if self._image_ns is None else (now_ns - self._image_ns) / 1e9
 
     def report(self, stamp_ns: int, now_ns: int) -> ShownPictures:
@@ -108,6 +108,6 @@ class Display:
         )
 
     def _vbot_camera(self, unknown: Pose) -> Pose:
-        """Pose of the v-bot's camera."""
+        """Return the pose of the v-bot's camera; ``unknown`` if it is unknown."""
         vbot = self._poses.vbot_pose()
         return unknown if vbot is None else pose_message(vbot @ self._poses.camera_mount())

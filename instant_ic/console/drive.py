@@ -37,8 +37,8 @@ class DriveConfig:
         beat_timeout_s: silence of the driver's page (pings at 20 Hz) after which the driver is reported lost to the
             arbiter.
         lease_timeout_s: silence of the driver's page after which it loses the lease.
-        stop_after_s: time for which the console stood still after which the driver must let go of the controls; at most
-            the arbiter's timeouts.stop_after_s.
+        stop_after_s: standstill of the console after which the driver must let go of the controls; at most the
+            arbiter's timeouts.stop_after_s.
     """
 
     max_linear_mps: Annotated[float, Plausible(0.02, 3)] = 0.4
@@ -61,8 +61,8 @@ class DriveConfig:
 class DriveGate:
     """Lease of one driver, and the newest command that is still valid; zero whenever in doubt.
 
-    Zeros mean that the operator is present and commands nothing; silence means that nobody is present. So an idle
-    driver's zeros are published only while his page is heard. After its loss one zero is published, then nothing.
+    Zeros mean that the operator is present and commands nothing; silence means that nobody is present. An idle driver's
+    zeros are therefore published only while his page is heard. After its loss one zero is published, then nothing.
     :meth:`driver_alive` reports the loss itself.
     """
 

@@ -1,4 +1,4 @@
-"""What the nodes report to the operator: diagnoses, missing heartbeats, and CPU."""
+"""Faults and CPU of the nodes for the operator: diagnoses and missing heartbeats."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from instant_ic.msg import DiagnosticArray, NodeStatus
 
 TIMEOUT_S = 3.0
 MAX_FAULTS = 4
-MOST_NAMES = 500  # of nodes, and of diagnoses: those of other machines come too
+MOST_NAMES = 500  # largest number of nodes, and of diagnoses; those of other machines count too
 OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
 
 

@@ -1,4 +1,4 @@
-"""Feeds the page with images, state, plan, health and maps, and requests rendered views. Knows no bus."""
+"""Images, state, plan, health and maps for the page, and requests for rendered views. Independent of the bus."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ class FeedClock(Protocol):
     """Time of the stack's stamps, and a steady clock."""
 
     def now_ns(self) -> int:
-        """Present time for stamps."""
+        """Return the present time for stamps."""
 
     def steady_ns(self) -> int:
-        """Time that is never set back."""
+        """Return a time that is never set back."""
 
 
 class PageServer(Protocol):
@@ -70,7 +70,7 @@ class PageServer(Protocol):
 
     @property
     def plain_http(self) -> bool:
-        """Pages come over the network without encryption."""
+        """True if pages come over the network without encryption."""
 
     def now_ms(self) -> float:
         """Return the server's time in milliseconds."""
@@ -98,21 +98,21 @@ class PageServer(Protocol):
 
 
 class PageFeed:
-    """Sends to the page's server what comes from the stack.
+    """Feed of the page's server with the stack's messages.
 
     Args:
         config: parameters of the console.
         server: receiver of the messages.
         tf: transform tree.
         inputs: newest messages.
-        send_request: requests a rendered view.
-        send_shown: reports to the arbiter which images are available. Called on any thread.
+        send_request: function that requests a rendered view.
+        send_shown: function that reports the available images to the arbiter. Called on any thread.
         clock: see :class:`FeedClock`.
-        diagnose: sets a diagnosis: name, level, text, values.
+        diagnose: function that sets a diagnosis: name, level, text, values.
 
     Attributes:
-        watched: whether there is a page. Without one, no state is sent, no view is requested and no report goes to the
-            arbiter.
+        watched: true while there is a page. Without one, no state is sent, no view is requested and no report goes to
+            the arbiter.
     """
 
     def __init__(
@@ -152,7 +152,9 @@ class PageFeed:
     def take_view(self, message: RenderedView) -> None:
         """Forward a rendered view, then request the next one."""
         if not (0 < message.fov_rad < math.pi):
-            self._diagnose("view", ERROR, f"rendered view dropped: its field of view is {message.fov_rad:.3g} rad")
+            self._diagnose(
+                "view", ERROR, f"View not shown: its field of view is {message.fov_rad:.3g} rad. Restart nerf."
+            )
             return
         request_id, now_ns = int(message.request_id), self._clock.steady_ns()
         delay_s = self.requests.answered(request_id, now_ns)
@@ -174,12 +176,12 @@ class PageFeed:
     def take_layers(self, layers: PageLayers | str) -> None:
         """Send a version of the virtual space that pages render by themselves; a text says what is wrong with it."""
         if isinstance(layers, str):
-            self._diagnose("layers", ERROR, f"virtual space dropped: {layers}")
+            self._diagnose("layers", ERROR, f"Virtual space not shown: {layers}. The page keeps the one before.")
             return
         try:
             self.server.send_layers(layers)
         except PageProtocolError as error:
-            self._diagnose("layers", ERROR, f"virtual space dropped: {error}")
+            self._diagnose("layers", ERROR, f"Virtual space not shown: {error}. The page keeps the one before.")
             return
         self._diagnose("layers", OK, "", version=layers.version, layers=len(layers.layers))
 

@@ -17,10 +17,12 @@ UNKNOWN = 255
 
 @dataclass(frozen=True)
 class GridImage:
-    """Grid as a grey PNG; row 0 is the highest y.
+    """A grid as a grey PNG; row 0 is the highest y.
 
-    ``header``: resolution (m), width and height (cells), and x and y (m) of the lower left corner of the
-    image in the grid's frame.
+    Attributes:
+        header: resolution (m), width and height (cells), x and y (m) of the lower left corner in the grid's frame.
+        png: encoded image.
+        digest: checksum of header and image.
     """
 
     header: dict[str, float]

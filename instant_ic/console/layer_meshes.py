@@ -1,4 +1,4 @@
-"""Layers for the page from panoramas with depth: triangles of what was seen, and of the guess behind it."""
+"""Layers for the page from panoramas with depth: triangles of seen surfaces, and of estimated ones behind them."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from instant_ic.vspace.layers import Content, Kind, Layer, Layers, LayersError, 
 from instant_ic.vspace.prior import edge_quads
 
 EDGE_RATIO = 0.2
-"""Two neighbours are an edge when their depths differ by more than this share. Where the depth is noisy, smaller steps
-are no edges: as squares of their own they would look like shards (0.7 dB in the corridor's live keyframes)."""
+"""Relative difference of depth above which two neighbours are an edge. With noisy depth, a smaller value would tear the
+surface into shards (0.7 dB in the corridor's live keyframes)."""
 
 
 class LayerMeshes:
-    """Makes the page's layers; what has not changed since the last call is not made again."""
+    """The page's layers of each version; a layer that has not changed since the last call is reused."""
 
     def __init__(self) -> None:
         self._before: dict[Hashable, PageLayer] = {}
 
     def layers(self, version: Layers) -> tuple[PageLayer, ...]:
-        """Return the layers in the order in which the page shows them: what was seen before all guesses.
+        """Return the layers in the order in which the page shows them: seen surfaces first, then the estimated ones.
 
         Args:
             version: a whole version of the virtual space.
 
         Raises:
-            LayersError: there is none that a camera saw, or one cannot be decoded.
+            LayersError: no layer was seen by a camera, or a layer cannot be decoded.
         """
         if not any(layer.kind is Kind.SEEN for layer in version.layers):
             raise LayersError("the layers hold no keyframe")
@@ -70,12 +70,13 @@ def page_layer(
     Args:
         colour: JPEG or PNG, equirectangular.
         inverse_depth: in 1/m along the ray, > 0, (h, 2 h).
-        shown: where there is a surface, (h, 2 h): by pixel, or for a guess by the quad right of and below it.
-        confidence: of a guess: shares from 0 to 1 of what was seen, (h', w'); None: all of it was seen.
+        shown: True where there is a surface, (h, 2 h): by pixel, or for an estimated surface by the quad right of and
+            below the pixel.
+        confidence: confidence of an estimated surface, 0 to 1, (h', w'); None if all of it was seen.
         map_from_camera: pose of the keyframe's camera, (4, 4).
 
     Raises:
-        ValueError: a geometry that is none.
+        ValueError: the geometry is not a surface.
     """
     if confidence is not None:
         for axis in (0, 1):  # a quad has four pixels

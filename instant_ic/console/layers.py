@@ -1,4 +1,4 @@
-"""The virtual space as layers that the page renders by itself: their check, and the frame that carries them."""
+"""Layers of the virtual space that the page renders by itself, and the frame that carries them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from instant_ic.console.protocol import PageProtocolError
 from instant_ic.geometry.poses import Matrix, quaternion_from_matrix
 
 MOST_LAYERS = 8
-"""The page marks each layer by a bit of its stencil buffer."""
+"""Largest number of layers; the page marks each by a bit of its stencil buffer."""
 
 
 def pose_fields(map_from_camera: Matrix) -> dict[str, list[float]]:
@@ -24,17 +24,17 @@ def pose_fields(map_from_camera: Matrix) -> dict[str, list[float]]:
 
 @dataclass(frozen=True)
 class PageLayer:
-    """Surface round a keyframe, as triangles with an equirectangular image (``vspace.layer_mesh``).
+    """A surface around a keyframe, as triangles with an equirectangular image (``vspace.layer_mesh``).
 
     Attributes:
         image: colours, JPEG or PNG.
-        confidence: grey PNG, white where the place was seen; empty: all of it.
+        confidence: grey PNG, white where the place was seen; empty if all of it was seen.
         gain: factors of the colours: red, green, blue.
         map_from_camera: pose of the keyframe's camera, (4, 4).
         size: height and width of the lattice that the corners belong to.
         corners: column and row of each vertex, (N, 2) uint16.
-        inverse_depth: of each vertex, in 1/m along the ray, (N,) float32; 0 is endlessly far.
-        triangles: indices of vertices, (T, 3) uint32, counter-clockwise as the keyframe's camera sees them.
+        inverse_depth: inverse depth of each vertex, 1/m along the ray, (N,) float32; 0 is infinitely far.
+        triangles: indices of the vertices, (T, 3) uint32, counter-clockwise as seen by the keyframe's camera.
     """
 
     image: bytes
@@ -48,7 +48,7 @@ class PageLayer:
 
     @cached_property
     def parts(self) -> dict[str, bytes]:
-        """The bytes of the layer by name, the arrays in little endian; numbers first, so that they stay aligned."""
+        """Bytes of the layer by name, arrays in little endian. Numbers come first, so that they stay aligned."""
         return {
             "inverse": self.inverse_depth.astype("<f4").tobytes(),
             "triangles": self.triangles.astype("<u4").tobytes(),
@@ -59,7 +59,7 @@ class PageLayer:
 
     @cached_property
     def digest(self) -> str:
-        """Identifies image, confidence and triangles: equal for equal content."""
+        """Digest of image, confidence and triangles."""
         content = hashlib.blake2b(repr(self.size).encode(), digest_size=12)
         for part in self.parts.values():
             content.update(len(part).to_bytes(8, "little") + part)
@@ -80,9 +80,9 @@ class PageLayers:
     """One version of the virtual space.
 
     Attributes:
-        version: differs from that of the layers sent before.
+        version: number of the version, which differs from that of the layers sent before.
         mount: position of the camera on the robot, m.
-        layers: each is shown where the ones before show nothing.
+        layers: layers in order; each is shown where the ones before show nothing.
     """
 
     version: int
@@ -106,7 +106,7 @@ class PageLayers:
         return frozenset(layer.digest for layer in self.layers)
 
     def frame(self, held: frozenset[str]) -> tuple[dict[str, Any], bytes]:
-        """Return header and payload of the frame, without the layers that the page holds already (``held``)."""
+        """Return header and payload of the frame, without the layers whose digests are in ``held``."""
         payload = bytearray()
         layers: list[dict[str, Any]] = []
         for layer in self.layers:

@@ -1,4 +1,4 @@
-"""Messages to the page, made from the stack's ROS messages; static/messages.js lists their fields."""
+"""Messages to the page from the stack's ROS messages; static/messages.js lists their fields."""
 
 from __future__ import annotations
 

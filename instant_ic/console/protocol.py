@@ -83,7 +83,7 @@ def decode_frame(data: bytes) -> PageFrame:
 
 
 class Parts:
-    """Puts frames together that come as pieces, in order."""
+    """Assembler of a frame that comes in pieces, in order."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -92,7 +92,7 @@ class Parts:
         """Take a piece; return the frame once it is complete.
 
         Raises:
-            PageProtocolError: a piece is missing, or what they make is no frame.
+            PageProtocolError: a piece is missing, or the pieces do not make a frame.
         """
         start, size = part.header.get("start"), part.header.get("size")
         if start == 0:

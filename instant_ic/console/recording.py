@@ -1,4 +1,4 @@
-"""Recording, snapshots and bookmarks of the page: calls a recorder and reports its state to the page."""
+"""Recording, snapshots and bookmarks of the page: commands to a recorder, and its state for the page."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class RecorderError(RuntimeError):
 
 
 class RecordingDesk:
-    """Calls the recorder in its own thread, because an answer may take seconds and the page must not wait.
+    """Caller of the recorder, with a thread of its own: an answer may take seconds, and the page must not wait.
 
     Args:
-        ask: calls a command of the recorder (``record``, ``stop``, ``snapshot`` or ``status``) with named arguments and
-            returns the answer; raises RecorderError if there is none or the recorder refuses.
-        report: called with the page's ``recording`` message every ``poll_s`` and after each command.
+        ask: function that calls a command of the recorder (``record``, ``stop``, ``snapshot`` or ``status``) with named
+            arguments and returns the answer; raises RecorderError if there is none or the recorder refuses.
+        report: function that takes the page's ``recording`` message, every ``poll_s`` and after each command.
         poll_s: period of the recorder's status, s.
     """
 
@@ -65,7 +65,7 @@ class RecordingDesk:
         try:
             self._wishes.put_nowait(wish)
         except queue.Full:
-            logger.warning("recorder: %d commands are pending; this one is dropped", self._wishes.maxsize)
+            logger.warning("Recorder command dropped: %d are pending. Wait, then try again.", self._wishes.maxsize)
 
     # ---- the desk's thread ---------------------------------------------------------------------------
 

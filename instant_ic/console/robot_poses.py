@@ -20,7 +20,7 @@ class Newest(Protocol):
 
 
 class RobotPoses:
-    """Poses for the page, all in the map frame.
+    """Poses of both robots, all in the map frame.
 
     Args:
         tf: transform tree.

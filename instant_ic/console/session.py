@@ -1,4 +1,4 @@
-"""Send queue of one connected page. It keeps only the newest of each kind, so a slow page delays no other."""
+"""Send queue of one page. It keeps only the newest message of each kind, so that a slow page delays no other."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ class PageSession:
         """Closing handshake, once the session has ended."""
         self.bad_messages = 0
         self.chokes = False
-        """Whether too many replies are pending, which means that the client does not read."""
+        """True if too many replies are pending, which means that the client does not read."""
         self.away = False
         self.renders = False
-        """Whether the page can render the virtual space by itself, once it has layers."""
+        """True if the page can render the virtual space by itself, once it has layers."""
         self.drawn: tuple[int, float] | None = None
         """Version of the layers that the page renders by itself, and time of the newest state that it has shown
         (server's clock, ms); None: it needs rendered views."""
@@ -107,9 +107,9 @@ class PageSession:
         self._wake.set()
 
     def acknowledge(self, kind: FrameKind, sequence: int, loaded: bool = True) -> bool:
-        """Note that the client has shown frame ``sequence``; False if it was not sent or already acknowledged.
+        """Note that the client has shown frame ``sequence``; return False if it was not sent or already acknowledged.
 
-        ``loaded``: the client holds the layers of the frame from now on; if not, the next ones are sent in full.
+        ``loaded``: True if the client holds the layers of the frame from now on; else the next ones are sent in full.
         """
         if self._unacknowledged.get(kind) != sequence:
             return False

@@ -1,4 +1,4 @@
-"""Look direction of the operator, and the shape of the views rendered for it."""
+"""The operator's look direction, and the shape of the views rendered for it."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ MAX_FOV_RAD = math.radians(150)
 FOV_MARGIN = 1.15
 """Requested over shown field of view: room to re-aim; a larger one gives coarser pixels."""
 RESPONSE_TIMEOUT_S = 0.5
-"""An unanswered request counts as lost after this time."""
+"""Time after which an unanswered request counts as lost, in seconds."""
 PROBE = (64, 36)
-"""Pixels of a view that is only judged: its expected PSNR is in VspaceStatus."""
+"""Pixels of a view that is not shown: it keeps the expected PSNR in VspaceStatus up to date."""
 PROBE_HZ = 1.0
 """Requests a second while no view is shown."""
 
@@ -33,9 +33,9 @@ class ViewConfig(Checked):
         virtual_rate_hz: requests a second while rendered views are shown (one outstanding at a time).
     """
 
-    width: Annotated[int, Range(16, 4096)] = 320  # times height: pixels of a view; its shape is the window's
+    width: Annotated[int, Range(16, 4096)] = 320
     height: Annotated[int, Range(16, 4096)] = 180
-    virtual_rate_hz: Positive = 10.0  # while views are shown
+    virtual_rate_hz: Positive = 10.0
 
 
 @dataclass(frozen=True)

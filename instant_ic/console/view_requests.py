@@ -14,9 +14,9 @@ _MOST_PENDING = 8
 
 
 class ViewRequests:
-    """Makes the requests: of views to be shown while a page needs them, else of small ones that are only judged.
+    """Requests for views: to be shown while a page needs them, else small ones for the expected PSNR.
 
-    One is outstanding at a time; the next follows its answer or time-out.
+    One request is outstanding at a time; the next follows its answer or time-out.
 
     Attributes:
         config: rate and size; may be replaced at any time.
@@ -34,8 +34,8 @@ class ViewRequests:
         """Return the request that is due, or None.
 
         Args:
-            renders: whether the virtual space can render.
-            needed: whether a page shows rendered views.
+            renders: True if the virtual space can render.
+            needed: True if a page shows rendered views.
             stamp_ns: stamp of the request.
             now_ns: steady clock.
         """
@@ -67,7 +67,7 @@ class ViewRequests:
         return since_s >= 1.0 / rate_hz - 0.001
 
     def answered(self, request_id: int, now_ns: int) -> float | None:
-        """Note an answer; return its delay in seconds, None for a view that is only judged.
+        """Note an answer; return its delay in seconds, None for a view that is not shown.
 
         A slow renderer answers after the time-out, which is when its delay matters most.
         """

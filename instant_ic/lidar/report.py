@@ -28,11 +28,12 @@ _PAST_HOUR = (
 _LEAST_BLOCKED_DEG = 5.0
 """A smaller sector without blocks is not reported; two blocks at 1200 rpm take 1.6 degrees."""
 _VIEW = "The sensor measures {view} degrees only, clockwise from ahead"
-_UNSEEN = _VIEW + ". Other directions are unseen: do not turn or reverse towards them."
+_UNSEEN = _VIEW + ". The robot does not see elsewhere: do not turn or reverse there."
 _TOO_SMALL = (
     _VIEW
     + ", of the {wanted} that the driver expects. No scan: the robot has stopped. Set the sensor's field of view to 0 "
-    "to 359 on its web page. If the rest may stay unseen, set vlp16_driver decoder.fov_start_deg and fov_end_deg."
+    "to 359 on its web page. If the rest may stay unseen, set vlp16_driver decoder.fov_start_deg and "
+    "decoder.fov_end_deg."
 )
 _PPS = ("absent", "synchronising", "locked", "error")
 
