@@ -23,7 +23,7 @@ RECORDER_TIMEOUT_S = 3.0
 
 
 class ConsoleNode(Node[ConsoleConfig]):
-    """The page's server with the topics: ``PageFeed`` feeds it, and the node is the backend of the operator's actions."""
+    """The page's server on the topics: ``PageFeed`` feeds it, and the node handles the operator's actions."""
 
     name = "console"
     live_parameters = ("view",)
