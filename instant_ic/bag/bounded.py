@@ -92,7 +92,7 @@ class _BoundedYaml:
         self._yaml = YAML(typ=typ)
 
     def load(self, text: str) -> object:
-        """The value of a document.
+        """Return the value of a document.
 
         Raises:
             BagError: it has too many values, or is not YAML.

@@ -49,7 +49,7 @@ class Tolerance:
 
     @property
     def exact(self) -> bool:
-        """Whether no difference is allowed."""
+        """True if no difference is allowed."""
         return not (self.atol or self.rtol or self.fields or self.ignore)
 
     def ignores(self, topic: str, path: str) -> bool:
@@ -85,7 +85,7 @@ class FieldDifference:
 
 @dataclass(frozen=True)
 class TopicDifference:
-    """How one topic of two bags differs.
+    """The differences of one topic in two bags.
 
     Attributes:
         first: text of the first difference; empty where the topic is the same in both bags, within the tolerance.
@@ -106,7 +106,7 @@ class TopicDifference:
 
     @property
     def same(self) -> bool:
-        """Whether both bags hold the same messages of the topic: bit for bit, or within the tolerance."""
+        """True if both bags hold the same messages of the topic: bit for bit, or within the tolerance."""
         return not self.first
 
 
@@ -116,8 +116,11 @@ def compare(
     """Compare every topic of two bags, in the order of the names.
 
     Args:
+        a: first bag.
+        b: second bag.
         ignore: topics to leave out, names or patterns.
         common: compare only topics that both bags have.
+        tolerance: allowed differences.
 
     Raises:
         BagError: a bag cannot be read.

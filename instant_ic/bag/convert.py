@@ -20,7 +20,7 @@ from instant_ic.bag.writer import BagWriter
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """What to copy, and how to write it.
+    """Selection of messages, and how to write them.
 
     Attributes:
         choice: topics to copy.

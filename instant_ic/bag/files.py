@@ -249,7 +249,7 @@ class BagReader(Closing):
         return lambda payload: store.deserialize_cdr(payload, topic.type_name)
 
     def differing_types(self) -> list[str]:
-        """Types whose definition in the bag differs from ours and cannot be converted: they do not fit our nodes."""
+        """Return the types whose definition in the bag differs from ours and cannot be converted."""
         found = set()
         for topic in self.topics:
             own = schema_or_unknown(topic.type_name)

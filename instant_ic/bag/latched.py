@@ -30,7 +30,7 @@ class LatchedValues:
 
 
 def _names(message: BagMessage) -> frozenset[str]:
-    """What a newer message replaces: child frames, or the publisher."""
+    """Return the names that a newer message replaces: child frames, or the publisher."""
     if message.topic in TRANSFORM_TOPICS:
         try:
             decoded = deserialize(message.payload, message.type_name)

@@ -37,7 +37,7 @@ class LiveTopics:
         self._next_nodes_s = 0.0
 
     def look(self, again: bool = False) -> tuple[list[TopicInfo], list[NodeInfo]]:
-        """Topics with a publisher; and the nodes, if they are due or ``again`` is set, otherwise none."""
+        """Return the topics with a publisher, and the nodes if they are due or ``again`` is set."""
         nodes: list[NodeInfo] = []
         if again or time.monotonic() >= self._next_nodes_s:
             self._next_nodes_s = time.monotonic() + _NODES_S
@@ -78,8 +78,10 @@ def refuse_base(bag: str, run_dir: Path, nodes: Collection[NodeInfo], played: Ma
     """Refuse to play what a base in the run directory, real or simulated, could obey.
 
     Args:
-        bag, run_dir: for the text of the error.
-        nodes, played: see :func:`reached_base`.
+        bag: name of the bag, for the error.
+        run_dir: run directory, for the error.
+        nodes: running nodes, without the player.
+        played: topic on the bus → topic in the bag.
 
     Raises:
         BagError: there is one, or a bridge to one.
@@ -101,6 +103,7 @@ def wait_for_readers(
 
     Args:
         wait_for: names of the nodes, which must subscribe to at least one played topic.
+        run_dir: run directory of the nodes.
         publishers: topic in the bag → its publisher.
         wait: waits for some seconds; returns True to give up.
 

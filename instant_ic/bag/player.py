@@ -229,6 +229,7 @@ class BagPlayer:
         Args:
             send: called with each message when it is due.
             stop: ends playback; also interrupts waiting.
+            now_s: monotonic time in seconds.
             on_clock: called with the bag's time, first at the start and then periodically; in between,
                 :attr:`position_ns` is valid.
 

@@ -271,12 +271,12 @@ class Recorder:
                 self._write_snapshot(waiting)
 
     def lost(self) -> dict[str, int]:
-        """Messages lost in transit, by topic; only topics with losses."""
+        """Return the messages lost in transit, by topic; only topics with losses."""
         # A copy: the writing thread reads while this one may add topics.
         return {topic: counter.lost for topic, counter in list(self._losses.items()) if counter.lost}
 
     def lost_by(self) -> dict[str, dict[str, int]]:
-        """Messages lost in transit: topic → publisher → messages."""
+        """Return the messages lost in transit: topic → publisher → messages."""
         return {topic: dict(counter.lost_by) for topic, counter in list(self._losses.items()) if counter.lost_by}
 
     def unknown_types(self) -> dict[str, str]:
@@ -306,7 +306,7 @@ class Recorder:
         return status
 
     def summary(self) -> str:
-        """One line on the content of the recording."""
+        """Return the content of the recording in one line."""
         status = self.status()
         text = f"{status['messages']} messages, {status['topics']} topics, {self.state}"
         if "bytes" in status:
@@ -314,7 +314,7 @@ class Recorder:
         return f"{text}, the last {status['cached_s']:g} s at hand ({status['cached_bytes'] / 1e6:.0f} MB)"
 
     def diagnoses(self, fault: str = "") -> Iterator[Diagnosis]:
-        """State of the recording; ``fault`` is one of another recording that goes before its own."""
+        """Yield the diagnoses of the recording; ``fault`` of another recording replaces its own."""
         lost, now_ns = self.lost(), time.monotonic_ns()
         overflow, now_lost = self.dropped.overflow, self._recent_lost.rise(sum(lost.values()), now_ns)
         now_dropped = self._recent_dropped.rise(sum(overflow.values()), now_ns)

@@ -106,6 +106,7 @@ def make_node(name: str, params_files: Sequence[Path] | None, overrides: Sequenc
     """Create a node with its parameters.
 
     Args:
+        name: name of the node.
         params_files: parameter files; None takes those of ``config/`` for the node.
         overrides: ``node.key:=value`` arguments; those of other nodes are skipped.
 
@@ -134,9 +135,12 @@ def replay(
     Topics that a replayed node publishes are not fed, nor are transforms whose child frame a replayed node broadcasts.
 
     Args:
+        bag: bag to feed.
+        nodes: nodes to replay.
         output: folder of the new bag, which must not exist.
         drop_transforms: further child frames to drop.
         on_progress: called with the completed share of the bag, 0 to 1.
+        compressed: compress the new bag with zstd.
 
     Raises:
         BagError: a bag cannot be read or written.

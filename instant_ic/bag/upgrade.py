@@ -16,7 +16,7 @@ _INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 3
 
 @functools.lru_cache(maxsize=200)
 def upgrade_of(schema: Schema) -> Callable[[bytes], bytes] | None:
-    """Function that converts a payload of ``schema`` to the present definition of its type; None where none can.
+    """Return a function that converts payloads of ``schema`` to the present definition; None where that cannot be done.
 
     A type may have grown by fields of plain numbers, booleans and strings at its end; they get 0, False or "". It may
     have lost fields at its end.
@@ -47,7 +47,7 @@ def upgrade_of(schema: Schema) -> Callable[[bytes], bytes] | None:
 
 
 def _default(kind: Any) -> bool | float | str | None:
-    """Value of an added field; None where the type has no plain default."""
+    """Return the value of an added field; None where the type has no plain default."""
     name = kind[1][0] if isinstance(kind[1], tuple) else None
     return 0 if name in _INTEGERS else _DEFAULTS.get(str(name))
 

@@ -95,7 +95,7 @@ class BagWriter(Closing):
 
     @property
     def part_is_empty(self) -> bool:
-        """Whether the current file has no messages yet."""
+        """True while the current file has no messages."""
         return self._part is None or not self._part.given
 
     def write(

@@ -112,7 +112,7 @@ class TopicQoS:
     depth: int = _DEFAULT_DEPTH
 
     def encode(self) -> str:
-        """``<reliability>:<durability>:<history>,<depth>:<deadline>:<lifespan>:<liveliness>``; defaults empty."""
+        """Return ``reliability:durability:history,depth:deadline:lifespan:liveliness``; defaults are empty."""
         reliability = "" if self.reliable else "2"
         durability = "1" if self.latched else ""
         depth = "" if self.depth == _DEFAULT_DEPTH else str(self.depth)

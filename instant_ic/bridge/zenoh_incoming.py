@@ -159,13 +159,13 @@ class Incoming:
         entry.gone_s = None
 
     def wants(self, topic: str) -> bool:
-        """Whether a topic is imported once it has a publisher in the ROS graph."""
+        """Return whether a topic is imported once it has a publisher in the ROS graph."""
         if topic in self._commands:
             return True
         return takes(self._patterns, topic) and not takes(ACTED_ON, topic)
 
     def _same_type(self, topic: str, token: Token, entry: _In | None) -> bool:
-        """Whether a ROS publisher's type matches the local topic; report a mismatch."""
+        """Check that a ROS publisher's type is that of the local topic; report a mismatch."""
         wanted = entry.type_name if entry is not None else token.type_name
         who = f"{token.node} there sends {token.type_name}"
         if token.type_name != wanted:
@@ -280,7 +280,7 @@ class Incoming:
 
 
 def topic_counts(outgoing: Outgoing, incoming: Incoming) -> tuple[str, int, dict[str, int]]:
-    """Traffic in both directions: a line of text, the number of lost messages, and the values of the diagnosis."""
+    """Return the traffic in both directions: text, number of lost messages, and values of the diagnosis."""
     lost_by = incoming.lost_by()
     values = {f"lost {topic} from {gid[:8]}": n for topic, by in lost_by.items() for gid, n in by.items()}
     lost = sum(count for by in lost_by.values() for count in by.values())

@@ -113,7 +113,7 @@ class Outgoing:
         return out.publishers[node]
 
     def _came_in(self, topic: str, publisher: str) -> bool:
-        """Whether a publisher only republishes imported messages, which must not be exported again."""
+        """Return whether a publisher only republishes imported messages, which must not be exported again."""
         return publisher == self._node.node_name and self.brought_in(topic)
 
     def _forward(self, received: Received) -> None:
@@ -129,7 +129,7 @@ class Outgoing:
         self.count += 1
 
     def _early(self, out: _Out, received: Received) -> bool:
-        """Whether the rate limit drops a message; each publisher has its own limit."""
+        """Return True if the rate limit drops a message; each publisher has its own limit."""
         if not out.period_ns:
             return False
         due_ns = out.due_ns.get(received.publisher, 0)

@@ -130,7 +130,7 @@ def load_config(
 
 
 def is_client(config: Any) -> bool:
-    """Whether the configuration is a client's; a client cannot open before its router runs."""
+    """Return whether the configuration is a client's; a client cannot open before its router runs."""
     return bool(json.loads(config.get_json("mode")) == "client")
 
 

@@ -62,7 +62,7 @@ class Namespace:
 
 
 def takes(patterns: Sequence[str], topic: str) -> bool:
-    """Whether one of the patterns (``/camera/*``) matches."""
+    """Return whether one of the patterns (``/camera/*``) matches."""
     return any(fnmatch.fnmatchcase(topic, pattern) for pattern in patterns)
 
 

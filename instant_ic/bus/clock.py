@@ -52,15 +52,15 @@ class ManualClock:
         self._suspended_ns = 0
 
     def now_ns(self) -> int:
-        """The time that was set last."""
+        """Return the time that was set last."""
         return self._now_ns
 
     def steady_ns(self) -> int:
-        """The same value as ``now_ns``: time-outs also run in simulated time."""
+        """Return the same value as ``now_ns``: time-outs also run in simulated time."""
         return self._now_ns
 
     def suspended_ns(self) -> int:
-        """The sum of all :meth:`suspend`."""
+        """Return the sum of all :meth:`suspend`."""
         return self._suspended_ns
 
     def suspend(self, seconds: float) -> None:
@@ -84,7 +84,7 @@ class JumpDetector:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
 
     def jump_s(self) -> float:
-        """Seconds the clock was set forward since the last call (negative: back); 0.0 if it was not set."""
+        """Return the seconds the clock was set forward since the last call (negative: back); 0.0 if it was not set."""
         offset_ns = time.time_ns() - time.monotonic_ns()
         jumped_ns = offset_ns - self._offset_ns
         self._offset_ns = offset_ns

@@ -244,7 +244,7 @@ class NodeControl:
         return [ParameterInfo(**entry) for entry in self.request({"op": "describe"})["parameters"]]
 
     def get(self) -> dict[str, Any]:
-        """Value of every parameter."""
+        """Return the value of every parameter."""
         values: dict[str, Any] = self.request({"op": "get"})["values"]
         return values
 
@@ -263,11 +263,11 @@ class NodeControl:
         return changed
 
     def log_level(self, level: str | None = None) -> str:
-        """The node's log level, after setting it if ``level`` is given."""
+        """Set the node's log level if ``level`` is given; return its level."""
         return str(self.request({"op": "log_level", "level": level})["level"])
 
     def status(self) -> dict[str, Any]:
-        """``pid``, ``threads``, ``busy`` (the callback its thread runs, or empty) and ``busy_s`` (for how long)."""
+        """Return ``pid``, ``threads``, ``busy`` (running callback, or empty) and ``busy_s`` (for how long)."""
         return self.request({"op": "status"})
 
     def call(self, command: str, **arguments: Any) -> Any:
@@ -315,7 +315,7 @@ class NodeControl:
 
 
 def _read_line(reader: BinaryIO, max_bytes: int) -> bytes:
-    """The next line; empty when the other side has closed."""
+    """Return the next line; empty when the other side has closed."""
     line = reader.readline(max_bytes + 1)
     if len(line) > max_bytes:
         raise _RequestError(f"line longer than {max_bytes} bytes")

@@ -32,7 +32,10 @@ class FlowReport:
         """Report what a subscription did not get; nothing where it has got everything.
 
         Args:
+            topic: name of the topic.
+            stats: counts of the subscription.
             values: figures beside the text.
+            now_ns: steady time.
         """
         lost_by = dict(stats.lost_by)
         lost = {node: self._rise(stats, f"lost from {node}", count, now_ns) for node, count in sorted(lost_by.items())}

@@ -20,10 +20,10 @@ INLINE, SHARED = 0, 1
 """Kinds: the body is the CDR itself, or a :data:`REFERENCE` to it."""
 
 REFERENCE = struct.Struct("<IIII")
-"""Where a message lies: process and descriptor of its slot, number of the slot, smallest number still in use."""
+"""Place of a message: process and descriptor of its slot, number of the slot, smallest number still in use."""
 
 KEY_COPY = b"="
-"""What precedes the name in the inline copy of a referenced message; readers of the name do not get it."""
+"""Prefix of the name in the inline copy of a referenced message; readers of the name do not get it."""
 
 MOST_BYTES = 0xFFFFFFFF
 """Largest message, in bytes."""
@@ -56,5 +56,5 @@ def unpack_header(part: bytes) -> Header:
 
 @functools.cache
 def type_digest(type_name: str) -> bytes:
-    """First 8 bytes of a type's RIHS01 hash, which covers its name and its fields."""
+    """Return the first 8 bytes of a type's RIHS01 hash, which covers its name and its fields."""
     return bytes.fromhex(type_hash(type_name).removeprefix("RIHS01_")[:16])

@@ -12,7 +12,7 @@ STATES = ("starting", "running", "degraded", "failed", "stopping")
 SILENT_AFTER_S = 3.0
 """A node without a heartbeat for longer than this is stale (state ``silent``)."""
 EVERY_NODES = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events")
-"""Ends of the names of the topics that every node publishes. A node that stops them is silent, not slow."""
+"""Last parts of the topics that every node publishes. A node that stops them is silent, not slow."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +49,17 @@ class Heartbeat:
 
     @property
     def silent(self) -> bool:
-        """Whether the next heartbeat is overdue."""
+        """True if the next heartbeat is overdue."""
         return time.monotonic() - self.seen_s > SILENT_AFTER_S
 
     @property
     def up(self) -> bool:
-        """Whether the node reports that it runs."""
+        """True if the node reports that it runs."""
         return self.state in ("running", "degraded")
 
 
 def from_message(message: Any) -> Heartbeat:
-    """Heartbeat from a NodeStatus message; of lists of different lengths, which any program can send, the shorter."""
+    """Return the heartbeat of a NodeStatus message; lists of different lengths are cut to the shorter."""
     flows = zip(message.inputs, message.input_rates_hz, message.input_ages_s, strict=False)
     sent = zip(message.outputs, message.output_rates_hz, message.output_ages_s, strict=False)
     lost = zip(message.lost_topics, message.lost_publishers, message.lost_counts, strict=False)

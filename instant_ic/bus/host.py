@@ -1,4 +1,4 @@
-"""What the publishers and subscriptions of one transport share."""
+"""The part of a transport that its publishers and subscriptions share."""
 
 from __future__ import annotations
 

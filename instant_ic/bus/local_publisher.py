@@ -26,7 +26,7 @@ SLOTS_A_READER = 5
 """How many slots each reader adds to a publisher's limit; see also :data:`~.local_subscription.VIEWS_HELD`."""
 
 _QUEUE_BYTES = 128 << 20
-"""What may wait for a blocked reader: of messages through the socket, and of large ones that no slot had room for."""
+"""Queue limits for a slow subscriber: messages sent inline, and large messages for which no slot was free."""
 LINGER_S = 0.2  # lets a last zero command leave when a node shuts down
 _NO_MEMORY_S = 5.0  # after a try for memory that failed
 _MORE = int(zmq.SNDMORE)
@@ -201,7 +201,7 @@ class LocalPublisher:
         self._send_part(body)
 
     def _has_room(self, size: int) -> bool:
-        """Whether a large message may go through the socket: its own limit counts messages, not bytes."""
+        """Return whether a large message may go through the socket; the limit counts messages, not bytes."""
         seen = min((progress.sequence() for progress in self._progress.values()), default=self._sequence)
         while self._inlined and self._inlined[0][0] <= seen:
             self._inlined.popleft()
@@ -211,7 +211,7 @@ class LocalPublisher:
         return True
 
     def _slot(self, size: int) -> Slot | None:
-        """A locked slot, or None when this message must go through the socket."""
+        """Return a locked slot, or None when this message must go through the socket."""
         why = "readers hold all slots"
         most = LEAST_SLOTS + SLOTS_A_READER * self.subscriber_count
         if time.monotonic() < self._no_memory_until_s:  # a try takes as long as a message, and what memory there is

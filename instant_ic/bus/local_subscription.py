@@ -206,7 +206,7 @@ class LocalSubscription:
         self.stats.add(steady)
 
     def _met(self, publisher: bytes) -> _Source:
-        """The publisher of a first message.
+        """Return the publisher of a first message.
 
         Raises:
             FrameError: the registry does not name it.
@@ -221,7 +221,7 @@ class LocalSubscription:
         raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")
 
     def _shared(self, source: _Source, header: Header, body: bytes | memoryview) -> memoryview | None:
-        """The message in shared memory; None when its slot holds another message by now."""
+        """Return the message in shared memory; None when its slot holds another message by now."""
         if len(body) != REFERENCE.size:
             raise FrameError(f"reference of {len(body)} bytes; it has {REFERENCE.size}")
         pid, fd, number, oldest = REFERENCE.unpack(body)

@@ -94,8 +94,9 @@ class LocalTransport(Host):
         """Subscribe to all present and future publishers.
 
         Args:
-            topic, qos: what to read.
+            topic: topic to read.
             type_name: its type; None accepts any.
+            qos: queue of the subscription.
             on_ready: called when :meth:`LocalSubscription.take` has messages again, on the thread that reads; it must
                 not wait.
         """

@@ -148,7 +148,9 @@ class LockstepBus(Closing):
         Args:
             node_class: class of the node.
             config: parameters; the defaults if None.
-            name, namespace, remaps: see ``Node``.
+            name: name of the node; that of its class if None.
+            namespace: prefix of its topics.
+            remaps: topic → topic.
             parts: further arguments of the node's constructor, such as a simulated device.
         """
         configuration = node_class.config_class()() if config is None else config
@@ -198,15 +200,15 @@ class LockstepBus(Closing):
         self.advance_to(self.clock.now_ns() + int(seconds * 1e9))
 
     def records(self, topic: str) -> list[Record]:
-        """All messages of a topic, as sent over the bus."""
+        """Return all messages of a topic, as sent over the bus."""
         return list(self._records.get(topic, ()))
 
     def messages(self, topic: str) -> list[Any]:
-        """All messages of a topic, decoded."""
+        """Return all messages of a topic, decoded."""
         return [deserialize(r.payload, r.type_name) for r in self._records.get(topic, ())]
 
     def last(self, topic: str) -> Any:
-        """Newest message of a topic, decoded; None before the first."""
+        """Return the newest message of a topic, decoded; None before the first."""
         records = self._records.get(topic)
         return deserialize(records[-1].payload, records[-1].type_name) if records else None
 
@@ -220,7 +222,7 @@ class LockstepBus(Closing):
     # -- for publishers and subscriptions --------------------------------------------------------
 
     def new_instance(self) -> bytes:
-        """Identity of a new publisher."""
+        """Return the identity of a new publisher."""
         return next(self._instances).to_bytes(8)
 
     def route(

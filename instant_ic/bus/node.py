@@ -121,7 +121,7 @@ class Node(Generic[ConfigT]):
 
     @classmethod
     def config_class(cls) -> type[Any]:
-        """The dataclass given in ``class X(Node[Config])``."""
+        """Return the dataclass given in ``class X(Node[Config])``."""
         for base in getattr(cls, "__orig_bases__", ()):
             arguments = get_args(base)
             if arguments and isinstance(arguments[0], type):
@@ -134,7 +134,7 @@ class Node(Generic[ConfigT]):
         return self._transport.run_dir
 
     def resolve(self, topic: str) -> str:
-        """Name of a topic after remaps and namespace."""
+        """Return the name of a topic after remaps and namespace."""
         topic = self._remaps.get(topic, topic)
         return f"/{self.namespace}{topic}" if self.namespace else topic
 
@@ -242,7 +242,7 @@ class Node(Generic[ConfigT]):
 
     @property
     def stopping(self) -> bool:
-        """Whether the loop has been asked to end."""
+        """True once the loop has been asked to end."""
         return self._stop.is_set()
 
     def be_patient(self, patient: bool) -> None:
@@ -357,7 +357,7 @@ class Node(Generic[ConfigT]):
             self._transport.close()
 
     def describe(self) -> dict[str, Any]:
-        """The node's entry in the registry."""
+        """Return the node's entry in the registry."""
         return {
             "name": self.node_name,
             "executable": type(self).name,

@@ -16,7 +16,7 @@ class NodeFileError(ValueError):
 
 
 def node_class(name: str) -> type[Node[Any]]:
-    """Class of a shipped node.
+    """Return the class of a shipped node.
 
     Raises:
         NodeFileError: there is no such node.
@@ -27,7 +27,7 @@ def node_class(name: str) -> type[Node[Any]]:
 
 
 def load(file: Path, module_name: str = "") -> type[Node[Any]]:
-    """The node class that a file defines; each process runs the file only once.
+    """Return the node class that a file defines. A process runs the file only once.
 
     Args:
         file: Python source with one subclass of `Node`.

@@ -23,7 +23,7 @@ _STRINGS = 9
 
 
 def parameter_event(node: str, changed: Mapping[str, Any], stamp_ns: int) -> Any:
-    """ParameterEvent for the values (plain JSON) that a node has accepted."""
+    """Return a ParameterEvent for the values (plain JSON) that a node has accepted."""
     return message_type("rcl_interfaces/ParameterEvent")(
         stamp=to_time(stamp_ns),
         node=f"/{node}",
@@ -34,7 +34,7 @@ def parameter_event(node: str, changed: Mapping[str, Any], stamp_ns: int) -> Any
 
 
 def _parameter(name: str, value: Any) -> Any:
-    """One rcl_interfaces/Parameter; a value without a type there (a mixed list) becomes JSON text."""
+    """Return a rcl_interfaces/Parameter; a value without a type there (a mixed list) becomes JSON text."""
     fields = {field: kind() for kind, (_, field) in _SCALARS.items()}
     fields |= {field: np.zeros(0, dtype) for _, field, dtype in _ARRAYS.values()}
     fields |= {"type": _NOT_SET, "byte_array_value": np.zeros(0, np.uint8), "string_array_value": []}

@@ -30,7 +30,7 @@ _SETUP_ENDS_S = 1.0
 
 
 def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
-    """Command line parser of a node."""
+    """Return the command line parser of a node."""
     parser = argparse.ArgumentParser(
         prog=f"ic run {node_class.name}",
         description=(sys.modules[node_class.__module__].__doc__ or "").strip(),

@@ -171,7 +171,7 @@ def open_lock(path: Path | str, create: bool = False) -> int:
 
 
 def topic_dir(run_dir: Path, topic: str) -> Path:
-    """Folder of a topic's publishers."""
+    """Return the folder of a topic's publishers."""
     return run_dir / "topics" / check_topic(topic)[1:].replace("/", ".")
 
 
@@ -284,7 +284,7 @@ def announce(claim: Claim, topic: str, type_name: str, qos: str, node: str, sock
 
 
 def _is_at(fd: int, path: Path) -> bool:
-    """Whether this path still names the open file, and no other one or none."""
+    """Return whether this path still names the open file."""
     try:
         return os.fstat(fd).st_ino == path.lstat().st_ino
     except FileNotFoundError:
@@ -292,7 +292,7 @@ def _is_at(fd: int, path: Path) -> bool:
 
 
 def _alive(lock_path: Path | str) -> bool:
-    """Whether the owner of an entry holds its lock."""
+    """Return whether the owner of an entry holds its lock."""
     try:
         fd = open_lock(lock_path)
     except (FileNotFoundError, RegistryError):  # another user's file is not an entry
@@ -308,7 +308,7 @@ def _alive(lock_path: Path | str) -> bool:
 
 @functools.lru_cache(1024)
 def _content(path: str, written: tuple[int, int]) -> dict[str, Any]:
-    """Content of a JSON file, which is never changed after it was written."""
+    """Return the content of a JSON file, which is never changed after it was written."""
     entry: dict[str, Any] = json.loads(Path(path).read_text())
     return entry
 
@@ -331,7 +331,7 @@ def _entries(folder: Path | str) -> Iterator[dict[str, Any]]:
 
 
 def topic_publishers(run_dir: Path, topic: str) -> list[PublisherInfo]:
-    """Live publishers of one topic."""
+    """Return the live publishers of one topic."""
     return [_publisher(entry) for entry in _entries(topic_dir(run_dir, topic))]
 
 
@@ -399,7 +399,7 @@ class TopicWatch:
 
 
 def list_topics(run_dir: Path) -> list[TopicInfo]:
-    """Topics with a live publisher, by name."""
+    """Return the topics with a live publisher, by name."""
     return TopicWatch(run_dir).topics()
 
 
@@ -416,7 +416,7 @@ def _publisher(entry: dict[str, Any]) -> PublisherInfo:
 
 
 def settled(mtime_ns: int) -> bool:
-    """Whether a folder with this time of change can be trusted to show its next change by another time.
+    """Return whether a folder with this time of change will show its next change by another time.
 
     The kernel's file times advance in steps of up to 10 ms: a change soon after a look leaves the time as it was.
     """
@@ -424,7 +424,7 @@ def settled(mtime_ns: int) -> bool:
 
 
 def running(publisher: PublisherInfo) -> bool:
-    """Whether a publisher's process exists: a cheap look between those at its lock, which are certain."""
+    """Return whether a publisher's process exists; cheaper than a look at its lock, but less certain."""
     try:
         os.kill(publisher.pid, 0)
     except ProcessLookupError:
@@ -435,7 +435,7 @@ def running(publisher: PublisherInfo) -> bool:
 
 
 def list_nodes(run_dir: Path) -> list[NodeInfo]:
-    """Live nodes, by name. Keys that this version does not know are ignored.
+    """Return the live nodes, by name. Keys that this version does not know are ignored.
 
     Raises:
         RegistryError: an entry is incomplete, as of a node of another version. It could be a base: it is not skipped.

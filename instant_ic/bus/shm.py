@@ -52,7 +52,7 @@ class Memory:
 
     @classmethod
     def make(cls, size: int) -> Self:
-        """New memory.
+        """Create memory.
 
         Raises:
             OSError: the machine does not have that much free memory.
@@ -115,7 +115,7 @@ class Slot(Memory):
 
     @classmethod
     def create(cls, number: int, size: int, publisher: bytes) -> Slot:
-        """A publisher's slot for messages of ``size`` bytes and a little more: compressed images vary in size.
+        """Create a slot for messages of ``size`` bytes and a little more: compressed images vary in size.
 
         Raises:
             OSError: the machine does not have that much free memory.
@@ -145,7 +145,7 @@ class Slot(Memory):
         fcntl.flock(self.fd, fcntl.LOCK_UN)
 
     def begin(self, size: int) -> memoryview:
-        """Memory for the next message of ``size`` bytes, under the lock; the previous message becomes invalid."""
+        """Return memory for the next message of ``size`` bytes, under the lock; the previous one becomes invalid."""
         self.finish(0)
         return memoryview(self.map)[_PAYLOAD_AT : _PAYLOAD_AT + size]
 
@@ -164,7 +164,7 @@ class Slot(Memory):
         return self.held
 
     def view(self, size: int) -> memoryview:
-        """Read-only view of the message."""
+        """Return a read-only view of the message."""
         return memoryview(self.map)[_PAYLOAD_AT : _PAYLOAD_AT + size].toreadonly()
 
 
@@ -188,7 +188,7 @@ class SlotPool:
         return min((slot.number for slot in self.slots), default=0)
 
     def acquire(self, size: int, most: int, must: int, should: int, keep: Slot | None = None) -> Slot | None:
-        """A locked slot for ``size`` bytes; None when all are in use.
+        """Return a locked slot for ``size`` bytes; None when all are in use.
 
         Args:
             size: bytes of the message.
@@ -228,7 +228,7 @@ class SlotPool:
 
 
 def progress_page(newest_only: bool) -> tuple[Memory, bytes]:
-    """A subscription's page, on which it stores how far it has read; and the ZeroMQ subscription that announces it.
+    """Return a subscription's progress page, and the ZeroMQ subscription that announces it.
 
     Args:
         newest_only: a publisher may overwrite a message before this subscription has looked at it.
@@ -272,7 +272,7 @@ class PeerProgress:
         self._map = page.map
 
     def sequence(self) -> int:
-        """The subscription has looked at all messages up to this one."""
+        """Return the number of the last message that the subscription has looked at."""
         at = self._map.find(self._publisher)
         if at < 0 or at % _ENTRY.size:
             return self._joined

@@ -41,7 +41,7 @@ class Received(NamedTuple):
     """Identity of the publisher; a node that is started again has another one. Empty: unknown."""
 
     def given_ns(self, stamp_ns: int) -> int:
-        """Time on the node's steady clock when the content was measured or commanded; all ages count from it.
+        """Return when the content was measured or commanded, on the node's steady clock; ages count from it.
 
         The stamp is compared with the machine's clock once, on arrival. After that only the steady clock counts, so
         setting the machine's clock changes no age. A stamp in the future counts as the time of arrival.
@@ -89,7 +89,7 @@ class Stats:
         self._arrivals.append(now_ns)
 
     def rate_hz(self, now_ns: int) -> float:
-        """Messages per second over the last 50 messages or 5 s, whichever is shorter."""
+        """Return the message rate in 1/s over the last 50 messages or 5 s, whichever is shorter."""
         recent = [t for t in list(self._arrivals) if 0 <= now_ns - t < 5_000_000_000]
         if len(recent) < 2 or recent[-1] <= recent[0]:
             return 0.0
@@ -98,7 +98,7 @@ class Stats:
         return (len(recent) - 1) * 1e9 / span
 
     def age_s(self, now_ns: int) -> float:
-        """Seconds since the newest message; inf before the first, and after simulated time went back."""
+        """Return the seconds since the newest message; inf before the first, and after simulated time went back."""
         age = (now_ns - self.newest_ns) / 1e9
         return age if self.count and age >= -_TOLERANCE_S else float("inf")
 
@@ -134,7 +134,7 @@ class RawPublisher(Protocol):
 
 
 def joined(payload: Payload) -> bytes | memoryview:
-    """A payload as one buffer; copied only if it consists of several."""
+    """Return a payload as one buffer; copied only if it consists of several."""
     if isinstance(payload, (bytes, memoryview)):
         return payload
     return memoryview(payload) if isinstance(payload, bytearray) else b"".join(payload)
@@ -149,7 +149,7 @@ class RawSubscription(Protocol):
     stats: Stats
 
     def take(self) -> list[Received]:
-        """Messages since the last call, in order of arrival; with ``sensor``, the newest of each publisher."""
+        """Return the messages since the last call, in order of arrival; with ``sensor``, the newest per publisher."""
         ...
 
     def close(self) -> None: ...

@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 
 
 def psnr_db(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Peak signal-to-noise ratio of two 8-bit images of one shape, dB; inf if they are equal."""
+    """Return the peak signal-to-noise ratio of two 8-bit images of one shape, dB; inf if they are equal."""
     error = float(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2))
     return float("inf") if error == 0 else 10 * float(np.log10(255.0**2 / error))
 
 
 def psnr_of_mse(mse: float) -> float:
-    """PSNR in dB of a mean squared error of colours in 0..1, at most 100; NaN stays NaN."""
+    """Return the PSNR in dB of a mean squared error of colours in 0..1, at most 100; NaN stays NaN."""
     return -10 * math.log10(max(mse, 1e-10))
 
 
 def ssim(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Structural similarity of two 8-bit images (H, W, 3), as in Wang et al. 2004: Gaussian window, sigma 1.5."""
+    """Return the structural similarity of two 8-bit images (H, W, 3) (Wang et al. 2004; Gaussian window, sigma 1.5)."""
     from skimage.metrics import structural_similarity
 
     return float(

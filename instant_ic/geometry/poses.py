@@ -15,7 +15,7 @@ Pose2 = NDArray[np.float64]
 
 
 def rotation_matrix(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Matrix:
-    """Rotation about the fixed axes x, y, z in this order (REP-103), radians, (3, 3)."""
+    """Return the rotation about the fixed axes x, y, z in this order (REP-103), radians, (3, 3)."""
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
@@ -31,7 +31,7 @@ def rotation_matrix(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> 
 def pose_matrix(
     x: float = 0.0, y: float = 0.0, z: float = 0.0, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
 ) -> Matrix:
-    """Pose from a translation in metres and fixed-axis angles in radians, (4, 4)."""
+    """Return the pose from a translation in metres and fixed-axis angles in radians, (4, 4)."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_matrix(roll, pitch, yaw)
     matrix[:3, 3] = (x, y, z)
@@ -39,7 +39,7 @@ def pose_matrix(
 
 
 def matrix_from_quaternion(xyzw: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
-    """Pose from a quaternion (x, y, z, w) of any length and a translation.
+    """Return the pose from a quaternion (x, y, z, w) of any length and a translation.
 
     Raises:
         ValueError: the quaternion is zero or not finite.
@@ -62,7 +62,7 @@ def matrix_from_quaternion(xyzw: ArrayLike, translation: ArrayLike = (0.0, 0.0, 
 
 
 def quaternion_from_matrix(matrix: ArrayLike) -> NDArray[np.float64]:
-    """Unit quaternion (x, y, z, w), w ≥ 0, of a pose or a rotation matrix."""
+    """Return the unit quaternion (x, y, z, w), w ≥ 0, of a pose or a rotation matrix."""
     return np.array(_quaternion(np.asarray(matrix, dtype=np.float64)))
 
 
@@ -82,7 +82,7 @@ def _quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float
 
 
 def inverse(matrix: Matrix) -> Matrix:
-    """Inverse of a rigid transform."""
+    """Return the inverse of a rigid transform."""
     (a, b, c, x), (d, e, f, y), (g, h, i, z), _ = matrix.tolist()
     return np.array(
         [
@@ -103,12 +103,12 @@ def transform_points(target_from_source: Matrix, points: NDArray[np.floating]) -
 
 
 def yaw_of(matrix: Matrix) -> float:
-    """Yaw of a pose, radians."""
+    """Return the yaw of a pose, radians."""
     return math.atan2(matrix[1, 0], matrix[0, 0])
 
 
 def interpolate(matrix0: Matrix, matrix1: Matrix, alpha: float) -> Matrix:
-    """Pose between two poses: linear in translation, shortest arc in rotation (slerp).
+    """Return the pose between two poses: linear in translation, shortest arc in rotation (slerp).
 
     ``alpha`` outside 0..1 extrapolates.
     """
@@ -126,25 +126,25 @@ def interpolate(matrix0: Matrix, matrix1: Matrix, alpha: float) -> Matrix:
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """The same angle in (−π, π]."""
+    """Return the same angle in (−π, π]."""
     wrapped = math.remainder(angle_rad, 2 * math.pi)
     return math.pi if wrapped == -math.pi else wrapped
 
 
 def pose2_from_matrix(matrix: Matrix) -> Pose2:
-    """Planar part ``(x, y, yaw)`` of a pose."""
+    """Return the planar part ``(x, y, yaw)`` of a pose."""
     return np.array([matrix[0, 3], matrix[1, 3], yaw_of(matrix)])
 
 
 def matrix_from_pose2(pose: ArrayLike) -> Matrix:
-    """Pose on the plane z = 0 from ``(x, y, yaw)``."""
+    """Return the pose on the plane z = 0 from ``(x, y, yaw)``."""
     x, y, yaw = np.asarray(pose, dtype=np.float64).tolist()
     c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s, 0.0, x], [s, c, 0.0, y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def compose2(a: ArrayLike, b: ArrayLike) -> Pose2:
-    """Planar composition ``a ∘ b``: ``b`` is given in ``a``'s frame, the result in the parent frame of ``a``."""
+    """Return the planar composition ``a ∘ b``; ``b`` is in ``a``'s frame, the result in the parent frame of ``a``."""
     ax, ay, ayaw = np.asarray(a, dtype=np.float64).tolist()
     bx, by, byaw = np.asarray(b, dtype=np.float64).tolist()
     c, s = math.cos(ayaw), math.sin(ayaw)
@@ -158,12 +158,12 @@ def inverse2(a: ArrayLike) -> Pose2:
 
 
 def relative2(a: ArrayLike, b: ArrayLike) -> Pose2:
-    """``b`` in the frame of ``a``: ``inverse2(a) ∘ b``."""
+    """Return ``b`` in the frame of ``a``: ``inverse2(a) ∘ b``."""
     return compose2(inverse2(a), b)
 
 
 def planar_covariance(covariance: NDArray[np.float64], unmeasured: float = 0.0) -> NDArray[np.float64]:
-    """Covariance (6, 6) in the order x y z rx ry rz from one of x, y, yaw (3, 3).
+    """Return the covariance (6, 6) in the order x y z rx ry rz from one of x, y, yaw (3, 3).
 
     Args:
         covariance: (3, 3).

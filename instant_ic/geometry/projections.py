@@ -19,19 +19,19 @@ Indices = NDArray[np.intp]
 
 
 def equirect_directions(width: int, height: int) -> NDArray[np.float32]:
-    """Unit viewing direction of every pixel of a panorama, (height, width, 3)."""
+    """Return the unit viewing direction of every pixel of a panorama, (height, width, 3)."""
     azimuth = math.pi - (np.arange(width) + 0.5) * (2 * math.pi / width)
     return directions_at(azimuth, math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height))
 
 
 @functools.lru_cache(maxsize=4)
 def rays_of(size: tuple[int, int]) -> NDArray[np.float32]:
-    """``equirect_directions`` of a panorama of (height, width), kept; not to be changed."""
+    """Return ``equirect_directions`` of a panorama of (height, width), kept; not to be changed."""
     return equirect_directions(size[1], size[0])
 
 
 def directions_at(azimuth: Floats, elevation: Floats) -> NDArray[np.float32]:
-    """Unit directions at all azimuths (W,) of all elevations (H,), radians, (H, W, 3)."""
+    """Return the unit directions at all azimuths (W,) of all elevations (H,), radians, (H, W, 3)."""
     horizontal = np.cos(elevation)[:, None]
     directions = np.empty((len(elevation), len(azimuth), 3), np.float32)
     directions[..., 0] = horizontal * np.cos(azimuth)
@@ -41,7 +41,7 @@ def directions_at(azimuth: Floats, elevation: Floats) -> NDArray[np.float32]:
 
 
 def equirect_pixels(directions: Floats, width: int, height: int) -> tuple[Floats, Floats]:
-    """Index coordinates ``(u, v)`` of directions (..., 3) of any length.
+    """Return the index coordinates ``(u, v)`` of directions (..., 3) of any length.
 
     ``u`` is in [−0.5, width − 0.5); the sampler must wrap column ``width`` to 0. ``v`` is in [−0.5, height − 0.5].
     """
@@ -55,13 +55,13 @@ def equirect_pixels(directions: Floats, width: int, height: int) -> tuple[Floats
 
 
 def nearest_pixels(directions: Floats, width: int, height: int) -> tuple[Indices, Indices]:
-    """Rows and columns of the pixels nearest to directions (..., 3) of any length."""
+    """Return the rows and columns of the pixels nearest to directions (..., 3) of any length."""
     u, v = equirect_pixels(directions, width, height)
     return np.clip(np.rint(v).astype(np.intp), 0, height - 1), np.rint(u).astype(np.intp) % width
 
 
 def perspective_directions(width: int, height: int, hfov_rad: float) -> NDArray[np.float32]:
-    """Viewing directions (x = 1, not normalised) of a pinhole image that looks along x, (height, width, 3).
+    """Return the viewing directions (x = 1, not normalised) of a pinhole image that looks along x, (height, width, 3).
 
     Raises:
         ValueError: the field of view is not between 0 and π.
@@ -78,7 +78,7 @@ def perspective_directions(width: int, height: int, hfov_rad: float) -> NDArray[
 
 
 def sample_equirect(image: NDArray[np.generic], directions: Floats) -> NDArray[np.float32]:
-    """Bilinear samples of a panorama (H, W) or (H, W, C) along directions (..., 3); wraps at the seam."""
+    """Return the bilinear samples of a panorama (H, W) or (H, W, C) along directions (..., 3); wraps at the seam."""
     height, width = image.shape[:2]
     u, v = equirect_pixels(directions, width, height)
     v = np.clip(v, 0, height - 1)
@@ -105,6 +105,6 @@ CUBE_FACES: dict[str, NDArray[np.float64]] = {
 
 
 def equirect_to_cube(image: NDArray[np.generic], size: int) -> NDArray[np.float32]:
-    """The six 90° × 90° faces (paper, IV.A) in the order of ``CUBE_FACES``, (6, size, size[, C])."""
+    """Return the six 90° × 90° faces (paper, IV.A) in the order of ``CUBE_FACES``, (6, size, size[, C])."""
     face = perspective_directions(size, size, math.pi / 2)
     return np.stack([sample_equirect(image, face @ r.T.astype(np.float32)) for r in CUBE_FACES.values()])

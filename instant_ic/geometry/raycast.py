@@ -33,7 +33,7 @@ class RayCaster:
     def cast(
         self, origins: FloatArray, directions: FloatArray
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-        """First hit of each ray.
+        """Return the first hit of each ray.
 
         Args:
             origins: (N, 3) metres, or (3,) for all rays.
@@ -51,7 +51,7 @@ class RayCaster:
         return range_m, face
 
     def occluded(self, origins: FloatArray, directions: FloatArray, distance_m: FloatArray) -> npt.NDArray[np.bool_]:
-        """Whether anything lies within ``distance_m`` (N,) along each ray (N, 3)."""
+        """Return whether anything lies within ``distance_m`` (N,) along each ray (N, 3)."""
         hit = self._scene.run(
             np.ascontiguousarray(origins, np.float32),
             np.ascontiguousarray(directions, np.float32),

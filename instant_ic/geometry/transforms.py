@@ -95,7 +95,7 @@ class TransformBuffer:
             self._edges = {child: edge for child, edge in self._edges.items() if edge.static}
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix:
-        """``target_from_source`` at a time, interpolated; without a time, from each frame's newest value.
+        """Return ``target_from_source`` at a time, interpolated; without a time, from each frame's newest value.
 
         Raises:
             TransformError: unknown frame, no path, or the time is outside the stored range.
@@ -118,7 +118,7 @@ class TransformBuffer:
             return self._frames()
 
     def newest_ns(self, child: str) -> int | None:
-        """Stamp of a frame's newest value; None for an unknown frame."""
+        """Return the stamp of a frame's newest value; None for an unknown frame."""
         with self._lock:
             edge = self._edges.get(child)
             return edge.stamps_ns[-1] if edge else None

@@ -96,7 +96,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Message classes by their short name: ``from instant_ic.msg import Odometry``."""
+    """Return a message class by its short name: ``from instant_ic.msg import Odometry``."""
     if name.startswith("_"):
         raise AttributeError(name)
     try:

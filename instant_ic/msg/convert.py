@@ -35,12 +35,12 @@ _IMAGE_DTYPES = {encoding: (np.dtype(code), channels) for encoding, (code, chann
 
 
 def to_time(ns: int) -> Any:
-    """builtin_interfaces/Time from nanoseconds since the epoch."""
+    """Return a builtin_interfaces/Time from nanoseconds since the epoch."""
     return message_type("Time")(sec=int(ns // 1_000_000_000), nanosec=int(ns % 1_000_000_000))
 
 
 def stamp_ns(message: Any) -> int:
-    """Stamp in nanoseconds of a message with a header, of a header, or of a Time.
+    """Return the stamp in nanoseconds of a message with a header, of a header, or of a Time.
 
     Raises:
         MessageError: the message has no stamp.
@@ -54,7 +54,7 @@ def stamp_ns(message: Any) -> int:
 
 
 def header(frame_id: str, stamp: int) -> Any:
-    """std_msgs/Header."""
+    """Return a std_msgs/Header."""
     return message_type("Header")(stamp=to_time(stamp), frame_id=frame_id)
 
 
@@ -62,7 +62,7 @@ def header(frame_id: str, stamp: int) -> Any:
 
 
 def image_message(array: NDArray[Any], encoding: str, frame_id: str, stamp: int) -> Any:
-    """sensor_msgs/Image from an array (H, W) or (H, W, C); a contiguous array is not copied.
+    """Return a sensor_msgs/Image from an array (H, W) or (H, W, C); a contiguous array is not copied.
 
     Raises:
         MessageError: unknown encoding, or an array whose shape or dtype does not fit it.
@@ -87,7 +87,7 @@ def image_message(array: NDArray[Any], encoding: str, frame_id: str, stamp: int)
 
 
 def image_array(message: Any) -> NDArray[Any]:
-    """Array (H, W) or (H, W, C) from a sensor_msgs/Image; a read-only view unless rows are padded.
+    """Return the array (H, W) or (H, W, C) from a sensor_msgs/Image; a read-only view unless rows are padded.
 
     Raises:
         MessageError: unknown encoding, big-endian data, or too few bytes.
@@ -110,7 +110,7 @@ def image_array(message: Any) -> NDArray[Any]:
 def compressed_image_message(
     data: bytes | bytearray | memoryview | NDArray[np.uint8], frame_id: str, stamp: int, format: str = "jpeg"
 ) -> Any:
-    """sensor_msgs/CompressedImage from encoded bytes."""
+    """Return a sensor_msgs/CompressedImage from encoded bytes."""
     array = data if isinstance(data, np.ndarray) else np.frombuffer(data, np.uint8)
     return message_type("CompressedImage")(header=header(frame_id, stamp), format=format, data=array)
 
@@ -119,7 +119,7 @@ def compressed_image_message(
 
 
 def cloud_message(points: NDArray[Any], frame_id: str, stamp: int) -> Any:
-    """sensor_msgs/PointCloud2 from a structured array (N,), whose layout becomes the message's; not copied."""
+    """Return a sensor_msgs/PointCloud2 from a structured array (N,), whose layout becomes the message's; not copied."""
     if points.dtype.fields is None or points.ndim != 1:
         raise MessageError(f"a point cloud needs a structured array (N,), got {points.dtype} {points.shape}")
     field_type = message_type("PointField")
@@ -142,7 +142,7 @@ def cloud_message(points: NDArray[Any], frame_id: str, stamp: int) -> Any:
 
 
 def cloud_of_points(xyz: NDArray[np.floating], frame_id: str, stamp: int) -> Any:
-    """sensor_msgs/PointCloud2 of points (N, 3) in metres."""
+    """Return a sensor_msgs/PointCloud2 of points (N, 3) in metres."""
     points = np.zeros(len(xyz), [("x", np.float32), ("y", np.float32), ("z", np.float32)])
     points["x"], points["y"], points["z"] = np.asarray(xyz, np.float32).T
     return cloud_message(points, frame_id, stamp)
@@ -161,7 +161,7 @@ def _cloud_dtype(fields: tuple[tuple[str, int, int], ...], step: int) -> np.dtyp
 
 
 def cloud_array(message: Any) -> NDArray[Any]:
-    """Structured view (N,) of a PointCloud2, its rows concatenated.
+    """Return the structured view (N,) of a PointCloud2, its rows concatenated.
 
     Raises:
         MessageError: big-endian data, unknown field type, or too few bytes.
@@ -182,12 +182,12 @@ def cloud_array(message: Any) -> NDArray[Any]:
 
 
 def cloud_xyz(message: Any) -> NDArray[np.float32]:
-    """Coordinates (N, 3) of a PointCloud2, in metres."""
+    """Return the coordinates (N, 3) of a PointCloud2, in metres."""
     return cloud_points(cloud_array(message))
 
 
 def cloud_points(points: NDArray[Any]) -> NDArray[np.float32]:
-    """Coordinates (N, 3) of a structured array (N,) with the fields x, y and z."""
+    """Return the coordinates (N, 3) of a structured array (N,) with the fields x, y and z."""
     return np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float32, copy=False)
 
 
@@ -202,7 +202,7 @@ def scan_message(
     intensities: ArrayLike | None = None,
     scan_time: float = 0.1,
 ) -> Any:
-    """sensor_msgs/LaserScan; ranges in metres as in REP-117 (inf: no return)."""
+    """Return a sensor_msgs/LaserScan; ranges in metres as in REP-117 (inf: no return)."""
     values = np.asarray(ranges, np.float32)
     return message_type("LaserScan")(
         header=header(frame_id, stamp),
@@ -221,7 +221,7 @@ def scan_message(
 def grid_message(
     grid: NDArray[np.int8], resolution: float, origin_xy: Sequence[float], frame_id: str, stamp: int
 ) -> Any:
-    """nav_msgs/OccupancyGrid; ``grid`` (H, W) int8, −1 unknown, 0..100; row 0 has the lowest y."""
+    """Return a nav_msgs/OccupancyGrid; ``grid`` (H, W) int8, −1 unknown, 0..100; row 0 has the lowest y."""
     height, width = grid.shape
     origin = np.eye(4)
     origin[:2, 3] = origin_xy[:2]
@@ -238,7 +238,7 @@ def grid_message(
 
 
 def grid_array(message: Any) -> tuple[NDArray[np.int8], float, tuple[float, float]]:
-    """``(grid (H, W) int8, resolution in m, (x, y) of the grid's corner)`` from an OccupancyGrid.
+    """Return ``(grid (H, W) int8, resolution in m, (x, y) of the grid's corner)`` from an OccupancyGrid.
 
     Raises:
         MessageError: the number of cells is not width × height.
@@ -256,7 +256,7 @@ def grid_array(message: Any) -> tuple[NDArray[np.int8], float, tuple[float, floa
 
 
 def pose_message(matrix: Matrix) -> Any:
-    """geometry_msgs/Pose from a 4×4 matrix."""
+    """Return a geometry_msgs/Pose from a 4×4 matrix."""
     x, y, z = matrix[:3, 3].tolist()
     qx, qy, qz, qw = quaternion_from_matrix(matrix).tolist()
     return message_type("Pose")(
@@ -266,12 +266,12 @@ def pose_message(matrix: Matrix) -> Any:
 
 
 def pose2_from_message(message: Any) -> NDArray[np.float64]:
-    """Planar pose (3,) of a Pose, PoseStamped, PoseWithCovariance, Odometry, ...; errors as `matrix_from_pose`."""
+    """Return the planar pose (3,) of a pose message or Odometry; errors as `matrix_from_pose`."""
     return pose2_from_matrix(matrix_from_pose(message))
 
 
 def pose2_message(pose: ArrayLike) -> Any:
-    """geometry_msgs/Pose from a planar pose (x, y, yaw)."""
+    """Return a geometry_msgs/Pose from a planar pose (x, y, yaw)."""
     x, y, yaw = np.asarray(pose, np.float64).tolist()
     half = 0.5 * wrap_angle(yaw)
     return message_type("Pose")(
@@ -281,7 +281,7 @@ def pose2_message(pose: ArrayLike) -> Any:
 
 
 def matrix_from_pose(pose: Any) -> Matrix:
-    """4×4 matrix from a Pose, PoseStamped, PoseWithCovariance(Stamped) or Odometry.
+    """Return the 4×4 matrix from a Pose, PoseStamped, PoseWithCovariance(Stamped) or Odometry.
 
     Raises:
         MessageError: the quaternion is zero or not finite.
@@ -300,12 +300,12 @@ def _matrix(rotation: Any, translation: Any, what: str) -> Matrix:
 
 
 def pose_stamped(matrix: Matrix, frame_id: str, stamp: int) -> Any:
-    """geometry_msgs/PoseStamped."""
+    """Return a geometry_msgs/PoseStamped."""
     return message_type("PoseStamped")(header=header(frame_id, stamp), pose=pose_message(matrix))
 
 
 def transform_message(parent_from_child: Matrix, parent: str, child: str, stamp: int) -> Any:
-    """geometry_msgs/TransformStamped."""
+    """Return a geometry_msgs/TransformStamped."""
     pose = pose_message(parent_from_child)
     translation = message_type("Vector3")(x=pose.position.x, y=pose.position.y, z=pose.position.z)
     return message_type("TransformStamped")(
@@ -316,7 +316,7 @@ def transform_message(parent_from_child: Matrix, parent: str, child: str, stamp:
 
 
 def transform_matrix(message: Any) -> Matrix:
-    """4×4 ``parent_from_child`` from a Transform or TransformStamped.
+    """Return the 4×4 ``parent_from_child`` from a Transform or TransformStamped.
 
     Raises:
         MessageError: the quaternion is zero or not finite.
@@ -326,7 +326,7 @@ def transform_matrix(message: Any) -> Matrix:
 
 
 def twist_message(v: float = 0.0, w: float = 0.0) -> Any:
-    """geometry_msgs/Twist of a planar robot: m/s forward, rad/s counter-clockwise."""
+    """Return a geometry_msgs/Twist of a planar robot: m/s forward, rad/s counter-clockwise."""
     vector = message_type("Vector3")
     return message_type("Twist")(linear=vector(x=float(v), y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=float(w)))
 
@@ -336,19 +336,19 @@ HARD_STOP = "hard_stop"
 
 
 def twist_stamped(v: float, w: float, stamp: int, frame_id: str = "base_link") -> Any:
-    """geometry_msgs/TwistStamped of a planar robot; ``frame_id`` is ``HARD_STOP`` for a stop without the soft ramp."""
+    """Return a TwistStamped of a planar robot; ``frame_id`` is ``HARD_STOP`` for a stop without the soft ramp."""
     return message_type("TwistStamped")(header=header(frame_id, stamp), twist=twist_message(v, w))
 
 
 def twist_values(message: Any) -> tuple[float, float]:
-    """``(v in m/s, w in rad/s)`` from a Twist, TwistStamped, TwistWithCovariance or Odometry."""
+    """Return ``(v in m/s, w in rad/s)`` from a Twist, TwistStamped, TwistWithCovariance or Odometry."""
     while hasattr(message, "twist"):
         message = message.twist
     return float(message.linear.x), float(message.angular.z)
 
 
 def battery_message(voltage_v: float, charge: float, frame_id: str, stamp: int) -> Any:
-    """sensor_msgs/BatteryState of a discharging battery with ``charge`` 0-1; what is not measured is NaN."""
+    """Return a sensor_msgs/BatteryState of a discharging battery with ``charge`` 0-1; what is not measured is NaN."""
     state, nan, none = message_type("BatteryState"), float("nan"), np.zeros(0, np.float32)
     return state(
         header=header(frame_id, stamp),
@@ -380,7 +380,7 @@ def odometry_message(
     pose_covariance: NDArray[np.float64] | None = None,
     twist_covariance: NDArray[np.float64] | None = None,
 ) -> Any:
-    """nav_msgs/Odometry; covariances (6, 6) in the order x y z rx ry rz (REP-103), zero by default."""
+    """Return a nav_msgs/Odometry; covariances (6, 6) in the order x y z rx ry rz (REP-103), zero by default."""
     zero = np.zeros((6, 6))
     pose_cov = zero if pose_covariance is None else pose_covariance
     twist_cov = zero if twist_covariance is None else twist_covariance
@@ -398,7 +398,7 @@ def odometry_message(
 
 
 def path_message(poses: ArrayLike, frame_id: str, stamp: int) -> Any:
-    """nav_msgs/Path from planar poses (N, 3)."""
+    """Return a nav_msgs/Path from planar poses (N, 3)."""
     array, shared = np.asarray(poses, np.float64).reshape(-1, 3), header(frame_id, stamp)
     stamped = message_type("PoseStamped")
     return message_type("Path")(
@@ -407,5 +407,5 @@ def path_message(poses: ArrayLike, frame_id: str, stamp: int) -> Any:
 
 
 def path_array(message: Any) -> NDArray[np.float64]:
-    """Planar poses (N, 3) from a nav_msgs/Path."""
+    """Return the planar poses (N, 3) from a nav_msgs/Path."""
     return np.array([pose2_from_message(p) for p in message.poses]).reshape(-1, 3)

@@ -17,18 +17,18 @@ _COLUMN = 40
 
 @functools.cache
 def ros_fields() -> dict[str, dict[str, str]]:
-    """Comments on the ROS 2 types that this stack uses: type → field → unit, frame or meaning."""
+    """Return the comments on the ROS 2 types that this stack uses: type → field → unit, frame or meaning."""
     comments: dict[str, dict[str, str]] = yaml.safe_load(_ROS_FIELDS.read_text(encoding="utf-8"))
     return comments
 
 
 def own_types() -> list[str]:
-    """Full names of the types defined in this project."""
+    """Return the full names of the types defined in this project."""
     return sorted(f"{path.parent.name}/msg/{path.stem}" for path in DEFINITIONS.glob("*/*.msg"))
 
 
 def definition(name: str) -> str:
-    """Definition of a type, by full or short name, with its comments, without nested types.
+    """Return the definition of a type, by full or short name, with its comments, without nested types.
 
     Raises:
         MessageError: no such type.

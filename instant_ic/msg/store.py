@@ -120,7 +120,7 @@ class TypeIndex:
 
 
 def entries_of(store: Typestore, names: set[str] | None = None) -> dict[str, Entry]:
-    """Definitions of a store's types.
+    """Return the definitions of a store's types.
 
     Args:
         store: with all nested types.
@@ -142,7 +142,7 @@ def entries_of(store: Typestore, names: set[str] | None = None) -> dict[str, Ent
 
 
 def read_entries(definitions: Path, make: Callable[[], Typestore]) -> dict[str, Entry]:
-    """All definitions, from the cache if it belongs to this rosbags and these files.
+    """Return all definitions, from the cache if it belongs to this rosbags and these files.
 
     Args:
         definitions: folder of our own ``.msg`` files.
@@ -163,7 +163,7 @@ def read_entries(definitions: Path, make: Callable[[], Typestore]) -> dict[str, 
 
 
 def _key(definitions: Path) -> str:
-    """Text that changes with whatever the definitions depend on."""
+    """Return a hash of everything that the definitions depend on."""
     import rosbags
 
     digest = hashlib.sha256(Path(__file__).read_bytes())

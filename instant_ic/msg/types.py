@@ -32,7 +32,7 @@ class MessageError(ValueError):
 
 @functools.cache
 def typestore() -> Typestore:
-    """Store of rosbags with Jazzy's types and our own, for tools; created once per process (about 0.1 s).
+    """Return the store of rosbags with Jazzy's types and our own, for tools; created once per process (about 0.1 s).
 
     Its classes are not those of :func:`message_type`.
     """
@@ -79,7 +79,7 @@ def register_type(name: str, definition: str) -> None:
 
 @functools.cache
 def message_type(name: str) -> Any:
-    """Class of a type by full name (``sensor_msgs/msg/Image``, ``sensor_msgs/Image``) or short name (``Image``).
+    """Return the class of a type by full (``sensor_msgs/msg/Image``, ``sensor_msgs/Image``) or short name (``Image``).
 
     Raises:
         MessageError: no such type.
@@ -96,7 +96,7 @@ def message_type(name: str) -> Any:
 
 
 def type_name(message_or_class: Any) -> str:
-    """Full type name, for example ``sensor_msgs/msg/Image``.
+    """Return the full type name, for example ``sensor_msgs/msg/Image``.
 
     Raises:
         MessageError: the object is not a message.
@@ -109,7 +109,7 @@ def type_name(message_or_class: Any) -> str:
 
 @functools.cache
 def type_hash(name: str) -> str:
-    """RIHS01 hash of a type, as ROS 2 computes it."""
+    """Return the RIHS01 hash of a type, as ROS 2 computes it."""
     return str(_index().entries[name]["hash"])
 
 
@@ -126,7 +126,7 @@ def serialize(message: Any) -> memoryview:
 
 
 def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
-    """Size of a message's CDR bytes, and a function that writes them into memory of that size.
+    """Return the size of a message's CDR bytes, and a function that writes them into memory of that size.
 
     This allows a large message to be written once, straight into shared memory. Previous contents do not matter.
 
