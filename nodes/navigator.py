@@ -114,7 +114,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.cmd_vel.publish(msg.twist_stamped(*command, self.clock.now_ns()))
 
     def command(self, state: msg.ControlState) -> tuple[float, float]:
-        """Twist for the r-bot; zero, with a diagnosis, while an input is missing."""
+        """Return the twist for the r-bot; zero, with a diagnosis, while an input is missing."""
         grid, goal = self.costmap.fresh, self.subgoal.fresh
         if grid is None or goal is None:
             missing = "costmap" if grid is None else "subgoal"

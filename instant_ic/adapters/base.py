@@ -36,7 +36,7 @@ class BaseCommand(NamedTuple):
 
 
 def read_command(received: Received) -> BaseCommand:
-    """The command of a Twist or TwistStamped.
+    """Return the command of a Twist or TwistStamped.
 
     Raises:
         NodeError: the message is of another type.
@@ -51,7 +51,7 @@ def read_command(received: Received) -> BaseCommand:
 
 
 def estimate_message(estimate: OdometryEstimate, odom_frame: str, base_frame: str) -> Any:
-    """Odometry of an estimate."""
+    """Return the odometry of an estimate."""
     v, lateral, w = (float(part) for part in estimate.twist)
     covariances = (estimate.pose_covariance, estimate.twist_covariance)
     odom_from_base = matrix_from_pose2(estimate.pose)

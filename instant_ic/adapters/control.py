@@ -73,7 +73,7 @@ class ArbiterInbox:
     _zeros_of: str = ""  # sender of the last zero
 
     def scan(self) -> ArrivedScan | None:
-        """The newest scan."""
+        """Return the newest scan."""
         latest = self.sources["scan"]
         m = latest.message
         if m is None:
@@ -82,7 +82,7 @@ class ArbiterInbox:
         return ArrivedScan(m.header.frame_id, stamp_ns(m), self._arrived_ns(latest), *beams)
 
     def cloud(self) -> ArrivedCloud | None:
-        """The newest 3D points; a message that cannot be read is reported to the surroundings."""
+        """Return the newest 3D points; a message that cannot be read is reported to the surroundings."""
         if self.points is None or self.points.message is None:
             return None
         message = self.points.message
@@ -164,7 +164,7 @@ class ArbiterInbox:
         return shown is not None and command is not None and stamp_ns(command) <= stamp_ns(shown.operator_lost)
 
     def ages(self, timeouts: TimeoutConfig, points_every_s: float = 0.0) -> dict[str, float]:
-        """Seconds since the newest message of each source, as ``ArbiterInputs.ages``."""
+        """Return seconds since the newest message of each source, as ``ArbiterInputs.ages``."""
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
         ages = {key: _age_s(latest) for key, latest in self.sources.items()} | {"vspace": self.vspace.age_s}
         ages |= self.view.ages(page_report(self.shown.message), self.shown.age_s, steady_ns)
@@ -178,7 +178,7 @@ class ArbiterInbox:
     def inputs(
         self, latch: KeptEstop, walls: WallMap | None, timeouts: TimeoutConfig, points_every_s: float = 0.0
     ) -> ArbiterInputs:
-        """Inputs of a step now; of the 3D points, the costmap takes a sweep every ``points_every_s`` (0: each)."""
+        """Return the inputs of a step now; the costmap takes a sweep of points every ``points_every_s`` (0: each)."""
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
         view, surroundings = self.view, self.surroundings
         ages, near = self.ages(timeouts, points_every_s), surroundings.near_points(self.scan())
@@ -269,12 +269,12 @@ def page_report(shown: ShownPictures | None) -> PageReport | None:
 
 
 def command_message(decision: Decision, now_ns: int) -> TwistStamped:
-    """Message for ``/cmd_vel``; its frame demands a hard stop where the operator did not command the zero."""
+    """Return the message for ``/cmd_vel``; its frame demands a hard stop if the operator did not command the zero."""
     return twist_stamped(*decision.command, now_ns, HARD_STOP if decision.hard else "base_link")
 
 
 def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> ControlState:
-    """ControlState of one step of the arbiter."""
+    """Return the ControlState of one step of the arbiter."""
     return ControlState(
         header=header("map", now_ns),
         mode=int(decision.mode),
@@ -306,12 +306,12 @@ def _pose_lost_probability(trust: PoseIntegrity | None) -> float:
 
 
 def _age_s(latest: Latest) -> float:
-    """Seconds since the newest message, by its stamp; inf without one."""
+    """Return seconds since the newest message, by its stamp; inf without one."""
     return math.inf if latest.message is None else latest.stamp_age_s
 
 
 def _present_pose(odometry: Odometry, now_ns: int) -> NDArray[np.float64]:
-    """Pose (3,) extrapolated to now: the message is up to a period old."""
+    """Return the pose (3,) extrapolated to now: the message is up to a period old."""
     pose = pose2_from_message(odometry)
     return extrapolate(pose, twist_values(odometry), (now_ns - stamp_ns(odometry)) / 1e9)
 

@@ -37,7 +37,7 @@ from instant_ic.util.diagnosis import Diagnosis, Level
 
 
 def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> tuple[Scan, FloatArray]:
-    """The scan of a LaserScan, and the laser's planar mount (3,) on the robot.
+    """Return the scan of a LaserScan, and the laser's planar mount (3,) on the robot.
 
     Raises:
         ScanError: the mount is not known yet, or the scan cannot be used.
@@ -54,7 +54,7 @@ def read_scan(message: LaserScan, mounts: TransformBuffer, base_frame: str) -> t
 
 
 def integrity_message(slam: GridSlam, result: SlamResult, map_frame: str, stamp: int) -> Any:
-    """PoseIntegrity after a scan, of which ``result`` is the result."""
+    """Return the PoseIntegrity after a scan, of which ``result`` is the result."""
     trust, found = result.integrity, slam.contradiction
     return PoseIntegrity(
         header=header(map_frame, stamp),
@@ -69,7 +69,7 @@ def integrity_message(slam: GridSlam, result: SlamResult, map_frame: str, stamp:
 
 
 def pose_message(result: SlamResult, map_frame: str, stamp: int) -> Any:
-    """PoseWithCovarianceStamped after a scan."""
+    """Return the PoseWithCovarianceStamped after a scan."""
     covariance = planar_covariance(result.covariance).reshape(36)
     pose = PoseWithCovariance(pose=_pose(matrix_from_pose2(result.map_from_base)), covariance=covariance)
     return PoseWithCovarianceStamped(header=header(map_frame, stamp), pose=pose)
@@ -83,7 +83,7 @@ def read_mounts(message: TFMessage, mounts: TransformBuffer) -> None:
 
 
 def read_initial_pose(message: PoseWithCovarianceStamped, map_frame: str) -> FloatArray:
-    """Pose (3,) that was set from outside.
+    """Return the pose (3,) that was set from outside.
 
     Raises:
         ValueError: it is in another frame than the map's.
@@ -94,7 +94,7 @@ def read_initial_pose(message: PoseWithCovarianceStamped, map_frame: str) -> Flo
 
 
 def map_messages(updates: MapUpdates, slam: GridSlam, map_frame: str, stamp: int, steady_ns: int) -> tuple[Any, Any]:
-    """OccupancyGridUpdate of the changed part and OccupancyGrid of the whole map; None for what is not to be sent."""
+    """Return the changed part (OccupancyGridUpdate) and the whole map (OccupancyGrid); None for what is not due."""
     part, whole = updates.update(slam.map_version, slam.grid, steady_ns)
     update = grid = None
     if part is not None:

@@ -128,7 +128,7 @@ class TrackWatch:
         return ""
 
     def _load(self, current_a: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Power that the loads of the tracks need at most, (2,), by the currents, amperes, (2,)."""
+        """Return the power that the loads of the tracks need at most, (2,), by the currents, amperes, (2,)."""
         known = (current_a >= LEAST_A) & (self._stall_a > 0.0)
         share = current_a / np.maximum(self._stall_a, LEAST_A)
         return np.where(known, np.minimum(_MARGIN * share + _MARGIN_POWER, _MOST_LOAD), _BLANKED_POWER)

@@ -20,7 +20,7 @@ class TwistLimiter:
         self.w = 0.0
 
     def step(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
-        """Next twist towards (v, w) after ``dt_s`` seconds.
+        """Return the next twist towards (v, w) after ``dt_s`` seconds.
 
         A twist above the speed limits is scaled as a whole, which keeps its curvature. Accelerations are limited
         separately.
@@ -38,7 +38,7 @@ class TwistLimiter:
         return self.v, self.w
 
     def brake(self, deceleration: float, w_deceleration: float, dt_s: float) -> tuple[float, float]:
-        """Next twist towards zero after ``dt_s`` seconds, at the given rates (m/s^2, rad/s^2)."""
+        """Return the next twist towards zero after ``dt_s`` seconds, at the given rates (m/s^2, rad/s^2)."""
         self.v = step_towards(self.v, 0.0, deceleration * dt_s)
         self.w = step_towards(self.w, 0.0, w_deceleration * dt_s)
         return self.v, self.w

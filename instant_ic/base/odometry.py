@@ -118,7 +118,7 @@ class WheelOdometry:
         self._pose = np.array([x, y, (yaw + np.pi) % (2.0 * np.pi) - np.pi])
 
     def _twist_covariance(self, step: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
-        """Covariance of the mean twist over the step: growth of the pose variance per second plus a floor, (6, 6)."""
+        """Return the covariance (6, 6) of the mean twist: growth of the pose's variance per second, plus a floor."""
         distance, turn = abs(float(step[0])), abs(float(step[2]))
         v_variance = _V_FLOOR**2 + _POSITION_PER_METRE * distance / dt_s
         w_variance = _W_FLOOR**2 + (_YAW_PER_METRE * distance + _YAW_PER_RADIAN * turn) / dt_s
@@ -126,5 +126,5 @@ class WheelOdometry:
 
 
 def unwrap_counts(before: NDArray[np.int64], now: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Signed pulses from one unsigned 32-bit count to the next, in the shorter direction."""
+    """Return the signed pulses from one unsigned 32-bit count to the next, in the shorter direction."""
     return (now - before + 2**31) % 2**32 - 2**31

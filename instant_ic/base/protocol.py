@@ -95,23 +95,23 @@ class ProtocolError(Exception):
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/XMODEM: polynomial 0x1021, initial 0, most significant bit first."""
+    """Compute the CRC-16/XMODEM: polynomial 0x1021, initial 0, most significant bit first."""
     return binascii.crc_hqx(data, 0)
 
 
 def write_frame(address: int, command: int, data: bytes = b"") -> bytes:
-    """Frame of a write command: address, command, data, CRC."""
+    """Return the frame of a write command: address, command, data, CRC."""
     body = bytes((address, command)) + data
     return body + struct.pack(">H", crc16(body))
 
 
 def read_request(address: int, command: int) -> bytes:
-    """Frame of a read command, which has no CRC."""
+    """Return the frame of a read command, which has no CRC."""
     return bytes((address, command))
 
 
 def encode_reply(address: int, command: int, data: bytes) -> bytes:
-    """Reply of the controller to a read command: data, then the CRC over address, command and data."""
+    """Return the reply of the controller to a read command: data, then the CRC over address, command and data."""
     return data + struct.pack(">H", crc16(bytes((address, command)) + data))
 
 
@@ -135,7 +135,7 @@ ESTOP_BITS = {4: 0x0001, 2: 0x0004}
 
 
 def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str]]:
-    """Texts of the faults and warnings in a status.
+    """Return the texts of the faults and warnings in a status.
 
     Args:
         status: value of command 90.

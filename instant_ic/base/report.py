@@ -30,13 +30,13 @@ class BaseReport:
         self._repeats, self._jumps = RecentCount(config.recent_s), RecentCount(config.recent_s)
 
     def link(self, connected: bool, text: str, steady_ns: int) -> Diagnosis:
-        """A change of the serial link; soon after the start, a missing controller is only a warning."""
+        """Diagnose a change of the serial link; soon after the start, a missing controller is only a warning."""
         self._linked |= connected
         starting = not self._linked and steady_ns - self._started_ns < _CONNECT_GRACE_S * 1e9
         return Diagnosis("link", Level.OK if connected else Level.WARN if starting else Level.ERROR, text)
 
     def recent(self, steady_ns: int) -> Iterator[Diagnosis]:
-        """Repeated commands and impossible encoder readings of the last ``recent_s``."""
+        """Yield the diagnoses of repeated commands and impossible encoder readings in the last ``recent_s``."""
         counters, recent = self._controller.roboclaw.counters, f"the last {self.config.recent_s:g} s"
         repeated = self._repeats.rise(counters.retries, steady_ns)
         values = {
@@ -69,7 +69,7 @@ class BaseReport:
         self._fault = "the motor controller has restarted: check its supply voltage"
 
     def controller(self, status: ControllerStatus) -> Diagnosis:
-        """Faults and warnings of the controller; a fault until the stop is released, under its name."""
+        """Diagnose faults and warnings of the controller; a fault lasts until the stop is released."""
         faults, warnings = ", ".join(status.faults), ", ".join(status.warnings)
         self._fault = faults or self._fault
         values = {"status": f"0x{status.value:0{2 * status.size}x}"}
@@ -84,6 +84,6 @@ class BaseReport:
         self._fault = ""
 
     def charge(self, health: Health) -> float:
-        """Charge of the battery by its voltage, 0-1."""
+        """Return the charge of the battery by its voltage, 0-1."""
         empty_v, full_v = self.config.battery_empty_v, self.config.battery_full_v
         return min(1.0, max(0.0, (health.battery_v - empty_v) / (full_v - empty_v)))

@@ -127,7 +127,7 @@ _DRAIN_READS = 20
 
 
 def _tenths(timeout_s: float) -> int:
-    """Value of command 14 for a watchdog time: rounded down, at least 1, because 0 turns the watchdog off."""
+    """Return the value of command 14 for a watchdog time, rounded down, at least 1: 0 turns the watchdog off."""
     return max(1, int(timeout_s * 10 + 1e-6))
 
 
@@ -241,7 +241,7 @@ class Roboclaw:
             )
 
     def watchdog_s(self) -> float:
-        """Watchdog time of the controller, seconds; 0 is off (command 15)."""
+        """Return the watchdog time of the controller, seconds; 0 is off (command 15)."""
         return self._read(Command.READ_TIMEOUT, 1)[0] * 0.1
 
     def check_button(self) -> None:
@@ -291,23 +291,23 @@ class Roboclaw:
         return self._read(Command.READ_SPEED_ERROR_LIMITS, len(wanted)) == wanted
 
     def pwm(self) -> NDArray[np.float64]:
-        """Power on M1 and M2, -1 to 1, (2,) (command 48)."""
+        """Return the power on M1 and M2, -1 to 1, (2,) (command 48)."""
         return np.array(struct.unpack(">hh", self._read(Command.READ_PWM, 4))) / PWM_MAX
 
     def currents_a(self) -> NDArray[np.float64]:
-        """Currents of M1 and M2, amperes, (2,) (command 49)."""
+        """Return the currents of M1 and M2, amperes, (2,) (command 49)."""
         return np.array(struct.unpack(">hh", self._read(Command.READ_CURRENTS, 4))) * 0.01
 
     def encoders(self) -> NDArray[np.int64]:
-        """Counts of M1 and M2 modulo 2^32, (2,) (command 78)."""
+        """Return the counts of M1 and M2 modulo 2^32, (2,) (command 78)."""
         return np.array(struct.unpack(">II", self._read(Command.READ_ENCODERS, 8)), np.int64)
 
     def battery_v(self) -> float:
-        """Main battery voltage, volts (command 24)."""
+        """Return the main battery voltage, volts (command 24)."""
         return int.from_bytes(self._read(Command.READ_MAIN_BATTERY, 2), "big") * 0.1
 
     def status(self) -> ControllerStatus:
-        """Faults and warnings (command 90).
+        """Return the faults and warnings (command 90).
 
         Old firmware replies with 2 bytes, newer firmware with 4. The first reply determines the size, which is kept
         until the next connect, so that old firmware does not cost a time-out on each call.
@@ -318,7 +318,7 @@ class Roboclaw:
         return ControllerStatus(int.from_bytes(data, "big"), len(data))
 
     def version(self) -> str:
-        """Firmware version text (command 21)."""
+        """Return the firmware version text (command 21)."""
         return self._transact(Command.READ_VERSION, self._version_reply).decode("ascii", "replace").strip()
 
     def _watchdog_holds(self, found_s: float) -> bool:
@@ -350,7 +350,7 @@ class Roboclaw:
         return self._transact(command, self._reply(size))
 
     def _reply(self, *sizes: int) -> Callable[[SerialPort, int], bytes]:
-        """Reader of a reply with one of ``sizes`` bytes of data, which depend on the firmware; ascending."""
+        """Return the reader of a reply with one of ``sizes`` bytes of data, which depend on the firmware; ascending."""
 
         def read(port: SerialPort, command: int) -> bytes:
             received = port.read(sizes[-1] + 2)

@@ -113,7 +113,7 @@ def read_recording(
 
 
 def read_clouds(bag: BagReader, points_topic: str = "") -> tuple[TransformBuffer, Iterator[CalibrationCloud]]:
-    """All transforms of a bag, and its LiDAR revolutions, from points or packets.
+    """Return the all transforms of a bag, and its LiDAR revolutions, from points or packets.
 
     Raises:
         BagError: the bag is damaged.
@@ -151,7 +151,7 @@ def _transforms(bag: BagReader, types: dict[str, str]) -> TransformBuffer:
 
 
 def _stamps(path: Path, bag: BagReader, topic: str) -> tuple[list[int], str]:
-    """Stamps of the images in rising order, and their frame id."""
+    """Return the stamps of the images in rising order, and their frame id."""
     stamps, frame = set(), ""
     for message in bag.messages([topic]):
         picture = deserialize(message.payload, message.type_name)
@@ -209,7 +209,7 @@ def _places(stamps: list[int], transforms: TransformBuffer | None, most_frames: 
 
 
 def _moved(a: Matrix, b: Matrix) -> tuple[float, float]:
-    """Distance in metres and yaw in radians between two poses."""
+    """Return the distance in metres and yaw in radians between two poses."""
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), abs(wrap_angle(yaw_of(b) - yaw_of(a)))
 
 
@@ -220,7 +220,7 @@ def _evenly(values: list[int], most: int) -> list[int]:
 
 
 def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) -> Iterator[CalibrationCloud]:
-    """Revolutions from points or packets whose messages are close in time to an image."""
+    """Return the revolutions from points or packets whose messages are close in time to an image."""
     if kind == CLOUD:
         for message in bag.messages([topic]):
             if near(message.stamp_ns):
@@ -241,7 +241,7 @@ def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) 
 def _nearest_clouds(
     path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int]
 ) -> dict[int, CalibrationCloud]:
-    """Revolution nearest in time to each stamp, where one is near enough."""
+    """Return the revolution nearest in time to each stamp, where one is near enough."""
     # The bag stamps messages on arrival, up to a second late on a busy machine.
     at = np.array(stamps)
     found: dict[int, CalibrationCloud] = {}

@@ -97,13 +97,13 @@ def lidar_edges(points: Floats, intensity: Floats, ring: NDArray[np.integer], fl
 
 
 def _between(points: Floats, range_m: Floats, a: NDArray[np.intp], b: NDArray[np.intp], at_m: Floats) -> Floats:
-    """Points (K, 3) at distance ``at_m`` in the directions halfway between points ``a`` and ``b``."""
+    """Return points (K, 3) at distance ``at_m`` in the directions halfway between points ``a`` and ``b``."""
     middle = points[a] / range_m[a][:, None] + points[b] / range_m[b][:, None]
     return np.asarray(middle * (at_m / np.linalg.norm(middle, axis=1))[:, None])
 
 
 def _jumps(points: Floats, range_m: Floats, ring: NDArray[np.int64], azimuth: Floats) -> Floats:
-    """Near side of depth discontinuities along a ring; that surface ends there in the image too."""
+    """Find the near side of depth discontinuities along a ring; that surface ends there in the image, too."""
     a = np.arange(max(len(range_m) - 1, 0))
     b = a + 1
     near = np.minimum(range_m[a], range_m[b])
@@ -113,7 +113,7 @@ def _jumps(points: Floats, range_m: Floats, ring: NDArray[np.int64], azimuth: Fl
 
 
 def _shades(points: Floats, range_m: Floats, intensity: Floats, ring: NDArray[np.int64], azimuth: Floats) -> Floats:
-    """Points on one surface where the mean intensities of the three points before and after differ most."""
+    """Find points on one surface where the mean intensities of the three points before and after differ most."""
     if len(range_m) < 7:
         return np.empty((0, 3))
     i = np.arange(3, len(range_m) - 2)
@@ -135,7 +135,7 @@ def _across_rings(
     azimuth: Floats,
     floor: FloorPlane | None,
 ) -> tuple[Floats, Floats]:
-    """Feet of walls, and intensity steps between neighbouring rings."""
+    """Find feet of walls, and intensity steps between neighbouring rings."""
     table = np.full((int(ring.max(initial=0)) + 1, _COLUMNS), -1)
     table[ring, ((azimuth + np.pi) * (_COLUMNS / (2 * np.pi))).astype(np.intp) % _COLUMNS] = np.arange(len(ring))
     low, high = table[:-1].ravel(), table[1:].ravel()
@@ -157,7 +157,7 @@ def _across_rings(
 
 
 def picture_edges(rgb: NDArray[np.uint8], sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Blurred strength of vertical and of horizontal edges of a panorama (H, W, 3), each (H, W), divided by its mean.
+    """Compute the strengths of a panorama's (H, W, 3) vertical and horizontal edges, (H, W), over their mean.
 
     Computed from the logarithm of the brightness, so that dark and bright corners count alike. The strongest twentieth
     is clipped, so that a lamp does not outweigh everything else.

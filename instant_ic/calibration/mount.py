@@ -113,7 +113,7 @@ class _EdgeLevel:
         self.plane = (edges.frame + np.where(edges.upright, 0, len(frames))).astype(np.int64)
 
     def each(self, camera_from_lidar: Matrix) -> NDArray[np.float64]:
-        """Weighted strength under each edge point, (N,)."""
+        """Return the weighted strength under each edge point, (N,)."""
         from instant_ic.calibration.kernels import strength_under
 
         strength = np.empty(len(self.plane))
@@ -121,7 +121,7 @@ class _EdgeLevel:
         return np.asarray(self.edges.weight * strength)
 
     def score(self, camera_from_lidar: Matrix) -> float:
-        """Weighted mean strength under the edge points."""
+        """Return the weighted mean strength under the edge points."""
         return float(self.each(camera_from_lidar).sum() / self.edges.weight.sum())
 
 
@@ -265,13 +265,13 @@ def _moved(camera_from_lidar: Matrix, units: Floats) -> Matrix:
 
 
 def _correction(before: Matrix, after: Matrix) -> NDArray[np.float64]:
-    """Motion (6,) in the camera's frame, metres and radians, from one pose to another; inverse of ``_moved``."""
+    """Return the motion (6,) from one pose to another in the camera's frame, metres and radians."""
     change = after @ np.linalg.inv(before)
     return np.concatenate([change[:3, 3], Rotation.from_matrix(change[:3, :3]).as_rotvec()])
 
 
 def _around(level: _EdgeLevel, camera_from_lidar: Matrix, step_deg: float) -> tuple[Matrix, float]:
-    """Pose with the best yaw of the full circle, and the score ratio of its closest rival."""
+    """Return the pose with the best yaw of the full circle, and the score ratio of its closest rival."""
     count = round(360 / step_deg)
     yaws = np.arange(count) * (2 * np.pi / count)
     scores = np.array([level.score(_turned(camera_from_lidar, yaw)) for yaw in yaws])
@@ -283,7 +283,7 @@ def _around(level: _EdgeLevel, camera_from_lidar: Matrix, step_deg: float) -> tu
 
 
 def _climb(level: _EdgeLevel, start: Matrix, found: Matrix) -> Matrix:
-    """Pose of the highest score near ``found``, with a weak prior towards ``start``."""
+    """Return the pose of the highest score near ``found``, with a weak prior towards ``start``."""
     from scipy.optimize import minimize
 
     reach = np.array([_REACH_M] * 3 + [math.radians(_REACH_DEG)] * 3) / _UNIT
@@ -330,13 +330,13 @@ def _among_rivals(level: _EdgeLevel, start: Matrix, found: Matrix) -> tuple[Matr
 
 
 def _difference(level: _EdgeLevel, best: Matrix, other: Matrix) -> float:
-    """Score difference between two poses in standard deviations of the scatter over the blocks."""
+    """Return the score difference between two poses in standard deviations of the scatter over the blocks."""
     apart = np.bincount(level.edges.block, level.each(best) - level.each(other))
     return float(apart.sum() / max(float(np.sqrt((apart**2).sum())), 1e-12))
 
 
 def _covariance(level: _EdgeLevel, found: Matrix) -> NDArray[np.float64]:
-    """Covariance (6, 6) of the maximum in ``_UNIT``: H^-1 G H^-1 with the scatter G of the blocks' gradients."""
+    """Return the covariance (6, 6) of the maximum in ``_UNIT``: H^-1 G H^-1, G the scatter of block gradients."""
     edges, step = level.edges, 1.0
 
     def at(units: Floats) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from instant_ic.geometry.poses import Matrix, transform_points
 
 
 def overlay(frame: CalibrationFrame, camera_from_lidar: Matrix, width: int = 1600) -> NDArray[np.uint8]:
-    """Points coloured by range (near bright, far dark) on a dimmed panorama, (width / 2, width, 3) RGB."""
+    """Render points by range (near bright, far dark) on a dimmed panorama, (width / 2, width, 3) RGB."""
     import cv2
 
     picture = cv2.resize(frame.rgb, (width, width // 2), interpolation=cv2.INTER_AREA)
@@ -28,7 +28,7 @@ def overlay(frame: CalibrationFrame, camera_from_lidar: Matrix, width: int = 160
 def before_and_after(
     frames: list[CalibrationFrame], before: Matrix, after: Matrix, most: int = 3, width: int = 1600
 ) -> NDArray[np.uint8]:
-    """Sheet of some frames, each with the overlay before and after, cropped to the rows that the LiDAR sees."""
+    """Render some frames, each with the overlay before and after, cropped to the rows that the LiDAR sees."""
     import cv2
 
     places = np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int)

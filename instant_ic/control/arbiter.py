@@ -164,7 +164,7 @@ class Arbiter:
         )
 
     def stale_in_s(self, inputs: ArbiterInputs, now_ns: int) -> float:
-        """Seconds from this step until the first fresh source becomes stale; inf for none.
+        """Return seconds from this step until the first fresh source becomes stale; inf for none.
 
         A step at that moment sends the zero command on time, not up to a period later.
         """
@@ -215,7 +215,7 @@ class Arbiter:
     # -- assessing the inputs
 
     def _assess(self, inputs: ArbiterInputs, now_ns: int) -> Snapshot:
-        """Snapshot of this step; keeps the instants from which its durations count."""
+        """Return the snapshot of this step; keeps the instants from which its durations count."""
         in_mode_s = self._since_s(self._since_ns, now_ns, 0.0)
         operator = self._operator
         if inputs.vspace.ready:
@@ -292,7 +292,7 @@ class Arbiter:
         return inputs.contradictions > self._contradictions
 
     def _vbot_jumps(self, pose: NDArray[np.float64], now_ns: int) -> bool:
-        """As ``_jumps``, while the r-bot follows the v-bot."""
+        """Return whether the v-bot's pose jumps, as ``_jumps``, while the r-bot follows it."""
         if not self.mode.shows_vbot:
             self._poses_before.pop("v-bot", None)
             return False
@@ -313,7 +313,7 @@ class Arbiter:
         )
 
     def _durations_s(self, now_ns: int) -> tuple[float, float]:
-        """Seconds since the last change of mode, and since the v-bot has been shown."""
+        """Return seconds since the last change of mode, and since the v-bot has been shown."""
         return self._since_s(self._since_ns, now_ns, 0.0), self._since_s(self._shown_since_ns, now_ns, 0.0)
 
     @staticmethod
@@ -321,7 +321,7 @@ class Arbiter:
         return otherwise_s if since_ns is None else (now_ns - since_ns) / 1e9
 
     def _vspace(self, inputs: ArbiterInputs, now_ns: int) -> Vspace:
-        """Status of the virtual space, or of its last ready keyframe for a short time while it learns the next one."""
+        """Return the status of the virtual space; for a short time that of its last ready keyframe while it learns."""
         now = inputs.vspace
         if now.ready or not now.training or self._ready is None:
             return now
@@ -365,7 +365,7 @@ class Arbiter:
         return s.agree_s < 0.0 and abs(linear) < STANDS_M_S and abs(angular) < STANDS_RAD_S
 
     def _against_switch(self, s: Snapshot, now_ns: int) -> Notice | None:
-        """Reason against a switch, where the question arises: in REAL, with an obstacle ahead."""
+        """Return the reason against a switch, where the question arises: in REAL, with an obstacle ahead."""
         if s.mode != Mode.REAL or not s.obstacle_ahead:
             return None
         if estop_pressed(s):
@@ -373,7 +373,7 @@ class Arbiter:
         return hold(s) or against_switch(s) or self._blocked_passage(s, now_ns)
 
     def _blocked_passage(self, s: Snapshot, now_ns: int) -> Notice | None:
-        """Reason why there is no way round the obstacle ahead; None when there is one.
+        """Return the reason why there is no way round the obstacle ahead; None when there is one.
 
         Planning takes milliseconds, so the answer is kept for a costmap's period.
         """
@@ -386,7 +386,7 @@ class Arbiter:
 
 
 def _nothing(snapshot: Snapshot, now_ns: int) -> None:
-    """The new state does everything."""
+    """Do nothing more than the new state does."""
 
 
 def _kept(since_ns: int | None, now_ns: int) -> int:
@@ -401,7 +401,7 @@ def _target(inputs: ArbiterInputs) -> NDArray[np.float64]:
 
 
 def _may_enter_again(s: Snapshot) -> bool:
-    """After an abandoned entry: do not retry under a held key, wait until a view fits or the operator lets go."""
+    """Block a retry after an abandoned entry until a view fits or the operator lets go of the controls."""
     if s.mode != Mode.REAL:
         return False
     switch = s.config.switch

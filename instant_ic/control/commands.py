@@ -40,7 +40,7 @@ class CommandRules:
         self.sources = SourceMonitor(config)
 
     def command(self, s: Snapshot, stopped_by: Notice) -> DriveCommand:
-        """Command of the present state; ``stopped_by``: what led to STOPPED."""
+        """Return the command of the present state; ``stopped_by``: what led to STOPPED."""
         if s.mode == Mode.STOPPED:
             return DriveCommand(NO_MOTION, why_stopped(s, stopped_by), hard=True)
         held = hold(s)
@@ -54,7 +54,7 @@ class CommandRules:
         return sent
 
     def _virtual(self, s: Snapshot) -> DriveCommand:
-        """The path follower's command; the operator drives the v-bot."""
+        """Return the path follower's command; the operator drives the v-bot."""
         hard = not s.fresh
         if s.leading_back:
             text = "no command: the view goes back to the robot; drive to continue"
@@ -81,7 +81,7 @@ class CommandRules:
         return DriveCommand(sent.command, notice, hard=hard or sent.action == "stop")
 
     def _real(self, s: Snapshot) -> DriveCommand:
-        """The operator's command, slowed before an obstacle and during a switch."""
+        """Return the operator's command, slowed before an obstacle and during a switch."""
         command, blocked, notice = s.command, False, Notice(Reason.DRIVE_ROBOT, "you drive the robot")
         if s.prediction is not None and s.obstacle_ahead and command != NO_MOTION:
             command = self._slowed(command, s.prediction.distance_m, s.predictor.reach_m)
@@ -113,7 +113,7 @@ class CommandRules:
         return DriveCommand(sent.command, notice, blocked, hard=not s.fresh or sent.action == "stop")
 
     def monitored(self, command: Twist2, inputs: ArbiterInputs) -> MonitoredCommand:
-        """The command after the collision monitor, which gets all points seen and remembered near the robot."""
+        """Return the command after the collision monitor, which gets all points seen and remembered near the robot."""
         points = inputs.scan_points
         if command != NO_MOTION and inputs.costmap is not None and inputs.robot_pose is not None:
             config = self.config.collision_monitor
@@ -123,7 +123,7 @@ class CommandRules:
         return self.monitor.limit(command, points, age_s, inputs.robot_velocity, inputs.moving)
 
     def _slowed(self, command: Twist2, distance_m: float, reach_m: float) -> Twist2:
-        """The command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""
+        """Return the command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""
         left = max(0.0, distance_m - self.config.switch.stop_margin_m)
         # Half of the base's deceleration; the other half covers the latency.
         allowed = math.sqrt(self.config.limits.max_linear_accel_m_s2 * left)
@@ -132,7 +132,7 @@ class CommandRules:
         return command[0] * factor, command[1] * factor
 
     def _paced(self, command: Twist2, s: Snapshot) -> Twist2:
-        """The command slowed to what the image rate and the trust in the pose allow, with the same curvature."""
+        """Return the command slowed to what the image rate and the trust in the pose allow, with the same curvature."""
         limit = self.sources.speed_limit_m_s(s.inputs, s.mode)
         if s.must_be_slow:
             limit = min(limit, self.config.pose_trust.speed_m_s)
@@ -167,7 +167,7 @@ def why_stopped(s: Snapshot, stopped_by: Notice) -> Notice:
 
 
 def _far_from_keyframe(s: Snapshot) -> str:
-    """Text for a v-bot outside the region that the virtual space shows well; "" inside."""
+    """Return the text for a v-bot outside the region that the virtual space shows well; "" inside."""
     expected_db = s.inputs.vspace.expected_psnr_db
     if 0.0 < expected_db < s.config.switch.min_expected_psnr_db:
         return f"; most of the view is guessed here ({expected_db:.0f} dB expected)"

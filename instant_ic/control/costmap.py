@@ -85,12 +85,12 @@ class Costmap:
     """(N, 2) centres of the cells that 3D points marked: low and hanging things that the flat scan does not see."""
 
     def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row and column of points (..., 2); not checked against the window."""
+        """Return the row and column of points (..., 2); not checked against the window."""
         index = np.floor((np.asarray(points, dtype=np.float64) - self.origin) / self.resolution).astype(np.int64)
         return index[..., 1], index[..., 0]
 
     def centres(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Centres (..., 2) of cells in metres."""
+        """Return the centres (..., 2) of cells in metres."""
         return self.origin + (np.stack([columns, rows], axis=-1) + 0.5) * self.resolution
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -100,14 +100,14 @@ class Costmap:
         return (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
 
     def cost_at(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Cost (...) at points (..., 2); UNKNOWN outside the window."""
+        """Return the cost (...) at points (..., 2); UNKNOWN outside the window."""
         rows, columns = self.cells(points)
         height, width = self.costs.shape
         found = self.costs[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
         return np.where(self.contains(points), found, UNKNOWN).astype(np.uint8)
 
     def lethal_overlap(self, poses: NDArray[np.float64], body: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Number of ``body`` points (M, 2) in a lethal cell, for each pose (N, 3)."""
+        """Return the number of ``body`` points (M, 2) in a lethal cell, for each pose (N, 3)."""
         poses = np.ascontiguousarray(poses, dtype=np.float64).reshape(-1, 3)
         body = np.ascontiguousarray(body, dtype=np.float64)
         ox, oy = float(self.origin[0]), float(self.origin[1])
@@ -115,7 +115,7 @@ class Costmap:
         return overlap
 
     def lethal_near(self, pose: NDArray[np.float64], radius_m: float) -> NDArray[np.float64]:
-        """Centres (N, 2) of lethal cells within ``radius_m`` of ``pose`` (x, y, yaw), in the frame of ``pose``."""
+        """Return the centres (N, 2) of lethal cells within ``radius_m`` of ``pose`` (x, y, yaw), in its frame."""
         row, column = (int(i) for i in self.cells(np.asarray(pose)[:2]))
         reach = math.ceil(radius_m / self.resolution) + 1
         top, left = max(0, row - reach), max(0, column - reach)
@@ -130,8 +130,8 @@ class Costmap:
     def memory_near(
         self, pose: NDArray[np.float64], blind_radius_m: float, remembered_radius_m: float
     ) -> NDArray[np.float64]:
-        """Marks that no sensor may see at present, (N, 2) in the frame of ``pose``: lethal cells in the blind zone
-        round the LiDAR, and farther out the marks of 3D points.
+        """Return marks that no sensor may see at present, (N, 2) in the frame of ``pose``: lethal cells in the
+        blind zone round the LiDAR, and farther out the marks of 3D points.
         """
         away = self.remembered - np.asarray(pose)[:2]
         away = away[(away**2).sum(axis=-1) <= remembered_radius_m**2]
@@ -139,12 +139,12 @@ class Costmap:
         return np.concatenate([self.lethal_near(pose, blind_radius_m), away @ np.array([[c, -s], [s, c]])])
 
     def occupancy(self) -> NDArray[np.int8]:
-        """The costs in the range -1..100 of ``nav_msgs/OccupancyGrid``, as nav2 publishes them."""
+        """Return the costs in the range -1..100 of ``nav_msgs/OccupancyGrid``, as nav2 publishes them."""
         return _TO_OCCUPANCY[self.costs]
 
     @staticmethod
     def from_occupancy(occupancy: NDArray[np.int8], resolution: float, origin: NDArray[np.float64]) -> Costmap:
-        """Inverse of ``occupancy``; inflated costs are exact to 1.3."""
+        """Return the inverse of ``occupancy``; inflated costs are exact to 1.3."""
         costs = _FROM_OCCUPANCY[np.asarray(occupancy, dtype=np.int8).view(np.uint8)]
         return Costmap(costs, float(resolution), np.asarray(origin, dtype=np.float64)[:2])
 
@@ -180,7 +180,7 @@ class ScanRays:
 def scan_points(
     ranges: NDArray[np.floating], angle_min: float, angle_increment: float, range_min: float, range_max: float
 ) -> NDArray[np.float64]:
-    """Hits (N, 2) in the sensor's plane, metres, without invalid ranges (REP-117)."""
+    """Return the hits (N, 2) in the sensor's plane, metres, without invalid ranges (REP-117)."""
     r = np.asarray(ranges, dtype=np.float64)
     valid = np.isfinite(r) & (r >= range_min) & (r <= range_max)
     angle = angle_min + angle_increment * np.flatnonzero(valid)
@@ -196,7 +196,7 @@ def scan_rays(
     map_from_lidar: NDArray[np.float64],
     config: CostmapConfig,
 ) -> ScanRays:
-    """Beams of a scan in the map frame.
+    """Return the beams of a scan in the map frame.
 
     +inf (nothing within range, REP-117) clears to ``raytrace_max_range`` if ``inf_is_valid``. Use that only with
     sensors that distinguish «nothing there» from «too near to be seen»; a VLP-16 does not. NaN, -inf and ranges
@@ -257,7 +257,7 @@ class RollingCostmap:
         corner, c, s = np.array(self._corner), math.cos(moved[2]), math.sin(moved[2])
 
         def carried(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-            """Rows and columns (2, N) of the cells in ``mask``, and where they go."""
+            """Return the rows and columns (2, N) of the cells in ``mask``, and where they go."""
             cells = np.argwhere(mask)
             places = (cells[:, ::-1] + corner + 0.5) @ np.array([[c, s], [-s, c]]) + moved[:2] / self.config.resolution
             goals = np.floor(places).astype(np.intp)[:, ::-1] - corner[::-1]
@@ -370,7 +370,7 @@ class RollingCostmap:
 
 
 def inflated_cost(distance_m: float, config: CostmapConfig, footprint: Footprint) -> int:
-    """Cost of a place ``distance_m`` from the nearest obstacle."""
+    """Return the cost of a place ``distance_m`` from the nearest obstacle."""
     if distance_m <= 0:
         return LETHAL
     if distance_m <= footprint.inscribed_radius_m + SLACK_M:
@@ -394,7 +394,7 @@ def _join(
     through: NDArray[np.uint8],
     seen_through: int,
 ) -> NDArray[np.uint8]:
-    """Master grid of the observations and the map, whose origin lies ``shift`` metres before the window's."""
+    """Return the master grid of observations and map, whose origin lies ``shift`` metres before the window's."""
     size_y, size_x = observed.shape
     height, width = occupancy.shape
     master = np.empty_like(observed)

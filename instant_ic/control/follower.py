@@ -103,7 +103,7 @@ class PathFollower:
         goal_velocity: tuple[float, float] = (0.0, 0.0),
         costmap: Costmap | None = None,
     ) -> FollowerCommand:
-        """Twist for the robot at ``pose`` (3,) at ``speed_m_s``; the goal is the plan's last pose.
+        """Return the twist for the robot at ``pose`` (3,) at ``speed_m_s``; the goal is the plan's last pose.
 
         Args:
             pose: x, y, yaw in the frame of the plan.
@@ -141,7 +141,7 @@ class PathFollower:
         return self._pursue(pose, speed_m_s, plan, costmap)
 
     def _track(self, ahead: float, left: float, turn: float, goal_velocity: tuple[float, float]) -> tuple[float, float]:
-        """Tracking law of Kanayama et al. (1990): the goal's own twist plus the error in the robot's frame."""
+        """Apply the tracking law of Kanayama et al. (1990): the goal's own twist plus the error at the robot."""
         linear, angular = goal_velocity
         v = linear * math.cos(turn) + TRACK_GAIN_X * ahead
         # The law is for forward motion: backwards, the term of the heading would turn the robot away.
@@ -222,7 +222,7 @@ class PathFollower:
 
 
 def _piece(pose: NDArray[np.float64], plan: Plan, tolerance_m: float) -> tuple[NDArray[np.float64], bool]:
-    """The next part of the path with one driving direction, from the robot on; and whether it is driven backwards."""
+    """Return the next part of the path with one driving direction, and whether it is driven backwards."""
     if len(plan.reverse) != len(plan.poses) or len(plan.poses) < 2:
         return plan.poses, False
     # A turn on the spot belongs to the piece that follows it.
@@ -242,7 +242,7 @@ def _piece(pose: NDArray[np.float64], plan: Plan, tolerance_m: float) -> tuple[N
 
 
 def _carrot(pose: NDArray[np.float64], path: NDArray[np.float64], lookahead: float) -> NDArray[np.float64]:
-    """Point (2,) of the path at distance ``lookahead`` from the robot, past its nearest point."""
+    """Return the point (2,) of the path at distance ``lookahead`` from the robot, past its nearest point."""
     away = np.linalg.norm(path[:, :2] - np.asarray(pose)[:2], axis=1)
     near = int(np.argmin(away))
     far = np.flatnonzero(away[near:] >= lookahead)
@@ -250,7 +250,7 @@ def _carrot(pose: NDArray[np.float64], path: NDArray[np.float64], lookahead: flo
 
 
 def _remaining(pose: NDArray[np.float64], path: NDArray[np.float64]) -> float:
-    """Metres from the robot along the path to its end."""
+    """Return metres from the robot along the path to its end."""
     away = np.linalg.norm(path[:, :2] - np.asarray(pose)[:2], axis=1)
     near = int(np.argmin(away))
     rest = float(np.linalg.norm(np.diff(path[near:, :2], axis=0), axis=1).sum())

@@ -26,12 +26,12 @@ class Footprint(Rectangle):
         return 0.5 * math.hypot(self.length_m, self.width_m)
 
     def corners(self, padding_m: float = 0.0) -> NDArray[np.float64]:
-        """Corners (4, 2) in ``base_link``, counter-clockwise from front left."""
+        """Return the corners (4, 2) in ``base_link``, counter-clockwise from front left."""
         a, b = 0.5 * self.length_m + padding_m, 0.5 * self.width_m + padding_m
         return np.array([[a, b], [-a, b], [-a, -b], [a, -b]])
 
     def points(self, spacing_m: float, padding_m: float = 0.0) -> NDArray[np.float64]:
-        """Points (N, 2) over the whole rectangle, edges included, no farther apart than ``spacing_m``."""
+        """Return the points (N, 2) over the whole rectangle, edges included, no farther apart than ``spacing_m``."""
         a, b = 0.5 * self.length_m + padding_m, 0.5 * self.width_m + padding_m
         xs = np.linspace(-a, a, max(2, math.ceil(2 * a / spacing_m) + 1))
         ys = np.linspace(-b, b, max(2, math.ceil(2 * b / spacing_m) + 1))

@@ -68,7 +68,7 @@ class TimeoutConfig(Checked):
     recover_s: Annotated[float, Plausible(0.05, 10)] = 0.5
 
     def allowed_s(self, key: str, usual_s: float | None = None) -> float:
-        """Allowed age of source ``key`` in seconds, if its usual age is ``usual_s`` when the next message arrives.
+        """Return the allowed age of source ``key`` in seconds, if its usual age on arrival is ``usual_s``.
 
         >>> timeouts = TimeoutConfig()
         >>> [round(timeouts.allowed_s("camera", usual_s), 2) for usual_s in (0.1, 0.2, 0.33, 1.0, 2.0, math.inf)]
@@ -81,7 +81,7 @@ class TimeoutConfig(Checked):
         return max(least, period_s + max(self.late_s, _LATE_SHARE * period_s))
 
     def lost_s(self, key: str, usual_s: float | None = None) -> float:
-        """Seconds of silence after which source ``key`` counts as lost: the machine goes to STOPPED.
+        """Return the seconds of silence after which source ``key`` counts as lost: the machine goes to STOPPED.
 
         One missing image is no loss at any image rate.
         """

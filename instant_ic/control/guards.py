@@ -61,7 +61,7 @@ def no_view_in_time(s: Snapshot) -> bool:
 
 
 def way_free(s: Snapshot) -> bool:
-    """The way that triggers an entry must be free, and also a longer and wider one.
+    """Return whether the way that triggers an entry is free, and also a longer and wider one.
 
     Thus the conditions for entry and return never hold together.
     """
@@ -141,7 +141,7 @@ GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {name: globals()[name] 
 
 
 def hold(s: Snapshot) -> Notice | None:
-    """Reason why nothing may move in this state; None when it may."""
+    """Return the reason why nothing may move in this state; None when it may."""
     if s.settles:
         return Notice(Reason.INTERRUPTED, "stopped: the robot's control stood still for a moment")
     if s.stale:
@@ -175,7 +175,7 @@ def images_agree(s: Snapshot, within_m: float, within_deg: float) -> bool:
 
 
 def against_switch(s: Snapshot) -> Notice | None:
-    """Reason against a switch although an obstacle is ahead, except that there is no way round it; None for none."""
+    """Return the reason against a switch with an obstacle ahead, except that there is no way round it."""
     inputs, switch, vspace = s.inputs, s.config.switch, s.vspace
     assert inputs.robot_pose is not None
     if s.pose_doubtful:
@@ -213,7 +213,7 @@ def against_switch(s: Snapshot) -> Notice | None:
 
 
 def stop_notice(s: Snapshot) -> Notice:
-    """Reason of a transition to STOPPED."""
+    """Return the reason of a transition to STOPPED."""
     if estop_pressed(s):
         return Notice(Reason.ESTOP, "emergency stop")
     if s.interrupted is not None:

@@ -179,16 +179,16 @@ class HeightLayer:
         _mark(marks, window, sweep.obstacles, sweep.ends, sweep.origin, pose, self.config.obstacle_max_range)
 
     def occupied(self) -> NDArray[np.bool_]:
-        """Mask (H, W) of the cells that hold an obstacle."""
+        """Return the mask (H, W) of the cells that hold an obstacle."""
         return (self.hits >= self.config.mark_threshold) & (self.evidence >= 0)
 
     def dismissed(self) -> NDArray[np.bool_]:
-        """Mask (H, W) of the cells that hold points, but only noise of a surface behind them."""
+        """Return the mask (H, W) of the cells that hold points, but only noise of a surface behind them."""
         return (self.hits > 0) & (self.evidence < 0)
 
 
 def shifted(array: NDArray[Cell], columns: int, rows: int, fill: float) -> NDArray[Cell]:
-    """Window (H, W) moved by whole cells; new cells get ``fill``."""
+    """Return the window (H, W) moved by whole cells; new cells get ``fill``."""
     moved = np.full_like(array, fill)
     height, width = array.shape
     if abs(columns) < width and abs(rows) < height:
@@ -200,7 +200,7 @@ def shifted(array: NDArray[Cell], columns: int, rows: int, fill: float) -> NDArr
 
 @njit(cache=True, fastmath=FAST)
 def _angle(y: float, x: float) -> float:
-    """atan2 accurate to 1e-5 rad, four times as fast (Hastings: Approximations for digital computers, 1955)."""
+    """Compute atan2 to 1e-5 rad, four times as fast (Hastings: Approximations for digital computers, 1955)."""
     ax, ay = abs(x), abs(y)
     if ax == 0.0 and ay == 0.0:
         return 0.0
@@ -216,7 +216,7 @@ def _angle(y: float, x: float) -> float:
 
 @njit(cache=True, fastmath=FAST)
 def _bin(y: float, x: float) -> int:
-    """Bin of the azimuth of (x, y)."""
+    """Return the bin of the azimuth of (x, y)."""
     return min(int((_angle(y, x) + math.pi) * (AZIMUTHS / (2.0 * math.pi))), AZIMUTHS - 1)
 
 

@@ -28,7 +28,8 @@ class Interruptions:
         """Note a step of the arbiter.
 
         Args:
-            steady_ns, suspended_ns: as for :meth:`StepGap.step`.
+            steady_ns: steady time.
+            suspended_ns: time for which the machine was suspended since its start.
             instances: publishers of the sources, as in ``ArbiterInputs``.
             longest_s: a longer gap is an interruption.
 

@@ -15,7 +15,7 @@ from instant_ic.geometry.poses import wrap_angle
 def accelerate(
     velocity: tuple[float, float], command: tuple[float, float], limits: MotionLimits, dt_s: float
 ) -> tuple[float, float]:
-    """Velocity (m/s, rad/s) after accelerating towards ``command`` for ``dt_s`` within the limits."""
+    """Return the velocity (m/s, rad/s) after accelerating towards ``command`` for ``dt_s`` within the limits."""
     command = limits.clip(*command)
     return (
         step_towards(velocity[0], command[0], limits.max_linear_accel_m_s2 * dt_s),
@@ -30,6 +30,6 @@ def move(pose: NDArray[np.float64], linear: float, angular: float, dt_s: float) 
 
 
 def extrapolate(pose: NDArray[np.float64], velocity: tuple[float, float], age_s: float) -> NDArray[np.float64]:
-    """Present pose (3,) from one of a message that is up to a period old: 0.1 s on at most, at a finite velocity."""
+    """Return the present pose (3,) from that of a message, which is up to a period old: at most 0.1 s on."""
     known = math.isfinite(velocity[0]) and math.isfinite(velocity[1])
     return move(pose, *velocity, min(max(0.0, age_s), 0.1)) if known else pose.copy()

@@ -55,7 +55,7 @@ class _Look:
     """(AZIMUTHS,) hit at enough elevations at this range."""
 
     def points(self) -> NDArray[np.float64]:
-        """(M, 2) the tall things within ``_RANGE_M``, by azimuth."""
+        """Return the tall things within ``_RANGE_M``, by azimuth, (M, 2)."""
         index = np.flatnonzero(self.tall & (self.ranges < _RANGE_M))
         angle = (index + 0.5) * (2 * math.pi / AZIMUTHS) - math.pi
         return self.origin + self.ranges[index, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -91,7 +91,7 @@ class _MovingBody:
         return len(self.places) >= 6 and float(np.hypot(*self.velocity)) < 0.5 * _LEAST_SPEED_M_S
 
     def at(self, time_s: float) -> NDArray[np.float64]:
-        """Middle (2,) expected at a time."""
+        """Return the middle (2,) expected at a time."""
         return self.places[-1][1] + self.velocity * (time_s - self.places[-1][0])
 
 
@@ -134,7 +134,7 @@ class MovingThings:
         return mine
 
     def moving(self, time_s: float) -> MovingPoints:
-        """The points of all moving bodies, moved on to ``time_s``."""
+        """Return the points of all moving bodies, moved on to ``time_s``."""
         parts = []
         for body in self._bodies:
             velocity = body.velocity
@@ -157,12 +157,12 @@ def _look(sweep: SortedPoints, time_s: float) -> _Look:
 
 
 def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Middle (2,) of the box round points."""
+    """Return the middle (2,) of the box round points."""
     middle: NDArray[np.float64] = 0.5 * (points.min(axis=0) + points.max(axis=0))
     return middle
 
 
 def _groups(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Runs of at least ``_LEAST_POINTS`` neighbours by azimuth no farther apart than ``_MARGIN_M``."""
+    """Return runs of at least ``_LEAST_POINTS`` neighbours by azimuth no farther apart than ``_MARGIN_M``."""
     gaps = np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=1) > _MARGIN_M) + 1
     return [group for group in np.split(points, gaps) if len(group) >= _LEAST_POINTS]

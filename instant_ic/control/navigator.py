@@ -84,7 +84,7 @@ class Navigator:
         now_ns: int,
         subgoal_velocity: tuple[float, float] = (0.0, 0.0),
     ) -> NavigatorStep:
-        """Twist towards ``subgoal`` (x, y, yaw) from ``pose``, both in the costmap's frame; zero if not finite."""
+        """Return the twist from ``pose`` to ``subgoal`` (x, y, yaw) in the costmap's frame; zero if not finite."""
         if not np.isfinite([*pose, speed_m_s, *subgoal, *subgoal_velocity]).all():
             unknown = replace(self._plan, reached=False, reason="pose, subgoal or a speed is not a number")
             return NavigatorStep((0.0, 0.0), "end", unknown, False)
@@ -148,7 +148,7 @@ _MOST_AHEAD_M = 0.2
 def meeting_pose(
     vbot_pose: NDArray[np.float64], shown_pose: NDArray[np.float64], robot_pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Pose (3,) of the r-bot at which the delayed camera image is one taken from the v-bot's place.
+    """Return the pose (3,) of the r-bot at which the delayed camera image is one taken from the v-bot's place.
 
     It lies ahead of the v-bot by the distance that the r-bot, at ``robot_pose``, has driven since ``shown_pose``, where
     the image was taken that arrives with the next view. When the two meet, nothing is left to ease.
@@ -168,14 +168,14 @@ def moving_subgoal(
     shown_pose: NDArray[np.float64],
     robot_pose: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], Twist2]:
-    """Subgoal (3,) and its velocity; if it is the v-bot, from the v-bot's own newer pose and twist."""
+    """Return the subgoal (3,) and its velocity; if it is the v-bot, from the v-bot's own newer pose and twist."""
     if vbot is None or float(np.linalg.norm(vbot[0][:2] - subgoal[:2])) >= _AT_VBOT_M:
         return subgoal, (0.0, 0.0)
     return meeting_pose(vbot[0], shown_pose, robot_pose), vbot[1]
 
 
 def _with_end(plan: Plan, subgoal: NDArray[np.float64]) -> Plan:
-    """The plan with its end at the present subgoal, which moves between two plans."""
+    """Return the plan with its end at the present subgoal, which moves between two plans."""
     if not plan.reached or float(np.linalg.norm(plan.poses[-1, :2] - subgoal[:2])) > 0.3:
         return plan
     return replace(plan, poses=np.concatenate([plan.poses[:-1], subgoal[None]]))

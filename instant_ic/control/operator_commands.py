@@ -90,11 +90,11 @@ class OperatorCommands:
             del self._must_release[next(iter(self._must_release))]
 
     def idle_s(self, now_ns: int) -> float:
-        """Seconds since the last motion was commanded."""
+        """Return seconds since the last motion was commanded."""
         return 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / 1e9
 
     def let_go_s(self, now_ns: int) -> float:
-        """Seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
+        """Return seconds for which fresh commands have been zero; -1 while they are not, or not fresh."""
         return -1.0 if self._let_go_ns is None else (now_ns - self._let_go_ns) / 1e9
 
     def forget_zeros(self) -> None:

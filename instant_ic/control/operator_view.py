@@ -78,25 +78,25 @@ class OperatorView:
         return new
 
     def ages(self, report: PageReport | None, report_age_s: float, steady_ns: int) -> dict[str, float]:
-        """Ages of ``camera`` and ``view`` in seconds; where there is a page, the images that arrived there count."""
+        """Return the ages of ``camera`` and ``view`` in seconds; with a page, of the images that arrived there."""
         camera_s = math.inf if self._camera_ns is None else (steady_ns - self._camera_ns) / 1e9
         if report is None:
             return {"camera": camera_s, "view": math.inf}
         return {"camera": max(camera_s, report.image_age_s + report_age_s), "view": report.view_age_s + report_age_s}
 
     def usual(self, with_page: bool) -> dict[str, float]:
-        """Usual ages of ``camera`` and ``view`` in seconds when the next one arrives; inf while unknown."""
+        """Return the usual ages of ``camera`` and ``view`` in seconds when the next one arrives; inf while unknown."""
         camera_s = self._camera.usual_s
         return {"camera": max(camera_s, self._page.usual_s) if with_page else camera_s, "view": self._views.usual_s}
 
     def delay_s(self, report: PageReport | None) -> float:
-        """Seconds until the operator has an image or a view, whichever takes longer."""
+        """Return seconds until the operator has an image or a view, whichever takes longer."""
         return max(self.image_delay_s or 0.0, 0.0 if report is None else report.view_delay_s)
 
     def shown_pose(
         self, report: PageReport | None, pose: NDArray[np.float64] | None, velocity: tuple[float, float], now_ns: int
     ) -> NDArray[np.float64] | None:
-        """Position of the r-bot when the image now shown was taken, with its present heading (3,).
+        """Return the position of the r-bot when the image now shown was taken, with its present heading (3,).
 
         A view of this pose is shown when the next images have arrived, so the pose lies ahead by the delay of a view.
         None without a page, or while ``pose`` is unknown.
@@ -118,7 +118,7 @@ class OperatorView:
         return np.array([place[0], place[1], now[2]])
 
     def image_position(self) -> NDArray[np.float64] | None:
-        """Position (2,) of the camera in the map for the page's newest image; None while unknown."""
+        """Return the position (2,) of the camera in the map for the page's newest image; None while unknown."""
         for frame in ("camera", "base_link"):
             try:
                 odom_from_camera = self._tf.lookup("odom", frame, self._image[0])

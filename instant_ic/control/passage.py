@@ -38,7 +38,7 @@ def find_passage(
     planner: HybridPlanner,
     config: PassageConfig,
 ) -> Notice | None:
-    """Reason why the r-bot cannot get behind the obstacle ahead; None when it can.
+    """Return the reason why the r-bot cannot get behind the obstacle ahead; None when it can.
 
     Looks straight on from where the predicted trajectory meets the obstacle, then plans a way there.
     The first place behind it that is free, or not seen yet, must come before any wall. The path to it may be at most

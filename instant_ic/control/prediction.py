@@ -62,7 +62,7 @@ class Prediction:
 
 
 def stopping_distance(speed_m_s: float, limits: MotionLimits, latency_s: float) -> float:
-    """Metres from the stop command to standstill."""
+    """Return metres from the stop command to standstill."""
     return speed_m_s * latency_s + speed_m_s**2 / (2.0 * limits.max_linear_accel_m_s2)
 
 
@@ -81,7 +81,7 @@ class Predictor:
         self.body = footprint.points(0.045, config.padding_m)
 
     def horizon(self, linear: float, angular: float) -> float:
-        """Metres for which the farthest corner is followed at a speed of (m/s, rad/s)."""
+        """Return metres for which the farthest corner is followed at a speed of (m/s, rad/s)."""
         speed = abs(linear) + self.reach_m * abs(angular)
         if speed == 0.0:
             return 0.0
@@ -98,7 +98,7 @@ class Predictor:
         extra_m: float = 0.0,
         side_m: float = 0.0,
     ) -> Prediction:
-        """Trajectory from ``pose`` (x, y, yaw) at ``velocity`` under ``command`` (m/s, rad/s).
+        """Return the trajectory from ``pose`` (x, y, yaw) at ``velocity`` under ``command`` (m/s, rad/s).
 
         ``extra_m`` is added to the horizon, ``side_m`` to every side of the footprint. Without a
         costmap the way is free.
@@ -146,7 +146,7 @@ def _roll_out(
     length_m: float,
     reach_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Poses (N, 3) under a command, and how far the farthest corner has travelled at each, (N,).
+    """Return the poses (N, 3) under a command, and how far the farthest corner has travelled at each, (N,).
 
     As ``kinematics.accelerate`` and ``move``, step by step: the command takes effect after ``late_steps``, and changes
     the velocity by at most ``steepest`` (2,) per step.

@@ -66,7 +66,7 @@ class Progress:
 
 
 def _left_m(plan: Plan, pose: NDArray[np.float64]) -> float:
-    """Metres along the plan from the pose to its end."""
+    """Return metres along the plan from the pose to its end."""
     if len(plan.poses) == 0:
         return _NO_WAY_M
     near = int(np.argmin(np.linalg.norm(plan.poses[:, :2] - pose[:2], axis=1)))

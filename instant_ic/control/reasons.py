@@ -16,7 +16,7 @@ class Notice(NamedTuple):
     text: str
 
     def prefixed(self, prefix: str) -> Notice:
-        """The same reason with text before it."""
+        """Return the same reason with text before it."""
         return Notice(self.reason, prefix + self.text)
 
 
@@ -28,7 +28,7 @@ class Stale(NamedTuple):
 
 
 def stale_notice(stale: Sequence[Stale]) -> Notice:
-    """Notice for stale sources, at least one: the code of the first, the text of all."""
+    """Return a notice for stale sources, at least one: the code of the first, the text of all."""
     texts = [
         source.text or (f"no {source.name} yet" if math.isinf(age_s) else f"no {source.name} for {age_s:.1f} s")
         for source, age_s in stale

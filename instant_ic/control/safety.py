@@ -71,12 +71,12 @@ class PolygonConfig:
             parse_polygon(self.points)
 
     def corners(self, footprint: Footprint) -> NDArray[np.float64]:
-        """Corners (N, 2) in ``base_link``, counter-clockwise: ``points``, or the footprint with ``padding_m``."""
+        """Return the corners (N, 2) in ``base_link``, counter-clockwise: ``points``, or the padded footprint."""
         return parse_polygon(self.points) if self.points else footprint.corners(self.padding_m)
 
 
 def parse_polygon(text: str) -> NDArray[np.float64]:
-    """Corners (N, 2), counter-clockwise, of a convex polygon in nav2's notation: ``[[0.5, 0.3], [0.5, -0.3], ...]``.
+    """Return the corners (N, 2), counter-clockwise, of a polygon in nav2's notation: ``[[0.5, 0.3], ...]``.
 
     Raises:
         ValueError: another form, fewer than three corners, or not convex; the message begins with ``points``.
@@ -128,7 +128,7 @@ class CollisionMonitorConfig(Checked):
     approach: PolygonConfig = field(default_factory=PolygonConfig)
 
     def polygons(self) -> dict[str, PolygonConfig]:
-        """The enabled polygons, by name."""
+        """Return the enabled polygons, by name."""
         named = {"stop": self.stop, "slowdown": self.slowdown, "limit": self.limit, "approach": self.approach}
         return {name: polygon for name, polygon in named.items() if polygon.enabled}
 
@@ -182,7 +182,7 @@ class CollisionMonitor:
         velocity: tuple[float, float] | None = None,
         moving: MovingPoints = NOTHING_MOVES,
     ) -> MonitoredCommand:
-        """The part of the command (m/s, rad/s) that may be sent.
+        """Return the part of the command (m/s, rad/s) that may be sent.
 
         Args:
             command: the requested command.
@@ -219,7 +219,7 @@ class CollisionMonitor:
         seen: MovingPoints,
         moving: bool,
     ) -> tuple[float, float]:
-        """Share of the command that one polygon allows from the twist ``start`` on, and the time to collision.
+        """Return the share of the command that one polygon allows from the twist ``start``, and the time to collision.
 
         The time is inf where it is not computed.
         """

@@ -102,7 +102,7 @@ class ArbiterInputs:
     """Seconds until the operator has an image, from its exposure, or from the view's request if that takes longer."""
 
     def age(self, key: str) -> float:
-        """Age of a source in seconds; inf before its first message."""
+        """Return the age of a source in seconds; inf before its first message."""
         return self.ages.get(key, math.inf)
 
 

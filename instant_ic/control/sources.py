@@ -26,7 +26,7 @@ class SourceMonitor:
     def stale(
         self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float, shown_s: float = math.inf
     ) -> tuple[Stale, ...]:
-        """Stale sources that ``mode`` needs, with their ages, ``in_mode_s`` after the last change of mode.
+        """Return the stale sources that ``mode`` needs, with their ages, ``in_mode_s`` after the last change of mode.
 
         The v-bot has been shown for ``shown_s``.
         """
@@ -51,7 +51,7 @@ class SourceMonitor:
         return inputs.age("command") <= self._command_s and not inputs.operator_gone
 
     def stale_in_s(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float, shown_s: float = math.inf) -> float:
-        """Seconds until the first fresh source becomes stale; inf for none."""
+        """Return seconds until the first fresh source becomes stale; inf for none."""
         left = [
             self._allowed_s(source, inputs) - _age_s(source, inputs, in_mode_s, shown_s)
             for source in SOURCES
@@ -62,7 +62,7 @@ class SourceMonitor:
         return min((one for one in left if one >= 0.0), default=math.inf)
 
     def speed_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
-        """Speed at which the robot drives at most ``image_travel_m`` until a missing image stops it.
+        """Return the speed at which the robot drives at most ``image_travel_m`` until a missing image stops it.
 
         Rare images therefore slow the robot, instead of stopping it at each late one.
         """
@@ -72,7 +72,7 @@ class SourceMonitor:
         return min(most, self.config.timeouts.image_travel_m / longest_s) if longest_s > 0 else most
 
     def slowed(self, inputs: ArbiterInputs, mode: Mode, speed_m_s: float) -> str:
-        """Text for the operator while rare images keep ``speed_m_s`` from being driven; empty while they do not."""
+        """Return the text for the operator while rare images keep ``speed_m_s`` from being driven; else empty."""
         limit = self.speed_limit_m_s(inputs, mode)
         if speed_m_s <= limit:
             return ""
@@ -85,7 +85,7 @@ class SourceMonitor:
         return f"; slowed to {limit:.2f} m/s: {every}"
 
     def vbot_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
-        """Speed limit of the v-bot; below full speed it is slow enough for the r-bot to catch up."""
+        """Return the speed limit of the v-bot; below full speed it is slow enough for the r-bot to catch up."""
         limit = self.speed_limit_m_s(inputs, mode)
         return limit if limit >= self.config.limits.max_linear_m_s else _CATCH_UP * limit
 

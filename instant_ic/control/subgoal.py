@@ -44,7 +44,7 @@ class Subgoal:
 
 
 def extend_ahead(pose: NDArray[np.float64], length_m: float, step_m: float) -> NDArray[np.float64]:
-    """Poses (N, 3) straight ahead of ``pose``, ``step_m`` apart, without ``pose`` itself."""
+    """Return the poses (N, 3) straight ahead of ``pose``, ``step_m`` apart, without ``pose`` itself."""
     distance = step_m * np.arange(1, math.floor(length_m / step_m) + 1)
     direction = np.array([math.cos(pose[2]), math.sin(pose[2])])
     ahead = np.asarray(pose)[:2] + distance[:, None] * direction
@@ -56,7 +56,7 @@ _UNSEEN_DEPTH_M = 0.6
 
 
 def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of the poses (N, 3) straight ahead, one cell apart, lie behind the first obstacle on the line.
+    """Mark the poses (N, 3) straight ahead, one cell apart, that lie behind the first obstacle on the line.
 
     Free space before the obstacle does not count. Without an obstacle every free place counts.
     """
@@ -73,7 +73,7 @@ def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64]) -> NDArray[np.
 
 
 def _free(costmap: Costmap, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points (..., 2) may be the subgoal."""
+    """Mark the points (..., 2) that may be the subgoal."""
     costs = costmap.cost_at(points)
     # The place behind an obstacle has not been seen yet, so unknown cells may be a goal. The planner does not drive
     # into them; it goes on as the robot sees more.
@@ -88,7 +88,7 @@ def choose_subgoal(
     walls: WallMap | None,
     config: SubgoalConfig,
 ) -> Subgoal | None:
-    """Subgoal for the v-bot's pose (3,) and its predicted trajectory.
+    """Return the subgoal for the v-bot's pose (3,) and its predicted trajectory.
 
     The v-bot's pose if free; else the farthest free point of the trajectory; else the first free point straight on
     from its end, before any wall; else the nearest free cell round the v-bot; else None. With ``anticipate``, a free
@@ -123,7 +123,7 @@ def choose_subgoal(
 def _straight_on(
     costmap: Costmap, pose: NDArray[np.float64], forward: bool, walls: WallMap | None, length_m: float
 ) -> NDArray[np.float64] | None:
-    """First free pose (3,) behind the obstacle ahead of ``pose``; None when a wall comes first."""
+    """Return the first free pose (3,) behind the obstacle ahead of ``pose``; None when a wall comes first."""
     heading = pose if forward else pose + np.array([0.0, 0.0, math.pi])
     ahead = extend_ahead(heading, length_m, costmap.resolution)
     index = np.flatnonzero(behind_obstacle(costmap, ahead))

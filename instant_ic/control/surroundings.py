@@ -105,7 +105,7 @@ class Surroundings:
         self._in_costmap: tuple[int, int] = (-1, -1)  # stamps of the scan and the points in the costmap
 
     def robot_pose(self) -> NDArray[np.float64] | None:
-        """Pose (3,) of the robot in the map; None while unknown."""
+        """Return the pose (3,) of the robot in the map; None while unknown."""
         try:
             pose = pose2_from_matrix(self._tf.lookup("map", "base_link"))
         except TransformError as error:
@@ -115,7 +115,7 @@ class Surroundings:
         return pose
 
     def near_points(self, scan: ArrivedScan | None) -> NDArray[np.float64] | None:
-        """Hits (N, 2) of the newest scan and 3D points in ``base_link`` now, by odometry, which does not jump.
+        """Return the hits (N, 2) of the newest scan and points in ``base_link`` now, by odometry, which never jumps.
 
         None while there is no scan, or its place is unknown.
         """
@@ -136,7 +136,7 @@ class Surroundings:
         return np.asarray(near @ base_from_odom[:2, :2].T + base_from_odom[:2, 3])
 
     def moving_points(self, now_ns: int) -> MovingPoints:
-        """Points and velocities of people and other moving things, in ``base_link`` now; needs 3D points."""
+        """Return the points and velocities of people and other moving things, in ``base_link`` now; needs 3D points."""
         found = self._moving.moving(now_ns / 1e9)
         if len(found.points) == 0:
             return NOTHING_MOVES
@@ -148,7 +148,7 @@ class Surroundings:
         return MovingPoints(found.points @ turn + base_from_odom[:2, 3], found.velocities @ turn)
 
     def used_age_s(self, key: str, now_ns: int, steady_ns: int) -> float:
-        """Age of the last ``scan`` or ``points`` with a transform, since its arrival or its stamp, whichever is longer.
+        """Return the age of the last ``scan`` or ``points`` with a transform, by arrival or stamp, the longer.
 
         Seconds; inf without one.
         """

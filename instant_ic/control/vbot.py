@@ -124,7 +124,7 @@ class VirtualRobot:
         self.slowed_by = ""
 
     def lead_factor(self, linear: float, robot_pose: NDArray[np.float64]) -> float:
-        """Share of the linear speed that remains: a little less than 1 with a lead, 0 at ``max_lead_m``.
+        """Return the share of the linear speed that remains: a little less than 1 with a lead, 0 at ``max_lead_m``.
 
         Only motion that draws the two apart is slowed; back towards the r-bot the v-bot drives freely.
         """
@@ -150,7 +150,7 @@ def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 def _eased(
     pose: NDArray[np.float64], goal: NDArray[np.float64], share: float, most_m: float, most_rad: float
 ) -> NDArray[np.float64]:
-    """``pose`` (3,) moved towards ``goal`` by a share of the error, within the given limits."""
+    """Move ``pose`` (3,) towards ``goal`` by a share of the error, within the given limits."""
     gap, turn = np.asarray(goal)[:2] - pose[:2], wrap_angle(float(goal[2] - pose[2]))
     step = min(share, most_m / max(float(np.linalg.norm(gap)), 1e-9))
     turn = max(-most_rad, min(most_rad, share * turn))

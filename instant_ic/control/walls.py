@@ -41,7 +41,7 @@ class WallMap:
             self._distance = np.full(self.mask.shape, np.inf)
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Metres (...) from points (..., 2) to the nearest wall; inf outside the map."""
+        """Return the metres (...) from points (..., 2) to the nearest wall; inf outside the map."""
         index = np.floor((np.asarray(points) - self.static.origin) / self.static.resolution).astype(np.int64)
         height, width = self._distance.shape
         columns, rows = index[..., 0], index[..., 1]

@@ -151,7 +151,7 @@ class FrontEnd:
         self._build_known(pose)
 
     def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
-        """Guess at ``pose`` after an odometry step (3,) in the base's own frame."""
+        """Return the guess at ``pose`` after an odometry step (3,) in the base's own frame."""
         distance, turn = math.hypot(step[0], step[1]), abs(step[2])
         translation = FLOOR_SIGMA_M + SIGMA_M_PER_M * distance
         rotation = FLOOR_SIGMA_RAD + SIGMA_RAD_PER_RAD * turn + SIGMA_RAD_PER_M * distance
@@ -160,14 +160,14 @@ class FrontEnd:
         return self._guess(pose, translation, rotation, window_m, window_rad, rotation > DOUBTFUL_TURN_RAD)
 
     def guess_from_velocity(self, pose: FloatArray, elapsed_s: float) -> Guess:
-        """Guess at ``pose`` without odometry: the window covers any motion possible in the elapsed time."""
+        """Return the guess at ``pose`` without odometry: the window covers any motion possible in the elapsed time."""
         match = self.config.match
         translation = 0.5 * match.free_motion_speed_mps * elapsed_s + 0.05
         rotation = 0.5 * match.free_motion_yaw_rate_radps * elapsed_s + 0.05
         return self._guess(pose, translation, rotation, SEARCH_M + translation, SEARCH_RAD + rotation)
 
     def constant_velocity(self, pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:
-        """Pose after another ``elapsed_s`` at the velocity of the last ``step`` (3,), which took ``step_s`` seconds.
+        """Return the pose after ``elapsed_s`` at the velocity of the last ``step`` (3,), which took ``step_s`` seconds.
 
         The velocity is at most ``match.free_motion_*``: stamps of a few milliseconds would make it arbitrarily large.
         """
@@ -248,7 +248,7 @@ class FrontEnd:
         return match.at_border or match.score < usual or guess.doubtful
 
     def _search_all_headings(self, points: FloatArray, guess: Guess, score: float) -> Match | None:
-        """Best pose over all headings near the guess; None unless it is unique and clearly better than ``score``."""
+        """Return the best pose over all headings near the guess; None unless unique and better than ``score``."""
         found = find_place(self._field, points, guess.pose, self.reach_m(guess), math.pi)
         if found is None or found.score < RECOVERY_SCORE:
             return None
@@ -258,7 +258,7 @@ class FrontEnd:
         return Match(found.pose, found.covariance, found.score, False, found.covariance)
 
     def reach_m(self, guess: Guess) -> float:
-        """Distance from the guess within which the robot is, by odometry since the last match."""
+        """Return the distance from the guess within which the robot is, by odometry since the last match."""
         sigma_m = float(guess.sigma[0]) + self._lost_sigma_m
         return min(RECOVERY_M + WIDE_SIGMAS * sigma_m, WIDE_REACH_M)
 

@@ -76,7 +76,7 @@ LOST_SIGMA_M, LOST_SIGMA_RAD = 10.0, math.pi / math.sqrt(3.0)
 
 @njit(cache=True)
 def _compare_rays(cells, seen, since, origin, resolution, pose, laser, points):  # type: ignore[no-untyped-def]
-    """Numbers of rays that the map knows something about, that pass through a wall, and that end in free space.
+    """Count the rays that the map knows something about, that pass through a wall, and that end in free space.
 
     Arguments as of `contradiction`; the laser's centre ``laser`` (2,) and the hits ``points`` (n, 2) are in the base
     frame.
@@ -125,7 +125,7 @@ def contradiction(
     scan: ScanPoints,
     since: int = 1,
 ) -> float:
-    """Share of a scan's rays, 0..1, that contradict a map: through its walls, or ending in its free space.
+    """Return the share of a scan's rays, 0..1, that contradict a map: through its walls, or ending in its free space.
 
     Args:
         cells: log-odds (H, W).
@@ -267,7 +267,7 @@ class IntegrityMonitor:
         self.after_gap = self.after_gap or (not self.doubts and self._unseen_s + elapsed_s > self._usual_s(elapsed_s))
 
     def _usual_s(self, elapsed_s: float) -> float:
-        """Time between matched scans that raises no doubt."""
+        """Return the time between matched scans that raises no doubt."""
         return max(UNSEEN_S, UNSEEN_PERIODS * (elapsed_s if self._period_s is None else self._period_s))
 
     def _unseen(self, elapsed_s: float) -> None:
@@ -282,7 +282,7 @@ class IntegrityMonitor:
         self._period_s = period_s + LEVEL_SHARE * (min(elapsed_s, usual_s) - period_s)
 
     def integrity(self, covariance: FloatArray, localized: bool) -> Integrity:
-        """Trust in a pose of this ``covariance`` (3, 3); a robot without a place in its saved map is lost."""
+        """Return the trust in a pose of ``covariance`` (3, 3); a robot without a place in its saved map is lost."""
         lost = self.lost_probability if localized else 1.0
         mixed = mixture(covariance, lost)
         sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(mixed[:2, :2])[-1]), 0.0))
@@ -299,7 +299,7 @@ class IntegrityMonitor:
 
 
 def mixture(covariance: FloatArray, lost_probability: float) -> FloatArray:
-    """Covariance (3, 3) of a pose that is wrong with a probability; below the monitor's floor the pose's own."""
+    """Return the covariance (3, 3) of a pose that is wrong with a probability; its own below the monitor's floor."""
     floor = 1.0 / (1.0 + math.exp(-FLOOR))
     p = min(max((lost_probability - floor) / (1.0 - floor), 0.0), 1.0)
     lost = np.diag(np.square([LOST_SIGMA_M, LOST_SIGMA_M, LOST_SIGMA_RAD]))

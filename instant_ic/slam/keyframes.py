@@ -40,7 +40,7 @@ class ScanKeyframe:
     merged_into: tuple[ScanKeyframe, FloatArray] | None = None
 
     def pose(self) -> FloatArray:
-        """Current map_from_base (3,); for a removed keyframe, computed from the keyframe it was merged into."""
+        """Return the current map_from_base (3,); a removed keyframe's by the one it was merged into."""
         if self.merged_into is None:
             return self.map_from_base
         other, other_from_this = self.merged_into
@@ -48,7 +48,7 @@ class ScanKeyframe:
 
 
 def grown_drift(drift: FloatArray, way: FloatArray, yaw: float, step_covariance: FloatArray) -> FloatArray:
-    """Covariance (3, 3), map frame, one step after a pose with covariance ``drift``.
+    """Return the covariance (3, 3), map frame, one step after a pose with covariance ``drift``.
 
     Args:
         drift: (3, 3).
@@ -63,7 +63,7 @@ def grown_drift(drift: FloatArray, way: FloatArray, yaw: float, step_covariance:
 
 
 def turned(covariance: FloatArray, yaw: float) -> FloatArray:
-    """A covariance (3, 3) of a frame with heading ``yaw``, in the frame with heading zero."""
+    """Return a covariance (3, 3) of a frame with heading ``yaw``, in the frame with heading zero."""
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     turn = np.array([[cos_yaw, -sin_yaw, 0.0], [sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
     result: FloatArray = turn @ covariance @ turn.T

@@ -53,9 +53,10 @@ def accumulate(  # type: ignore[no-untyped-def]
 
     Args:
         weight: float64 (H, W), changed in place, as sum_x and sum_y.
-        sum_x, sum_y: weighted sums of the hits' coordinates, in cells.
+        sum_x: weighted sums of the hits' x in cells, (H, W).
+        sum_y: weighted sums of the hits' y in cells, (H, W).
         touched: int32 (n, 2), row and column of the cells with weight; the first ``count`` are in use.
-        count: see ``touched``.
+        count: number of rows of ``touched`` in use.
         origin: (2,) centre of cell (0, 0), metres.
         resolution: metres per cell.
         pose: field_from_base (3,).
@@ -94,8 +95,12 @@ def fill_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # typ
 
     Args:
         field: float32 (H, W), changed in place.
-        weight, sum_x, sum_y, touched, count: as in `accumulate`.
-        sigma: of the field, in cells.
+        weight: weights of the hits, (H, W).
+        sum_x: weighted sums of their x, (H, W).
+        sum_y: weighted sums of their y, (H, W).
+        touched: row and column of the cells with weight, (n, 2).
+        count: number of rows of ``touched`` in use.
+        sigma: standard deviation of the field, in cells.
         pull: σ, in cells, within which the hits of neighbouring cells count as the same surface.
     """
     radius = math.ceil(3.0 * sigma)

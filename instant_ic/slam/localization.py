@@ -188,11 +188,11 @@ class Localizer:
 
     @staticmethod
     def _rival(score: float) -> float:
-        """Score of another place from which on a place with ``score`` is ambiguous."""
+        """Return the score of another place from which on a place with ``score`` is ambiguous."""
         return (score - MIN_GAIN) / (1.0 - MIN_GAIN)
 
     def _levels(self, nodes: NDArray[np.intp]) -> list[_SearchLevel]:
-        """The levels of a search in ``nodes`` (n, 2) of the last one, at all headings."""
+        """Return the levels of a search in ``nodes`` (n, 2) of the last one, at all headings."""
         rotations = np.repeat(np.arange(self._rotations), len(nodes))
         first = np.column_stack([rotations, np.tile(nodes, (self._rotations, 1))]).astype(np.int32)
         return [*(_SearchLevel.of(np.zeros((0, 3), dtype=np.int32)) for _ in range(LEVELS - 1)), _SearchLevel.of(first)]
@@ -224,7 +224,7 @@ class Localizer:
         return left
 
     def _starts(self, level: _SearchLevel, count: int, floor: float) -> FloatArray:
-        """Poses (k, 3), best bound first, around which every score of ``floor`` or more lies."""
+        """Return the poses (k, 3), best bound first, around which every score of ``floor`` or more lies."""
         good = (level.counts == count) & (level.sums >= floor * count)
         order = np.flatnonzero(good)[np.argsort(-level.sums[good], kind="stable")]
         nodes = level.nodes[order]
@@ -234,14 +234,14 @@ class Localizer:
         return np.column_stack([places, kept[:, 0] * (2 * math.pi / self._rotations)])
 
     def _refined(self, points: FloatArray, starts: FloatArray) -> list[Found]:
-        """Best poses near ``starts`` (k, 3)."""
+        """Return the best poses near ``starts`` (k, 3)."""
         found = [refined(self._field, points, start) for start in starts]
         return [one for one in found if one is not None]
 
 
 @njit(cache=True)
 def keep_peaks(nodes, rotations, count):  # type: ignore[no-untyped-def]
-    """Indices of at most ``count`` nodes (k, 3), none next to one before it in translation and rotation."""
+    """Return the indices of at most ``count`` nodes (k, 3), none next to one before it in translation and rotation."""
     kept = np.zeros(count, dtype=np.int64)
     taken = 0
     for k in range(nodes.shape[0]):

@@ -262,7 +262,7 @@ class LoopClosure:
         return self._optimise(accepted)
 
     def _chains(self, pose: FloatArray, old: int, radius_m: float) -> list[list[int]]:
-        """Runs of keyframes before ``old`` within ``radius_m`` of a pose, those with the lowest drift first."""
+        """Return the runs of keyframes before ``old`` within ``radius_m`` of a pose, lowest drift first."""
         way = self._poses[:old, :2] - pose[:2]
         near = np.flatnonzero(((way**2).sum(axis=1) <= radius_m**2) & self._alive[:old])
         if len(near) == 0:
@@ -272,7 +272,7 @@ class LoopClosure:
         return sorted(chains, key=lambda chain: float(np.trace(self._drifts[chain[0]][:2, :2])))
 
     def _query(self, first: int, here: int) -> FloatArray:
-        """Points of the last keyframes in the frame of the newest, (n, 2)."""
+        """Return the points of the last keyframes in the frame of the newest, (n, 2)."""
         members = range(first, here + 1)
         return gather([self._poses[k] for k in members], [self._keyframes[k].scan for k in members])
 
@@ -402,12 +402,12 @@ class LoopClosure:
 
 
 def _loop_covariance(covariance: FloatArray, yaw: float) -> FloatArray:
-    """Covariance of a loop in the frame of its start, which has the heading ``yaw`` in the map."""
+    """Return the covariance of a loop in the frame of its start, which has the heading ``yaw`` in the map."""
     return turned(covariance, -yaw) + np.diag(np.square([LOOP_SIGMA_M, LOOP_SIGMA_M, LOOP_SIGMA_RAD]))
 
 
 def _reversed(edge: Edge) -> Edge:
-    """The same edge seen from its other end."""
+    """Return the same edge seen from its other end."""
     b_from_a = inverse2(edge.a_from_b)
     carry = np.eye(3)
     carry[0, 2], carry[1, 2] = edge.a_from_b[1], -edge.a_from_b[0]
@@ -424,7 +424,7 @@ def _chained(first: Edge, second: Edge) -> Edge:
 
 
 def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints]) -> FloatArray:
-    """Points of scans at poses (3,), in the frame of the last pose, evenly spread, (n, 2)."""
+    """Return the points of scans at poses (3,), in the frame of the last pose, evenly spread, (n, 2)."""
     parts = []
     for pose, scan in zip(poses, scans, strict=True):
         x, y, yaw = relative2(poses[-1], pose)

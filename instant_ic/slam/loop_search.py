@@ -38,7 +38,7 @@ LEAST = np.float64(0.05)  # float32 would round it up, and leave out a cell of j
 
 
 def pool(field: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Best value near each pooled cell.
+    """Return the best value near each pooled cell.
 
     Args:
         field: (H, W).
@@ -61,7 +61,7 @@ def pool(field: NDArray[np.float32], size: int) -> NDArray[np.float32]:
 
 @njit(cache=True)
 def score_volume(field, origin, resolution, points, centre, cells, rotations, rotation_step):  # type: ignore[no-untyped-def]
-    """Mean field value of the points at each pose of a window.
+    """Return the mean field value of the points at each pose of a window.
 
     Arguments as of `matcher.correlate`.
 
@@ -90,7 +90,7 @@ def score_volume(field, origin, resolution, points, centre, cells, rotations, ro
 
 
 def peaks(volume: NDArray[np.float32], count: int, apart: int, apart_rotations: int) -> NDArray[np.int64]:
-    """Best poses of a score volume, each apart from every better one; rows of rotation, y, x indices."""
+    """Return the best poses of a score volume, each apart from every better one; rows of rotation, y, x indices."""
     left, found = volume.copy(), list[NDArray[np.int64]]()
     reach = np.array([apart_rotations, apart, apart])
     while len(found) < count:
@@ -124,7 +124,7 @@ class Found:
 def find_place(
     field: LikelihoodField, points: FloatArray, centre: FloatArray, reach_m: float, reach_rad: float
 ) -> Found | None:
-    """Best pose of ``points`` (n, 2) within ``reach_m``, ``reach_rad`` of ``centre`` (3,); None if nothing fits."""
+    """Return the best pose of ``points`` (n, 2) within ``reach_m``, ``reach_rad`` of ``centre`` (3,), or None."""
     resolution = field.resolution
     coarse = POOL * resolution
     cells = max(1, math.ceil(reach_m / coarse))
@@ -150,7 +150,7 @@ def find_place(
 
 
 def refined(field: LikelihoodField, points: FloatArray, start: FloatArray) -> Found | None:
-    """Best pose of ``points`` (n, 2) within a pooled cell and a heading step of ``start`` (3,), without a runner-up.
+    """Return the best pose of ``points`` (n, 2) within a pooled cell and a heading step of ``start`` (3,).
 
     None if the points give no information.
     """
@@ -182,7 +182,7 @@ def apart(a: FloatArray, b: FloatArray) -> bool:
 
 
 def spread(points: FloatArray, cell_m: float, max_points: int) -> FloatArray:
-    """One point per cell of ``cell_m``, at most ``max_points``, evenly chosen, (n, 2)."""
+    """Return the one point per cell of ``cell_m``, at most ``max_points``, evenly chosen, (n, 2)."""
     if len(points) == 0:
         return points
     _, first = np.unique(np.floor(points / cell_m).astype(np.int64), axis=0, return_index=True)

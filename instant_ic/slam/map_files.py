@@ -32,14 +32,14 @@ class MapError(ValueError):
 
 
 def graph_file(stem: Path) -> Path:
-    """Path of the pose graph beside ``stem.yaml``."""
+    """Return the path of the pose graph beside ``stem.yaml``."""
     return stem.with_name(stem.name + ".graph.npz")
 
 
 def ros_map(
     values: NDArray[np.int8], resolution: float, origin: Sequence[float] | NDArray[np.float64], image: str
 ) -> tuple[NDArray[np.uint8], str]:
-    """Image (H, W), largest y on top, and YAML text of a map, as map_server reads them.
+    """Return the image (H, W), largest y on top, and YAML text of a map, as map_server reads them.
 
     Args:
         values: cells (H, W), lowest y first; 0..100, -1 unknown.
@@ -159,7 +159,7 @@ def _checked_number(what: str, value: Any) -> float:
 
 
 def occupied_points(grid: OccupancyGrid) -> FloatArray:
-    """Centres of the occupied cells in the map, (n, 2)."""
+    """Return the centres of the occupied cells in the map, (n, 2)."""
     rows, columns = np.nonzero(grid.values >= round(100 * OCCUPIED_THRESH))
     points: FloatArray = grid.origin + grid.resolution * (np.column_stack([columns, rows]) + 0.5)
     return points

@@ -81,7 +81,8 @@ def cast_scan(  # type: ignore[no-untyped-def]
 
     Args:
         cells: changed in place.
-        seen: int32 (H, W), ``mark`` where this scan has changed the cell; it is > 0 and grows from scan to scan.
+        seen: int32 (H, W), set to ``mark`` where this scan changes a cell.
+        mark: number of the scan, from 1 on.
         origin: (2,) corner of cell (0, 0).
         resolution: metres per cell.
         pose: map_from_base (3,).
@@ -169,7 +170,7 @@ class OccupancyMap:
 
     @classmethod
     def of_grid(cls, grid: OccupancyGrid) -> OccupancyMap:
-        """A map with the walls, the free and the unknown cells of a grid, to compare scans with."""
+        """Return a map with the walls, the free and the unknown cells of a grid, to compare scans with."""
         made = cls(MapConfig(resolution_m=grid.resolution))
         made._first = np.round(grid.origin / grid.resolution).astype(np.int64)
         made._cells = np.where(grid.values >= 50, HIGH, LOW).astype(np.float32)
@@ -177,13 +178,13 @@ class OccupancyMap:
         return made
 
     def copy(self) -> OccupancyMap:
-        """A copy that later scans leave as it is."""
+        """Return a copy that later scans leave as it is."""
         made = copy.copy(self)
         made._cells, made._seen = self._cells.copy(), self._seen.copy()
         return made
 
     def contradiction(self, map_from_base: FloatArray, scan: ScanPoints, newest: int | None = None) -> float:
-        """Share of a scan's rays, 0..1, that contradict the map or its ``newest`` scans (`integrity.contradiction`)."""
+        """Return the share of rays, 0..1, that contradict the map or its ``newest`` scans (`contradiction`)."""
         resolution, since = self.config.resolution_m, 1 if newest is None else max(1, self._mark - newest + 1)
         return contradiction(self._cells, self._seen, self.origin, resolution, map_from_base, scan, since)
 

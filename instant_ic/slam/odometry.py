@@ -45,7 +45,7 @@ class OdometryBuffer:
         self._poses.clear()
 
     def at(self, stamp_ns: int, extrapolate_s: float = 0.0) -> FloatArray | None:
-        """Pose (3,) at a time, along the arc between its neighbours.
+        """Return the pose (3,) at a time, along the arc between its neighbours.
 
         After the newest pose the last motion is extrapolated by at most ``extrapolate_s``. None if the time is not
         covered.
@@ -67,7 +67,7 @@ class OdometryBuffer:
 
 
 def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
-    """Fraction ``part`` of a planar step (3,) along its circular arc."""
+    """Return the fraction ``part`` of a planar step (3,) along its circular arc."""
     x, y, turn = step.tolist()
     half = 0.5 * turn
     # The logarithm of SE(2): turn the chord back by half the turn, and stretch it to the arc.
@@ -100,7 +100,7 @@ class CorrectionLimiter:
         self._map_from_odom = None
 
     def follow(self, map_from_odom: FloatArray, odom_from_base: FloatArray, stamp_ns: int) -> FloatArray:
-        """Value to broadcast (3,): as close to the estimate as the speed limit allows, measured at the base."""
+        """Return the value to broadcast (3,): as close to the estimate as the speed limit at the base allows."""
         if self._map_from_odom is None:
             limited = map_from_odom.copy()
         else:

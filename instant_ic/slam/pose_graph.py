@@ -56,7 +56,7 @@ class Solution:
 
 
 def residuals(poses: FloatArray, a: NDArray[np.intp], b: NDArray[np.intp], measured: FloatArray) -> FloatArray:
-    """Residual of each edge (m, 3) at poses (n, 3); ``a``, ``b`` (m,) index the poses, ``measured`` is (m, 3)."""
+    """Return the residual of each edge (m, 3) at poses (n, 3); ``a``, ``b`` (m,) index them; ``measured``: (m, 3)."""
     cos, sin = np.cos(poses[a, 2]), np.sin(poses[a, 2])
     dx, dy = (poses[b, :2] - poses[a, :2]).T
     turn = poses[b, 2] - poses[a, 2] - measured[:, 2]
@@ -115,14 +115,14 @@ def optimise(poses: FloatArray, edges: Sequence[Edge], index: dict[int, int]) ->
 
 
 def _weights(chi2: FloatArray, robust: NDArray[np.bool_], width: float) -> FloatArray:
-    """Dynamic covariance scaling: s = min(1, 2Φ/(Φ + χ²))."""
+    """Compute the dynamic covariance scaling: s = min(1, 2Φ/(Φ + χ²))."""
     if math.isinf(width):
         return np.ones(len(chi2))
     return np.where(robust, np.minimum(1.0, 2 * width / (width + chi2)), 1.0)
 
 
 def _robust_cost(chi2: FloatArray, robust: NDArray[np.bool_], width: float) -> float:
-    """Cost that dynamic covariance scaling minimises: sum of s²χ² + Φ(1 − s)²."""
+    """Return the cost that dynamic covariance scaling minimises: sum of s²χ² + Φ(1 − s)²."""
     scale = _weights(chi2, robust, width)
     missing = 0.0 if math.isinf(width) else width * float(((1 - scale) ** 2).sum())
     return float((scale**2 * chi2).sum()) + missing
@@ -136,7 +136,7 @@ def _step(
     information: FloatArray,
     damping: float,
 ) -> FloatArray:
-    """Damped Gauss-Newton step (n, 3); NaN if the system is singular."""
+    """Return the damped Gauss-Newton step (n, 3); NaN if the system is singular."""
     from scipy.sparse import csc_matrix
     from scipy.sparse.linalg import splu
 

@@ -31,7 +31,7 @@ _MOTIONS = {
 
 
 def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel_odom: bool) -> Iterator[Diagnosis]:
-    """State of the SLAM after a scan.
+    """Yield the state of the SLAM after a scan.
 
     Args:
         slam: after `GridSlam.process`.

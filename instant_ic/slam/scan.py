@@ -61,7 +61,7 @@ COLLINEAR_GAP_RATIO = 2.0
 
 
 def _joined(points: FloatArray, beams: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Which points (n, 2) continue the surface of the previous one.
+    """Mark the points (n, 2) that continue the surface of the previous one.
 
     Points of neighbouring beams are joined if they are close together. On a wall seen at a grazing angle, where hits
     lie metres apart, points are also joined if they are in line with the next hit on either side.
@@ -87,7 +87,7 @@ def _joined(points: FloatArray, beams: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def scan_points(scan: Scan, base_from_laser: FloatArray, clear_m: float) -> ScanPoints:
-    """Hits and free rays of ``scan``; a range is a hit if ``range_min <= r <= range_max`` (REP-117).
+    """Return hits and free rays of ``scan``; a range is a hit if ``range_min <= r <= range_max`` (REP-117).
 
     Neighbouring beams whose hits lie no more than `JOIN_GAP_M` apart, or in a line, are one surface. A ray of +inf is
     free for ``clear_m`` metres (0: unknown).
@@ -106,7 +106,7 @@ def scan_points(scan: Scan, base_from_laser: FloatArray, clear_m: float) -> Scan
 
 
 def thin(points: FloatArray, joined: NDArray[np.bool_], max_points: int) -> FloatArray:
-    """Points for matching: at least `POINT_SPACING_M` apart along a surface, at most ``max_points``, evenly chosen.
+    """Return the points for matching: `POINT_SPACING_M` apart along a surface, at most ``max_points``.
 
     Without thinning, a near wall hit by many beams outweighs the far walls that determine the heading.
     """

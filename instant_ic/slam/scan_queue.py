@@ -88,7 +88,7 @@ class ScanQueue:
         self.state = Diagnosis("scan", Level.WARN, reason, {"dropped": self.dropped})
 
     def watch(self, steady_ns: int) -> Diagnosis:
-        """State at a steady time: an error once no scan has arrived for ``max_scan_age_s``."""
+        """Return the state at a steady time: an error once no scan has arrived for ``max_scan_age_s``."""
         age_s = (steady_ns - self._came_ns) * 1e-9
         if self.last_ns is not None and age_s > self.config.max_scan_age_s:
             return Diagnosis("scan", Level.ERROR, f"no scan for {age_s:.1f} s", {"dropped": self.dropped})
@@ -131,7 +131,7 @@ class ScanQueue:
 
 
 def level_mount(base_from_laser: Matrix) -> FloatArray:
-    """Planar mount (3,) of a laser; ValueError if its scan plane is not level."""
+    """Return the planar mount (3,) of a laser; raise ValueError if its scan plane is not level."""
     if base_from_laser[2, 2] < 0.9:
         raise ValueError("the laser's z axis is more than 25° off the vertical: check its mount (lidar_mount)")
     return pose2_from_matrix(base_from_laser)
