@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Counts lines of code by package, and the nodes' parameters; prints JSON.
+"""Lines of code by package, and the nodes' parameters; prints JSON.
 
     python scripts/count_lines.py
 
-All lines of tracked ``.py``, ``.js``, ``.html``, ``.css`` and ``.sh`` files count, tests apart, but for the written
+All lines of tracked ``.py``, ``.js``, ``.html``, ``.css`` and ``.sh`` files count, except for the written
 report in ``docs/``. ``runtime`` is what a running stack may load: everything in ``instant_ic/`` and ``nodes/`` but
 ``training`` and ``experiments``.
 """
@@ -22,7 +22,7 @@ NOT_RUNTIME = ("instant_ic/training", "instant_ic/experiments")
 
 
 def lines_by_package() -> dict[str, int]:
-    """Lines of ``nodes``, of each folder in ``instant_ic`` and of the other folders at the top."""
+    """Count the lines of ``nodes``, of each folder in ``instant_ic`` and of the other folders at the top."""
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     counts: Counter[str] = Counter()
     for name in listed.splitlines():
@@ -35,7 +35,7 @@ def lines_by_package() -> dict[str, int]:
 
 
 def parameters() -> dict[str, int]:
-    """Parameters of each node."""
+    """Count the parameters of each node."""
     from instant_ic.bus.node_files import node_class
     from instant_ic.config.parameter_info import parameter_infos
     from instant_ic.util.paths import node_names
@@ -44,7 +44,7 @@ def parameters() -> dict[str, int]:
 
 
 def main() -> int:
-    """Prints the counts."""
+    """Print the counts."""
     packages, by_node = lines_by_package(), parameters()
     tests = packages.pop("tests")
     runtime = {name for name in packages if name.startswith(("instant_ic", "nodes"))} - set(NOT_RUNTIME)

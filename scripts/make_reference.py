@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write docs/reference.md: topics and parameters of every node, and the message types, read from the code.
+"""The page docs/reference.md, made from the code: topics and parameters of every node, and the message types.
 
 Usage: python scripts/make_reference.py [--check]
 """
@@ -19,11 +19,7 @@ CALLS = {"publisher": "gives", "subscribe": "takes", "latest": "takes", "subscri
 
 
 def topics(source: str) -> dict[str, dict[str, str]]:
-    """Topics of the publisher, subscribe and latest calls with literal names in a node's source.
-
-    Returns:
-        Direction → topic → type.
-    """
+    """Return the topics with literal names in a node's source, as direction → topic → type."""
     found: dict[str, dict[str, str]] = {"takes": {}, "gives": {}}
     for call in ast.walk(ast.parse(source)):
         if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute):
@@ -56,7 +52,7 @@ EVERY_NODE = {
 
 
 def topic_table() -> list[str]:
-    """Lines of a table of all topics with a literal name: type, publishers, subscribers."""
+    """Return the lines of a table of all topics with a literal name: type, publishers, subscribers."""
     from instant_ic.msg import message_type
 
     kinds: dict[str, str] = {}
@@ -128,7 +124,7 @@ def render() -> str:
 
 
 def messages() -> list[str]:
-    """Lines of the section on message types: our own, then those of ROS 2 that the stack uses."""
+    """Return the lines of the section on message types: our own, then those of ROS 2 that the stack uses."""
     from instant_ic.msg.definition import definition, own_types, ros_fields
 
     own = own_types()

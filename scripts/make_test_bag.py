@@ -53,7 +53,7 @@ STANDING_S = 0.6
 
 
 def twist(time_s: float, seconds: float) -> tuple[float, float]:
-    """Commanded twist: drive ahead in a gentle S curve, then stop."""
+    """Return the commanded twist: drive ahead in a gentle S curve, then stop."""
     if time_s < STANDING_S or time_s > seconds - 0.6:
         return 0.0, 0.0
     return 0.3, 0.25 * math.sin(2 * math.pi * (time_s - STANDING_S) / (seconds - STANDING_S))
@@ -105,7 +105,7 @@ def make(path: Path, seconds: float, quality: int) -> None:
 
 
 def mounts(simulation: Simulation) -> TFMessage:
-    """Sensor mounts as the drivers publish them."""
+    """Return the sensor mounts as the drivers publish them."""
     mounts = (("camera", simulation.config.camera_mount), ("velodyne", simulation.config.lidar_mount))
     return TFMessage(
         transforms=[
@@ -124,7 +124,7 @@ class _Lidar:
         self._first_ns = 0
 
     def due(self, time_s: float) -> list[tuple[VelodyneScan, int]]:
-        """Messages whose last packet is complete, each with the stamp of that packet."""
+        """Yield messages whose last packet is complete, each with the stamp of that packet."""
         done = []
         simulation = self._simulation
         while simulation.scanner.due(time_s) > 0:
@@ -139,7 +139,7 @@ class _Lidar:
 
 
 def main() -> int:
-    """Command line."""
+    """Write the bag."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bag", type=Path, help="output folder")
     parser.add_argument("--seconds", type=float, default=5.0)

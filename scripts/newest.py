@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes an environment with the newest version of everything, without pins; `make newest` runs the unit tests in it.
+"""An environment with the newest version of everything, without pins, for the unit tests of `make newest`.
 
     python scripts/newest.py FOLDER [--python PYTHON]    # default: the newest of 3.11 to 3.14 here
 

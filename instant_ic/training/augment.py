@@ -67,7 +67,7 @@ def photograph(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor
 
 
 def without_lidar(prior: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """Priors (B, 6, H, W) of which a share has nothing measured: their depth is the network's, with a large sigma."""
+    """Replace a share of the priors (B, 6, H, W) by the network's depth with a large sigma, as without a LiDAR."""
     chosen = (torch.rand(len(prior), generator=generator) < share).to(prior.device)
     alone = prior.clone()
     alone[:, 0], alone[:, 2] = prior[:, 5], 0
@@ -76,7 +76,7 @@ def without_lidar(prior: Tensor, share: float, generator: torch.Generator) -> Te
 
 
 def _on(device: torch.device, generator: torch.Generator) -> torch.Generator:
-    """A generator of the device, seeded by another: a CPU takes 0.2 s for the noise of 64 images."""
+    """Return a generator on the device, seeded by another; a CPU takes 0.2 s for the noise of 64 images."""
     if device == generator.device:
         return generator
     seed = int(torch.randint(2**62, (), generator=generator))
@@ -89,7 +89,7 @@ def _uniform(like: Tensor, generator: torch.Generator, low: float, high: float, 
 
 
 def camera_colours(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Exposure (over- and under-), contrast, white balance, saturation and sensor noise; (B, 3, H, W) in 0..1.
+    """Change exposure, contrast, white balance and saturation, and add sensor noise; (B, 3, H, W) in 0..1.
 
     Some images change strongly, others hardly, so that accuracy on images of a good camera does not drop.
     """
@@ -133,7 +133,7 @@ def robot_body(rgb: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def floor_reflection(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor:
-    """Polished floor: add reflections of everything above the horizon, stronger at grazing angles.
+    """Add reflections of everything above the horizon to the floor, stronger at grazing angles.
 
     Pixels as low as the lowest known pixel count as floor. The reflection is read at the same elevation above the
     horizon, which is exact for distant surfaces only.
@@ -150,7 +150,7 @@ def floor_reflection(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> 
 
 
 def blur(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Soft lens or slight motion: blend in a 3 × 3 mean by a random share; circular in width."""
+    """Blend in a 3 × 3 mean by a random share, like a soft lens or slight motion; circular in width."""
     padded = functional.pad(functional.pad(rgb, (1, 1, 0, 0), mode="circular"), (0, 0, 1, 1), mode="replicate")
     return rgb + _uniform(rgb, generator, 0.3, 1.0) * (functional.avg_pool2d(padded, 3, stride=1) - rgb)
 

@@ -1,12 +1,16 @@
 """Depth completion: a network that corrects fused depth (the *prior*, ``instant_ic.depth.sources``) by the image.
 
-It gives a factor on the prior's depth and on its sigma, both 1 before the training, so that it starts as its prior. The
-image's features are those of EfficientNet-lite0 (Tan and Le, ICML 2019; the "lite" variant has no
-squeeze-and-excitation) down to 1/16, because ImageNet weights for it may be used under Apache-2.0; its batch norms keep
-their published statistics. The decoder ends at 1/4 and gives 4 × 4 pixels at each place: it sees the prior's pixels
-there, and a step costs a quarter of one with a decoder at 1/2. All convolutions are circular in width. At 1/16 the
-features of each column are folded into a vector and exchanged along the horizon, as in SliceNet (Pintore et al., CVPR
-2021), with convolutions instead of an LSTM.
+The network outputs a factor on the prior's depth and one on its sigma. Both are 1 before the training, so the network
+starts as its prior.
+
+1. ``LiteEncoder``: features of the image at 1/4, 1/8 and 1/16 by EfficientNet-lite0 (Tan and Le, ICML 2019; the "lite"
+   variant has no squeeze-and-excitation), because its ImageNet weights may be used under Apache-2.0.
+2. ``Mix``: image and prior at 1/4 to 1/16, joined with these features on the way up. The decoder ends at 1/4 and gives
+   4 x 4 pixels at each place; a training step costs a quarter of one with a decoder at 1/2.
+3. ``Slices``: at 1/16 the features of each column are folded into a vector and exchanged along the horizon, as in
+   SliceNet (Pintore et al., CVPR 2021), with convolutions instead of an LSTM.
+
+All convolutions are circular in width.
 """
 
 from __future__ import annotations
@@ -24,11 +28,13 @@ from instant_ic.training.slicenet import CheckpointError, check_state, read_chec
 GEOMETRY_CHANNELS = 8
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 40.0
 _TYPICAL_M, _UNKNOWN_SIGMA = 2.5, 0.6
-"""Where there is no prior."""
+"""Depth in metres and relative sigma where there is no prior."""
 _LEAST_STEP, _MOST_STEP = 0.05, 0.6
-"""Logarithm of the factor on the depth for an output of 1: the prior's sigma, within these bounds. What is known to a
-percent is hardly changed by a network that has not learnt it yet, and what nobody measured moves at once. By outliers
-the mean error of what claims a percent is 4 percent."""
+"""Bounds of the prior's sigma where it serves as the logarithmic step of the depth for an output of 1.
+
+An untrained network hardly changes depth that is known to a percent, and moves unmeasured depth at once. The lower
+bound is above a percent because outliers make the mean error of such pixels 4 percent.
+"""
 
 # Blocks of EfficientNet-lite0 to 1/16: repeats, kernel, stride, expansion, outputs. The stem is fixed in "lite".
 _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112))
@@ -68,15 +74,15 @@ class CompletionConfig:
         return 2 * self.height
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, for checkpoints and records."""
+        """Return plain values for checkpoints and records."""
         return {**asdict(self), "decoder": list(self.decoder)}
 
 
 class Convolution(nn.Module):
     """Convolution, batch norm and optionally ReLU6; circular in width, zeros above and below.
 
-    With a stride the padding is the one of TensorFlow, for which the published weights were trained: nothing on the
-    side where the stride begins.
+    With a stride the padding is TensorFlow's, with which the published weights were trained: none on the side where the
+    stride begins.
     """
 
     def __init__(
@@ -119,7 +125,7 @@ class Block(nn.Module):
         return x + y if self.residual else y
 
 
-class Encoder(nn.Module):
+class LiteEncoder(nn.Module):
     """EfficientNet-lite0 down to 1/16; its batch norms use the published statistics, in training too."""
 
     def __init__(self) -> None:
@@ -132,7 +138,7 @@ class Encoder(nn.Module):
                 self.blocks.append(Block(inputs, outputs, kernel, stride if index == 0 else 1, expansion))
                 inputs = outputs
 
-    def train(self, mode: bool = True) -> Encoder:
+    def train(self, mode: bool = True) -> LiteEncoder:
         return super().train(False)
 
     def forward(self, image: Tensor) -> list[Tensor]:
@@ -182,7 +188,7 @@ class Slices(nn.Module):
 
 
 class CompletionNet(nn.Module):
-    """Image (B, 3, H, W) in 0..1 and prior (B, 6, H, W) -> depth in metres and relative sigma, (B, H, W) each.
+    """Network from image (B, 3, H, W) in 0..1 and prior (B, 6, H, W) to depth in metres and relative sigma, (B, H, W).
 
     The output at measured pixels is the prior's depth and sigma, exactly.
     """
@@ -192,7 +198,7 @@ class CompletionNet(nn.Module):
         self.config = config = config or CompletionConfig()
         sixteenth, eighth, quarter = config.decoder
         at4, at8, at16 = _TAPS.values()
-        self.encoder = Encoder()
+        self.encoder = LiteEncoder()
         self.down4 = Mix(16 * (3 + GEOMETRY_CHANNELS), quarter)
         self.down8 = Mix(4 * quarter, eighth)
         self.down16 = Mix(4 * eighth, sixteenth)
@@ -254,7 +260,7 @@ def load_encoder(model: CompletionNet, path: str | Path) -> None:
 
 
 def _own_name(key: str) -> str:
-    """Name of a published tensor in :class:`Encoder`."""
+    """Return the name of a published tensor in :class:`LiteEncoder`."""
     if key.startswith("_blocks."):
         _, number, part, rest = key.split(".", 3)
         first = "_expand_conv" if number != "0" else ""

@@ -81,7 +81,7 @@ class RenderedDataset:
             raise DatasetError(f"{path}: damaged ({error}): delete it and run ic depth render again") from error
 
     def split(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indices for training and for evaluation; a world stays where it is when more are rendered."""
+        """Return the indices for training and for evaluation; a world keeps its part when more are rendered."""
         held = np.array([_world(path) % _HELD_OUT_WORLDS == 0 for path, _ in self.samples])
         if held.all() or not held.any():
             raise DatasetError(f"{self.folder}: worlds for training or for evaluation are missing: render "
@@ -94,7 +94,7 @@ def _world(path: Path) -> int:
 
 
 def _shape(path: Path) -> tuple[int, ...]:
-    """Shape of a panorama's priors, from the header alone."""
+    """Return the shape of a panorama's priors, from the header alone."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open("priors.npy") as file:
             version = np.lib.format.read_magic(file)

@@ -77,19 +77,7 @@ def export_onnx(
                 output_names=["depth", "sigma"][: len(inputs)],
             )  # fmt: skip
         report("running the network in onnxruntime")
-        got = _run(plain, inputs)
-        result = {"difference": _difference(got, expected)}
-        told = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
-        if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
-            # Weights may amplify rounding beyond any fixed bound; a float64 run then shows which side is wrong.
-            report(f"{told}; running torch in float64")
-            with torch.inference_mode():
-                exact = _depth(copy.deepcopy(model).double()(*(value.double() for value in inputs.values())))
-            result["rounding"] = _difference(expected, exact)
-            if not _difference(got, exact) < max(2 * result["rounding"], MAX_RELATIVE_DIFFERENCE):
-                raise ExportError(f"{told}, {_difference(got, exact):.1e} to float64")
-            told += f", while float32 alone costs torch {result['rounding']:.1e} with these weights"
-        report(told)
+        result = _compare(model, inputs, expected, _run(plain, inputs), report)
         if half_weights:
             report("converting the weights to float16 and running again")
             plain.write_bytes(_halve_weights(plain.read_bytes()))
@@ -99,6 +87,33 @@ def export_onnx(
             report(f"float16 weights change the depth by {result['half_difference']:.1e}")
         with replacing(path) as file:
             file.write(plain.read_bytes())
+    return result
+
+
+def _compare(
+    model: SliceNet | CompletionNet,
+    inputs: dict[str, torch.Tensor],
+    expected: NDArray[np.floating],
+    got: NDArray[np.floating],
+    report: Callable[[str], None],
+) -> dict[str, float]:
+    """Compare the depth of ONNX with that of torch.
+
+    Raises:
+        ExportError: the difference exceeds what rounding explains.
+    """
+    result = {"difference": _difference(got, expected)}
+    text = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
+    if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
+        # Weights may amplify rounding beyond any fixed bound; a float64 run then shows which side is wrong.
+        report(f"{text}; running torch in float64")
+        with torch.inference_mode():
+            exact = _depth(copy.deepcopy(model).double()(*(value.double() for value in inputs.values())))
+        result["rounding"] = _difference(expected, exact)
+        if not _difference(got, exact) < max(2 * result["rounding"], MAX_RELATIVE_DIFFERENCE):
+            raise ExportError(f"{text}, {_difference(got, exact):.1e} to float64")
+        text += f", while float32 alone costs torch {result['rounding']:.1e} with these weights"
+    report(text)
     return result
 
 

@@ -32,7 +32,7 @@ class Samples(Protocol):
 
 
 def stack(samples: Sequence[Sample], rng: np.random.Generator | None = None) -> Batch:
-    """Stack panoramas of one size into a batch; ``rng`` draws the prior of those without one.
+    """Stack panoramas of one size into a batch; ``rng`` simulates the prior of those without one.
 
     Raises:
         FeedError: no LiDAR fits to any of the panoramas.
@@ -53,8 +53,10 @@ class FileFeed:
     """Batches by number, requested in ascending order: passes over stored panoramas, each in a different order.
 
     Args:
-        indices: of the samples to use.
+        samples: stored panoramas.
+        indices: numbers of the samples to use.
         batch_size: panoramas per batch.
+        seed: seed of the order and of the simulated priors.
         info: recipe.
         threads: number of reader threads (decoding images takes longer than a training step of a small network).
     """
@@ -98,7 +100,7 @@ class FileFeed:
 
 
 class MixedFeed:
-    """Combines feeds: each batch concatenates one batch of every feed."""
+    """Several feeds as one; each batch concatenates one batch of every feed."""
 
     def __init__(self, feeds: Sequence[FileFeed]) -> None:
         self.feeds = list(feeds)
@@ -126,7 +128,7 @@ Feed: TypeAlias = FileFeed | MixedFeed
 
 
 class Ahead:
-    """Prepares the next batch in a thread while the current one is used."""
+    """A thread that prepares the next batch while the current one is used."""
 
     def __init__(self, feed: Feed) -> None:
         self.feed = feed

@@ -50,7 +50,7 @@ class FoldedStage(nn.Module):
 
 
 def fold_kernel(kernel: Tensor, upscale: tuple[int, int]) -> Tensor:
-    """(O, I, 3, 3) for the doubled map -> (n O, I, 3, 3) for the small one; n = 2 or 4 phases, rows first.
+    """Return the kernel (n O, I, 3, 3) for the small map of one (O, I, 3, 3) for the doubled map; n = 2 or 4 phases.
 
     Along a doubled axis the even pixel has the small map's taps (w0, w1 + w2, 0), the odd one (0, w0 + w1, w2).
     """

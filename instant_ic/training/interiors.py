@@ -27,10 +27,13 @@ _HALLS = ("library", "exhibition", "canteen", "office", "store")
 
 
 def interior_world(seed: int, kind: str = "", light_cell_m: float = 0.45, rays: int = 12) -> World:
-    """Interior of one of :data:`KINDS`; the same seed gives the same world.
+    """Return an interior of one of :data:`KINDS`; the same seed gives the same world.
 
-    Without a kind, it is chosen at random by frequency. The baked light has texels of ``light_cell_m``, each of so many
-    ``rays``.
+    Args:
+        seed: seed of the world.
+        kind: one of :data:`KINDS`; empty: chosen at random by frequency.
+        light_cell_m: size of a texel of the baked light, in metres.
+        rays: number of rays per texel of the baked light.
 
     Raises:
         ValueError: unknown kind.
@@ -85,7 +88,13 @@ class _Floor:
                 self.taken.append((x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
 
     def take(self, centre: tuple[float, float], size: tuple[float, float], margin: float = 0.0) -> bool:
-        """Reserve a rectangle (its extent along x and y) if it lies inside and is free; return True on success."""
+        """Reserve a rectangle if it lies inside and is free; return whether it was.
+
+        Args:
+            centre: x and y in metres.
+            size: extent along x and y in metres.
+            margin: distance from occupied parts in metres.
+        """
         x0, y0, x1, y1 = (centre[0] - size[0] / 2, centre[1] - size[1] / 2,
                           centre[0] + size[0] / 2, centre[1] + size[1] / 2)  # fmt: skip
         z = self.zone
@@ -123,7 +132,7 @@ def _tinted(rng: np.random.Generator, names: tuple[str, ...], lowest: float = 0.
 
 
 def _plain_finish(rng: np.random.Generator) -> Finish:
-    """Nearly white walls and ceiling with little texture, as in most real interiors."""
+    """Return nearly white walls and ceiling with little texture, as in most real interiors."""
     shade = float(rng.uniform(0.85, 1.12))
     wall = Material(str(rng.choice(["white", "paint", "paint:4"])), float(rng.uniform(1.5, 3)), (shade,) * 3)
     base = worlds.random_finish(rng)
@@ -135,7 +144,7 @@ def _finish(rng: np.random.Generator, plain: float) -> Finish:
 
 
 def _hall(rng: np.random.Generator, building: Building, kind: str) -> list[Zone]:
-    """A large room, often with pillars, sometimes open to a second one of different height."""
+    """Add a large room, often with pillars, sometimes open to a second one of different height."""
     u = rng.uniform
     width, depth = float(u(7, 22)), float(u(6, 16))
     height = float(u(2.6, 6.0) if kind == "store" or rng.random() < 0.3 else u(2.5, 3.6))
@@ -155,7 +164,7 @@ def _hall(rng: np.random.Generator, building: Building, kind: str) -> list[Zone]
 
 
 def _home(rng: np.random.Generator, building: Building) -> list[Zone]:
-    """A living room with up to three rooms behind doors."""
+    """Add a living room with up to three rooms behind doors."""
     u = rng.uniform
     finish = _finish(rng, 0.75)
     w, d, h = float(u(3, 8)), float(u(3, 6.5)), float(u(2.3, 3.0))
@@ -185,7 +194,7 @@ def _pillars(rng: np.random.Generator, build: WorldBuilder, zone: Zone) -> None:
 
 
 def _glass_front(rng: np.random.Generator, building: Building, zone: Zone) -> None:
-    """One or two walls of panes from near the floor to near the ceiling, often brighter than the image range."""
+    """Add one or two walls of panes from near the floor to near the ceiling, often brighter than the image range."""
     frame = _tinted(rng, ("white", "metal"), 0.2, 0.6)
     variant, shine = int(rng.integers(0, 24)), float(rng.uniform(0.9, 4.0))
     bottom, top = float(rng.choice([0.05, 0.4, 0.9])), zone.height - float(rng.uniform(0.08, 0.7))
@@ -203,7 +212,7 @@ def _glass_front(rng: np.random.Generator, building: Building, zone: Zone) -> No
 
 
 def _ceiling(rng: np.random.Generator, building: Building, zone: Zone) -> None:
-    """Lamps in the ceiling, rows of strips or pendants; sometimes beams and ducts below it."""
+    """Add lamps in the ceiling, rows of strips or pendants; sometimes beams and ducts below it."""
     build, u = building.builder, rng.uniform
     w, d = zone.x1 - zone.x0, zone.y1 - zone.y0
     style, shine = rng.random(), float(u(2.0, 7.0))
@@ -236,7 +245,7 @@ def _ceiling(rng: np.random.Generator, building: Building, zone: Zone) -> None:
 
 def _show_case(rng: np.random.Generator, build: WorldBuilder, at: tuple[float, float], yaw: float,
                size: tuple[float, float]) -> None:  # fmt: skip
-    """Glass case on a base: its posts and contents are visible, and so is the room behind it."""
+    """Add a glass case on a base: its posts and contents are visible, and so is the room behind it."""
     base, top = float(rng.uniform(0.2, 0.9)), float(rng.uniform(1.1, 2.2))
     wood, post = _tinted(rng, ("wood", "white", "metal"), 0.3), _tinted(rng, ("metal", "white"), 0.3, 0.4)
     build.box(at, (*size, base), 0.0, yaw, side=wood, top=_tinted(rng, ("white", "fabric"), 0.3, 0.5))
@@ -260,7 +269,7 @@ def _show_case(rng: np.random.Generator, build: WorldBuilder, at: tuple[float, f
 
 
 def _desk(rng: np.random.Generator, build: WorldBuilder, at: tuple[float, float], yaw: float) -> None:
-    """Desk with a screen; its chair stands at the desk's own +x."""
+    """Add a desk with a screen, and its chair at the desk's own +x."""
     furniture.table(build, at, yaw + math.pi / 2, (float(rng.uniform(1.2, 1.8)), 0.75), _tinted(rng, ("wood", "white")))
     c, s = math.cos(yaw), math.sin(yaw)
     dark = Material("metal", 0.4, (0.12, 0.12, 0.13))
@@ -367,7 +376,7 @@ def _store(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None
 
 
 def _room(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None:
-    """Furniture of homes: bed, sofa, wardrobe, kitchen row, table, mostly along the walls."""
+    """Add furniture of homes, mostly along the walls: bed, sofa, wardrobe, kitchen row, table."""
     height = floor.zone.height
     if rng.random() < 0.5:
         x, y = floor.zone.centre
@@ -411,7 +420,7 @@ def _room(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None:
 
 
 def _corridor(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None:
-    """Benches, machines, radiators and pipes along the walls."""
+    """Add benches, machines, radiators and pipes along the walls."""
     zone = floor.zone
     for _ in range(int(rng.integers(0, 6))):
         size = (float(rng.uniform(0.1, 0.45)), float(rng.uniform(0.3, 1.6)))
@@ -428,7 +437,7 @@ def _corridor(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> N
 
 
 def _clutter(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None:
-    """Bins, plants, boxes, bags and person-high objects at random free places."""
+    """Add bins, plants, boxes, bags and person-high objects at random free places."""
     zone = floor.zone
     area = (zone.x1 - zone.x0) * (zone.y1 - zone.y0)
     for _ in range(int(rng.poisson(0.04 * area + 0.3))):

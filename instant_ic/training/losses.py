@@ -11,19 +11,19 @@ ONE_SIGMA = 0.68
 
 
 def berhu(error: Tensor, threshold: float) -> Tensor:
-    """Reverse Huber: |e| up to ``threshold``, (e² + c²) / 2c above; continuous, with continuous slope."""
+    """Return the reverse Huber loss: |e| up to the threshold c, (e² + c²) / 2c above it; the slope is continuous."""
     magnitude = error.abs()
     return torch.where(magnitude <= threshold, magnitude, (error**2 + threshold**2) / (2 * threshold))
 
 
 def weighted_mean(values: Tensor, valid: Tensor, row_weights: Tensor) -> Tensor:
-    """Mean of (B, H, W) values over valid pixels, each weighted by its row, (H,); 0 if no pixel is valid."""
+    """Return the mean of values (B, H, W) over valid pixels, weighted by row (H,); 0 if no pixel is valid."""
     weights = valid.to(values.dtype) * row_weights[:, None]
     return (values * weights).sum() / weights.sum().clamp_min(1e-9)
 
 
 def depth_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor, metres_share: float = 0.1) -> Tensor:
-    """|log d - log t| plus a small share of berHu in metres, (B, H, W) in metres, truth 0 = unknown.
+    """Return the mean of |log d - log t| plus a small share of berHu; (B, H, W) in metres, truth 0 is unknown.
 
     The logarithm measures relative error, the criterion for scaled depth. It is clipped at ``MIN_DEPTH_M``; the term in
     metres keeps a gradient there.
@@ -35,9 +35,9 @@ def depth_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor, metres_sha
 
 
 def edge_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
-    """|∇ log d - ∇ log t| between neighbours in both directions (including the panorama's seam).
+    """Return the mean of |∇ log d - ∇ log t| between neighbours in both directions, across the panorama's seam too.
 
-    Keeps walls flat and depth discontinuities sharp, which a per-pixel loss does not enforce.
+    This keeps walls flat and depth discontinuities sharp, which a per-pixel loss does not enforce.
     """
     valid = truth > 0
     log_ratio = predicted.clamp_min(MIN_DEPTH_M).log() - torch.where(valid, truth, 1.0).clamp_min(MIN_DEPTH_M).log()
@@ -47,7 +47,7 @@ def edge_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
 
 
 def sigma_loss(predicted: Tensor, sigma: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
-    """Quantile loss (Koenker and Bassett, 1978) of log sigma: smallest where 68 % of the log errors lie within sigma.
+    """Return the quantile loss (Koenker and Bassett, 1978) of log sigma, smallest if 68 % of the errors are within it.
 
     A likelihood would give the mean error instead, which a few outliers multiply: it is not comparable to the sigma of
     the fused depth. The depth gets no gradient: otherwise it would be trained least where it is worst.

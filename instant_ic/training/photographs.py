@@ -1,4 +1,4 @@
-"""Photographic textures for training worlds. The images are not part of this repository: :func:`unpack` writes them."""
+"""Photographic textures for training worlds, unpacked from a wheel because they are not in this repository."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from instant_ic.training.dataset import DatasetError
 
 SIZE = 512
 WHEEL_FOLDER = "robosuite/models/assets/textures/"
-"""In the wheel of robosuite (MIT licence)."""
+"""Folder of the textures in the wheel of robosuite (MIT licence)."""
 NOT_A_SURFACE = ("bread", "can", "cereal", "lemon", "soda", "glass")
 PHOTO_SHARE = 0.75
 
 
 def unpack(wheel: Path, folder: Path) -> int:
-    """Write the surface textures of a robosuite wheel into a folder as JPEG of at most ``SIZE``; returns their number.
+    """Write the surface textures of a robosuite wheel into a folder as JPEG of at most ``SIZE``; return their number.
 
     Raises:
         DatasetError: not such a wheel.
@@ -52,7 +52,7 @@ def unpack(wheel: Path, folder: Path) -> int:
 
 @lru_cache(maxsize=1)
 def load(folder: str) -> TextureSet:
-    """Texture set of all images of a folder.
+    """Return the texture set of all images of a folder.
 
     Raises:
         DatasetError: the folder has no image that can be read.
@@ -69,7 +69,7 @@ def load(folder: str) -> TextureSet:
 
 
 def with_photographs(world: World, folder: str, rng: np.random.Generator) -> World:
-    """The world with most of its repeating textures exchanged for random photographs, of about the same brightness."""
+    """Return the world with most repeating textures exchanged for random photographs of about the same brightness."""
     own, photos = world.textures, load(folder)
     count = len(own.levels)
     joined = TextureSet(

@@ -94,7 +94,7 @@ class CircularPad(nn.Module):
         self.columns = columns
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) -> (B, C, H, W + 2 columns)."""
+        """Pad (B, C, H, W) to (B, C, H, W + 2 columns)."""
         # Slices and a concatenation export to plain ONNX operators.
         return torch.cat((x[..., -self.columns :], x, x[..., : self.columns]), dim=-1)
 
@@ -102,7 +102,7 @@ class CircularPad(nn.Module):
 def wrapped_conv(
     inputs: int, outputs: int, kernel: int, stride: int | tuple[int, int] = 1, bias: bool = True
 ) -> nn.Sequential:
-    """Convolution that is circular in width and zero-padded in height."""
+    """Return a convolution that is circular in width and zero-padded in height."""
     pad = kernel // 2
     conv = nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=(pad, 0), bias=bias)
     return nn.Sequential(CircularPad(pad), conv)
@@ -149,7 +149,7 @@ class Bottleneck(nn.Module):
         return functional.relu(y + (x if self.downsample is None else self.downsample(x)))
 
 
-class Encoder(nn.Module):
+class ResNetEncoder(nn.Module):
     """ResNet without its pooled head; circular in width except for the max-pool."""
 
     def __init__(self, config: SliceNetConfig) -> None:
@@ -179,7 +179,7 @@ class Encoder(nn.Module):
             self.channels.append(outputs)
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """(B, 3, H, W) -> four levels at 1/4, 1/8, 1/16, 1/32."""
+        """Return the features of images (B, 3, H, W) at 1/4, 1/8, 1/16 and 1/32."""
         x = self.maxpool(functional.relu(self.bn1(self.conv1(x))))
         levels = []
         for level in range(4):
@@ -216,7 +216,7 @@ class Contraction(nn.Module):
         self.layer = nn.Sequential(*(ConvStage(a, b, (2, 1)) for a, b in pairwise(sizes)))
 
     def forward(self, x: Tensor, columns: int) -> Tensor:
-        """(B, C, H, W) -> (B, C/8 * H/8, columns)."""
+        """Fold (B, C, H, W) to (B, C/8 * H/8, columns)."""
         x = self.layer(x)
         height, width = x.shape[-2:]
         if columns != width:
@@ -230,7 +230,7 @@ class Contraction(nn.Module):
 
 
 class SliceNet(nn.Module):
-    """(B, 3, H, 2H) RGB, 0..1 -> (B, H, 2H) depth in metres (radial), unclamped.
+    """Network from RGB (B, 3, H, 2H) in 0..1 to radial depth in metres (B, H, 2H), unclamped.
 
     Example:
         >>> model = SliceNet(SliceNetConfig(backbone="resnet18", height=64, lstm_hidden=16)).eval()
@@ -244,7 +244,7 @@ class SliceNet(nn.Module):
     def __init__(self, config: SliceNetConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or SliceNetConfig()
-        encoder = Encoder(config)
+        encoder = ResNetEncoder(config)
         channels = encoder.channels
         # The dictionaries give the parameters their published names.
         self.feature_extractor = nn.ModuleDict({"encoder": encoder})
@@ -279,7 +279,7 @@ class SliceNet(nn.Module):
 
 
 def _contracted_height(height: int) -> int:
-    """Rows after three stages of stride 2 with a padded 3x3 kernel."""
+    """Return the rows after three stages of stride 2 with a padded 3x3 kernel."""
     for _ in range(3):
         height = (height + 1) // 2
     return height
@@ -331,7 +331,7 @@ def load_checkpoint(path: str | Path) -> SliceNet:
 
 
 def read_checkpoint(path: Path) -> Any:
-    """Content of a checkpoint, on the CPU; only tensors and plain values, so that a file cannot run code.
+    """Read a checkpoint to the CPU; only tensors and plain values, so that a file cannot run code.
 
     Raises:
         CheckpointError: the file is missing, damaged, or holds more.
@@ -360,7 +360,7 @@ def read_checkpoint(path: Path) -> Any:
 
 
 def _config(path: Path, payload: dict[str, Any]) -> SliceNetConfig:
-    """Network configuration that a checkpoint names."""
+    """Return the network configuration that a checkpoint names."""
     key = next((key for key in ("config", "kwargs") if key in payload), None)
     if key is None:
         raise CheckpointError(f"{path}: neither 'config' nor 'kwargs' in the file (it has: {_some(payload)}); cannot "
@@ -405,6 +405,6 @@ def check_state(what: str, state: dict[str, Tensor], expected: dict[str, tuple[i
 
 
 def _some(names: Iterable[Any], joint: str = ", ", most: int = 4) -> str:
-    """The first ``most`` names, and how many more there are."""
+    """Join the first ``most`` names, and say how many more there are."""
     listed = [str(name) for name in names]
     return joint.join(listed[:most]) + (f"{joint}... {len(listed) - most} more" if len(listed) > most else "")

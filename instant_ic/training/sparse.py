@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.floating]
 MOST_REVOLUTIONS = 24
 MODEL_SHARE, FAULTY_SHARE, BENT_SHARE = 0.3, 0.6, 0.6
-"""Shares of priors with a local model of 2 to ``MOST_REVOLUTIONS`` revolutions (the others have one revolution), with
-faults of the revolution beyond noise, and with the network as wrong as in rooms unlike those it was trained on."""
+"""Shares of priors with a local model of 2 to ``MOST_REVOLUTIONS`` revolutions instead of one, with faults of the
+revolution beyond noise, and with errors of the network as in rooms unlike those it was trained on."""
 _MOST_BEND = 0.35
 _MOST_TILT_DEG, _MOST_SHIFT_M = 1.0, 0.02
 _UP = np.array([0.0, 0.0, 1.0])
@@ -36,9 +36,14 @@ def sample_prior(
     renderer: EquirectRenderer, map_from_camera: Floats, rgb: NDArray[np.uint8], depth_m: Floats,
     rng: np.random.Generator,
 ) -> NDArray[np.float32] | None:  # fmt: skip
-    """Prior (6, H, W) (``depth.completion``) of a camera (4, 4) in a world with its floor at 0; None without a fit.
+    """Simulate the prior (6, H, W) (``depth.completion``) of a camera in a world; None without a fit.
 
-    The camera sees ``rgb`` (H, W, 3) and ``depth_m`` (H, W).
+    Args:
+        renderer: renderer of the world, whose floor is at 0.
+        map_from_camera: pose of the camera, (4, 4).
+        rgb: image of the camera, (H, W, 3) uint8.
+        depth_m: true radial depth of the image in metres, (H, W).
+        rng: source of faults and places.
     """
     camera_m = float(map_from_camera[2, 3])
     lidar_m = min(rng.uniform(0.35, 0.9), camera_m - 0.1)
@@ -52,7 +57,7 @@ def sample_prior(
 
 
 def prior_of_image(rgb: NDArray[np.uint8], depth_m: Floats, rng: np.random.Generator) -> NDArray[np.float32] | None:
-    """The same for a level panorama with true depth (H, W) instead of a world: one revolution."""
+    """Simulate the prior of a level panorama with true depth (H, W) from one revolution; None without a fit."""
     mount, faulty = np.array([0.0, 0.0, -rng.uniform(0.1, 0.7)]), rng.random() < FAULTY_SHARE
     points = measure(depth_m, 0.0, -mount[2], _errors(rng, 0.0))
     return _prior(rgb, depth_m, points, mount, faulty, _UP, None, None, rng)
@@ -66,7 +71,7 @@ def _prior(
     rgb: NDArray[np.uint8], depth_m: Floats, points: Floats, mount: Floats, faulty: bool, up: Floats,
     camera_m: float | None, local: LocalView | None, rng: np.random.Generator,
 ) -> NDArray[np.float32] | None:  # fmt: skip
-    """Prior as ``DepthSource`` gives it to a completion, from the network's view of a degraded image."""
+    """Return the prior that ``DepthSource`` gives to a completion, with the network's depth of a degraded image."""
     if faulty:
         points = misplaced(spoiled(points - mount, rng) + mount, rng)
     image = torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 255
@@ -82,7 +87,7 @@ def _prior(
 
 
 def bend(size: tuple[int, ...], rng: np.random.Generator) -> NDArray[np.float32]:
-    """Smooth factors (H, W) around 1, of neighbours some 45 degrees apart."""
+    """Return smooth random factors (H, W) around 1, which vary over some 45 degrees."""
     coarse = rng.uniform(0, _MOST_BEND) * rng.standard_normal((5, 8))
     wide = np.concatenate((coarse[:, -1:], coarse, coarse[:, :1]), axis=1).astype(np.float32)
     step = size[1] // 8
@@ -106,7 +111,7 @@ def _model() -> LocalModel:
 
 
 def drive(renderer: EquirectRenderer, map_from_camera: Floats, lidar_m: float, rng: np.random.Generator) -> LocalModel:
-    """Local model after a straight drive in free space that ends at the camera. The model is used again each time."""
+    """Return the local model after a straight drive in free space to the camera; each call reuses the same model."""
     model, end = _model(), np.asarray(map_from_camera[:3, 3])
     model.clear()
     heading = rng.uniform(-math.pi, math.pi)
@@ -126,9 +131,9 @@ def drive(renderer: EquirectRenderer, map_from_camera: Floats, lidar_m: float, r
 
 
 def spoiled(points: Floats, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Points (N, 3) in the LiDAR's frame with the faults of a real revolution, (M, 3), M <= N.
+    """Give points (N, 3) in the LiDAR's frame the faults of a real revolution; return (M, 3), M <= N.
 
-    They are lost returns and rings, dark surfaces, glass, mixed pixels at edges.
+    The faults are lost returns and rings, dark surfaces, glass, and mixed pixels at edges.
     """
     range_m = np.linalg.norm(points, axis=1)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
@@ -156,7 +161,7 @@ def spoiled(points: Floats, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def misplaced(points: Floats, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Points (N, 3) in the camera's frame under a wrong mount (up to 1 degree, 2 cm) and a wrong time (a yaw)."""
+    """Move points (N, 3) in the camera's frame by a wrong mount (up to 1 degree, 2 cm) and a wrong time (a yaw)."""
     turn = np.clip(rng.normal(0, 0.4, 3), -_MOST_TILT_DEG, _MOST_TILT_DEG) * rng.random()
     turn[2] += rng.normal(0, 0.3)
     shift = np.clip(rng.normal(0, 0.008, 3), -_MOST_SHIFT_M, _MOST_SHIFT_M)

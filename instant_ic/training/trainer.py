@@ -32,12 +32,15 @@ from instant_ic.training.slicenet import CheckpointError, read_checkpoint
 from instant_ic.util.files import replacing
 
 POLE_WEIGHT = 0.1
-"""Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
-hardly trained, and appear as spikes above and below the camera in the point cloud.
+"""Minimum weight of a row in the loss, with a mean row weight of 1.
+
+By solid angle alone the rows at the poles would hardly be trained, and would be spikes above and below the camera.
 """
 HEAD_RATE = 0.1
-"""Learning rate of the last layer over that of the decoder. Adam moves each of the some 400 weights behind an output by
-the rate in a step: together they would leave the prior in a few steps, before they have learnt anything.
+"""Learning rate of the last layer over that of the decoder.
+
+Adam moves each of the 400 weights behind an output by the rate in a step. At the decoder's rate they would together
+leave the prior in a few steps, before they have learnt anything.
 """
 
 
@@ -117,7 +120,7 @@ def describe_device(device: torch.device) -> str:
 
 
 def schedule(progress: float, warmup: float) -> float:
-    """Factor of the learning rate at ``progress`` 0..1: linear rise, then half a cosine down to 0."""
+    """Return the factor of the learning rate at ``progress`` 0..1: a linear rise, then half a cosine down to 0."""
     if progress < warmup:
         return max(progress / warmup, 0.02)
     return 0.5 * (1 + math.cos(math.pi * min(1.0, (progress - warmup) / (1 - warmup))))
@@ -125,7 +128,7 @@ def schedule(progress: float, warmup: float) -> float:
 
 @torch.no_grad()
 def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
-    """``average = decay * average + (1 - decay) * model`` for every floating tensor of the state."""
+    """Set ``average`` to ``decay * average + (1 - decay) * model`` for every floating tensor of the state."""
     for kept, new in zip(average.state_dict().values(), model.state_dict().values(), strict=True):
         if kept.is_floating_point():
             kept.lerp_(new.to(kept.dtype), 1 - decay)
@@ -134,8 +137,9 @@ def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
 
 
 def to_tensors(batch: Batch, max_range_m: float, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Convert a batch to tensors: (B, 3, H, W) in 0..1, ground truth (B, H, W), 0 where unknown or too far, and prior
-    (B, 6, H, W).
+    """Convert a batch to images (B, 3, H, W) in 0..1, ground truth (B, H, W) and priors (B, 6, H, W).
+
+    Ground truth is 0 where it is unknown or beyond ``max_range_m``.
     """
     rgb, depth, prior = (torch.from_numpy(part).to(device) for part in batch)
     truth = depth.float()
@@ -147,9 +151,9 @@ def to_tensors(batch: Batch, max_range_m: float, device: torch.device) -> tuple[
 def predict(
     model: CompletionNet, sample: Sample, max_range_m: float, brightness: float = 0.0, seed: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth of a panorama as in inference, and its ground truth, 0 where unknown; (H, W) metres each.
+    """Return the depth of a panorama as in inference, and its ground truth; (H, W) metres each, 0 is unknown.
 
-    Without augmentation, in float32, on the model's device. ``seed``: of the prior of a sample without one.
+    There is no augmentation; it runs in float32 on the model's device. ``seed`` is that of a simulated prior.
     """
     model.eval()
     rgb, truth, prior = to_tensors(
@@ -160,7 +164,7 @@ def predict(
 
 
 def evaluate(model: CompletionNet, samples: Samples, max_range_m: float, brightness: float = 0.0) -> DepthMetrics:
-    """Mean metrics of :func:`predict` over panoramas, weighted by solid angle."""
+    """Return the mean metrics of :func:`predict` over panoramas, weighted by solid angle."""
     weights = solid_angle_weights(model.config.height)[:, None]
     each = (predict(model, samples[index], max_range_m, brightness, index) for index in range(len(samples)))
     return mean_metrics([depth_metrics(depth, truth, weights=weights) for depth, truth in each])
@@ -175,7 +179,8 @@ class Trainer:
         held_out: panoramas for evaluation, from worlds or scenes that are not in the feed.
         model: network to train; it keeps the weights it has.
         output: checkpoint file.
-        origin, command: where these weights come from, and the user's command line, for the record.
+        origin: source of the first weights, for the record.
+        command: the user's command line, for the record.
         bar: receives the progress 0..1 after each step.
         stop: set it to end early.
     """
@@ -341,7 +346,7 @@ class Trainer:
         log.row({**entry, "loss": None}, f"held-out panoramas: {entry}")
 
     def record(self) -> dict[str, Any]:
-        """Origin of the weights: command, start, data, network, training, device, results (plain values)."""
+        """Return the origin of the weights as plain values: command, start, data, network, training and results."""
         return {
             "command": self.command,
             "start": self.origin,
