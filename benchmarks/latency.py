@@ -37,11 +37,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+from browser import launch_chromium
 from reporting import parser_for, report
 
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.console.view import PROBE
-from instant_ic.experiments.page_renderer import launch_chromium
 from instant_ic.experiments.stack import Stack, free_port
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.launch.pacing import machine_pace

@@ -25,12 +25,12 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+from browser import launch_chromium
 from cpu_usage import Usage, cpu_percent, reference_loop, usage
 from reporting import note, parser_for, report
 
 from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.experiments.drive import DriveRecorder
-from instant_ic.experiments.page_renderer import launch_chromium
 from instant_ic.experiments.stack import Stack, StackError, free_ports, processes_of
 from instant_ic.msg import ControlState, message_type, twist_values
 

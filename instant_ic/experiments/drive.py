@@ -1,4 +1,4 @@
-"""The paper's teleoperation experiment (V.D), scripted: into the obstacle, through the virtual space, and back."""
+"""Watching a drive of a running stack, from the bus and from asyncio code."""
 
 from __future__ import annotations
 
@@ -11,11 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED
-from instant_ic.console.client import ConsoleClient
 from instant_ic.experiments.stack import Stack, StackError
 from instant_ic.msg import message_type, pose2_from_message
-
-SPEED_M_S = 0.35
 
 
 class DriveRecorder:
@@ -124,49 +121,3 @@ async def pump(stack: Stack) -> AsyncIterator[Callable[[Callable[[], Any], float
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError, StackError):
             await task
-
-
-async def drive_through_obstacle(stack: Stack, recorder: DriveRecorder, console_url: str, beyond_x_m: float) -> None:
-    """Drive straight ahead until the v-bot is past the obstacle, stop there, and wait for the r-bot.
-
-    If late sensor data stops the robot on the way, the operator releases the controls and continues, as a person would.
-
-    Args:
-        stack: a running ``launch/sim.yaml`` whose world has an obstacle straight ahead.
-        recorder: of the same stack.
-        console_url: the page's address; the drive uses its WebSocket.
-        beyond_x_m: map x to which the v-bot is driven.
-
-    Raises:
-        StackError: a condition was not met in time.
-    """
-    control = message_type("ControlState")
-    async with pump(stack) as until:
-        await until(lambda: recorder.mode == control.REAL and recorder.ready, 240, "virtual space that is fit to show")
-        async with ConsoleClient(console_url) as console:
-
-            async def drive_until(condition: Callable[[], Any], timeout_s: float, what: str) -> None:
-                deadline = asyncio.get_running_loop().time() + timeout_s / stack.pace
-                while True:
-                    console.drive(SPEED_M_S, 0.0)
-                    left = (deadline - asyncio.get_running_loop().time()) * stack.pace
-                    await until(lambda: condition() or recorder.mode == control.STOPPED, max(left, 0.0), what)
-                    if condition():
-                        return
-                    await console.stop()
-                    await until(lambda: recorder.mode != control.STOPPED, 60, "end of the stop")
-
-            await console.wait_for(lambda c: any(c.frame_counts.values()), 30)
-            await console.acquire()
-            await drive_until(lambda: recorder.mode == control.VIRTUAL, 120, "passage into the virtual space")
-            await drive_until(
-                lambda: recorder.vbot_pose is not None and recorder.vbot_pose[0] > beyond_x_m,
-                120,
-                "v-bot past the obstacle",
-            )
-            await console.stop()
-            await until(lambda: recorder.mode == control.REAL, 120, "passage back to the real robot")
-            console.drive(SPEED_M_S, 0.0)
-            await asyncio.sleep(1.5 / stack.pace)
-            await console.stop()
-            await asyncio.sleep(1.0 / stack.pace)

@@ -9,8 +9,8 @@ from typing import Any
 
 from instant_ic.experiments.compared import command_of, family, measure_views, near_mean, view_units
 from instant_ic.experiments.lab import WORLD, Options, Result, Unit
-from instant_ic.experiments.places import KINDS
 from instant_ic.experiments.report import Answer, Figure, Part, Section, Table, Text
+from instant_ic.experiments.worlds import KINDS
 from instant_ic.vspace.config import ReadinessConfig
 
 measure = measure_views

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from instant_ic.adapters.nerf import decode_keyframe
 from instant_ic.bus.lockstep import Record
-from instant_ic.experiments.illusion_truth import Passage, Score, score, without
+from instant_ic.experiments.illusion_truth import Passage, Score, score
 from instant_ic.experiments.teleop import photograph
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
-from instant_ic.experiments.teleop_worlds import Course, Obstacle
+from instant_ic.experiments.teleop_worlds import Course
+from instant_ic.experiments.worlds import Obstacle, without
 from instant_ic.geometry.poses import pose2_from_matrix, pose_matrix
 from instant_ic.msg import deserialize
 from instant_ic.sim.render import EquirectRenderer
@@ -76,6 +77,8 @@ class FilmedStack(SimulatedStack):
         episode: number of the episode.
         on_frame: called with each frame, its images by source, and the true image.
     """
+
+    size = (WIDTH, HEIGHT)
 
     def __init__(
         self,
@@ -145,9 +148,9 @@ class FilmedStack(SimulatedStack):
         map_from_shown = pose_matrix(x, y, yaw=yaw) @ self._base_from_camera
         world_from_shown = self._world_from_map @ map_from_shown
         renderer, distance_m, with_obstacle = self._truth_at(world_from_shown)
-        truth = renderer.render_perspective(world_from_shown, WIDTH, HEIGHT, FOV_RAD)
+        truth = renderer.render_perspective(world_from_shown, *self.size, FOV_RAD)
         live, true_depth = (
-            space.render(map_from_shown, WIDTH, HEIGHT, FOV_RAD) for space in (self.space, self._truth_space)
+            space.render(map_from_shown, *self.size, FOV_RAD) for space in (self.space, self._truth_space)
         )
         self.on_view(live, map_from_shown)
         unseen = true_depth.confidence == 0
@@ -177,9 +180,9 @@ class FilmedStack(SimulatedStack):
     def _camera_image(self, world_from_shown: FloatArray) -> Image:
         newest = self.newest.get(False)
         if newest is None:
-            return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+            return np.zeros((self.size[1], self.size[0], 3), np.uint8)
         photo = replace(newest, heading=float(pose2_from_matrix(world_from_shown)[2]))
-        return photograph(self, photo, WIDTH, HEIGHT, FOV_RAD)
+        return photograph(self, photo, *self.size, FOV_RAD)
 
     def _truth_at(self, world_from_camera: FloatArray) -> tuple[EquirectRenderer, float | None, bool]:
         """Return the truth's renderer at a pose, the distance behind the near face, and whether it has the obstacle.

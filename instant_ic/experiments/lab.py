@@ -21,9 +21,9 @@ from typing import Any
 
 import joblib
 
-from instant_ic.experiments.places import GENERATED
 from instant_ic.experiments.processes import LostError, run_all
 from instant_ic.experiments.results import finite, save_json
+from instant_ic.experiments.worlds import GENERATED
 from instant_ic.util.paths import share_dir
 
 EXPERIMENTS = ("reconstruction", "training-time", "ablation", "teleoperation", "operators", "environments")
@@ -39,7 +39,7 @@ class Options:
 
     Attributes:
         seeds: number of seeds, 0 first.
-        worlds: names of ``places.make_place_world``. A generated world without a seed gets each seed; a mesh file gets
+        worlds: names of ``worlds.named_world``. A generated world without a seed gets each seed; a mesh file gets
             its own start, then random free ones. Empty: the experiment's own worlds.
         method: virtual space that is compared, ``ours`` or ``paper``.
         bag: recording to use instead of worlds; None: none.

@@ -5,12 +5,10 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 from instant_ic.experiments.compared import command_of
-from instant_ic.experiments.illusion_truth import without
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.report import Part, Section, Table, Text
 from instant_ic.experiments.scan import QUALITIES, scan_world
@@ -46,9 +44,8 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         if method == "mesh":
             course, file = settings.course(0), Path(folder) / "scan.glb"
-            free = reduce(without, course.obstacles, course.world)
             start = course.world.spawn  # where the map begins
-            scan_world(free, start, QUALITIES["tripod"], seed, file, start)
+            scan_world(course.free_world, start, QUALITIES["tripod"], seed, file, start)
             settings = replace(settings, overrides=("nerf.space.source:=mesh", f"nerf.space.mesh:={file}"))
         (drive,) = run_episode(settings, 0)
     return {"drive": {key: value for key, value in asdict(drive).items() if key != "tracks"}}

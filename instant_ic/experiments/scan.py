@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.illusion_truth import moved_by, things
+from instant_ic.experiments.worlds import moved_by, things
 from instant_ic.geometry.poses import pose_matrix
 
 if TYPE_CHECKING:

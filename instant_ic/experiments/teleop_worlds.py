@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.follow_worlds import shortest_way
+from instant_ic.experiments.worlds import Obstacle, named_world, without
 
 if TYPE_CHECKING:
     from instant_ic.sim.contact import OccupancyMask
@@ -40,18 +41,6 @@ _LONGEST_THING_M = 1.5
 
 
 @dataclass(frozen=True)
-class Obstacle:
-    """A box on the floor: centre (m), length and width (m), yaw (rad), height (m)."""
-
-    x: float
-    y: float
-    length: float
-    width: float
-    yaw: float
-    height: float
-
-
-@dataclass(frozen=True)
 class Course:
     """A world with the operator's goals.
 
@@ -65,6 +54,11 @@ class Course:
     world: World
     goals: FloatArray
     obstacles: tuple[Obstacle, ...]
+
+    @property
+    def free_world(self) -> World:
+        """The world without the obstacles."""
+        return functools.reduce(without, self.obstacles, self.world)
 
     @property
     def way_m(self) -> float:
@@ -93,9 +87,7 @@ def make_course(name: str, seed: int, index: int) -> Course:
 @functools.lru_cache(maxsize=1)
 def _world(name: str) -> World:
     """Make a world; cached, because a mesh with its textures takes seconds to load."""
-    from instant_ic.sim.worlds import make_world
-
-    return make_world(name)
+    return named_world(name)
 
 
 def random_corridor(rng: np.random.Generator, name: str, attempts: int = 50) -> Course:

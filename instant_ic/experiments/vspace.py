@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.places import make_place_world, path_poses, start_pose
 from instant_ic.experiments.recorded import later_keyframes, read_keyframes
 from instant_ic.experiments.vspace_sources import (
     FILLED,
@@ -34,6 +33,7 @@ from instant_ic.experiments.vspace_sources import (
     take_shot,
     train,
 )
+from instant_ic.experiments.worlds import named_world, path_poses, start_pose
 from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix, relative2
 from instant_ic.sim.render import EquirectRenderer
@@ -104,7 +104,7 @@ def make_place(world: str, start_seed: int = 0) -> Place:
     Raises:
         ValueError: no such world, or its start is not free.
     """
-    made = before = make_place_world(world)
+    made = before = named_world(world)
     if world.partition(":")[0] == "corridor":  # the obstacle was not there when the place was scanned
         before = make_world(world.replace("corridor", "corridor-free", 1))
     return Place(made, before, EquirectRenderer(made), start_pose(made, start_seed))

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.places import CAMERA_HEIGHT_M, LIDAR_HEIGHT_M
 from instant_ic.experiments.scan import QUALITIES, aged, scan_world
+from instant_ic.experiments.worlds import CAMERA_HEIGHT_M, LIDAR_HEIGHT_M
 
 if TYPE_CHECKING:
     from instant_ic.depth.model import DepthModel

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 from console_pages import BROWSER_TEST
+from page_renderer import PageRenderer
 
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayers
 from instant_ic.experiments import box_room
-from instant_ic.experiments.page_renderer import PageRenderer
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig

@@ -16,10 +16,10 @@ from instant_ic.cli.main import main
 from instant_ic.experiments import illusion, teleop, teleop_worlds
 from instant_ic.experiments.illusion_plot import save_plot, save_strip
 from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, FilmedStack, IllusionFrame
-from instant_ic.experiments.illusion_truth import Passage, Score, corners, fog_pixels, score, surfaces, without
+from instant_ic.experiments.illusion_truth import Passage, Score, fog_pixels, score, surfaces
 from instant_ic.experiments.results import save_json
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
-from instant_ic.experiments.teleop_worlds import Obstacle
+from instant_ic.experiments.worlds import Obstacle, without
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.building import Building, Zone
@@ -49,7 +49,7 @@ def test_distance_behind_the_near_face_by_hand() -> None:
     assert passage.obstacle_at(np.array([5.5, 0.3])) == (pytest.approx(1.5), BOX)
     assert passage.obstacle_at(np.array([6.5, 0.0])) == (pytest.approx(0.5), boxes[0])
     assert Passage.of(np.array([3.0, 0.0, math.pi]), boxes).obstacle_at(np.zeros(2)) is None
-    turned = corners(Obstacle(0.0, 0.0, 2.0, 1.0, math.pi / 2, 1.0))
+    turned = Obstacle(0.0, 0.0, 2.0, 1.0, math.pi / 2, 1.0).corners()
     assert turned[0] == pytest.approx([-0.5, 1.0])
 
 
@@ -151,16 +151,23 @@ def test_wrong_arguments_are_reported(words: list[str], message: str, capsys: py
 # -- a short film
 
 
+class SmallFilm(FilmedStack):
+    """A page of few pixels, which costs less."""
+
+    size = (160, 90)
+
+
 def film(corridor: teleop_worlds.Course) -> illusion.Film:
     """From 1.6 m before the box's face into it, with depth from the LiDAR alone."""
     world = copy.copy(corridor.world)
     world.spawn = (2.4, 0.0, 0.0)
     course = teleop_worlds.Course(world, np.array([[4.6, 0.0]]), corridor.obstacles)
-    settings = illusion.TeleopSettings(1, 0, "corridor", ("ic",), "lidar", pictures=False)
+    small = ("theta_camera.theta.width:=640", "theta_camera.theta.height:=320")
+    settings = illusion.TeleopSettings(1, 0, "corridor", ("ic",), "lidar", pictures=False, overrides=small)
     result = illusion.Film(0)
 
     def make_stack(world: teleop_worlds.World, config: StackConfig) -> FilmedStack:
-        return FilmedStack(world, config, course, 0, result.take)
+        return SmallFilm(world, config, course, 0, result.take)
 
     def at_most_8_s(stack: SimulatedStack) -> None:
         if stack.time_s > 8.0:

@@ -27,9 +27,7 @@ from instant_ic.experiments import (
     vspace,
 )
 from instant_ic.experiments.depth_lidar import measure_world
-from instant_ic.experiments.illusion_truth import moved_by, things
 from instant_ic.experiments.lab import Options, Result, Unit
-from instant_ic.experiments.places import make_place_world
 from instant_ic.experiments.plots import curves_svg, image_strip
 from instant_ic.experiments.recorded_drive import Moment
 from instant_ic.experiments.scan import (
@@ -44,6 +42,7 @@ from instant_ic.experiments.scan import (
 )
 from instant_ic.experiments.teleoperation import stills
 from instant_ic.experiments.vspace_sources import VspaceSettings
+from instant_ic.experiments.worlds import moved_by, named_world, things
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import (
@@ -306,7 +305,7 @@ def test_full_size_fits_into_an_hour_on_two_cores() -> None:
 
 
 def test_places_have_what_they_are_named_for() -> None:
-    glass = make_place_world("windows:0")
+    glass = named_world("windows:0")
     upright = (glass.emission > 0) & (np.abs(glass.normal[:, 2]) < 0.5)
     assert upright.sum() >= 6
     points, through = (
@@ -315,7 +314,7 @@ def test_places_have_what_they_are_named_for() -> None:
     )
     assert len(through) < 0.95 * len(points)
     with pytest.raises(ValueError, match="must be an integer"):
-        make_place_world("hall:big")
+        named_world("hall:big")
 
 
 def test_a_path_is_driven_with_the_poses_of_slam(monkeypatch) -> None:

@@ -20,7 +20,8 @@ from rosbags.highlevel import AnyReader
 
 from benchmarks.cpu_usage import cpu_percent, reference_loop, usage
 from instant_ic.bus import registry
-from instant_ic.experiments.drive import DriveRecorder, drive_through_obstacle
+from instant_ic.console.client import ConsoleClient
+from instant_ic.experiments.drive import DriveRecorder, pump
 from instant_ic.experiments.stack import Stack, free_ports, processes_of
 from instant_ic.geometry.poses import compose2
 from instant_ic.launch.pacing import machine_pace
@@ -47,6 +48,45 @@ class Outcome:
     loops: dict[str, float]
     """CPU of each process per second of the stack's time, from ready to the end of the drive, in units of the time of
     one million iterations of an empty loop, measured at the same time."""
+
+
+async def drive_through_obstacle(stack: Stack, recorder: DriveRecorder, console_url: str, beyond_x_m: float) -> None:
+    """Drive straight ahead until the v-bot is past the obstacle, stop there, and wait for the r-bot.
+
+    If late sensor data stops the robot on the way, the operator releases the controls and continues, as a person would.
+
+    ``beyond_x_m`` is the map's x to which the v-bot is driven.
+    """
+    control = ControlState
+    async with pump(stack) as until:
+        await until(lambda: recorder.mode == control.REAL and recorder.ready, 240, "virtual space that is fit to show")
+        async with ConsoleClient(console_url) as console:
+
+            async def drive_until(condition, timeout_s, what):
+                deadline = asyncio.get_running_loop().time() + timeout_s / stack.pace
+                while True:
+                    console.drive(0.35, 0.0)
+                    left = (deadline - asyncio.get_running_loop().time()) * stack.pace
+                    await until(lambda: condition() or recorder.mode == control.STOPPED, max(left, 0.0), what)
+                    if condition():
+                        return
+                    await console.stop()
+                    await until(lambda: recorder.mode != control.STOPPED, 60, "end of the stop")
+
+            await console.wait_for(lambda c: any(c.frame_counts.values()), 30)
+            await console.acquire()
+            await drive_until(lambda: recorder.mode == control.VIRTUAL, 120, "passage into the virtual space")
+            await drive_until(
+                lambda: recorder.vbot_pose is not None and recorder.vbot_pose[0] > beyond_x_m,
+                120,
+                "v-bot past the obstacle",
+            )
+            await console.stop()
+            await until(lambda: recorder.mode == control.REAL, 120, "passage back to the real robot")
+            console.drive(0.35, 0.0)
+            await asyncio.sleep(1.5 / stack.pace)
+            await console.stop()
+            await asyncio.sleep(1.0 / stack.pace)
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import shutil
 import tempfile
@@ -34,20 +33,18 @@ def make_scan(folder: Path, world: str, seed: int) -> Path:
     Raises:
         StudyError: there is no such world, or it has no course straight ahead.
     """
-    from instant_ic.experiments.illusion_truth import without
     from instant_ic.experiments.scan import QUALITIES, scan_world
     from instant_ic.experiments.teleop_worlds import straight_ahead
-    from instant_ic.sim.worlds import make_world
+    from instant_ic.experiments.worlds import named_world
 
     file = folder / "scans" / f"{''.join(c if c.isalnum() else '_' for c in world)}.glb"
     if file.exists():
         return file
     try:
-        course = straight_ahead(make_world(world))
-        free = functools.reduce(without, course.obstacles, course.world)
+        course = straight_ahead(named_world(world))
         make_folder(file.parent, exist_ok=True)
         beside = file.with_suffix(".part")
-        scan_world(free, course.world.spawn, QUALITIES["tripod"], seed, beside, course.world.spawn)
+        scan_world(course.free_world, course.world.spawn, QUALITIES["tripod"], seed, beside, course.world.spawn)
     except ValueError as error:
         raise StudyError(f"{folder / 'study.yaml'}: world {world}: {error}") from None
     beside.replace(file)

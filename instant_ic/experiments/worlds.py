@@ -1,11 +1,13 @@
-"""Worlds of the experiments by name, and the paths of a camera through them."""
+"""Worlds of the experiments: by name, with objects removed or moved, and the paths of a camera through them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +15,8 @@ from instant_ic.geometry.poses import pose_matrix
 
 if TYPE_CHECKING:
     from instant_ic.sim.building import Building, Zone
-    from instant_ic.sim.worlds import World
+    from instant_ic.sim.contact import OccupancyMask
+    from instant_ic.sim.world import World
 
 KINDS = {
     "hall": "open hall",
@@ -24,13 +27,18 @@ KINDS = {
 """Kinds of worlds beside those of the simulator, each with seeds (``hall:3``)."""
 GENERATED = ("corridor", "corridor-free", "random", "long", *KINDS)
 """Worlds that have seeds."""
+OBJECT_M, WALL_M = (0.03, 1.6), (1.9, 2.2)
+"""Heights in which an object has surfaces, and in which only walls have."""
+_CELL_M = 0.05
+_AWAY_M = 1000.0
+"""Depth below the floor to which removed objects are moved."""
 _PLANS = {"furnished": "room", "windows": "corridor"}
 CAMERA_HEIGHT_M, LIDAR_HEIGHT_M = 1.2, 0.6
 CLEARANCE_M = 0.3
 _RADII_M = (2.5, 4.0, 6.0, 10.0, 16.0)
 
 
-def make_place_world(name: str) -> World:
+def named_world(name: str) -> World:
     """Make a world of ``KINDS`` with its seed, or any of ``sim.worlds.make_world``.
 
     Raises:
@@ -62,6 +70,71 @@ def glaze(rng: np.random.Generator, building: Building, zone: Zone) -> None:
             for number in range(int((high - low) / (width + 0.2))):
                 at = low + 0.1 + 0.5 * width + number * (width + 0.2)
                 building.window(zone, side, at, width, int(rng.integers(0, 12)), float(rng.uniform(1.2, 2.2)))
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A box on the floor: centre (m), length and width (m), yaw (rad), height (m)."""
+
+    x: float
+    y: float
+    length: float
+    width: float
+    yaw: float
+    height: float
+
+    def corners(self) -> NDArray[np.float64]:
+        """Return the corners (4, 2) of the outline."""
+        along = np.array([math.cos(self.yaw), math.sin(self.yaw)])
+        across = np.array([-along[1], along[0]])
+        signs = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)])
+        half = np.stack([0.5 * self.length * along, 0.5 * self.width * across])
+        return np.array([self.x, self.y]) + signs @ half
+
+
+def things(world: World) -> tuple[NDArray[np.int32], OccupancyMask, NDArray[np.int32]]:
+    """Find the free-standing objects of a world.
+
+    An object is what is connected in the floor plan of ``OBJECT_M`` without the walls. Its surfaces lie in its cells
+    completely, above the floor and below ``OBJECT_M``. Posters and skirting boards lie on a wall and are no objects.
+
+    Returns:
+        Number of the object of each surface, (S,), 0 for none; the floor plan; the number of the object of each cell.
+    """
+    plan, walls = (world.occupied(low, high, _CELL_M) for low, high in (OBJECT_M, WALL_M))
+    beside_walls = cv2.dilate(walls.cells.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    _, labels = cv2.connectedComponents((plan.cells & ~beside_walls).astype(np.uint8), connectivity=8)
+    around = cv2.dilate(labels.astype(np.float32), np.ones((5, 5), np.uint8)).astype(np.int32)
+    vertices = world.vertices.reshape(len(world.normal), -1, 3)
+    row, column = plan.index(world.vertices[:, :2]).T
+    inside = (row >= 0) & (row < around.shape[0]) & (column >= 0) & (column < around.shape[1])
+    row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+    own = np.where(inside, around[row, column], 0).reshape(vertices.shape[:2])
+    on_wall = (inside & beside_walls[row, column]).reshape(own.shape).all(axis=1)
+    high = vertices[..., 2].max(axis=1)
+    # A box's sides begin on the floor; the floor itself does not rise.
+    whole = (own == own[:, :1]).all(axis=1) & (high > 0.01) & (high < WALL_M[0]) & ~on_wall
+    return np.where(whole, own[:, 0], 0), plan, labels
+
+
+def moved_by(world: World, surfaces: NDArray[np.bool_], shift_m: NDArray[np.float64]) -> World:
+    """Return the world with surfaces (S,) displaced by (3,) metres, together with their texture and light."""
+    changed = {name: getattr(world, name).copy() for name in ("vertices", "offset", "uv", "light_uv", "light_linear")}
+    by = shift_m.astype(np.float32)
+    changed["vertices"].reshape(len(world.normal), -1, 3)[surfaces] += by
+    changed["offset"][surfaces] += world.normal[surfaces] @ by
+    for name in ("uv", "light_uv", "light_linear"):
+        changed[name][surfaces, ..., 3] -= changed[name][surfaces, ..., :3] @ by
+    return replace(world, **changed)
+
+
+def without(world: World, obstacle: Obstacle) -> World:
+    """Return the world without the object that stands at an obstacle's place; its shadow remains."""
+    owner, plan, labels = things(world)
+    outline = np.fliplr(plan.index(obstacle.corners())).astype(np.int32)
+    place = cv2.dilate(cv2.fillConvexPoly(np.zeros(labels.shape, np.uint8), outline, 1), np.ones((3, 3), np.uint8))
+    found = np.setdiff1d(np.unique(labels[place > 0]), [0])
+    return moved_by(world, np.isin(owner, found), np.array([0.0, 0.0, -_AWAY_M]))
 
 
 def path_poses(world: World, start: tuple[float, float, float], path: str, distances: Iterable[float]) -> list[Any]:

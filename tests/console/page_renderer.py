@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import math
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,6 @@ from instant_ic import console
 from instant_ic.console.layers import PageLayers
 from instant_ic.console.protocol import FrameKind, PageFrame, encode_frame
 
-CHROMIUM_FLAGS = [
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
-    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
 _STATIC = Path(console.__file__).parent / "static"
 _ORIGIN = "http://page.invalid/"
 _TIMEOUT_MS = 60_000
@@ -45,18 +40,7 @@ _SETUP = """async ([width, height, full]) => {
     };
     window.view = (mapFromLook, position, tanHalf) =>
         read({tanHalf, mapFromLook, camera: {mapFromLook, position, tanHalf}, blend: 1, viewColour: plain});
-    window.photo = async (mapFromLook, to, tanHalf, panoramaFromLook, from, moved) => {
-        const image = await (await fetch("/photo")).blob();
-        viewer.setPanorama(await createImageBitmap(image, {colorSpaceConversion: "none"}));
-        const glide = moved ? {from, to} : null;
-        return read({tanHalf, mapFromLook, panoramaFromLook, glide, blend: 0, panoramaColour: plain});
-    };
 }"""
-
-
-def launch_chromium(playwright: Any) -> Any:
-    """Launch the machine's Chromium, which renders WebGL on the CPU."""
-    return playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
 
 
 class PageRenderer:
@@ -67,7 +51,7 @@ class PageRenderer:
 
     def __init__(self, browser: Any, width: int, height: int, full: bool = True) -> None:
         self.width, self.height = width, height
-        self._frame = self._photo = b""
+        self._frame = b""
         self._page = browser.new_page()
         self._page.set_default_timeout(_TIMEOUT_MS)
         self._page.route("**/*", self._answer)
@@ -82,38 +66,10 @@ class PageRenderer:
 
     def render(self, map_from_camera: NDArray[np.floating], fov_rad: float) -> NDArray[np.uint8]:
         """Return the view along the camera's x axis, (height, width, 3), with this horizontal field of view."""
-        return self._seen("view", *self._camera(map_from_camera, fov_rad))
-
-    def render_photo(
-        self,
-        jpeg: bytes,
-        taken: NDArray[np.floating],
-        map_from_camera: NDArray[np.floating],
-        fov_rad: float,
-        moved: bool,
-    ) -> NDArray[np.uint8]:
-        """Return the camera's image (JPEG) as the page shows it in REAL, (height, width, 3).
-
-        Args:
-            jpeg: the camera's image.
-            taken: map_from_camera of the image, (4, 4).
-            map_from_camera: pose from which it is shown, (4, 4).
-            fov_rad: horizontal field of view.
-            moved: move the image by the depth of the layers; else show it as it was taken.
-        """
-        self._photo = jpeg
-        camera = self._camera(map_from_camera, fov_rad)
-        relative = (taken[:3, :3].T @ map_from_camera[:3, :3]).ravel().tolist()
-        rotation, position = self._camera(taken, fov_rad)[:2]
-        return self._seen("photo", *camera, relative, {"mapFromCamera": rotation, "position": position}, moved)
-
-    def _camera(self, map_from_camera: NDArray[np.floating], fov_rad: float) -> list[list[float]]:
         tan = math.tan(fov_rad / 2)
         rotation, position = map_from_camera[:3, :3].ravel().tolist(), map_from_camera[:3, 3].tolist()
-        return [rotation, position, [tan, tan * self.height / self.width]]
-
-    def _seen(self, function: str, *values: Any) -> NDArray[np.uint8]:
-        seen = self._page.evaluate(f"{function}(...{json.dumps(values)})")
+        values = json.dumps([rotation, position, [tan, tan * self.height / self.width]])
+        seen = self._page.evaluate(f"view(...{values})")
         rgba = np.frombuffer(base64.b64decode(seen["rgba"]), np.uint8).reshape(self.height, self.width, 4)
         return np.ascontiguousarray(rgba[::-1, :, :3])
 
@@ -123,8 +79,6 @@ class PageRenderer:
             route.fulfill(body="<!doctype html><canvas></canvas>", content_type="text/html")
         elif name == "layers":
             route.fulfill(body=self._frame, content_type="application/octet-stream")
-        elif name == "photo":
-            route.fulfill(body=self._photo, content_type="image/jpeg")
         elif (_STATIC / name).is_file():
             route.fulfill(path=_STATIC / name)
         else:
