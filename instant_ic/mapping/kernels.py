@@ -1,10 +1,26 @@
 """Compiled loops of the local model: a window of columns of voxels that moves with the robot.
 
-``key`` (N, N, 2) int32 names the cell that each column holds, so the window needs no shifting: a column is reused when
-a point or a beam reaches another cell with the same place modulo N, a power of two. ``odds`` (N, N, L) int8 is the log
-odds of each voxel, 0 where nothing was measured. ``sums`` (N, N, 6) float32 holds count, x, y, xx, xy and yy of a
-column's points, relative to its cell's centre. ``last`` (N, N) float32 is the age of the newest point, in the units of
-``now``. ``sight`` (N, N) float32 is the height up to which revolutions with points in a column looked there.
+Adding a revolution (``add_revolution``; occupancy mapping by log odds, Moravec and Elfes, 1985):
+
+1. ``_free_beams``: walk every n-th beam through the columns (Amanatides and Woo, 1987) and lower the odds of the voxels
+   that it passes, except beside and along known surfaces.
+2. ``_add_ends``: raise the odds at the beams' ends, and add them to the moments of their column.
+
+Rendering a depth image:
+
+3. ``solid_columns``: find the solid voxels and the surface of each column, in the steps ``_index_columns``,
+   ``_measured_voxels`` (and what lies between measured ones), ``_continue_upwards`` and ``_bridge``.
+4. ``put_plates``: continue the tops of low things behind their faces.
+5. ``cast_rays``: walk each pixel's ray through the columns to the first surface (``_cast``).
+
+State of the model, with N a power of two:
+
+- ``key`` (N, N, 2) int32: cell that each column holds. The window needs no shifting: a column is reused when a point or
+  a beam reaches another cell with the same place modulo N.
+- ``odds`` (N, N, L) int8: log odds of each voxel, 0 where nothing was measured.
+- ``sums`` (N, N, 6) float32: count, x, y, xx, xy and yy of a column's points, relative to its cell's centre.
+- ``last`` (N, N) float32: path of the robot at the newest point, in the units of ``now``.
+- ``sight`` (N, N) float32: height up to which revolutions with points in a column looked there.
 """
 
 from __future__ import annotations
@@ -18,18 +34,18 @@ HIT, MOST, LEAST = 4, 12, -8
 THROUGH = 2  # odds that a beam takes from the voxels of a column whose mean it passes; elsewhere 1
 OCCUPIED, FREE = 3, -2
 UNSEEN, OPEN, PLATE = -2, -1, -10  # values of the index of columns
-_BESIDE_M = 0.02  # a beam that passes a column's mean at this distance says nothing about its surface
-_GRAZING = 4.0  # beams along whose line the points around spread so much farther (variance) run along their surface
-_CROWDED_M = 1.2  # nearer, beams pass so close to each other that a quarter of them is enough
+_BESIDE_M = 0.02  # a beam that passes a column's mean farther away than this does not test its surface
+_GRAZING = 4.0  # a beam runs along a surface whose points spread this factor more along it than across (variance)
+_CROWDED_M = 1.2  # nearer, beams are so dense that a quarter of them is enough
 _SHORT_OF_M = 0.12  # beams free space up to this distance before their end
-_THING_CELLS = 12  # sides of a thing take their height from columns so far away
+_THING_CELLS = 12  # sides of a thing take their height from columns up to this many cells away
 _HANGS_M = 1.5  # sills, shelves and table tops are lower, lintels are not
-_RINGS = math.radians(2.0)  # between two rings: where the uppermost alone passed, it may be lost
+_RINGS = math.radians(2.0)  # angle between two rings: a return of the uppermost alone may be lost
 _MOST_POINTS = 256.0  # a column's sums are halved from here on, so that they follow changes
 
-# How a voxel of a column is known to be solid.
+# Reasons why a voxel of a column is solid.
 EMPTY, MEASURED, BETWEEN, UP, DOWN, BEHIND = 0, 1, 2, 3, 4, 5
-# What a ray ends on: one of the above on an upright surface, or:
+# Surfaces that a ray ends on: one of the above on an upright surface, or:
 NOTHING, TOP, FLOOR, CEILING, ASSUMED = 0, 6, 7, 8, 9
 # As UP, but in doubt: beams there had no return (a window above this wall, or one behind this thing), or it stands on
 # nothing (a sill). A ray goes on through it as far as places are known.
@@ -38,7 +54,7 @@ PANE = 10
 
 @njit(cache=True)
 def _take(key, odds, sums, last, sight, ix, iy, now, keep):  # type: ignore[no-untyped-def]
-    """Place of a cell's column; what another cell left there, or what is too old, is cleared."""
+    """Return the place of a cell's column; clear what another cell left there, or what is too old."""
     n = key.shape[0]
     a, b = ix & (n - 1), iy & (n - 1)
     if key[a, b, 0] != ix or key[a, b, 1] != iy or now - last[a, b] > keep:
@@ -51,16 +67,20 @@ def _take(key, odds, sums, last, sight, ix, iy, now, keep):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
-    """Free the voxels that beams passed, then add their ends. All in metres and in the model's frame.
+def _walk(origin, dx, dy, t, cell):  # type: ignore[no-untyped-def]
+    """Return the cell at ``t`` along a ray, the steps to its neighbours, the next borders and their distances."""
+    ix, iy = math.floor((origin[0] + t * dx) / cell), math.floor((origin[1] + t * dy) / cell)
+    step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+    next_x = ((ix + (dx > 0)) * cell - origin[0]) / dx if dx != 0 else np.inf
+    next_y = ((iy + (dy > 0)) * cell - origin[1]) / dy if dy != 0 else np.inf
+    per_x = cell / abs(dx) if dx != 0 else np.inf
+    per_y = cell / abs(dy) if dy != 0 else np.inf
+    return ix, iy, step_x, step_y, next_x, next_y, per_x, per_y
 
-    Args:
-        points: (M, 3); origin: (3,) of the beams.
-        low: height of the lowest voxels.
-        body: heights (from, to) whose points make a column's mean.
-        first, stride: which beams free space.
-        reach: farther points free space up to there.
-    """
+
+@njit(cache=True)
+def _free_beams(key, odds, sums, last, sight, points, origin, cell, low, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
+    """Lower the odds of the voxels that beams passed; arguments of ``add_revolution``."""
     levels, moments = odds.shape[2], np.empty(6)
     for i in range(first, len(points), stride):
         dx, dy, dz = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
@@ -71,12 +91,7 @@ def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body
         end = min(length - _SHORT_OF_M, reach)
         flat = math.sqrt(dx * dx + dy * dy)
         t = 0.0 if (i >> 6) & 3 == 0 else _CROWDED_M
-        ix, iy = math.floor((origin[0] + t * dx) / cell), math.floor((origin[1] + t * dy) / cell)
-        step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
-        next_x = ((ix + (dx > 0)) * cell - origin[0]) / dx if dx != 0 else np.inf
-        next_y = ((iy + (dy > 0)) * cell - origin[1]) / dy if dy != 0 else np.inf
-        per_x = cell / abs(dx) if dx != 0 else np.inf
-        per_y = cell / abs(dy) if dy != 0 else np.inf
+        ix, iy, step_x, step_y, next_x, next_y, per_x, per_y = _walk(origin, dx, dy, t, cell)
         while t < end:
             leave = min(next_x, next_y, end)
             a, b = _take(key, odds, sums, last, sight, ix, iy, now, keep)
@@ -100,7 +115,12 @@ def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body
             else:
                 iy += step_y
                 next_y += per_y
-    steepest = -np.inf
+
+
+@njit(cache=True)
+def _add_ends(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, reach):  # type: ignore[no-untyped-def]
+    """Raise the odds at the ends of beams, and add them to their columns; arguments of ``add_revolution``."""
+    levels, steepest = odds.shape[2], -np.inf
     for i in range(len(points)):
         dx, dy = points[i, 0] - origin[0], points[i, 1] - origin[1]
         steepest = max(steepest, (points[i, 2] - origin[2]) / max(math.sqrt(dx * dx + dy * dy), 1e-3))
@@ -130,8 +150,25 @@ def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body
 
 
 @njit(cache=True)
+def add_revolution(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, first, stride, reach):  # type: ignore[no-untyped-def]
+    """Free the voxels that beams passed, then add their ends. All in metres and in the model's frame.
+
+    Args:
+        key, odds, sums, last, sight: state of the model.
+        points: ends of the beams, (M, 3); origin: start of the beams, (3,).
+        cell: side of a voxel; low: height of the lowest voxels.
+        body: heights (from, to) whose points make a column's mean.
+        now, keep: path of the robot, and how much of it is remembered.
+        first, stride: the beams ``first``, ``first + stride``... free space.
+        reach: points farther away are not added, and free space up to there.
+    """
+    _free_beams(key, odds, sums, last, sight, points, origin, cell, low, now, keep, first, stride, reach)
+    _add_ends(key, odds, sums, last, sight, points, origin, cell, low, body, now, keep, reach)
+
+
+@njit(cache=True)
 def _runs_along(key, sums, a, b, cell, dx, dy, moments):  # type: ignore[no-untyped-def]
-    """Whether a beam of horizontal direction (``dx``, ``dy``) runs along the surface of a column's points.
+    """Return whether a beam of horizontal direction (``dx``, ``dy``) runs along the surface of a column's points.
 
     Such a beam passes beside the surface for many columns: a centimetre decides, which no pose has.
     """
@@ -142,7 +179,7 @@ def _runs_along(key, sums, a, b, cell, dx, dy, moments):  # type: ignore[no-unty
 
 @njit(cache=True)
 def ceiling_levels(key, odds, last, now, keep, centre, within, first, under):  # type: ignore[no-untyped-def]
-    """Histogram (L,) of the level of the uppermost solid voxel of columns around ``centre`` (2,) cells.
+    """Return the histogram (L,) of the level of the uppermost solid voxel of columns around ``centre`` (2,) cells.
 
     Only columns with no other solid voxel in the ``under`` levels below it count: a wall has some.
     """
@@ -165,19 +202,9 @@ def ceiling_levels(key, odds, last, now, keep, centre, within, first, under):  #
 
 
 @njit(cache=True)
-def solid_columns(key, odds, sums, last, sight, now, keep, cell, low, ground, top, index):  # type: ignore[no-untyped-def]
-    """Solid voxels of every column with points, and its surface.
-
-    Args:
-        ground, top: lowest and one past the highest level between floor and ceiling.
-        index: (N, N) int32, written: row of each column in the results, -1 without a solid voxel.
-
-    Returns:
-        ``codes`` (M, L) uint8, and ``faces`` (M, 6) float32: a point x, y of the surface, its normal (0, 0: none), and
-        how far it reaches from the point to either side.
-    """
-    n, levels = key.shape[0], odds.shape[2]
-    count = 0
+def _index_columns(odds, sums, last, now, keep, ground, top, index):  # type: ignore[no-untyped-def]
+    """Number the columns with a solid voxel in ``index``, and return how many there are."""
+    n, count = odds.shape[0], 0
     for a in range(n):
         for b in range(n):
             index[a, b] = UNSEEN
@@ -190,65 +217,98 @@ def solid_columns(key, odds, sums, last, sight, now, keep, cell, low, ground, to
                         index[a, b] = count
                         count += 1
                         break
+    return count
+
+
+@njit(cache=True)
+def _measured_voxels(odds, code, tops, ground, top):  # type: ignore[no-untyped-def]
+    """Write the solid voxels of a column as far as they follow from its own measurements.
+
+    Args:
+        odds: of the column, (L,); code: out, (L,); ground, top: as in ``solid_columns``.
+        tops: out, (3,): one past the highest measured level, first free level above, and one past the highest level
+            that beams met again and again.
+    """
+    levels, below = len(odds), -1
+    for level in range(ground, top):
+        if odds[level] < OCCUPIED:
+            continue
+        code[level] = MEASURED
+        if odds[level] >= 2 * HIT:
+            tops[2] = level + 1
+        _fill_between(code, odds, below, level, ground)
+        below = level
+    tops[0] = tops[1] = below + 1
+    while tops[1] < levels and odds[tops[1]] > FREE:
+        tops[1] += 1
+
+
+@njit(cache=True)
+def _continue_upwards(key, odds, sight, index, a, b, tops, highest, low, cell, ground, top, code):  # type: ignore[no-untyped-def]
+    """Continue a column above its measured part: to the ceiling or to its thing's top, as its neighbours decide."""
+    n, levels = key.shape[0], odds.shape[2]
+    at, x0, y0 = index[a, b], key[a, b, 0], key[a, b, 1]
+    open_above, ends = 0, 0
+    for i in range(-2, 3):
+        for j in range(-2, 3):
+            p, q = (x0 + i) & (n - 1), (y0 + j) & (n - 1)
+            if index[p, q] >= 0 and key[p, q, 0] == x0 + i and key[p, q, 1] == y0 + j:
+                if tops[index[p, q], 1] >= top:
+                    open_above += 1
+                else:
+                    ends += 1
+    end = tops[at, 1]
+    height = low + tops[at, 0] * cell
+    hangs = height < _HANGS_M and _hangs(odds[a, b], ground)
+    if end < top and open_above > 2 * ends:
+        end = levels
+    elif end >= top and ends > 2 * open_above:
+        end = tops[at, 0]
+    elif end < top:
+        # It ends somewhere between the highest point and the lowest beam above, as high as the thing around. A sill, a
+        # shelf or a table top is thin: half way to the next beam it would hide the wall behind it.
+        end = max(tops[at, 0] if hangs else (tops[at, 0] + end) // 2, highest[at])
+    doubtful = sight[a, b] > height or hangs
+    code[tops[at, 0] : end] = PANE if end == levels and doubtful else UP
+
+
+@njit(cache=True)
+def solid_columns(key, odds, sums, last, sight, now, keep, cell, low, ground, top, index):  # type: ignore[no-untyped-def]
+    """Find the solid voxels of every column with points, and its surface.
+
+    Args:
+        key, odds, sums, last, sight: state of the model; now, keep, cell, low: as in ``add_revolution``.
+        ground, top: lowest level and one past the highest between floor and ceiling.
+        index: out, (N, N) int32: row of each column in the results, ``OPEN`` without a solid voxel.
+
+    Returns:
+        ``codes`` (M, L) uint8, and ``faces`` (M, 6) float32: a point x, y of the surface, its normal (0, 0: none), and
+        how far it reaches from the point to either side.
+    """
+    n, levels = key.shape[0], odds.shape[2]
+    count = _index_columns(odds, sums, last, now, keep, ground, top, index)
     codes = np.zeros((count, levels), np.uint8)
     faces = np.zeros((count, 6), np.float32)
-    # One past the highest measured level, first free level above, one past the highest that beams met again and again.
     tops = np.zeros((count, 3), np.int32)
     for a in range(n):
         for b in range(n):
             at = index[a, b]
-            if at < 0:
-                continue
-            below = -1
-            for level in range(ground, top):
-                if odds[a, b, level] < OCCUPIED:
-                    continue
-                codes[at, level] = MEASURED
-                if odds[a, b, level] >= 2 * HIT:
-                    tops[at, 2] = level + 1
-                _fill_between(codes[at], odds[a, b], below, level, ground)
-                below = level
-            tops[at, 0] = tops[at, 1] = below + 1
-            while tops[at, 1] < levels and odds[a, b, tops[at, 1]] > FREE:
-                tops[at, 1] += 1
-            _set_face(key, sums, index, a, b, cell, faces[at])
+            if at >= 0:
+                _measured_voxels(odds[a, b], codes[at], tops[at], ground, top)
+                _set_face(key, sums, index, a, b, cell, faces[at])
     highest = _highest_around(key, index, tops, top)
     for a in range(n):
         for b in range(n):
             at = index[a, b]
-            if at < 0:
-                continue
-            # Whether a surface goes on above its measured part is decided with its neighbours.
-            x0, y0 = key[a, b, 0], key[a, b, 1]
-            open_above, ends = 0, 0
-            for i in range(-2, 3):
-                for j in range(-2, 3):
-                    p, q = (x0 + i) & (n - 1), (y0 + j) & (n - 1)
-                    if index[p, q] >= 0 and key[p, q, 0] == x0 + i and key[p, q, 1] == y0 + j:
-                        if tops[index[p, q], 1] >= top:
-                            open_above += 1
-                        else:
-                            ends += 1
-            end = tops[at, 1]
-            height = low + tops[at, 0] * cell
-            hangs = height < _HANGS_M and _hangs(odds[a, b], ground)
-            if end < top and open_above > 2 * ends:
-                end = levels
-            elif end >= top and ends > 2 * open_above:
-                end = tops[at, 0]
-            elif end < top:
-                # It ends somewhere between the highest point and the lowest beam above, as high as the thing around. A
-                # sill, a shelf or a table top is thin: half way to the next beam it would hide the wall behind it.
-                end = max(tops[at, 0] if hangs else (tops[at, 0] + end) // 2, highest[at])
-            doubtful = sight[a, b] > height or hangs
-            codes[at, tops[at, 0] : end] = PANE if end == levels and doubtful else UP
+            if at >= 0:
+                _continue_upwards(key, odds, sight, index, a, b, tops, highest, low, cell, ground, top, codes[at])
     _bridge(key, index, faces, cell)
     return codes, faces
 
 
 @njit(cache=True)
 def _hangs(odds, ground):  # type: ignore[no-untyped-def]
-    """Whether beams have passed below the lowest solid voxel of a column."""
+    """Return whether beams have passed below the lowest solid voxel of a column."""
     for level in range(ground, len(odds)):
         if odds[level] >= OCCUPIED:
             return False
@@ -259,7 +319,7 @@ def _hangs(odds, ground):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _highest_around(key, index, tops, top):  # type: ignore[no-untyped-def]
-    """One past the highest measured level of the thing that each column belongs to, (M,), as far as its own is open.
+    """Return one past the highest measured level of each column's thing, (M,), as far as its own column is open.
 
     A side that is seen from near alone is not met by the beams that met the front's upper edge from afar.
     """
@@ -346,7 +406,7 @@ def _set_face(key, sums, index, a, b, cell, face):  # type: ignore[no-untyped-de
 
 @njit(cache=True)
 def _bridge(key, index, faces, cell):  # type: ignore[no-untyped-def]
-    """Columns without points between two of one plane show it too: beams lie apart far from the robot."""
+    """Let columns without points between two of one plane show it too: beams lie apart far from the robot."""
     n = key.shape[0]
     bridged = []
     for a in range(n):
@@ -369,7 +429,7 @@ def _bridge(key, index, faces, cell):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _fill_between(code, odds, below, above, ground):  # type: ignore[no-untyped-def]
-    """Solid between two measured voxels, or from the floor (``below`` -1) up, as far as nothing there is free."""
+    """Fill between two measured voxels, or from the floor (``below`` -1) up, as far as nothing there is free."""
     for level in range(above - 1, max(below, ground - 1), -1):
         if odds[level] <= FREE:
             break
@@ -428,104 +488,130 @@ def put_plates(key, odds, index, codes, faces, origin, cell, ground, behind, hig
 
 
 @njit(cache=True)
-def cast_rays(  # type: ignore[no-untyped-def]
-    key, index, codes, faces, origin, rays, cell, low, ceiling, assumed, reach, unseen, depth, kind, free
-):
-    """First surface on every ray.
+def _meet_column(code, face, origin, dx, dy, dz, flat, t, leave, cell, low, pending):  # type: ignore[no-untyped-def]
+    """Return where and on what a ray meets a column between ``t`` and ``leave``; ``pending`` if nothing is nearer.
 
     Args:
-        origin: (3,) of the rays; rays: (M, 3) unit directions in the model's frame.
-        ceiling: height of the level ceiling (inf: none); assumed: whether it is.
-        reach: longest horizontal distance; unseen: metres of a ray through columns that nobody has seen, at most.
-        depth: (M,) float32 and kind (M,) uint8, written; 0 where a ray ends nowhere.
-        free: (M,) float32, written: how far a ray came.
+        code, face: of the column, (L,) and (6,); origin: of the ray, (3,).
+        dx, dy, dz, flat: direction of the ray, and the length of its horizontal part.
+        pending: length and kind of the surface met before.
     """
-    n, levels = key.shape[0], codes.shape[1]
-    for i in range(len(rays)):
-        dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
-        depth[i], kind[i] = 0.0, NOTHING
-        limit, limit_kind = np.inf, NOTHING
-        if dz < -1e-6:
-            limit, limit_kind = -origin[2] / dz, FLOOR
-        elif dz > 1e-6 and ceiling < np.inf:
-            limit, limit_kind = (ceiling - origin[2]) / dz, (ASSUMED if assumed else CEILING)
-        flat = math.sqrt(dx * dx + dy * dy)
-        end = min(limit, reach / max(flat, 1e-6))
-        ix, iy = math.floor(origin[0] / cell), math.floor(origin[1] / cell)
-        step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
-        next_x = ((ix + (dx > 0)) * cell - origin[0]) / dx if dx != 0 else np.inf
-        next_y = ((iy + (dy > 0)) * cell - origin[1]) / dy if dy != 0 else np.inf
-        per_x = cell / abs(dx) if dx != 0 else np.inf
-        per_y = cell / abs(dy) if dy != 0 else np.inf
-        t, missing = 0.0, 0.0
-        pending, pending_kind = np.inf, NOTHING
-        pane, hidden = np.inf, False  # the last pane, and whether nobody has seen what lies behind it
-        while t < end:
-            leave = min(next_x, next_y, end)
-            a, b = ix & (n - 1), iy & (n - 1)
-            at = index[a, b]
-            if at == UNSEEN:
-                missing += (leave - t) * flat
-                hidden = pane < np.inf
-                if missing > unseen or hidden:
-                    break
-            elif at == OPEN:
-                missing = 0.0
-            else:
-                missing = 0.0
+    levels = len(code)
+    z0 = math.floor((origin[2] + t * dz - low) / cell)
+    z1 = math.floor((origin[2] + leave * dz - low) / cell)
+    if 0 <= z0 < levels and code[z0] != EMPTY:
+        nx, ny = face[2], face[3]
+        px, py = face[0] - origin[0], face[1] - origin[1]
+        across = dx * nx + dy * ny
+        if abs(across) > 0.02 * flat:
+            hit = (px * nx + py * ny) / across
+        elif nx == 0 and ny == 0:
+            hit = min(max((px * dx + py * dy) / (flat * flat), t), leave)
+        else:
+            hit = np.inf
+        if hit < t:
+            hit = max(hit, t - 2 * cell / flat)
+        if nx == 0 and ny == 0:
+            nx, ny = dx / flat, dy / flat
+        aside = (dx * hit - px) * ny - (dy * hit - py) * nx
+        if aside > face[4] or -aside > face[5]:
+            hit = np.inf
+        if hit < pending[0] and hit - t < 0.6 / flat:
+            return hit, np.int64(code[z0])
+    elif z1 != z0:
+        step = 1 if z1 > z0 else -1
+        for level in range(z0 + step, z1 + step, step):
+            if 0 <= level < levels and code[level] != EMPTY:
+                height = low + (level + (1 if step < 0 else 0)) * cell
+                return (height - origin[2]) / dz, np.int64(TOP)
+    return pending
+
+
+@njit(cache=True)
+def _cast(key, index, codes, faces, origin, ray, cell, low, limit, reach, unseen):  # type: ignore[no-untyped-def]
+    """Return length and kind of the first surface on a ray, how far it came, and its way through unseen columns.
+
+    Args:
+        ray: unit direction, (3,); limit: length at which it meets floor or ceiling.
+        key, index, codes, faces, origin, cell, low, reach, unseen: as in ``cast_rays``.
+    """
+    n = key.shape[0]
+    dx, dy, dz = ray[0], ray[1], ray[2]
+    flat = math.sqrt(dx * dx + dy * dy)
+    end = min(limit, reach / max(flat, 1e-6))
+    ix, iy, step_x, step_y, next_x, next_y, per_x, per_y = _walk(origin, dx, dy, 0.0, cell)
+    t, missing = 0.0, 0.0
+    pending = np.inf, np.int64(NOTHING)
+    pane, hidden = np.inf, False  # the last pane; hidden: no column behind it is known
+    while t < end:
+        leave = min(next_x, next_y, end)
+        a, b = ix & (n - 1), iy & (n - 1)
+        at = index[a, b]
+        if at == UNSEEN:
+            missing += (leave - t) * flat
+            hidden = pane < np.inf
+            if missing > unseen or hidden:
+                break
+        else:
+            missing = 0.0
+            if at != OPEN:
                 if key[a, b, 0] != ix or key[a, b, 1] != iy:
                     hidden = pane < np.inf
                     break
                 if at <= PLATE:
                     height = low + (PLATE - at) * cell
                     if origin[2] + t * dz <= height:
-                        pending, pending_kind = t, BEHIND
+                        pending = t, np.int64(BEHIND)
                     elif origin[2] + leave * dz <= height:
-                        pending, pending_kind = (height - origin[2]) / dz, TOP
+                        pending = (height - origin[2]) / dz, np.int64(TOP)
                 else:
-                    z0 = math.floor((origin[2] + t * dz - low) / cell)
-                    z1 = math.floor((origin[2] + leave * dz - low) / cell)
-                    if 0 <= z0 < levels and codes[at, z0] != EMPTY:
-                        nx, ny = faces[at, 2], faces[at, 3]
-                        px, py = faces[at, 0] - origin[0], faces[at, 1] - origin[1]
-                        across = dx * nx + dy * ny
-                        if abs(across) > 0.02 * flat:
-                            hit = (px * nx + py * ny) / across
-                        elif nx == 0 and ny == 0:
-                            hit = min(max((px * dx + py * dy) / (flat * flat), t), leave)
-                        else:
-                            hit = np.inf
-                        if hit < t:
-                            hit = max(hit, t - 2 * cell / flat)
-                        if nx == 0 and ny == 0:
-                            nx, ny = dx / flat, dy / flat
-                        aside = (dx * hit - px) * ny - (dy * hit - py) * nx
-                        if aside > faces[at, 4] or -aside > faces[at, 5]:
-                            hit = np.inf
-                        if hit < pending and hit - t < 0.6 / flat:
-                            pending, pending_kind = hit, codes[at, z0]
-                    elif z1 != z0:
-                        step = 1 if z1 > z0 else -1
-                        for level in range(z0 + step, z1 + step, step):
-                            if 0 <= level < levels and codes[at, level] != EMPTY:
-                                height = low + (level + (1 if step < 0 else 0)) * cell
-                                pending, pending_kind = (height - origin[2]) / dz, TOP
-                                break
-            if pending <= leave:
-                if pending_kind != PANE:
-                    break
-                pane, pending = pending, np.inf
-            t = leave
-            if next_x < next_y:
-                ix += step_x
-                next_x += per_x
-            else:
-                iy += step_y
-                next_y += per_y
-        if hidden:
-            pending, pending_kind = pane, PANE
-        if pending <= limit and pending < np.inf:
-            depth[i], kind[i] = pending, pending_kind
+                    pending = _meet_column(
+                        codes[at], faces[at], origin, dx, dy, dz, flat, t, leave, cell, low, pending
+                    )  # fmt: skip
+        if pending[0] <= leave:
+            if pending[1] != PANE:
+                break
+            pane, pending = pending[0], (np.inf, pending[1])
+        t = leave
+        if next_x < next_y:
+            ix += step_x
+            next_x += per_x
+        else:
+            iy += step_y
+            next_y += per_y
+    if hidden:
+        pending = pane, np.int64(PANE)
+    return pending[0], pending[1], t, missing / max(flat, 1e-6)
+
+
+@njit(cache=True)
+def cast_rays(  # type: ignore[no-untyped-def]
+    key, index, codes, faces, origin, rays, cell, low, ceiling, assumed, reach, unseen, depth, kind, free
+):
+    """Find the first surface on every ray.
+
+    Args:
+        key: state of the model; index, codes, faces: results of ``solid_columns``.
+        origin: start of the rays, (3,); rays: unit directions in the model's frame, (M, 3).
+        cell, low: as in ``add_revolution``.
+        ceiling: height of the level ceiling (inf: none); assumed: it was not seen.
+        reach: longest horizontal distance; unseen: longest way of a ray through columns that were not seen, in metres.
+        depth: out, (M,) float32; kind: out, (M,) uint8; 0 where a ray ends nowhere.
+        free: out, (M,) float32: how far a ray came.
+    """
+    for i in range(len(rays)):
+        dz = rays[i, 2]
+        depth[i], kind[i] = 0.0, NOTHING
+        limit, limit_kind = np.inf, NOTHING
+        if dz < -1e-6:
+            limit, limit_kind = -origin[2] / dz, FLOOR
+        elif dz > 1e-6 and ceiling < np.inf:
+            limit, limit_kind = (ceiling - origin[2]) / dz, (ASSUMED if assumed else CEILING)
+        met, met_kind, t, missing = _cast(
+            key, index, codes, faces, origin, rays[i], cell, low, limit, reach, unseen
+        )  # fmt: skip
+        if met <= limit and met < np.inf:
+            depth[i], kind[i] = met, met_kind
         elif t >= limit - 1e-9:
             depth[i], kind[i] = limit, limit_kind
-        free[i] = depth[i] if kind[i] != NOTHING else max(t - missing / max(flat, 1e-6), 0.0)
+        free[i] = depth[i] if kind[i] != NOTHING else max(t - missing, 0.0)

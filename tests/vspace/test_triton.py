@@ -278,12 +278,11 @@ def test_all_kernels_compile_for_gpus_that_are_not_here(tmp_path):
     )  # fmt: skip
     assert made.returncode == 0, made.stderr[-2000:]
     lines = [line.split() for line in made.stdout.splitlines()]
-    corners = {(name, capability, *shape) for stage, name, capability, *shape in lines if stage == "ttgir"}
-    assert corners == {
-        ("gradient", capability, levels, features, hidden)
-        for capability in ("80", "89", "90")
+    lowered = {(name, capability, *shape) for stage, name, capability, *shape in lines if stage == "ttgir"}
+    assert lowered == {("draw", "90"), ("gradient", "80", "8", "4", "32"), ("gradient", "89", "8", "4", "32")} | {
+        ("gradient", "90", levels, features, hidden)
         for levels, features in (("1", "4"), ("2", "2"), ("16", "2"), ("16", "4"))
         for hidden in ("4", "32")
     }
-    whole = [name for stage, name, capability, *_ in lines if stage == "cubin" and capability == "90"]
-    assert sorted(whole) == ["adam_network", "adam_table", "draw", "gradient", "sample_rays"]
+    whole = [name for stage, name, *_ in lines if stage == "cubin"]
+    assert sorted(whole) == ["adam_network", "adam_table", "gradient", "sample_rays"]

@@ -1,7 +1,7 @@
 """Compiles the Triton kernels for some compute capabilities, which needs no GPU: ``python triton_compile.py 89 90``.
 
-All of them wholly for the default field; ``gradient``, whose products depend on the GPU, for every corner of
-``FieldConfig`` up to the stage that has refused some.
+All but ``draw`` wholly for the default field and the newest capability; ``gradient``, whose products depend on the GPU,
+up to the stage that has refused some: for every corner of ``FieldConfig``, and for the older capabilities.
 """
 
 import itertools
@@ -85,18 +85,21 @@ def lower(source, target):
 
 def main(capabilities):
     targets = {capability: GPUTarget("cuda", capability, 32) for capability in capabilities}
-    for field in corners():
-        shape = kernel_shape(field)
-        source = source_of(triton_kernels.gradient, {**shape, "B": TRAIN_BLOCK})
-        for capability, target in targets.items():
-            lower(source, target)
+    newest = capabilities[-1]
+    # Every corner for the newest, which alone has refused some; the default field for all.
+    for capability, fields in {**{one: [FieldConfig()] for one in capabilities}, newest: corners()}.items():
+        for field in fields:
+            source = source_of(triton_kernels.gradient, {**kernel_shape(field), "B": TRAIN_BLOCK})
+            lower(source, targets[capability])
             sys.stdout.write(f"ttgir gradient {capability} {field.levels} {field.features} {field.hidden}\n")
     for kernel, constants in KERNELS:
         source = source_of(kernel, constants)
-        # `draw` takes 20 s and has no product that `gradient` has not: once, for the newest.
-        for capability in capabilities[-1:] if kernel is triton_kernels.draw else capabilities:
-            made = triton.compile(source, target=targets[capability], options={"num_warps": 4})
-            sys.stdout.write(f"cubin {kernel.fn.__name__} {capability} {len(made.asm['cubin'])}\n")
+        if kernel is triton_kernels.draw:  # takes 20 s to the end and has no product that `gradient` has not
+            lower(source, targets[newest])
+            sys.stdout.write(f"ttgir draw {newest}\n")
+        else:
+            made = triton.compile(source, target=targets[newest], options={"num_warps": 4})
+            sys.stdout.write(f"cubin {kernel.fn.__name__} {newest} {len(made.asm['cubin'])}\n")
 
 
 if __name__ == "__main__":
