@@ -140,17 +140,17 @@ class DepthSource:
         size: tuple[int, int] = (256, 512),
         local: LocalView | None = None,
     ) -> DepthResult:
-        """Depth of one image.
+        """Compute the depth of one image.
 
         ``fused`` and ``lidar`` take the local model first, then the structure of this revolution. In ``fused`` the
         network fills what both leave unknown; it overrides nothing.
 
         Args:
-            raw: (H, W) the network's depth in its own unit, 0 = unknown; None only for ``lidar``.
-            points: (N, 3) LiDAR points in the camera's frame at the image's time, metres.
-            up: (3,) gravity's up in the camera's frame.
-            camera_height_m: of the camera over the floor; None where it is not known.
-            size: height and width of the result where there is no ``raw``; else it has ``raw``'s.
+            raw: the network's depth in its own unit, (H, W); 0 is unknown. None only for ``lidar``.
+            points: LiDAR points in the camera's frame at the image's time, (N, 3) metres.
+            up: gravity's up in the camera's frame, (3,).
+            camera_height_m: height of the camera over the floor; None if it is unknown.
+            size: height and width of the result where there is no ``raw``; else it has the size of ``raw``.
             local: the local model, seen from the camera.
 
         Raises:
@@ -167,31 +167,38 @@ class DepthSource:
             return _of_fit(fit)
         network, top = self.network(fit, points, up, camera_height_m)
         built = self._built(points, up, camera_height_m, fit.depth_m.shape, local, top)
-        result = _of_fit(fit)
         if not fit.ok or built.structure.message:
-            # The LiDAR alone is the better estimate, but one of the two is wrong: not fit.
-            known = built.depth_m > 0
-            return replace(
-                result,
-                depth_m=np.where(known, built.depth_m, fit.depth_m),
-                sigma=np.where(known, built.sigma, result.sigma),
-                ok=False,
-                message=built.structure.message if fit.ok else fit.message,
-                source=config.source,
-            )
+            return self._unfit(fit, built)
+        result = self._fused(fit, network, built)
+        if config.source != "completed":
+            return result
+        ranges = self.structure.ranges(points, result.depth_m.shape)
+        channels = prior_channels(result.depth_m, result.sigma, ranges, up, camera_height_m, network.depth_m)
+        robot = np.zeros(result.depth_m.shape, bool)
+        return replace(result, prior=Prior(channels, built.free_m, built.measured, robot))
+
+    def _unfit(self, fit: ScaleFit, built: _Built) -> DepthResult:
+        """Return the LiDAR's depth, the better estimate, as unfit: LiDAR or network is wrong."""
+        result, known = _of_fit(fit), built.depth_m > 0
+        return replace(
+            result,
+            depth_m=np.where(known, built.depth_m, fit.depth_m),
+            sigma=np.where(known, built.sigma, result.sigma),
+            ok=False,
+            message=built.structure.message if fit.ok else fit.message,
+            source=self.config.source,
+        )
+
+    def _fused(self, fit: ScaleFit, network: Corrected, built: _Built) -> DepthResult:
+        """Fill what the LiDAR leaves unknown by the network, never nearer than free space."""
         known = built.depth_m > 0
         guess = np.maximum(network.depth_m, built.free_m)
         depth = np.where(known, built.depth_m, guess)
         sigma = np.where(known, built.sigma, np.where(guess > 0, _NETWORK_SIGMA, np.float32(np.inf)))
         message = f"{fit.message}; {_surfaces(built)}"
-        prior = None
-        if config.source == "completed":
-            ranges = self.structure.ranges(points, depth.shape)
-            channels = prior_channels(depth, sigma, ranges, up, camera_height_m, network.depth_m)
-            prior = Prior(channels, built.free_m, built.measured, np.zeros(depth.shape, bool))
         return replace(
-            result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source=config.source,
-            prior=prior,
+            _of_fit(fit), depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message,
+            source=self.config.source,
         )  # fmt: skip
 
     def refuse(self, raw: Floats | None, message: str, size: tuple[int, int] = (256, 512)) -> DepthResult:

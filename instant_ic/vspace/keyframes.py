@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.vspace.agreement import exposure_gains, moved
 from instant_ic.vspace.background import Background
 from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import PanoramaPrior
@@ -77,6 +78,32 @@ class KeyframeSet:
     def priors(self) -> tuple[PanoramaPrior, ...]:
         """Priors of ``keyframes``, newest first."""
         return tuple(keyframe.prior for keyframe in self.keyframes)
+
+
+def extended(prior: PanoramaPrior, shown: KeyframeSet | None, count: int, older: int) -> KeyframeSet:
+    """Prepare a new keyframe, with the earlier ones of its size that are used with it.
+
+    Args:
+        prior: the new keyframe.
+        shown: keyframes in use before; None before the first.
+        count: number of keyframes that the field learns from, in one exposure and without moved objects.
+        older: number of older keyframes that give their pixels of what is hidden from the new one.
+    """
+    before = () if shown is None else (*shown.keyframes, *shown.kept)
+    size = (prior.rgb.shape, prior.inverse_depth.shape)
+    before = tuple(one for one in before if (one.prior.rgb.shape, one.prior.inverse_depth.shape) == size)
+    keyframes = (Keyframe.build(prior), *before[: count - 1])
+    if len(keyframes) > 1:
+        gone = moved([keyframe.prior for keyframe in keyframes])
+        keyframes = tuple(one.without(mask) for one, mask in zip(keyframes, gone, strict=True))
+    gains = exposure_gains([keyframe.prior for keyframe in keyframes])
+    if not older:
+        return KeyframeSet(keyframes, gains)
+    first = keyframes[0]
+    kept = recent((first, *before[count - 1 :]))[1:]
+    others = [(one.prior, exposure_gains([first.prior, one.prior])[1]) for one in spread((first, *kept), older)]
+    first = replace(first, background=first.background.seen_by(others))
+    return KeyframeSet((first, *keyframes[1:]), gains, kept)
 
 
 def spread(keyframes: Sequence[Keyframe], count: int) -> list[Keyframe]:

@@ -83,7 +83,7 @@ def test_without_an_older_keyframe_the_warp_is_shown_and_the_field_learns():
 
 def test_a_field_that_loses_is_not_shown_and_stops():
     space = driven(3)
-    assert len(space._trials) == 2
+    assert len(space.trials) == 2
     assert space.status.gain_db < -3  # measured at once, untrained
     space.train()
     status = space.status
@@ -93,7 +93,7 @@ def test_a_field_that_loses_is_not_shown_and_stops():
 
 def test_a_field_that_wins_is_shown_until_it_loses(monkeypatch):
     space = driven(3)
-    true, colours = space._device.draw, {trial.rays.origin.tobytes(): trial.truth for trial in space._trials}
+    true, colours = space.device.backend.draw, {trial.rays.origin.tobytes(): trial.truth for trial in space.trials}
     before = space.render(space.keyframe.map_from_camera, 48, 27, 1.5).rgb
 
     def draw(rays, panorama_share, depth_share):
@@ -102,7 +102,7 @@ def test_a_field_that_wins_is_shown_until_it_loses(monkeypatch):
         return truth + np.float32(0.01), *true(rays, panorama_share, depth_share)[1:]
 
     with monkeypatch.context() as patch:
-        patch.setattr(space._device, "draw", draw)
+        patch.setattr(space.device.backend, "draw", draw)
         space.train(iterations=10)
         assert space.status.shows_field and space.status.gain_db > 3
         assert space.render(space.keyframe.map_from_camera, 48, 27, 1.5).rgb.mean() > 240
@@ -113,7 +113,7 @@ def test_a_field_that_wins_is_shown_until_it_loses(monkeypatch):
 
 def test_what_is_shown_survives_saving(tmp_path):
     space = driven(3)
-    space._choice.field = True
+    space.choice.field = True
     space.save(tmp_path)
     loaded = VirtualSpace.load(tmp_path)
     assert loaded.status.shows_field
@@ -126,4 +126,4 @@ def test_the_field_alone_is_not_measured():
     for x in (0.0, 0.5):
         image = box_room.panorama(pose_matrix(x), 96)
         space.set_keyframe(image.rgb, image.depth_m, pose_matrix(x), 0.02)
-    assert space._trials == () and space.status.shows_field
+    assert space.trials == () and space.status.shows_field

@@ -48,7 +48,7 @@ def test_the_newest_so_many_are_kept(keyframes):
     poses = [pose_matrix(x=x) for x in (-1.0, -0.5, 0.0, 0.5)]
     learn(space, *poses)
     assert [prior.map_from_camera[0, 3] for prior in space.keyframes] == [0.5, 0.0, -0.5][:keyframes]
-    assert len(space._scene.priors) == len(space.keyframes)  # one field learns from all of them
+    assert len(space.scene.priors) == len(space.keyframes)  # one field learns from all of them
     # A new one is shown from the first moment, and what was fit to show stays so.
     picture = box_room.panorama(FIRST, 96)
     space.set_keyframe(picture.rgb, picture.depth_m, FIRST, 0.02)
@@ -212,7 +212,7 @@ def test_a_thing_that_has_moved_away_is_left_out():
     learn(space, other)
     space.set_keyframe(picture.rgb, depth, pose, 0.02)
     assert (space.keyframes[1].content == MOVED).sum() > 100
-    assert not space._scene.priors[1].usable.all()  # nor does the field learn from it
+    assert not space.scene.priors[1].usable.all()  # nor does the field learn from it
 
 
 def test_a_refresh_costs_no_picture_more_than_a_decibel():

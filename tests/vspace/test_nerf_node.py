@@ -141,7 +141,7 @@ def test_auto_trains_nothing_on_a_cpu():
         status = bus.last("/vspace/status")
         assert (status.state, status.keyframe_id, status.iterations) == (READY, 4, 0)
         assert "source: warp" in status.message
-        assert node.work.space._scene is None  # not even an occupancy grid
+        assert node.work.space.scene is None  # not even an occupancy grid
 
 
 def test_a_view_is_rendered_again_only_when_it_would_differ():
@@ -217,7 +217,7 @@ def test_a_gpu_without_memory_is_told_and_the_next_keyframe_recovers(bus):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
     bus.advance(0.3)
     node = next(n for n in bus.nodes if isinstance(n, NerfNode))
-    device = node.work.space._device
+    device = node.work.space.device.backend
     whole = device.step
 
     def no_memory(*args):

@@ -178,10 +178,10 @@ def test_what_is_shown_passes_into_a_new_keyframe():
         expected = 255 * dissolve(*(np.float32(image / 255) for image in (first, shown[5])), number / 4)
         assert picture == pytest.approx(expected, abs=2)
     # The field has not learnt it yet, and can at any time.
-    assert len(space._scene.priors) == 1 and np.array_equal(space._scene.prior.map_from_camera, CAMERA)
+    assert len(space.scene.priors) == 1 and np.array_equal(space.scene.prior.map_from_camera, CAMERA)
     space.learn(prepared)
     assert space.train(iterations=2).iterations == 2
-    assert np.array_equal(space._scene.prior.map_from_camera, NEXT)
+    assert np.array_equal(space.scene.prior.map_from_camera, NEXT)
 
 
 def test_parts_that_disagree_change_at_once_and_the_others_pass():
@@ -211,8 +211,8 @@ def test_another_scale_starts_anew():
     picture = box_room.panorama(CAMERA, 192)
     space.set_keyframe(picture.rgb, 5 * picture.depth_m, CAMERA, 0.02)
     assert space.train(iterations=1).psnr_db < 16
-    cells = space._scene.lattice.cells_per_m
-    assert cells[0] == pytest.approx(trained(0)._scene.lattice.cells_per_m[0] / 5, rel=1e-3)
+    cells = space.scene.lattice.cells_per_m
+    assert cells[0] == pytest.approx(trained(0).scene.lattice.cells_per_m[0] / 5, rel=1e-3)
 
 
 def test_nothing_before_the_first_keyframe():
@@ -310,7 +310,7 @@ def test_a_gpu_without_memory_is_left_for_the_cpu_with_what_is_learnt(call, monk
     # Pictures by the field.
     ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1), picture=FIELD_ONLY.picture)
     space, whole = trained(6, ready), trained(6, ready)
-    monkeypatch.setattr(space._device, call, no_memory)
+    monkeypatch.setattr(space.device.backend, call, no_memory)
     assert not space.status.warning
     for s in (space, whole):
         if call == "set_scene":
@@ -330,12 +330,12 @@ def test_a_gpu_that_was_asked_for_fails_aloud_and_the_next_keyframe_recovers(mon
     space = trained(6, dataclasses.replace(SMALL, device="cpu"))  # any device that was asked for by name
     before = space.render(CAMERA, 64, 36, 1.5)
     with monkeypatch.context() as patch:
-        patch.setattr(space._device, "set_scene", no_memory)
+        patch.setattr(space.device.backend, "set_scene", no_memory)
         with pytest.raises(torch.OutOfMemoryError):
             refreshed(space)
         assert np.array_equal(space.render(CAMERA, 64, 36, 1.5).rgb, before.rgb)  # the old space is whole
         picture = box_room.panorama(CAMERA, 192)
-        patch.setattr(space._device, "set_scene", once(space._device.set_scene))
+        patch.setattr(space.device.backend, "set_scene", once(space.device.backend.set_scene))
         with pytest.raises(torch.OutOfMemoryError):
             space.set_keyframe(picture.rgb, 5 * picture.depth_m, CAMERA, 0.02)  # would start anew
         assert np.array_equal(space.render(CAMERA, 64, 36, 1.5).rgb, before.rgb)
