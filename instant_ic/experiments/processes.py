@@ -38,17 +38,15 @@ def run_all(
 ) -> list[T]:
     """Call a function for each task's arguments, ``jobs`` at once.
 
-    With one job and no time limit for each call, the calls run in this process.
-
     Args:
         function: function of a module, so that other processes find it.
         tasks: positional arguments of each call.
-        jobs: number of processes.
+        jobs: number of processes; one, without ``call_timeout_s``: this process.
         prepare: called first in each process.
         on_result: called with each result as it arrives.
         timeout_s: time limit for all calls.
         call_timeout_s: time limit for one call; its process is then killed.
-        on_lost: returns the result of a call whose process died or was killed, from the task's number; None: raise.
+        on_lost: returns the result of a lost call from the task's number and the error; None: raise.
 
     Returns:
         Results in the order of completion.
@@ -73,26 +71,35 @@ def run_all(
             on_result(result)
 
     if math.isinf(call_timeout_s) and (jobs == 1 or len(tasks) <= 1):
-        if tasks:
-            prepare()
-        for task in tasks:
-            check_time()
-            take(function(*task))
+        _run_here(function, tasks, prepare, take, check_time)
         return results
     workers = _Workers(function, tasks, prepare, call_timeout_s)
     try:
         while workers.start(jobs):
             check_time()
             for number, call in workers.ended(deadline):
-                try:
-                    take(call.result(0))
-                except LostError as lost:
-                    if on_lost is None:
-                        raise LostError(f"task {number}: {lost}; try --jobs 1") from None
+                lost = call.exception()
+                if on_lost is not None and isinstance(lost, LostError):
                     take(on_lost(number, lost))
+                else:
+                    take(call.result())
     finally:
         workers.kill()
     return results
+
+
+def _run_here(
+    function: Callable[..., T],
+    tasks: Sequence[tuple[Any, ...]],
+    prepare: Callable[[], None],
+    take: Callable[[T], None],
+    check_time: Callable[[], None],
+) -> None:
+    if tasks:
+        prepare()
+    for task in tasks:
+        check_time()
+        take(function(*task))
 
 
 class _Workers:

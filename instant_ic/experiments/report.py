@@ -40,7 +40,7 @@ class Figure:
     source: str
     command: str = ""
     wide: bool = False
-    """Whether it needs scrolling on a phone."""
+    """True if it needs scrolling on a phone."""
 
 
 Part: TypeAlias = Text | Table | Figure
@@ -61,9 +61,12 @@ LEAST_UNITS = 3
 
 @dataclass(frozen=True)
 class Answer:
-    """Whether a claim of the paper holds here, None where it was not measured, and the figures that decide it.
+    """Answer to a claim of the paper.
 
-    ``units`` is the number of measurements behind it; the report decides nothing from less than ``LEAST_UNITS``.
+    Attributes:
+        held: True if the claim holds here; None if it was not measured.
+        figures: figures that decide it.
+        units: number of measurements behind it; the report decides nothing from less than ``LEAST_UNITS``.
     """
 
     held: bool | None
@@ -76,18 +79,18 @@ class Section:
     """One experiment.
 
     Attributes:
-        verdict: sentence → whether it holds; None: not measured.
-        answers: claim of ``PAPER`` → whether it holds, from the results.
+        title: heading of the section.
+        parts: paragraphs, tables and figures.
+        answers: answers to claims of ``PAPER``, by the claim's key.
     """
 
     title: str
     parts: Sequence[Part]
-    verdict: dict[str, bool | None] = field(default_factory=dict)
     answers: dict[str, Answer] = field(default_factory=dict)
 
 
 def spread(values: Sequence[float | None], digits: int = 2) -> str:
-    """Mean ± standard deviation of what is known, and the number of values where it is one."""
+    """Format the mean ± standard deviation of the known values, or a single value with (1)."""
     known = [value for value in values if value is not None]
     if not known:
         return "–"
@@ -96,12 +99,12 @@ def spread(values: Sequence[float | None], digits: int = 2) -> str:
 
 
 def image_address(jpeg_or_other: bytes, kind: str = "image/jpeg") -> str:
-    """Bytes of an image as an address for a page."""
+    """Return the bytes of an image as an address for a page."""
     return f"data:{kind};base64,{base64.b64encode(jpeg_or_other).decode()}"
 
 
 def answers(sections: dict[str, Section]) -> dict[str, Answer]:
-    """Answer to each claim of ``PAPER``."""
+    """Return the answer to each claim of ``PAPER``."""
     found = {key: _decided(answer) for section in sections.values() for key, answer in section.answers.items()}
     none = Answer(None, "")
     return {key: found.get(key, none) for key in PAPER} | {"people": Answer(None, "it takes people: ic study")}
@@ -113,30 +116,20 @@ def _decided(answer: Answer) -> Answer:
     return replace(answer, held=None, figures=f"{answer.figures}; too few to decide: {answer.units} units")
 
 
-def write(
-    folder: Path,
-    sections: dict[str, Section],
-    results: Sequence[Result],
-    conditions: dict[str, Any],
-    title: str = "",
-    more: dict[str, Any] | None = None,
-) -> None:
+def write(folder: Path, sections: dict[str, Section], results: Sequence[Result], conditions: dict[str, Any]) -> None:
     """Write ``report.html`` and ``report.json``.
 
     Args:
         folder: existing folder.
         sections: sections by name.
-        results: results of the experiments' units; empty for a report without units.
+        results: results of the experiments' units.
         conditions: machine, versions, command and times.
-        title: title of the page; empty for the paper's experiments, whose claims are answered.
-        more: further entries of the JSON.
     """
-    claims = {} if title else {key: {"claim": PAPER[key], **vars(one)} for key, one in answers(sections).items()}
+    claims = {key: {"claim": PAPER[key], **vars(one)} for key, one in answers(sections).items()}
     pages = Environment(loader=PackageLoader(__package__, "."), autoescape=True, undefined=StrictUndefined)
     page = pages.get_template("report.html").render(
-        title=title or "Instant IC: the paper's experiments", sections=sections, claims=claims, results=results,
-        conditions=conditions, number=_number,
-    )  # fmt: skip
+        sections=sections, claims=claims, results=results, conditions=conditions, number=_number
+    )
     save_text(folder / "report.html", page)
     tables = {
         name: [vars(part) for part in section.parts if isinstance(part, Table)] for name, section in sections.items()
@@ -152,14 +145,7 @@ def write(
         }
         for one in results
     ]
-    known = {
-        **(more or {}),
-        "conditions": conditions,
-        **({"paper": claims} if claims else {}),
-        "verdict": {name: section.verdict for name, section in sections.items()},
-        "tables": tables,
-        "units": units,
-    }
+    known = {"conditions": conditions, "paper": claims, "tables": tables, "units": units}
     save_json(folder / "report.json", finite(known, 5))
 
 

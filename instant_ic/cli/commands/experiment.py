@@ -10,12 +10,15 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli.arguments import positive, positive_int, size, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.evaluations import errors_for_the_user, use_one_thread_for_matrices
 from instant_ic.cli.progress import progress
+
+if TYPE_CHECKING:
+    from instant_ic.experiments import lab
 
 _NAMES = ("reconstruction", "training-time", "ablation", "teleoperation", "operators", "environments", "all")
 _MESHES = (".glb", ".gltf", ".obj", ".ply")
@@ -58,17 +61,9 @@ def _experiment(args: argparse.Namespace) -> int:
 
     began, folder = time.monotonic(), args.out / "units"
     names = list(lab.EXPERIMENTS) if args.name == "all" else [args.name]
-    if args.bag is not None:
-        if args.world or args.meshes:
-            raise UserError("--bag needs no world: leave out --world and --meshes", 2)
-        if args.method == "paper":
-            raise UserError(
-                "--bag: --method paper needs unscaled depth, which a recording lacks. Leave out --method", 2
-            )
-        if args.name == "all":
-            names.remove("operators")
-    meshes = _meshes(args.meshes)
-    options = lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, args.size, meshes)
+    if args.bag is not None and args.name == "all":
+        names.remove("operators")
+    options = _options(args)
     modules = {name: lab.module(name) for name in names}
     units = [unit for module in modules.values() for unit in module.units(options)]
     found = lab.kept(units, folder)
@@ -117,13 +112,19 @@ def _experiment(args: argparse.Namespace) -> int:
     return 1 if failed else 0
 
 
-def _meshes(folder: Path | None) -> tuple[str, ...]:
-    if folder is None:
-        return ()
-    found = sorted(str(path) for path in folder.glob("*") if path.suffix.lower() in _MESHES)
-    if not found:
-        raise UserError(f"--meshes: {folder} has no mesh ({', '.join(_MESHES)})", 2)
-    return tuple(found)
+def _options(args: argparse.Namespace) -> lab.Options:
+    from instant_ic.experiments import lab
+
+    if args.bag is not None and (args.world or args.meshes):
+        raise UserError("--bag needs no world: leave out --world and --meshes", 2)
+    if args.bag is not None and args.method == "paper":
+        raise UserError("--bag: --method paper needs unscaled depth, which a recording lacks. Leave out --method", 2)
+    meshes = []
+    if args.meshes is not None:
+        meshes = sorted(str(path) for path in args.meshes.glob("*") if path.suffix.lower() in _MESHES)
+        if not meshes:
+            raise UserError(f"--meshes: {args.meshes} has no mesh ({', '.join(_MESHES)})", 2)
+    return lab.Options(args.seeds, tuple(args.world), args.method, args.bag, args.quick, args.size, tuple(meshes))
 
 
 def _size(text: str) -> tuple[int, int]:
