@@ -13,7 +13,7 @@ from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.passage import PassageConfig
 from instant_ic.control.planner import PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, stopping_distance
-from instant_ic.control.safety import CollisionMonitorConfig, contains
+from instant_ic.control.safety import CollisionMonitorConfig
 from instant_ic.control.subgoal import SubgoalConfig
 
 MOST_BLIND_M = 1.0
@@ -131,15 +131,15 @@ class ArbiterConfig(Checked):
     def __post_init__(self) -> None:
         check_ranges(self)
         require_protection(self.unprotected, self.unprotected_by, "the robot does not stop before an obstacle")
-        self._check_polygons()
+        self._check_approach()
         self._check_distances()
 
     @property
     def unprotected_by(self) -> list[str]:
-        """Names of what does not protect: polygons without their action, or things that are not seen or forgotten."""
+        """Names of the parameters that switch a protection off."""
         monitor = self.collision_monitor
         off = {
-            f"collision_monitor.{name}": not polygon.enabled or polygon.action_type != name
+            f"collision_monitor.{name}": not polygon.enabled
             for name, polygon in {"stop": monitor.stop, "approach": monitor.approach}.items()
         }
         off["collision_monitor.blind_radius_m"] = monitor.blind_radius_m == 0.0
@@ -147,13 +147,7 @@ class ArbiterConfig(Checked):
         off["costmap.points.enabled"] = not self.costmap.points.enabled
         return [name for name, is_off in off.items() if is_off]
 
-    def _check_polygons(self) -> None:
-        for name, polygon in self.collision_monitor.polygons().items():
-            if polygon.points and not contains(polygon.corners(self.footprint), self.footprint.corners()):
-                raise ValueError(
-                    f"collision_monitor.{name}.points must contain the footprint of {self.footprint.length_m:g} x "
-                    f"{self.footprint.width_m:g} m (got {polygon.points})"
-                )
+    def _check_approach(self) -> None:
         braking_s = self.limits.max_linear_m_s / self.limits.max_linear_accel_m_s2
         approach = self.collision_monitor.approach
         if approach.enabled and approach.time_before_collision < braking_s:

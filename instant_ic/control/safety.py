@@ -8,10 +8,9 @@ are too near or too low to be seen, and people with their velocity (``moving.py`
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -28,36 +27,46 @@ _step_towards = njit(cache=True)(step_towards)
 
 STEP_S = 0.05
 """Seconds between the simulated poses."""
-ActionType = Literal["stop", "slowdown", "limit", "approach"]
 
 
 @dataclass(frozen=True)
-class PolygonConfig:
-    """A region round the robot, and its effect on the command when something is inside.
+class PolygonConfig(Checked):
+    """The padded footprint, and what happens when something is inside.
 
     Attributes:
         enabled: whether the polygon is checked.
-        action_type: stop, slowdown, limit or approach.
-        points: "[[x, y], ...]" in base_link, convex; empty: the footprint with padding_m.
         padding_m: m round the footprint.
         min_points: number of points inside from which on the region counts as occupied.
-        slowdown_ratio: slowdown: share of the command that remains.
-        linear_limit: limit: largest linear speed, in m/s.
-        angular_limit: limit: largest angular speed, in rad/s.
-        time_before_collision: approach: seconds to contact below which the command is slowed in proportion.
-        stop_time_s: approach: seconds to contact at which the command becomes zero.
-        moving_stop_time_s: approach: the same for contact with a person or another moving thing: the robot stands by
-            then.
     """
 
     enabled: bool = True
-    action_type: ActionType = "approach"
-    points: str = ""
-    padding_m: Annotated[float, Plausible(0, 2)] = 0.04
+    padding_m: Annotated[float, Plausible(0, 2)] = 0.02
     min_points: Annotated[int, Plausible(1, 10)] = 2
+
+
+@dataclass(frozen=True)
+class SlowdownConfig(PolygonConfig):
+    """The polygon in which the robot is slower.
+
+    Attributes:
+        slowdown_ratio: share of the command that remains.
+    """
+
+    padding_m: Annotated[float, Plausible(0, 2)] = 0.10
     slowdown_ratio: Annotated[float, Plausible(0.05, 1)] = 0.6
-    linear_limit: Annotated[float, Plausible(0.01, 3)] = 0.25
-    angular_limit: Annotated[float, Plausible(0.02, 6)] = 0.5
+
+
+@dataclass(frozen=True)
+class ApproachConfig(PolygonConfig):
+    """The polygon whose contact with obstacles is predicted.
+
+    Attributes:
+        time_before_collision: seconds to contact below which the command is slowed in proportion.
+        stop_time_s: seconds to contact at which the command becomes zero.
+        moving_stop_time_s: the same for contact with a person or another moving thing: the robot stands by then.
+    """
+
+    padding_m: Annotated[float, Plausible(0, 2)] = 0.04
     time_before_collision: Annotated[float, Plausible(0.2, 10)] = 1.2
     stop_time_s: Annotated[float, Plausible(0, 5)] = 0.1
     moving_stop_time_s: Annotated[float, Plausible(0, 5)] = 0.6
@@ -67,40 +76,6 @@ class PolygonConfig:
         for name in ("stop_time_s", "moving_stop_time_s"):
             if not getattr(self, name) < self.time_before_collision:
                 raise ValueError(f"{name} must be below time_before_collision (got {getattr(self, name)})")
-        if self.points:
-            parse_polygon(self.points)
-
-    def corners(self, footprint: Footprint) -> NDArray[np.float64]:
-        """Return the corners (N, 2) in ``base_link``, counter-clockwise: ``points``, or the padded footprint."""
-        return parse_polygon(self.points) if self.points else footprint.corners(self.padding_m)
-
-
-def parse_polygon(text: str) -> NDArray[np.float64]:
-    """Return the corners (N, 2), counter-clockwise, of a polygon in nav2's notation: ``[[0.5, 0.3], ...]``.
-
-    Raises:
-        ValueError: another form, fewer than three corners, or not convex; the message begins with ``points``.
-    """
-    try:
-        corners = np.array(json.loads(text), dtype=np.float64)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"points must be a list like [[0.5, 0.3], [0.5, -0.3], [-0.5, 0]] (got {text!r})") from error
-    if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
-        raise ValueError(f"points must hold three corners [x, y] or more (got {text!r})")
-    edges = np.roll(corners, -1, axis=0) - corners
-    after = np.roll(edges, -1, axis=0)
-    bend = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
-    turning = np.arctan2(bend, (edges * after).sum(axis=1)).sum()
-    if not ((bend > 0).all() or (bend < 0).all()) or abs(abs(turning) - 2 * math.pi) > 0.01:
-        raise ValueError(f"points must go once round a convex polygon (got {text!r})")
-    return corners if bend[0] > 0 else corners[::-1].copy()
-
-
-def contains(polygon: NDArray[np.float64], points: NDArray[np.float64]) -> bool:
-    """Return whether a convex polygon (N, 2), counter-clockwise, contains all points (M, 2); its edge is inside."""
-    edges = np.roll(polygon, -1, axis=0) - polygon
-    offsets = points[:, None] - polygon
-    return bool((edges[:, 0] * offsets[..., 1] - edges[:, 1] * offsets[..., 0] >= -1e-9).all())
 
 
 @dataclass(frozen=True)
@@ -113,23 +88,19 @@ class CollisionMonitorConfig(Checked):
         memory_range_m: m; marks of 3D points count up to here, whether seen at present or not; 0: off.
         stop: something inside, and the command leads deeper: zero.
         slowdown: something inside: slower.
-        limit: something inside: at most the limits.
         approach: footprint makes contact within time_before_collision: slowed in proportion.
     """
 
     source_timeout: Annotated[float, Plausible(0.05, 2)] = 0.5
     blind_radius_m: Annotated[float, Plausible(0, 2)] = 0.45
     memory_range_m: Annotated[float, Plausible(0, 10)] = 2.5
-    stop: PolygonConfig = field(default_factory=lambda: PolygonConfig(action_type="stop", padding_m=0.02))
-    slowdown: PolygonConfig = field(default_factory=lambda: PolygonConfig(action_type="slowdown", padding_m=0.10))
-    limit: PolygonConfig = field(
-        default_factory=lambda: PolygonConfig(enabled=False, action_type="limit", padding_m=0.30)
-    )
-    approach: PolygonConfig = field(default_factory=PolygonConfig)
+    stop: PolygonConfig = field(default_factory=PolygonConfig)
+    slowdown: SlowdownConfig = field(default_factory=SlowdownConfig)
+    approach: ApproachConfig = field(default_factory=ApproachConfig)
 
     def polygons(self) -> dict[str, PolygonConfig]:
         """Return the enabled polygons, by name."""
-        named = {"stop": self.stop, "slowdown": self.slowdown, "limit": self.limit, "approach": self.approach}
+        named: dict[str, PolygonConfig] = {"stop": self.stop, "slowdown": self.slowdown, "approach": self.approach}
         return {name: polygon for name, polygon in named.items() if polygon.enabled}
 
 
@@ -139,7 +110,7 @@ class MonitoredCommand:
 
     command: tuple[float, float]
     action: str
-    """``free``, ``limit``, ``slowdown``, ``approach`` (slowed in proportion to the time to collision) or ``stop``."""
+    """``free``, ``slowdown``, ``approach`` (slowed in proportion to the time to collision) or ``stop``."""
     time_to_collision_s: float
     """Of the requested command; inf without contact within ``time_before_collision``."""
     polygon: str = ""
@@ -208,7 +179,7 @@ class CollisionMonitor:
                 soonest = min(soonest, time_s)
                 if share < factor:
                     factor, decided = share, polygon.name
-                    action = "stop" if share == 0.0 else polygon.config.action_type
+                    action = "stop" if share == 0.0 else polygon.name
         return MonitoredCommand((linear * factor, angular * factor), action, soonest, decided)
 
     def _allowed(
@@ -224,25 +195,20 @@ class CollisionMonitor:
         The time is inf where it is not computed.
         """
         config = polygon.config
-        looks_ahead = config.action_type in ("approach", "stop")
-        horizon = config.time_before_collision if config.action_type == "approach" else 3 * STEP_S
+        looks_ahead = not isinstance(config, SlowdownConfig)
+        horizon = config.time_before_collision if isinstance(config, ApproachConfig) else 3 * STEP_S
         speed = max(abs(command[0]), abs(start[0])) + (MOST_SPEED_M_S if moving else 0.0)
         reach = polygon.reach + 0.05 + (speed * horizon if looks_ahead else 0.0)
         close = (seen.points**2).sum(axis=1) < reach**2
         near = np.ascontiguousarray(seen.points[close], dtype=np.float64)
         if len(near) < config.min_points:
             return 1.0, math.inf
-        if not looks_ahead or config.action_type == "stop":
+        if not isinstance(config, ApproachConfig):
             inside = int((near @ polygon.normals.T < polygon.offsets).all(axis=1).sum())
             if inside < config.min_points:
                 return 1.0, math.inf
-        if config.action_type == "slowdown":
+        if isinstance(config, SlowdownConfig):
             return config.slowdown_ratio, math.inf
-        if config.action_type == "limit":
-            linear, angular = abs(command[0]), abs(command[1])
-            return min(
-                1.0, config.linear_limit / max(linear, 1e-9), config.angular_limit / max(angular, 1e-9)
-            ), math.inf
         time_s = float(
             _time_to_collision(
                 near,
@@ -257,14 +223,15 @@ class CollisionMonitor:
         )
         if math.isinf(time_s):
             return 1.0, time_s
-        stop_s = config.moving_stop_time_s if moving else config.stop_time_s
-        if config.action_type == "stop" or time_s <= stop_s:
+        if not isinstance(config, ApproachConfig):
+            return 0.0, time_s
+        if time_s <= (config.moving_stop_time_s if moving else config.stop_time_s):
             return 0.0, time_s
         return time_s / config.time_before_collision, time_s
 
 
 def _polygon(name: str, config: PolygonConfig, footprint: Footprint) -> _Polygon:
-    corners = config.corners(footprint)
+    corners = footprint.corners(config.padding_m)
     edges = np.roll(corners, -1, axis=0) - corners
     normals = np.stack([edges[:, 1], -edges[:, 0]], axis=-1) / np.linalg.norm(edges, axis=1)[:, None]
     offsets = (normals * corners).sum(axis=1)

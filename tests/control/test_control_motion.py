@@ -13,7 +13,13 @@ from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, accelerate, move
 from instant_ic.control.navigator import meeting_pose
 from instant_ic.control.prediction import PredictionConfig, Predictor
-from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig
+from instant_ic.control.safety import (
+    ApproachConfig,
+    CollisionMonitor,
+    CollisionMonitorConfig,
+    PolygonConfig,
+    SlowdownConfig,
+)
 from instant_ic.control.static_map import StaticMap
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
@@ -89,8 +95,8 @@ class TestPrediction:
 
 
 class TestCollisionMonitor:
-    off = PolygonConfig(enabled=False)
-    monitor = CollisionMonitor(CollisionMonitorConfig(stop=off, slowdown=off), Footprint())
+    config = CollisionMonitorConfig(stop=PolygonConfig(enabled=False), slowdown=SlowdownConfig(enabled=False))
+    monitor = CollisionMonitor(config, Footprint())
 
     @staticmethod
     def wall(x: float) -> np.ndarray:
@@ -221,7 +227,7 @@ class TestVirtualRobot:
         (lambda: MotionLimits(max_linear_m_s=0.0), "max_linear_m_s"),
         (lambda: Footprint(width_m=-1.0), "width_m"),
         (lambda: PredictionConfig(latency_s=-0.1), "latency_s"),
-        (lambda: PolygonConfig(stop_time_s=2.0), "stop_time_s"),
+        (lambda: ApproachConfig(stop_time_s=2.0), "stop_time_s"),
         (lambda: VbotConfig(slow_lead_m=3.0), "slow_lead_m"),
     ],
 )

@@ -76,10 +76,6 @@ def test_an_absurd_value_is_refused_and_the_error_says_what_may_be_meant(node: s
 
 
 COMBINED = [
-    (
-        ("collision_monitor.stop.points:='[[0.2, 0.1], [-0.2, 0.1], [-0.2, -0.1], [0.2, -0.1]]'",),
-        "contain the footprint",
-    ),
     (("limits.max_linear_m_s:=3", "limits.max_linear_accel_m_s2:=0.5"), "must stop the robot from max_linear_m_s"),
     (
         ("limits.max_linear_m_s:=1.5", "limits.max_linear_accel_m_s2:=2", "timeouts.scan:=1"),
@@ -103,7 +99,6 @@ COMBINED = [
     (("costmap.points.enabled:=false",), r"costmap\.points\.enabled: protection is off"),
     (("collision_monitor.blind_radius_m:=0",), r"collision_monitor\.blind_radius_m: protection is off"),
     (("collision_monitor.memory_range_m:=0",), r"collision_monitor\.memory_range_m: protection is off"),
-    (("collision_monitor.stop.action_type:=limit",), "collision_monitor.stop: protection is off"),
     (
         ("collision_monitor.stop.enabled:=false", "collision_monitor.approach.enabled:=false"),
         "collision_monitor.stop, collision_monitor.approach: protection is off, .* or set unprotected: true",
