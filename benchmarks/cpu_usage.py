@@ -2,58 +2,47 @@
 
 from __future__ import annotations
 
-import contextlib
 import statistics
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
 
 from instant_ic.experiments.stack import processes_of
+from instant_ic.util.closing import Closing
 
 _LOOPS = 100_000
-_REFERENCE_PERIOD_S = 0.5
+_PERIOD_S = 0.5
 
 
-class ReferenceLoop:
-    """CPU time of an empty loop in Python while a stack runs: the speed of this machine under the same load."""
+class ReferenceLoop(Closing):
+    """CPU time of an empty loop in Python, timed twice a second: the speed of this machine under the same load."""
 
     def __init__(self) -> None:
         self._samples: list[float] = []
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="reference loop", daemon=True)
+        self._thread.start()
 
-    def sample(self) -> None:
-        """Time a hundred thousand iterations."""
-        began = time.thread_time()
-        for _ in range(_LOOPS):
-            pass
-        self._samples.append(time.thread_time() - began)
+    def _run(self) -> None:
+        while True:
+            began = time.thread_time()
+            for _ in range(_LOOPS):
+                pass
+            self._samples.append(time.thread_time() - began)
+            if self._ended.wait(_PERIOD_S):
+                return
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join()
 
     @property
     def million_ms(self) -> float:
         """Milliseconds of CPU for one million iterations: the median of the samples."""
         return 1e3 * statistics.median(self._samples) * 1e6 / _LOOPS
-
-
-@contextlib.contextmanager
-def reference_loop() -> Iterator[ReferenceLoop]:
-    """Time the reference loop twice a second on a thread, until the end of the block."""
-    loop, ended = ReferenceLoop(), threading.Event()
-
-    def run() -> None:
-        loop.sample()
-        while not ended.wait(_REFERENCE_PERIOD_S):
-            loop.sample()
-
-    thread = threading.Thread(target=run, name="reference loop", daemon=True)
-    thread.start()
-    try:
-        yield loop
-    finally:
-        ended.set()
-        thread.join()
 
 
 @dataclass(frozen=True)

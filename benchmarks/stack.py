@@ -26,7 +26,7 @@ from typing import Any
 
 import psutil
 from browser import launch_chromium
-from cpu_usage import Usage, cpu_percent, reference_loop, usage
+from cpu_usage import ReferenceLoop, Usage, cpu_percent, usage
 from reporting import note, parser_for, report
 
 from instant_ic.bus import LATCHED, RELIABLE
@@ -268,7 +268,7 @@ def one_drive(pace: float | None, log: Path | None) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="ic-", ignore_cleanup_errors=True) as folder:
         run_dir = Path(folder)
         arguments = {**ports, "recordings": run_dir / "recordings"}
-        with Stack("sim.yaml", run_dir, arguments, log, pace=pace) as stack, reference_loop() as loop:
+        with Stack("sim.yaml", run_dir, arguments, log, pace=pace) as stack, ReferenceLoop() as loop:
             drive = PageDrive(stack, run_dir)
             try:
                 drive.run(f"http://127.0.0.1:{ports['console_port']}/")

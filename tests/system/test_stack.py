@@ -18,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
-from benchmarks.cpu_usage import cpu_percent, reference_loop, usage
+from benchmarks.cpu_usage import ReferenceLoop, cpu_percent, usage
 from instant_ic.bus import registry
 from instant_ic.console.client import ConsoleClient
 from instant_ic.experiments.drive import DriveRecorder, pump
@@ -97,7 +97,7 @@ def outcome(tmp_path_factory):
     try:
         # One recorder is enough: the page's would write into the working directory.
         arguments = {**ports, "record": bag, "recorder": False}
-        with Stack("sim.yaml", run_dir, arguments, pace=machine_pace()) as stack, reference_loop() as loop:
+        with Stack("sim.yaml", run_dir, arguments, pace=machine_pace()) as stack, ReferenceLoop() as loop:
             recorder = DriveRecorder(stack)
             stack.wait_for(lambda: recorder.ready, 240, "virtual space that is fit to show")
             before = usage(run_dir)
