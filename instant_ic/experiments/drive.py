@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED
 from instant_ic.experiments.stack import Stack, StackError
-from instant_ic.msg import message_type, pose2_from_message
+from instant_ic.msg import Bool, ControlState, Odometry, VspaceStatus, pose2_from_message
 
 
 class DriveRecorder:
@@ -22,9 +22,10 @@ class DriveRecorder:
         modes: every change of mode, including the first mode (ControlState.REAL, ...), with its reason in ``reasons``.
         truth: ground-truth poses of the r-bot, (x, y, yaw) in the world.
         vbot: poses of the v-bot in the map while it was active.
-        contact: whether the r-bot touched something.
-        ready_seconds: for each keyframe: seconds from its arrival until the virtual space was ready to be shown.
-        render_ms: of each view.
+        vbot_pose: newest pose of the v-bot; None before the first.
+        contact: True once the r-bot has touched something.
+        ready_seconds: seconds from the arrival of each keyframe until the virtual space was ready to be shown.
+        vspace: newest status of the virtual space; None before the first.
     """
 
     def __init__(self, stack: Stack) -> None:
@@ -32,28 +33,17 @@ class DriveRecorder:
         self.reasons: list[str] = []
         self.truth: list[NDArray[np.float64]] = []
         self.vbot: list[NDArray[np.float64]] = []
+        self.vbot_pose: NDArray[np.float64] | None = None
         self.contact = False
         self.ready_seconds: list[float] = []
-        self.render_ms: list[float] = []
         self.vspace: Any = None
-        self.vbot_pose: NDArray[np.float64] | None = None
-        self._virtual = message_type("ControlState").VIRTUAL
         self._ready_keyframe = -1
         observer = stack.observer
-        observer.subscribe("/ic/state", message_type("ControlState"), self._on_state, LATCHED)
-        observer.subscribe(
-            "/ground_truth/odom",
-            message_type("Odometry"),
-            lambda message: self.truth.append(pose2_from_message(message)),
-        )
-        observer.subscribe("/ground_truth/contact", message_type("Bool"), self._on_contact, LATCHED)
-        observer.subscribe("/vbot/odom", message_type("Odometry"), self._on_vbot)
-        observer.subscribe("/vspace/status", message_type("VspaceStatus"), self._on_vspace, LATCHED)
-        observer.subscribe(
-            "/vspace/view",
-            message_type("RenderedView"),
-            lambda message: self.render_ms.append(float(message.render_ms)),
-        )
+        observer.subscribe("/ic/state", ControlState, self._on_state, LATCHED)
+        observer.subscribe("/ground_truth/odom", Odometry, lambda m: self.truth.append(pose2_from_message(m)))
+        observer.subscribe("/ground_truth/contact", Bool, self._on_contact, LATCHED)
+        observer.subscribe("/vbot/odom", Odometry, self._on_vbot)
+        observer.subscribe("/vspace/status", VspaceStatus, self._on_vspace, LATCHED)
 
     @property
     def mode(self) -> int | None:
@@ -70,7 +60,7 @@ class DriveRecorder:
 
     def _on_vbot(self, message: Any) -> None:
         self.vbot_pose = pose2_from_message(message)
-        if self.mode == self._virtual:
+        if self.mode == ControlState.VIRTUAL:
             self.vbot.append(self.vbot_pose)
 
     def _on_vspace(self, message: Any) -> None:
