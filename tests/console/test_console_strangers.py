@@ -436,8 +436,8 @@ def test_a_request_that_is_no_websockets_keeps_no_place(serve):
 
 
 def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, tmp_path):
-    monkeypatch.setattr(connections_module, "HEADERS_S", 2.0)
-    monkeypatch.setattr("instant_ic.console.server.HEADERS_S", 2.0)
+    monkeypatch.setattr(connections_module, "HEADERS_S", 0.7)
+    monkeypatch.setattr("instant_ic.console.server.HEADERS_S", 0.7)
     server = serve(access=AccessConfig(token_file=token_file(tmp_path, "drive", DRIVE)))
     slow = b"POST /sign-in HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/x-www-form-urlencoded\r\n"
 
