@@ -30,7 +30,7 @@ export class ServerClock {
     this._offsetMs = this._samples.reduce((a, b) => (b.roundTrip < a.roundTrip ? b : a)).offset;
   }
 
-  /** Time of the server's clock at `nowMs`, ms; null before the first answer. @param {number} nowMs */
+  /** Returns the time of the server's clock at `nowMs`, ms; null before the first answer. @param {number} nowMs */
   at(nowMs) {
     return this._offsetMs === null ? null : nowMs + this._offsetMs;
   }

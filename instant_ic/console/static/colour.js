@@ -86,7 +86,7 @@ export function coloured(values, { gain, offset }) {
   return values.map((value, i) => clamp(value * gain[i % 3] + offset[i % 3], 0, 1));
 }
 
-/** Colour that fades out: all of it at first, none after `releaseMs`. */
+/** A colour that fades out within `releaseMs`. */
 export class Releasing {
   constructor() {
     this._colour = plain;

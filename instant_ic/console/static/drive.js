@@ -13,13 +13,16 @@ const KEYS = {
   KeyD: [0, -1], ArrowRight: [0, -1],
 };
 
-/** Whether a key event drives; keys of a focused slider belong to the slider. @param {KeyboardEvent} event */
+/** Returns whether a key event drives. Arrow keys belong to a focused slider. @param {KeyboardEvent} event */
 export function isDriveKey(event) {
   const slider = event.target instanceof HTMLInputElement && event.code.startsWith("Arrow");
   return event.code in KEYS && !slider;
 }
 
-/** Events: "change" when keys, stick or command may have changed; "stop" (detail: reason or "") when anything but a released key or stick ends a drive. */
+/**
+ * The operator's drive command. Events: "change" when keys, stick or command may have changed; "stop" (detail: reason or "")
+ * when anything but a released key or stick ends a drive.
+ */
 export class Drive extends EventTarget {
   /** @param {Link} link */
   constructor(link) {
@@ -54,7 +57,7 @@ export class Drive extends EventTarget {
     if (moving) this.dispatchEvent(new CustomEvent("stop", { detail: why }));
   }
 
-  /** Whether a key of this direction is held. @param {string} code KeyW, KeyA, KeyS or KeyD */
+  /** Returns whether a key of this direction is held. @param {string} code KeyW, KeyA, KeyS or KeyD */
   holds(code) {
     const [forward, left] = KEYS[code];
     return [...this._held].some((held) => KEYS[held][0] === forward && KEYS[held][1] === left);

@@ -39,8 +39,8 @@ export function extended(points) {
 }
 
 /**
- * Draws `trajectory` (map frame, [[x, y], ...]) on the floor as seen by the shown camera, and fits the canvas around it:
- * on a CPU, a layer over the whole window would cost as much as the view.
+ * Renders `trajectory` (map frame, [[x, y], ...]) on the floor as seen by the shown camera, and fits the canvas around it:
+ * on a CPU, a canvas over the whole window would cost as much as the view.
  * @param {HTMLCanvasElement} canvas @param {[number, number][]} trajectory
  * @param {{lookFromMap: Mat3, position: Vec3}} camera @param {[number, number]} tanHalf of the shown field of view
  * @param {number} halfWidth m @param {string} colour
@@ -74,7 +74,7 @@ export function drawGuide(canvas, trajectory, camera, tanHalf, halfWidth, colour
 }
 
 /**
- * Smallest box of whole tiles around the points within the window, pixels.
+ * Returns the smallest box of whole tiles around the points within the window, pixels.
  * @param {[number, number][]} points @param {number} width of the window @param {number} height
  */
 export function tiles(points, width, height) {
@@ -89,7 +89,7 @@ export function tiles(points, width, height) {
 }
 
 /**
- * Both rails of the ribbon in the window, pixels; null if it is out of view.
+ * Returns both rails of the ribbon in the window, pixels; null if it is out of view.
  * @param {[number, number][]} trajectory @param {{lookFromMap: Mat3, position: Vec3}} camera
  * @param {[number, number]} tanHalf @param {number} halfWidth
  */
@@ -122,7 +122,7 @@ function projected(trajectory, camera, tanHalf, halfWidth) {
 }
 
 /**
- * Tape of directions relative to the robot: 0 is straight ahead.
+ * Renders a tape of directions relative to the robot: 0 is straight ahead.
  * @param {HTMLCanvasElement} canvas @param {number} lookYaw @param {string} colour
  */
 export function drawCompass(canvas, lookYaw, colour) {

@@ -17,7 +17,7 @@ import { Prediction } from "./prediction.js";
 
 /** @typedef {1 | 2} Kind PANORAMA or VIEW. */
 /** @typedef {ViewHeader & {aspect: number}} View */
-/** @typedef {{from: Omit<Photo, "image">, to: Vec3}} Glide Where the camera's image was taken, and the place from which it is shown, m. */
+/** @typedef {{from: Omit<Photo, "image">, to: Vec3}} Glide Pose of the camera when the image was taken, and the place from which it is shown, m. */
 /**
  * @typedef {object} Scene
  * @property {[number, number]} tanHalf of the shown field of view: horizontal, vertical
@@ -57,7 +57,7 @@ export class Images {
     this.prediction = new Prediction();
     /** @type {LayersHeader | null} The layers that this page renders by itself; null: it shows rendered views. */
     this.layers = null;
-    /** @type {Map<string, Surface>} Those that are loaded, by id. */
+    /** @type {Map<string, Surface>} Loaded surfaces, by id. */
     this._held = new Map();
     this._loads = 0; // counts loads, so that a late one of a lost link is dropped
     this.framesPerSecond = 0; // of what this page renders
@@ -65,7 +65,7 @@ export class Images {
     this.cameraMs = null;
     /** @type {PanoramaHeader | null} The camera image of the frame that is being rendered. */
     this._rendering = null;
-    /** @type {PanoramaHeader | null} That of the last such frame. */
+    /** @type {PanoramaHeader | null} The camera image of the last rendered frame. */
     this._rendered = null;
     this.shownMs = 0; // time of the newest state that is shown, server's clock
     this.moves = false; // the v-bot moves, as far as this page knows
@@ -162,7 +162,7 @@ export class Images {
     return { surface, gain, mapFromCamera: fromQuaternion(q), position: p };
   }
 
-  /** Whether the layers take the place of rendered views. */
+  /** True if the layers take the place of rendered views. */
   get rendersLayers() {
     return this.layers !== null && !this.viewer.lost;
   }
@@ -247,8 +247,8 @@ export class Images {
   }
 
   /**
-   * Where the camera's image is shown from: from the shown robot's present place, by the depth of the layers, so that few
-   * images a second look smooth; null: as it was taken. An old image does not move: it must not look like a new one.
+   * Returns the place from which the camera's image is shown: the robot's present place, by the depth of the layers, so that
+   * a low frame rate looks smooth. Null: the image is shown as it was taken. An old image must not look like a new one.
    * @param {State | null} state @returns {Glide | null}
    */
   _glided(state) {
@@ -262,8 +262,8 @@ export class Images {
   }
 
   /**
-   * The v-bot's camera; null: its pose is unknown. Where the camera's image glides, both are shown from one place. Else, once the real robot is shown again, it goes on from where it was with
-   * that robot, so that both images of the dissolve move alike.
+   * Returns the v-bot's camera; null if its pose is unknown. A gliding camera image and the layers are shown from one place.
+   * When the real robot is shown again, the place moves on with that robot, so that both images of the dissolve move alike.
    * @param {LayersHeader} layers @param {Mat3} mapFromLook @param {[number, number]} tanHalf @param {Glide | null} glide
    * @returns {Camera | null}
    */
@@ -311,7 +311,7 @@ export class Images {
     return starts;
   }
 
-  /** Whether the newest image of a kind may be shown: made since the switch, or the wait is over. @param {Kind} kind */
+  /** Returns whether the newest image of a kind may be shown: made since the switch, or the wait is over. @param {Kind} kind */
   _fits(kind) {
     if (kind === VIEW && this.rendersLayers) return true;
     const header = kind === VIEW ? this.view : this.panorama;

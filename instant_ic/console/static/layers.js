@@ -1,6 +1,6 @@
 // @ts-check
-// What the page shows in WebGL 2: layers of triangles round a keyframe, rendered from any place (Python: vspace/layers.py),
-// with their own colours or with the camera's image; and the camera's image as it was taken, which has no depth.
+// Renderer in WebGL 2: layers of triangles around a keyframe, from any place (Python: vspace/layers.py), with their own
+// colours or with the camera's image; and the camera's image as it was taken, without depth.
 
 /** @import { Colour } from "./colour.js" */
 /** @import { Mat3, Vec3 } from "./math.js" */
@@ -12,7 +12,7 @@ import { Program } from "./program.js";
  * Triangles with an image. The vertices are corners of the panorama's pixels; `size` is height and width of that lattice.
  * @typedef {object} Surface
  * @property {ImageBitmap} image colours, equirectangular
- * @property {ImageBitmap | null} confidence grey image: white was seen, black is a guess; null: all of it was seen
+ * @property {ImageBitmap | null} confidence grey image: white is seen, black is estimated; null: all of it was seen
  * @property {[number, number]} size
  * @property {Uint16Array} corners column and row of each vertex
  * @property {Float32Array} inverse inverse depth of each vertex, 1/m
@@ -45,7 +45,7 @@ const NEAR_M = 0.02;
 const IMAGE = 6, CONFIDENCE = 7; // texture units
 const BEYOND_LEVEL = 4; // mipmap level of what no layer covers
 
-// Homogeneous coordinates are divided by the vertex's distance: what is endlessly far needs no large numbers.
+// Homogeneous coordinates are divided by the vertex's distance, so that infinitely far vertices need no large numbers.
 const VERTEX = `
 in vec2 corner;
 in float inverse;
@@ -84,7 +84,7 @@ in vec3 direction;
 out vec4 colour;
 uniform sampler2D image, confidence;
 uniform vec3 gain, offset;
-uniform bool soft; // what nobody has seen is blurred and paler
+uniform bool soft; // estimated surfaces are blurred and paler
 
 void main() {
   vec2 angle = angles(normalize(direction)), uv = vec2(0.5 - angle.x / (2.0 * PI), angle.y / PI);
@@ -98,14 +98,14 @@ void main() {
     float seen = textureLod(confidence, uv, 0.0).r;
     colour.a = seen;
     if (seen < 1.0) {
-      vec3 guess = textureLod(image, uv, 2.0).rgb;
-      colour.rgb = mix(mix(guess, vec3(dot(guess, GREY)), 0.5), colour.rgb, seen);
+      vec3 estimate = textureLod(image, uv, 2.0).rgb;
+      colour.rgb = mix(mix(estimate, vec3(dot(estimate, GREY)), 0.5), colour.rgb, seen);
     }
   }
   colour.rgb = colour.rgb * gain + offset;
 }`;
 
-// By direction alone: an image as it was taken; where no layer has a surface its colours, blurred.
+// Panorama by direction alone: an image as it was taken, or the blurred colours where no layer has a surface.
 const FAR = `
 in vec2 screen;
 out vec4 colour;
@@ -135,7 +135,7 @@ export class LayerRenderer {
     this._empty = this._texture(null);
   }
 
-  /** Replaces the layers; surfaces that are here already stay. @param {Layer[]} layers */
+  /** Replaces the layers; loaded surfaces stay. @param {Layer[]} layers */
   load(layers) {
     /** @type {Map<Surface, Loaded>} */
     const before = new Map(this._layers.map((loaded) => [loaded.surface, loaded]));
@@ -152,7 +152,7 @@ export class LayerRenderer {
    * The alpha of what is rendered is 1 where the place was seen.
    * @param {Camera} camera @param {number} width @param {number} height
    * @param {Colour} tint gain and offset of the colours
-   * @param {Photo | null} photo takes the place of the layers' own colours; a guess is one of the depth alone then
+   * @param {Photo | null} photo takes the place of the layers' own colours; only the depth of estimated surfaces counts then
    * @param {boolean} mixed blending is on: each pixel is written once, the nearest surface found before
    */
   render(camera, width, height, tint, photo = null, mixed = false) {

@@ -1,5 +1,5 @@
 // @ts-check
-// The right to drive: who has it, and how this page gets it and gives it back.
+// The lease: the right to drive, and how this page gets it and gives it back.
 
 /** @import { Link } from "./link.js" */
 /** @import { Session } from "./messages.js" */
@@ -27,7 +27,7 @@ export class Lease extends EventTarget {
     link.addEventListener("lost", () => { this.driver = "none"; });
   }
 
-  /** Whether drive commands of this page count. */
+  /** True if the drive commands of this page count. */
   get drives() {
     return this.driver === "you" && !this.estop;
   }

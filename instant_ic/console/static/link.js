@@ -37,7 +37,7 @@ export class Link extends EventTarget {
     window.addEventListener("pagehide", () => this._ping(true));
   }
 
-  /** Present time of the server's clock, ms; null before the first answer. */
+  /** Returns the present time of the server's clock, ms; null before the first answer. */
   serverNow() {
     return this.clock.at(performance.now());
   }

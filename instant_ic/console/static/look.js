@@ -49,7 +49,7 @@ export class Look {
     window.addEventListener("blur", () => this._held.clear());
   }
 
-  /** Whether keys or centring turn it. */
+  /** True if keys or centring turn it. */
   get moves() {
     return this._held.size > 0 || this._centring !== null;
   }

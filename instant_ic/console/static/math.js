@@ -50,7 +50,7 @@ export function fromQuaternion([x, y, z, w]) {
   ];
 }
 
-/** The same angle in [-π, π]. @param {number} angle */
+/** Returns the same angle in [-π, π]. @param {number} angle */
 export function wrapAngle(angle) {
   return angle - 2 * Math.PI * Math.round(angle / (2 * Math.PI));
 }

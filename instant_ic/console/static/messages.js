@@ -178,13 +178,13 @@ const layersHeader = object({
 });
 
 /**
- * A layer: triangles round the keyframe, whose vertices are corners of the panorama's pixels.
+ * A layer: triangles around the keyframe, whose vertices are corners of the panorama's pixels.
  * @typedef {object} LayerData
  * @property {string} id of the mesh: equal for equal content
  * @property {[number, number, number]} gain factors of the colours
  * @property {[number, number, number, number]} q rotation map_from_camera of the keyframe
  * @property {[number, number, number]} p its position in the map frame, m
- * @property {Mesh | null} mesh null: as in the layers before, by its id
+ * @property {Mesh | null} mesh null: the mesh of this id in the layers before
  */
 /**
  * @typedef {object} Mesh
@@ -206,7 +206,7 @@ const layersHeader = object({
 /** @typedef {PanoramaFrame | ViewFrame | GridFrame | LayersFrame} Frame */
 /** @typedef {{kind: 6, sequence: number, header: ReturnType<typeof partHeader>, payload: Blob}} PartFrame */
 
-/** Puts frames together that come as pieces, in order. */
+/** Assembler of a frame that comes in pieces, in order. */
 export class Parts {
   constructor() {
     /** @type {Blob[]} */
@@ -256,7 +256,7 @@ export function decodeFrame(buffer) {
 }
 
 /**
- * Kind and sequence of a frame, even of one that cannot be decoded; null: it has none.
+ * Returns kind and sequence of a frame, even of one that cannot be decoded; null if it has none.
  * @param {ArrayBuffer} buffer @returns {Pick<Frame | PartFrame, "kind" | "sequence"> | null}
  */
 export function frameNumber(buffer) {

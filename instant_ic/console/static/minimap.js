@@ -26,7 +26,7 @@ export class MiniMap {
     this.canvas = canvas;
     this.context = context2d(canvas);
     this.large = false;
-    this.changed = true; // must be drawn, although no pose has changed
+    this.changed = true; // render although no pose has changed
     /** @type {{floor: Layer | null, costs: Layer | null, walls: Layer | null}} */
     this._layers = { floor: null, costs: null, walls: null };
   }

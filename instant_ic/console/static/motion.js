@@ -1,5 +1,5 @@
 // @ts-check
-// Pose of the shown robot at render time, between and beyond the state messages.
+// Pose of the shown robot at render time, interpolated and extrapolated from the state messages.
 
 /** @import { Vec3 } from "./math.js" */
 import { clamp, wrapAngle } from "./math.js";

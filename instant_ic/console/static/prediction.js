@@ -1,5 +1,5 @@
 // @ts-check
-// The v-bot between a state message and now: what the operator has commanded since, with the v-bot's own kinematics.
+// Pose of the v-bot now, predicted from the last state message with the operator's later commands and the v-bot's kinematics.
 
 /** @import { Vec3 } from "./math.js" */
 /** @typedef {[number, number]} Twist m/s, rad/s */
@@ -32,9 +32,9 @@ export class Prediction {
   }
 
   /**
-   * Pose and twist at `now`, from those `at` the time of a state; times of the server's clock, ms.
+   * Returns pose and twist at `now`, from those of a state of the time `at`; times of the server's clock, ms.
    * @param {Vec3} pose @param {Twist} twist @param {number} at @param {number} now
-   * @param {number} delayMs time that a command takes to the robot: what was sent before the state by less is not in it
+   * @param {number} delayMs time that a command takes to the robot: commands sent less than this before the state are not in it
    * @returns {{pose: Vec3, twist: Twist}}
    */
   from(pose, twist, at, now, delayMs) {
@@ -53,10 +53,10 @@ export class Prediction {
       speed = next;
       t += step;
     }
-    return { pose, twist: end < now ? [0, 0] : speed }; // an old state carries on no longer
+    return { pose, twist: end < now ? [0, 0] : speed }; // an old state is not predicted further
   }
 
-  /** The command that held at a time; null before the first. @param {number} t @returns {Twist | null} */
+  /** Returns the command at a time; null before the first. @param {number} t @returns {Twist | null} */
   _at(t) {
     for (let i = this._commands.length - 1; i >= 0; i--) if (this._commands[i].at <= t) return this._commands[i].twist;
     return null;

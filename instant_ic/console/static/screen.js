@@ -1,6 +1,6 @@
 // @ts-check
 // Renders main image, trajectory, compass and map, each only if it has changed. Frames follow each other while something
-// moves; otherwise a message, an image or an input calls for the next one.
+// moves; otherwise a message, an image or an input requests the next one.
 
 /** @import { Settings } from "./settings.js" */
 /** @import { Plan, State } from "./messages.js" */
@@ -53,7 +53,7 @@ export class Screen {
     this._requested = this._wanted = false;
     this._timer = 0;
     this._latencyAt = this._mapAt = this._lookAt = 0;
-    /** Rotation and field of view of the last drawn image. @type {number[]} */
+    /** Rotation and field of view of the last rendered image. @type {number[]} */
     this._direction = [];
     this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
     this._reported = "";

@@ -1,5 +1,5 @@
 // @ts-check
-// Texts of the overlay, chosen by codes: modes, node names and states. Nothing is decided by a text of the robot.
+// Texts of the overlay, chosen by codes: modes, node names and states. No logic depends on a text of the robot.
 
 /** @import { Health, RecordingStatus, Session, State, Vspace } from "./messages.js" */
 
@@ -9,7 +9,7 @@
 /** @type {Record<Mode, [string, string]>} Name of a mode, and its usual reason. */
 const MODES = {
   real: ["REAL", "The robot obeys the operator"],
-  virtual: ["VIRTUAL", "The robot follows you round the obstacle"],
+  virtual: ["VIRTUAL", "The robot follows you around the obstacle"],
   entering: ["ENTERING", "Switching to the virtual space"],
   returning: ["RETURNING", "Switching back to the camera"],
   stopped: ["STOPPED", "The robot stands still"],

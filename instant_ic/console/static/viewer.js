@@ -106,7 +106,7 @@ export class GlViewer {
     gl.flush();
   }
 
-  /** Whether the CPU still renders the last frame; to be asked until it is done. */
+  /** True while the CPU renders the last frame. Read it until it is false. */
   get busy() {
     const gl = this.gl;
     if (!this._fence || this.lost) return false;
