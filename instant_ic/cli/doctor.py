@@ -25,7 +25,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 
 
 TCP_PORTS = {8080: "operator's page", 8089: "simulated Theta"}
-UDP_PORTS = {2368: "VLP-16 data", 8308: "VLP-16 position"}
+UDP_PORTS = {2368: "VLP-16 data"}
 
 
 def run_checks(
