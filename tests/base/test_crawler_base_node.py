@@ -62,7 +62,7 @@ def test_drives_forward_and_tells_odometry_transform_and_battery(bench: Bench) -
     assert twist_values(odometry)[0] == pytest.approx(0.4, abs=0.02)
     # 0.5 s of ramp (0.8 m/s^2) lose 0.1 m of 0.8 m; connecting and steps lose a little more.
     assert 0.60 < matrix_from_pose(odometry)[0, 3] < 0.71
-    assert len(bench.bus.messages("/wheel/odom")) > 50
+    assert len(bench.bus.records("/wheel/odom")) > 50
     transform = bench.bus.last("/tf").transforms[0]
     assert transform.transform.translation.x == pytest.approx(matrix_from_pose(odometry)[0, 3])
     assert stamp_ns(transform) == stamp_ns(odometry)
@@ -136,13 +136,13 @@ def test_unplugged_and_plugged_in_again(bench: Bench) -> None:
     bench.port.unplugged = True
     bench.run(0.1)
     assert bench.level("link") == ERROR
-    before = len(bench.bus.messages("/wheel/odom"))
+    before = len(bench.bus.records("/wheel/odom"))
     bench.run(1.0)
-    assert len(bench.bus.messages("/wheel/odom")) == before
+    assert len(bench.bus.records("/wheel/odom")) == before
     bench.port.unplugged = False
     bench.run(2.0)  # within the backoff that has grown by now
     assert bench.level("link") == OK
-    assert len(bench.bus.messages("/wheel/odom")) > before
+    assert len(bench.bus.records("/wheel/odom")) > before
     assert bench.emulator.timeout_s == pytest.approx(0.3)  # the watchdog is set again
 
 

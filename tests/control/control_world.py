@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -60,13 +61,16 @@ class World:
     def contact(self, pose: np.ndarray) -> bool:
         """Whether the true footprint touches a segment (sampled each centimetre)."""
         c, s = math.cos(pose[2]), math.sin(pose[2])
-        for a, b in self.segments:
-            n = max(2, math.ceil(float(np.linalg.norm(b - a)) / 0.01))
-            p = a + (b - a) * np.linspace(0, 1, n)[:, None] - pose[:2]
-            local = np.stack([c * p[:, 0] + s * p[:, 1], -s * p[:, 0] + c * p[:, 1]], axis=-1)
-            if ((np.abs(local[:, 0]) < LENGTH_M / 2) & (np.abs(local[:, 1]) < WIDTH_M / 2)).any():
-                return True
-        return False
+        x, y = (self.points - pose[:2]).T
+        inside = (np.abs(c * x + s * y) < LENGTH_M / 2) & (np.abs(-s * x + c * y) < WIDTH_M / 2)
+        return bool(inside.any())
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """Points (N, 2) on the segments, a centimetre apart."""
+        counts = [max(2, math.ceil(float(np.linalg.norm(b - a)) / 0.01)) for a, b in self.segments]
+        pairs = zip(self.segments, counts, strict=True)
+        return np.concatenate([a + (b - a) * np.linspace(0, 1, n)[:, None] for (a, b), n in pairs])
 
 
 def corridor(length: float = 16.0, width: float = 2.4, start: float = -2.0) -> np.ndarray:

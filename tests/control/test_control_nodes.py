@@ -165,8 +165,9 @@ class Stack:
         """What the console tells of the pictures that the operator has."""
         if self.k % 2 == 0 and "/camera/image/compressed" not in self.silent:
             self.picture_ns = now
-        if self.bus.messages("/vbot/odom") and "views" not in self.silent:
-            self.views.append((now, self.bus.last("/vbot/odom").pose.pose))
+        vbot = self.bus.last("/vbot/odom")
+        if vbot is not None and "views" not in self.silent:
+            self.views.append((now, vbot.pose.pose))
             self.view_ns = now
         asked_ns, pose = self.views[max(0, len(self.views) - 3)] if self.views else (now, pose_message(np.eye(4)))
         self.bus.publish(
@@ -360,12 +361,12 @@ def test_a_button_that_repeats_its_state_is_missed_where_that_is_set() -> None:
 def test_a_changed_command_is_obeyed_before_the_next_timer() -> None:
     stack = Stack(np.zeros((0, 2, 2)))
     stack.drive(1.5, None)
-    count = len(stack.bus.messages("/cmd_vel"))
+    count = len(stack.bus.records("/cmd_vel"))
     stack.send("/operator/cmd_vel", twist_stamped(0.4, 0.0, stack.now))
     assert twist_values(stack.bus.last("/cmd_vel"))[0] == pytest.approx(0.4)
     for speed in (0.3, 0.2, 0.1):  # not more than one between two timers
         stack.send("/operator/cmd_vel", twist_stamped(speed, 0.0, stack.now))
-    assert len(stack.bus.messages("/cmd_vel")) == count + 1
+    assert len(stack.bus.records("/cmd_vel")) == count + 1
 
 
 def test_the_robot_goes_on_after_a_long_loss_only_when_the_controls_were_let_go() -> None:
@@ -630,15 +631,15 @@ def test_at_rest_the_arbiter_works_rarely_and_a_start_is_checked_against_what_st
     stack.cloud = np.zeros((0, 3))
     stack.drive(2.0, None)
     updates = count_calls(stack.arbiter.surroundings, "update_costmap")
-    before = len(stack.bus.messages("/cmd_vel"))
+    before = len(stack.bus.records("/cmd_vel"))
     assert {state.mode for state in stack.drive(4.0, None)} == {ControlState.REAL}
-    assert 35 <= len(stack.bus.messages("/cmd_vel")) - before <= 41  # 10 a second: no receiver times out
+    assert 35 <= len(stack.bus.records("/cmd_vel")) - before <= 41  # 10 a second: no receiver times out
     assert 7 <= len(updates) <= 9  # 2 a second, and no source counts as stale
     # A box 0.1 m high, 0.6 m ahead, that only 3D points see, appears between two updates.
     stack.cloud = np.array([[0.62, y, z] for y in np.arange(-0.2, 0.2, 0.02) for z in (0.08, 0.1)])
     stack.step(None)
     stack.step(None)
-    seen, sent = len(updates), len(stack.bus.messages("/cmd_vel"))
+    seen, sent = len(updates), len(stack.bus.records("/cmd_vel"))
     state = stack.step((0.4, 0.0))
     assert len(updates) > seen
     costmap = stack.arbiter.surroundings.costmap
@@ -654,11 +655,11 @@ def test_the_navigator_works_only_in_the_virtual_space() -> None:
     stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
     navigator = next(node for node in stack.bus.nodes if isinstance(node, NavigatorNode))
     stack.drive(2.0, None)
-    assert navigator.follow_timer is None and 5 <= len(stack.bus.messages("/nav/cmd_vel")) <= 11
+    assert navigator.follow_timer is None and 5 <= len(stack.bus.records("/nav/cmd_vel")) <= 11
     assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
     assert navigator.follow_timer is not None
     assert stack.drive(14.0, (0.4, 0.0))[-1].mode == ControlState.REAL
-    sent = len(stack.bus.messages("/nav/cmd_vel"))
+    sent = len(stack.bus.records("/nav/cmd_vel"))
     stack.drive(0.5, (0.4, 0.0))
     rest = [twist_values(message) for message in stack.bus.messages("/nav/cmd_vel")[sent:]]
     assert navigator.follow_timer is None and len(rest) <= 3 and set(rest) == {(0.0, 0.0)}

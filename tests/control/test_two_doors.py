@@ -69,7 +69,7 @@ def test_idle_zeros_of_a_second_console_do_not_keep_the_robot_driving_in_virtual
     stack.drive(1.5, (0.0, 0.0))
     assert drive(stack, 6.0, 0.4, 0.0)[-1].mode == ControlState.VIRTUAL
     assert sent(stack)[-1] > 0.1
-    before, place = len(stack.bus.messages("/cmd_vel")), stack.base.pose[:2].copy()
+    before, place = len(stack.bus.records("/cmd_vel")), stack.base.pose[:2].copy()
     states = drive(stack, 4.0, None, 0.0)
     stopped = sent(stack, before)
     assert not any(stopped[round(0.3 * 20) + 2 :])  # the timer's steps, and one more at the time-out
@@ -99,7 +99,7 @@ def test_a_node_that_claims_to_be_the_driver_does_not_drive(free: Stack) -> None
     drive(free, LEASE_S + 0.5, None, None)
     command(free, 0.0, "console/page 1")
     assert free.step(None).holder == "console/page 1"
-    before = len(free.bus.messages("/cmd_vel"))
+    before = len(free.bus.records("/cmd_vel"))
     for _ in range(10):
         command(free, 0.0, "console/page 1")
         command(free, 0.3, "liar/page 1")

@@ -60,7 +60,7 @@ def test_driving_and_odometry_go_on_when_the_clock_is_set(set_s: float) -> None:
     bench = NodeBench()
     bench.run(1.0, v=0.4)
     bench.clock.set_by_ns = round(set_s * S)
-    before = len(bench.bus.messages("/wheel/odom"))
+    before = len(bench.bus.records("/wheel/odom"))
     bench.run(1.0, v=0.4)
     assert bench.line.speed == pytest.approx(0.4, abs=0.01)
     later = bench.bus.messages("/wheel/odom")[before:]

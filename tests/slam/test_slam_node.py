@@ -123,8 +123,8 @@ def test_the_map_is_not_sent_again_while_nothing_changes() -> None:
     rig = Rig()
     rig.wheel()
     rig.drive(0.0, 0.0, 50)
-    assert len(rig.bus.messages("/map")) == 1
-    assert len(rig.bus.messages("/pose")) == 50
+    assert len(rig.bus.records("/map")) == 1
+    assert len(rig.bus.records("/pose")) == 50
 
 
 def test_without_wheels_the_node_completes_the_transforms() -> None:
@@ -147,7 +147,7 @@ def test_no_wheel_odometry_at_all_is_told_and_bridged() -> None:
     rig.drive(0.3, 0.0, 5, wheels=False)
     assert rig.bus.messages("/pose") == []  # within STARTUP_WAIT_S
     rig.drive(0.3, 0.0, 15, wheels=False)
-    assert len(rig.bus.messages("/pose")) == 21  # none of those that waited is lost
+    assert len(rig.bus.records("/pose")) == 21  # none of those that waited is lost
     assert len(rig.transforms("base_link")) == 21
     level, text, _ = rig.node.diagnoses()["odometry"]
     assert level == WARN and "/wheel/odom" in text
@@ -173,7 +173,7 @@ def test_scans_that_cannot_be_used_are_counted_and_told() -> None:
     rig.wheel()
     rig.scan()
     rig.drive(0.2, 0.0, 5)
-    count = len(rig.bus.messages("/pose"))
+    count = len(rig.bus.records("/pose"))
 
     rig.scan(stamp=rig.now_ns - 2_000_000_000)
     level, text, values = rig.node.diagnoses()["scan"]
@@ -182,7 +182,7 @@ def test_scans_that_cannot_be_used_are_counted_and_told() -> None:
     assert "in the future" in rig.node.diagnoses()["scan"][1]
     rig.scan(stamp=rig.now_ns)
     assert rig.node.diagnoses()["scan"][2]["dropped"] == 3
-    assert len(rig.bus.messages("/pose")) == count
+    assert len(rig.bus.records("/pose")) == count
 
     rig.drive(0.2, 0.0, 1)
     assert rig.node.diagnoses()["scan"][0] == OK
@@ -191,7 +191,7 @@ def test_scans_that_cannot_be_used_are_counted_and_told() -> None:
     rig.now_ns += 33_333_333
     rig.wheel()
     assert "too few points" in rig.node.diagnoses()["slam"][1]
-    assert len(rig.bus.messages("/pose")) == count + 2
+    assert len(rig.bus.records("/pose")) == count + 2
     rig.bus.advance(5.0)
     assert rig.node.diagnoses()["scan"][0] == ERROR
 
@@ -352,6 +352,6 @@ def test_a_fault_of_the_worker_is_told_and_the_scans_go_on(monkeypatch: pytest.M
 
     monkeypatch.setattr(rig.node.slam.loop_closure, "update", broken)
     rig.drive(0.4, 0.3, 20)
-    assert len(rig.bus.messages("/pose")) == 21 and max(rig.pose_errors()) < 0.03
+    assert len(rig.bus.records("/pose")) == 21 and max(rig.pose_errors()) < 0.03
     level, text, _ = rig.node.diagnoses()["loops"]
     assert level == ERROR and "no more" in text
