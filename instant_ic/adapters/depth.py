@@ -19,7 +19,7 @@ def held_image(message: Any) -> HeldImage:
 
 
 def revolution_of(message: Any) -> TimedPoints:
-    """The revolution of a PointCloud2.
+    """Convert a PointCloud2 to a revolution.
 
     Raises:
         ValueError: its points cannot be read, or have no times.
@@ -30,7 +30,7 @@ def revolution_of(message: Any) -> TimedPoints:
 
 
 def keyframe_message(number: int, frame: str, frame_from_camera: Matrix, panorama: Any, depth: DepthResult) -> Any:
-    """A Keyframe message of a CompressedImage and its depth."""
+    """Build the Keyframe message of a CompressedImage and its depth."""
     camera, stamp = panorama.header.frame_id, stamp_ns(panorama)
     return Keyframe(
         header=header(frame, stamp),

@@ -38,7 +38,7 @@ def decode_keyframe(keyframe: Any) -> KeyframeArrays:
 
 
 def view_message(order: ViewOrder, encoded: EncodedView, schedule: JobSchedule, now_ns: int) -> Any:
-    """A RenderedView message of a request; the pose is that of the request that was rendered."""
+    """Build the RenderedView message of a request; its pose is that of the rendered request."""
     return RenderedView(
         header=header("map", now_ns),
         request_id=order.id,
@@ -54,7 +54,7 @@ def view_message(order: ViewOrder, encoded: EncodedView, schedule: JobSchedule, 
 
 
 def status_message(schedule: JobSchedule, now_ns: int) -> Any:
-    """A VspaceStatus message."""
+    """Build a VspaceStatus message."""
     keyframe = schedule.keyframe
     return VspaceStatus(
         header=header("map", now_ns),

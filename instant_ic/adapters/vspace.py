@@ -18,7 +18,7 @@ from instant_ic.vspace.layers import Kind, Layer, Layers, LayersError
 
 
 def layers_message(layers: Layers, stamp_ns: int) -> Any:
-    """A VspaceLayers message; ``stamp_ns``: time of this version."""
+    """Build the VspaceLayers message of a version; ``stamp_ns`` is its time."""
     return VspaceLayers(
         header=header("map", stamp_ns),
         version=layers.version,
@@ -45,7 +45,7 @@ def _format(image: bytes) -> str:
 
 
 def layers_of(message: Any) -> Layers:
-    """The layers of a VspaceLayers message.
+    """Read the layers of a VspaceLayers message.
 
     Raises:
         LayersError: a layer of an unknown kind.

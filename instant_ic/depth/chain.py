@@ -68,7 +68,7 @@ class DepthChain:
         return back_s if restarts else 0.0
 
     def due(self, image: HeldImage) -> bool:
-        """Whether a keyframe could be taken of the image."""
+        """Return whether a keyframe could be taken of the image."""
         try:
             due = self.selector.due(self.metric.map_from_camera(image.frame, image.stamp_ns), image.stamp_ns)
         except TransformError as error:
@@ -82,7 +82,7 @@ class DepthChain:
         return self._trigger.image(image, self._last_ns, self.config.max_rate_hz)
 
     def request_due(self, stamp_ns: int) -> bool:
-        """Whether to request the network's depth of an image."""
+        """Return whether to request the network's depth of an image."""
         if not self.requests.due(stamp_ns):
             return False
         silent_s = (stamp_ns - (self.requests.since_ns or stamp_ns)) / 1e9

@@ -26,7 +26,7 @@ class DepthFileError(ValueError):
 
 
 def load_picture(path: str | Path) -> NDArray[np.uint8]:
-    """An image as (H, W, 3) uint8 RGB.
+    """Load an image as (H, W, 3) uint8 RGB.
 
     Raises:
         DepthFileError: missing, or no image.

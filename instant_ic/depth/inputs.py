@@ -31,7 +31,7 @@ class RecentInputs:
             del self.images[next(iter(self.images))]
 
     def nearest_revolution(self, stamp_ns: int) -> TimedPoints | None:
-        """The revolution whose middle is nearest in time; None when none is within ``MAX_CLOUD_AGE_S``."""
+        """Return the revolution whose middle is nearest in time; None if none is within ``MAX_CLOUD_AGE_S``."""
 
         def gap_ns(revolution: TimedPoints) -> int:
             return abs(revolution.middle_ns - stamp_ns)
@@ -78,7 +78,7 @@ class RevolutionTrigger:
         return late
 
     def revolution(self, middle_ns: int) -> HeldImage | None:
-        """The held image if a revolution with this middle completes it.
+        """Return the held image if a revolution with this middle completes it.
 
         A later revolution would be nearer only if the image was taken in the second half of its period.
         """
@@ -104,7 +104,7 @@ class DepthRequests:
         self._newest_ns = 0
 
     def due(self, stamp_ns: int) -> bool:
-        """Whether to request the depth of this image, of which a keyframe could be taken, or to wait for the answer."""
+        """Return whether to request the depth of this image, or to wait for the answer to an earlier request."""
         if self.since_ns is not None and 0 <= stamp_ns - self._newest_ns < _REPEAT_NS:
             return False
         if self.since_ns is None or stamp_ns < self.since_ns:

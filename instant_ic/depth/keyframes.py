@@ -48,7 +48,7 @@ class KeyframeSelector:
         self._due_since_ns: int | None = None
 
     def take(self, map_from_camera: NDArray[np.float64], fit: bool, stamp_ns: int) -> bool:
-        """Whether the image at this pose becomes a keyframe; if so it is the last one from now on.
+        """Return whether the image at this pose becomes a keyframe; if so it is the last one from now on.
 
         Args:
             map_from_camera: (4, 4) pose of the image.
@@ -79,7 +79,7 @@ class KeyframeSelector:
         self._pose, self._fit, self._due_since_ns = None, False, None
 
     def due(self, map_from_camera: NDArray[np.float64], stamp_ns: int, fit: bool = True) -> bool:
-        """Whether an image at this pose and time would become a keyframe, with depth that could be scaled (``fit``)."""
+        """Return whether an image at this pose and time would become a keyframe; ``fit``: its depth could be scaled."""
         if self._pose is None or (fit and not self._fit):
             return True
         if fit and stamp_ns - self._taken_ns >= self.config.refresh_s * 1e9:
@@ -102,7 +102,7 @@ def encode_sigma(sigma: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def decode_sigma(code: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """What ``encode_sigma`` wrote; inf where unknown."""
+    """Decode the image of ``encode_sigma``; inf where unknown."""
     sigma = _LEAST_SIGMA * _SIGMA_SPAN ** ((np.arange(256) - 1) / 254)
     sigma[0] = np.inf
     return np.asarray(sigma.astype(np.float32)[code])

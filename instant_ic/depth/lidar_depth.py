@@ -93,7 +93,7 @@ class LidarDepth:
 
 
 def level_from_camera(up: Floats) -> NDArray[np.float64]:
-    """The smallest rotation (3, 3) that turns ``up`` (3,), gravity's up in the camera's frame, onto z.
+    """Return the smallest rotation (3, 3) that turns ``up`` (3,), gravity's up in the camera's frame, onto z.
 
     Raises:
         ValueError: ``up`` is no direction, or the camera hangs upside down within a degree.
@@ -149,7 +149,8 @@ def lonely(
 
     Args:
         measured: (H, W) ranges, 0 where no point is.
-        rows, columns: (N,) the pixels with points.
+        rows: rows of the pixels with points, (N,).
+        columns: columns of them, (N,).
         alike: two ranges are alike when they differ by less than this share.
     """
     height, width = measured.shape
@@ -167,7 +168,7 @@ def lonely(
 def _confirmed(
     points: Floats, size: tuple[int, int]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Of points (N, 3) the nearest in each pixel, without the lonely ones: index, row, column and range, each (M,)."""
+    """Return the nearest point (N, 3) in each pixel, without lonely ones: index, row, column and range, each (M,)."""
     rows, columns, range_m = pixels_of(points, size[1], size[0])
     nearest = np.full(size, -1, np.intp)
     far_first = np.argsort(-range_m, kind="stable")

@@ -34,7 +34,7 @@ class DepthMetrics:
     pixels: int
 
     def as_dict(self) -> dict[str, float]:
-        """Rounded plain values for records and printing."""
+        """Return rounded plain values for records and printing."""
         return {key: round(value, 5) for key, value in asdict(self).items()}
 
 
@@ -44,13 +44,14 @@ def depth_metrics(
     valid: NDArray[np.bool_] | None = None,
     weights: Floats | None = None,
 ) -> DepthMetrics:
-    """Compares two depth maps of the same shape, metres.
+    """Compare two depth maps of the same shape, metres.
 
     A pixel counts where the truth is finite and positive, and ``valid`` where given. A prediction that is not
     positive or not finite counts as 0 m: a full relative error and no hit in any delta.
 
     Args:
-        predicted, truth: of one shape, usually (H, W).
+        predicted: predicted depth, usually (H, W).
+        truth: true depth, of the same shape.
         valid: same shape; False leaves a pixel out.
         weights: how much each pixel counts, of a shape that broadcasts to theirs; by default all the same. For an
             equirect image by solid angle: ``solid_angle_weights(height)[:, None]``.

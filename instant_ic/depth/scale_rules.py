@@ -77,7 +77,8 @@ def consensus_scale(depth: Floats, range_m: Floats, tolerance: float = 0.15) -> 
     off, have no say however far off they are.
 
     Args:
-        depth, range_m: pairs of the same direction, both (N,).
+        depth: estimated depth, (N,).
+        range_m: LiDAR ranges in the same directions, (N,).
         tolerance: relative.
 
     Raises:
@@ -114,7 +115,8 @@ def ransac_line(
     """Line y = slope x + offset that most pairs agree on, refined by least squares over those that do.
 
     Args:
-        x, y: pairs, both (N,).
+        x: abscissas of the pairs, (N,).
+        y: ordinates of the pairs, (N,).
         tolerance: how far each y may lie from the line, (N,); residuals are weighted by its inverse.
         trials: pairs of points that are tried.
         seed: of the choice of pairs, so that the same input gives the same line.

@@ -131,7 +131,7 @@ class DepthScaler:
             return self.refuse(depth, str(error))
 
     def refuse(self, depth: Floats, message: str) -> ScaleFit:
-        """The fit that is not ok: depth (H, W) as the model gave it where that is metres, else all unknown."""
+        """Return a fit that is not ok: depth (H, W) as the model gave it if that is metres, else all unknown."""
         metric = self.config.output_kind == "metric"
         given = self._clean(depth) if metric else np.zeros(depth.shape, np.float32)
         return ScaleFit(False, 1.0, 0.0, given, 0.0, float("inf"), 0, message)

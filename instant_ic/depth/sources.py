@@ -95,7 +95,7 @@ class DepthResult(ScaleFit):
     prior: Prior | None = None
 
     def figures(self) -> dict[str, float | str]:
-        """Rounded values for a diagnosis."""
+        """Return rounded values for a diagnosis."""
         return {
             "scale": round(self.scale, 4),
             "quality": round(self.quality, 3),
@@ -211,7 +211,7 @@ class DepthSource:
     def network(
         self, fit: ScaleFit, points: Floats, up: Floats, camera_height_m: float | None
     ) -> tuple[Corrected, float | None]:
-        """The network, scaled and corrected by the points, and the height over the camera of the ceiling it shows."""
+        """Correct the scaled network by the points; return it and the height of its ceiling over the camera."""
         size = fit.depth_m.shape
         network = correct(fit.depth_m, self.structure.ranges(points, size))
         top = ceiling_height(network.depth_m, rays_of(size) @ np.asarray(up, np.float32))
@@ -293,14 +293,14 @@ def complete(result: DepthResult, completion: Complete) -> DepthResult:
 
 
 def _contradicts(found_m: Floats, prior_m: Floats) -> NDArray[np.bool_]:
-    """Where two depths (H, W) differ plainly, or there is no prior."""
+    """Return the pixels at which two depths (H, W) differ plainly, or there is no prior."""
     known = (prior_m > 0) & (found_m > 0)
     change = np.abs(np.log(np.where(known, found_m, 1) / np.where(known, prior_m, 1)))
     return ~known | (change > _LEAST_CHANGE)
 
 
 def _areas(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The parts of a panorama's mask (H, W) that are not narrow."""
+    """Return the parts of a panorama's mask (H, W) that are not narrow."""
     width = _LEAST_AREA
     around = np.pad(mask.astype(np.uint8), ((0, 0), (width, width)), mode="wrap")
     return cv2.morphologyEx(around, cv2.MORPH_OPEN, np.ones((width, width), np.uint8))[:, width:-width] > 0

@@ -33,7 +33,7 @@ def nearest_points(points: Floats, width: int, height: int) -> tuple[Indices, In
 
 
 def hidden(points: Floats, margin: float = 0.25, cell_deg: float = CELL_DEG) -> NDArray[np.bool_]:
-    """True (N,) for points (N, 3) in the camera's frame that the camera probably does not see.
+    """Return a mask (N,) of the points (N, 3) in the camera's frame that the camera probably does not see.
 
     A point is hidden when two others in its own or in one of the eight neighbouring cells of ``cell_deg`` are nearer
     by more than ``margin`` of the range; one alone may be an outlier. Rings lie two degrees apart, so one pixel alone
@@ -63,7 +63,7 @@ def azimuth_problem(columns: Indices, width: int) -> str:
 
 
 def on_depth_edge(depth: Floats, rows: Indices, columns: Indices, ratio: float = 1.25) -> NDArray[np.bool_]:
-    """True (N,) where known depth (H, W) differs by more than ``ratio`` within the 3 x 3 pixels around a pixel.
+    """Return a mask (N,) of pixels around which known depth (H, W) differs by more than ``ratio``, in 3 x 3 pixels.
 
     There a point may belong to either side, and a network's edge is blurred or a pixel off.
     """

@@ -25,8 +25,10 @@ def panorama_pixel(x, y, z, height, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
-    """A keyframe's opinion on a point of its camera's frame: ``FOR`` (it has seen a surface there), ``AGAINST`` (it has
-    looked through it) or ``NO_OPINION`` (it is hidden, or the depth is not known there).
+    """Return a keyframe's opinion on a point of its camera's frame.
+
+    ``FOR``: it has seen a surface there; ``AGAINST``: it has looked through it; ``NO_OPINION``: the point is hidden, or
+    the depth is not known there.
 
     ``room``: share of the distance by which depths may differ.
     """
@@ -49,7 +51,7 @@ def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
 def outvoted(directions, inverse, sure, map_from_camera, camera_from_map, room, own, step, out):  # type: ignore[no-untyped-def]
     """Pixels of keyframe ``own`` through which most of the keyframes with an opinion have looked.
 
-    Args:
+    Arrays and parameters:
         directions: of the panorama's pixels, (h, w, 3), camera frame.
         inverse, sure: of all keyframes, newest first, (K, h, w); map_from_camera, camera_from_map: (K, 4, 4).
         room: (K,) of each against ``own``.

@@ -1,8 +1,15 @@
-"""A guess of the surfaces behind a keyframe's surfaces, shown where no keyframe has seen anything.
+"""Surfaces hidden behind the visible ones of a keyframe.
 
-Behind each depth edge floor, ceiling and walls are continued, in depth and in colour, once for each keyframe
-(``continuation``). The guess lies fixed in the map, so that images of a moving camera agree with each other. The place
-under the robot is a continuation of the ground around it. The sky is rendered here too, infinitely far.
+Gaps open at depth edges when the viewpoint moves. Once per keyframe, this module estimates what they show:
+
+1. ``level_planes``: fit floor and ceiling, the horizontal planes on which most steep pixels agree.
+2. ``_hidden_pixels``: mark the pixels behind each depth edge, up to ``reach_rad`` from it, and moved things.
+3. ``continuation.continued_walls``: continue floor, ceiling or the column's wall into them, in depth.
+4. ``continuation.continued_colours``: colour them from the visible part of the same surface; ``seen_by`` then takes the
+   colours of older keyframes that saw the place.
+
+The result is fixed in the map, so that views from different poses agree. The ground under the robot is hidden too and
+is continued from the ground around it. Sky is placed at ``sky_m``.
 """
 
 from __future__ import annotations
@@ -20,29 +27,55 @@ from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import ROOM, SKY, PanoramaPrior, area_average, edge_quads, fill_holes
 from instant_ic.vspace.warp import pinhole
 
-REACH_RAD = 0.35
-"""How far behind an edge the background is continued, as seen from the keyframe."""
-_NEARER = 0.4  # a surface is in front of another where its inverse depth is greater by this share; less is noise
-_ON_LEVEL = 0.1  # inverse depths within this share of the floor's or the ceiling's are on it
-_BEHIND = 1.05  # a guess lies farther than what hides it by this factor
-_STEEP, _ALIKE, _LEVEL_SHARE = 0.6, 0.04, 0.6  # beyond this sine of the elevation so many heights agree so far
-_NOTHING = 9  # kind of what is no surface of the place
-_WALL_RISE = 0.7  # sine of the elevation up to which an upright surface says how far walls are
-_SEEN = 0.08  # depths within this share of a guess's are of its surface
-_SKY_M = 1e4
-_ROWS = 256  # of the images that the background is made in: it is smooth
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """Tuning of the background; angles as seen from the keyframe's camera.
+
+    Attributes:
+        rows: rows of the images that the background is made in; it is smooth.
+        reach_rad: largest distance from a depth edge at which hidden pixels are filled.
+        edge_ratio: relative step of the inverse depth that is a depth edge here; less is noise.
+        on_plane: largest relative difference of inverse depths at which a pixel is on floor or ceiling.
+        behind: factor by which a hidden surface must lie farther than what hides it.
+        steep: smallest sine of the elevation of the pixels that floor and ceiling are fitted to.
+        plane_tolerance: largest relative difference of a pixel's height from a plane's that still counts as on it.
+        plane_share: smallest share of the steep pixels that must lie on a plane.
+        wall_rise: largest sine of the elevation of upright surfaces that walls are taken from.
+        same_surface: largest relative difference of depths at which an older keyframe has seen a hidden surface.
+        sky_m: distance of the sky in metres.
+    """
+
+    rows: int = 256
+    reach_rad: float = 0.35
+    edge_ratio: float = 0.4
+    on_plane: float = 0.1
+    behind: float = 1.05
+    steep: float = 0.6
+    plane_tolerance: float = 0.04
+    plane_share: float = 0.6
+    wall_rise: float = 0.7
+    same_surface: float = 0.08
+    sky_m: float = 1e4
+
+
+CONFIG = BackgroundConfig()
+OTHER, FLOOR, CEILING, NOTHING = 0, 1, 2, 9
+"""Kinds of pixels: walls and things, floor, ceiling, and what is no surface of the place."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """A keyframe's background as a mesh of some quads of a panorama.
+    """Hidden surfaces of a keyframe, as a mesh over a panorama of (h, w) pixels.
 
     Attributes:
-        inverse: inverse depth, (h, w) float32; rgb: (h, w, 3) uint8.
-        sure: share that a guess has in an image, (h, w) uint8 of 255; the rest is continued from around in the image.
-        guessed: the upper left pixels (row, column) of the quads that are guesses, (N, 2) int32.
-        sky: of those that are sky.
-        map_from_camera: pose, (4, 4).
+        inverse: inverse depth, 1/m along each pixel's ray, (h, w) float32.
+        rgb: colours, (h, w, 3) uint8.
+        sure: opacity of the estimate when rendered, 0 to 255, (h, w) uint8; the renderer fills the rest from
+            neighbouring pixels of the view.
+        guessed: upper left pixel (row, column) of each quad of estimated surface, (N, 2) int32.
+        sky: the same for sky, (M, 2) int32.
+        map_from_camera: pose of the keyframe's camera, (4, 4) float64.
     """
 
     inverse: Floats
@@ -54,57 +87,50 @@ class Background:
 
     @classmethod
     def of(cls, prior: PanoramaPrior) -> Background:
-        """The background of a keyframe."""
-        from instant_ic.vspace.background_kernels import in_front
-
-        step = max(1, prior.inverse_depth.shape[0] // _ROWS)
+        """Estimate the background of a keyframe."""
+        step = max(1, prior.inverse_depth.shape[0] // CONFIG.rows)
         inverse = np.ascontiguousarray(prior.inverse_depth[::step, ::step])
         content = prior.content[::step, ::step]
-        height, width = inverse.shape
         sky = content == SKY
-        inverse[sky] = 1 / _SKY_M
-        directions = rays_of(inverse.shape)
-        rise = np.einsum("ijk,k->ij", directions, prior.map_from_camera[2, :3]).astype(np.float32)
+        inverse[sky] = 1 / CONFIG.sky_m
+        rise = np.einsum("ijk,k->ij", rays_of(inverse.shape), prior.map_from_camera[2, :3]).astype(np.float32)
         levels = level_planes(inverse, rise, content == ROOM)
-        kind = np.zeros(inverse.shape, np.uint8)  # 1 floor, 2 ceiling, 0 all else
-        for number, level in enumerate(levels, 1):
-            kind[(level > 0) & (np.abs(inverse - level) < _ON_LEVEL * level)] = number
-        reach = max(1, round(REACH_RAD / (2 * math.pi / width)))
-        steps = np.zeros(inverse.shape, np.int32)
-        edges = edge_quads(inverse, _NEARER)
-        in_front(inverse, edges, kind, reach, steps)
+        kind = np.full(inverse.shape, OTHER, np.uint8)
+        for number, level in enumerate(levels, FLOOR):
+            kind[(level > 0) & (np.abs(inverse - level) < CONFIG.on_plane * level)] = number
+        edges = edge_quads(inverse, CONFIG.edge_ratio)
         removed = (content != ROOM) & ~sky
-        hole = (steps > 0) | removed
+        hole = _hidden_pixels(inverse, edges, kind) | removed
         # In a room with a floor or a ceiling walls stand upright: their distance along it is the same up and down.
         flat = np.sqrt(np.maximum(1 - rise * rise, np.float32(1e-4))) if np.any(levels) else np.ones_like(rise)
-        upright = inverse / flat
-        kind[content != ROOM] = _NOTHING
-        far, found = continued_walls(upright, (kind == 0) & (np.abs(rise) < _WALL_RISE), hole)
-        planes = np.stack([np.where(removed, 0, found * flat), *levels])
-        rgb = area_average(prior.rgb, height, width) if prior.rgb.shape[:2] != inverse.shape else prior.rgb.copy()
-        painted, sure = continued_colours(rgb, planes, kind, grown(edges > 0), hole, upright, rise / flat, far, found)
+        kind[content != ROOM] = NOTHING
+        walls = continued_walls(inverse / flat, (kind == OTHER) & (np.abs(rise) < CONFIG.wall_rise), hole)
+        planes = np.stack([np.where(removed, 0, walls.found * flat), *levels])
+        rgb = prior.rgb
+        rgb = area_average(rgb, *inverse.shape) if rgb.shape[:2] != inverse.shape else rgb.copy()
+        colours, sure = continued_colours(rgb, planes, kind, grown(edges > 0), rise / flat, walls)
         filled = planes.max(axis=0)
         lost = removed & (filled <= 0)
-        if lost.any():  # in no plane: from around
+        if lost.any():  # on no plane: filled from the surroundings
             filled[lost] = fill_holes(np.where(hole, 0, inverse).astype(np.float32), ~hole)[lost]
-            painted[lost] = np.rint(fill_holes(np.where(hole[..., None], 0, rgb).astype(np.float32), ~hole)[lost])
+            colours[lost] = np.rint(fill_holes(np.where(hole[..., None], 0, rgb).astype(np.float32), ~hole)[lost])
             sure[lost] = 255
-        behind = hole & (filled > 0) & ((filled < inverse / _BEHIND) | removed)
+        behind = hole & (filled > 0) & ((filled < inverse / CONFIG.behind) | removed)
         inverse = np.where(hole, filled, inverse).astype(np.float32)
-        whole = edge_quads(inverse, _NEARER)[:-1] == 0
+        whole = edge_quads(inverse, CONFIG.edge_ratio)[:-1] == 0
         guessed = _any_corner(behind) & whole
         return cls(
-            np.maximum(inverse, 1 / _SKY_M), painted, np.where(sky, np.uint8(255), sure), _places(guessed),
+            np.maximum(inverse, 1 / CONFIG.sky_m), colours, np.where(sky, np.uint8(255), sure), _places(guessed),
             _places(_any_corner(sky) & ~guessed & whole), prior.map_from_camera,
         )  # fmt: skip
 
     def seen_by(self, others: Sequence[tuple[PanoramaPrior, Floats]]) -> Background:
-        """The background with the pixels of other keyframes that have seen places of it.
+        """Take the colours of other keyframes that have seen places of the background.
 
-        Of those that have, the nearest to the place counts, whatever their order.
+        Of several, the keyframe nearest to the place counts, whatever their order.
 
         Args:
-            others: keyframes, and the factors (3,) that bring their colours to this one's.
+            others: keyframes, and the factors (3,) that bring their colours to this one's exposure.
         """
         if not others or not len(self.guessed):
             return self
@@ -121,7 +147,7 @@ class Background:
         for prior, gain in others:
             local = prior.in_camera(points)
             distance = np.sqrt(np.einsum("ij,ij->i", local, local))
-            better = prior.sees(local, distance, _SEEN) & (distance < nearest)
+            better = prior.sees(local, distance, CONFIG.same_surface) & (distance < nearest)
             colours[better] = np.rint(np.clip(prior.colours(local[better]) * gain, 0, 255))
             nearest[better], sures[better] = distance[better], 255
         rgb[mask], sure[mask] = colours, sures
@@ -156,25 +182,46 @@ class Background:
         return share
 
 
-def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list[Floats]:
-    """Inverse depth of the floor and of the ceiling at each pixel, (h, w) each, 0 where it is not met or there is none.
+def _hidden_pixels(inverse: Floats, edges: NDArray[np.uint8], kind: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Return the pixels near a depth edge whose surface hides a farther one, (h, w).
 
     Args:
-        inverse: inverse depth, (h, w); rise: sine of the pixels' elevation in the map, (h, w).
-        room: (h, w) where the depth is of the place.
+        inverse: inverse depth, (h, w).
+        edges: quads that cross a depth edge, (h, w).
+        kind: kinds of the pixels, (h, w); floor and ceiling hide nothing.
+    """
+    from instant_ic.vspace.background_kernels import in_front
+
+    reach = max(1, round(CONFIG.reach_rad / (2 * math.pi / inverse.shape[1])))
+    steps = np.zeros(inverse.shape, np.int32)
+    in_front(inverse, edges, kind, reach, steps)
+    return steps > 0
+
+
+def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list[Floats]:
+    """Fit floor and ceiling.
+
+    Args:
+        inverse: inverse depth, (h, w).
+        rise: sine of the pixels' elevation in the map, (h, w).
+        room: pixels whose depth is of the place, (h, w).
+
+    Returns:
+        Inverse depth of the floor and of the ceiling at each pixel, (h, w) each; 0 where a plane is not met or found.
     """
     planes = []
     for side in (-1, 1):
-        steep = (side * rise > _STEEP) & room
+        steep = (side * rise > CONFIG.steep) & room
         heights = rise[steep] / inverse[steep]
         height = float(np.median(heights)) if len(heights) else 0.0
-        flat = len(heights) > 0 and np.mean(np.abs(heights - height) < _ALIKE * abs(height)) > _LEVEL_SHARE
+        on_plane = np.abs(heights - height) < CONFIG.plane_tolerance * abs(height)
+        flat = len(heights) > 0 and np.mean(on_plane) > CONFIG.plane_share
         planes.append(np.maximum(rise / height, 0).astype(np.float32) if flat else np.zeros_like(inverse))
     return planes
 
 
 def _any_corner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Of each quad, (h − 1, w)."""
+    """Return the quads with any corner in the mask, (h − 1, w)."""
     right = np.roll(mask, -1, 1)
     return (mask | right)[:-1] | (mask | right)[1:]
 

@@ -49,7 +49,7 @@ class WarpTrial:
 
 
 def trials(shown: KeyframeSet) -> tuple[WarpTrial, ...]:
-    """The older keyframes that are kept but neither shown nor learnt, rendered by the warp of those that are.
+    """Render the views of older keyframes, neither shown nor learnt, by the warp of the newest.
 
     Places hidden from the shown keyframes are left out: the warp has them from the very images that it is judged by.
     """

@@ -1,12 +1,15 @@
 """Continuation of walls, floor and ceiling of a panorama behind what hides them.
 
-Floor and ceiling are level planes. A wall is upright: what is seen of it above a near surface goes on below; where
-nothing is, the planes of the walls at both sides go on. Each is continued in the colours of its own kind.
+1. ``continued_walls``: find the wall behind each hidden pixel. A wall is upright: what is seen of it above a near
+   surface goes on below; where nothing is, the planes of the walls at both sides go on.
+2. ``continued_colours``: colour each surface from its own visible part, and mix the surfaces within a pixel of the line
+   where they meet. Floor and ceiling are level planes, so that a row lies at one distance.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,65 +17,113 @@ from numpy.typing import NDArray
 from instant_ic.vspace.nerf.field import Floats
 from instant_ic.vspace.prior import fill_holes
 
-SAME = 1.15
-"""Distances of neighbours that differ by less than this factor are of one surface."""
-WALL_BEHIND = 1.3
-"""A wall is farther than what hides it by this factor: if it is nearer, depth errors hide the gap."""
-FLOOR_SURE, CEILING_SURE = 1.0, 0.6
-"""Share of the continued colour in the image; the rest is continued from the image's own surroundings."""
-BESIDE_SURE, LEAST_SURE = 0.6, 0.2
-"""The same of a wall that is continued from beside, at the side and far from it. Seen above it is 1: a wall that leads
-on beside a doorway is a guess, one that leads on below what is seen of it is none."""
-_FAR_SHARE = 0.25  # of a column's upright surfaces count as its farthest wall
-_LOOK_RAD, _SPAN_RAD, _SEARCH_RAD = 0.15, 0.25, 1.5  # above a near surface; of a wall's plane; for colours
-_SLOPE_PRIOR, _FARTHEST_M = 2.0, 30.0
-_FADE_RAD, _SURE_FADE_RAD = 0.1, 0.37
-_WALL_COLOURS, _LEVEL_COLOURS = 24, 40  # pixels that a common colour is the median of
+
+@dataclass(frozen=True)
+class ContinuationConfig:
+    """Tuning of the continuation; angles as seen from the keyframe's camera.
+
+    Attributes:
+        same: largest ratio of neighbouring distances of one surface.
+        wall_behind: smallest ratio of the distance of a wall to that of what hides it; nearer ones are hidden by the
+            depth's error.
+        far_share: share of a column's upright surfaces, from the far end, that count as its farthest wall.
+        look_rad: height above a near surface in which its wall is looked for.
+        span_rad: width over which a wall's plane is fitted.
+        search_rad: largest distance at which colours are looked for.
+        slope_prior: number of pseudo-observations of a wall at right angles to the ray.
+        farthest_m: largest distance of a continued wall, in metres.
+        fade_rad: distance over which a wall's own pixels fade into its common colour.
+        wall_colours: number of pixels that a wall's common colour is the median of.
+        level_colours: the same for floor and ceiling.
+        floor_opacity: weight of the continued floor in the view; the rest is filled from the view's surroundings.
+        ceiling_opacity: the same for the ceiling.
+        beside_opacity: the same for a wall continued from beside, at its visible part; below its visible part it is 1,
+            because a wall that leads on beside a doorway is uncertain and one that leads on downwards is not.
+        least_opacity: the same far from its visible part.
+        opacity_fade_rad: distance over which that weight falls by a factor of e.
+    """
+
+    same: float = 1.15
+    wall_behind: float = 1.3
+    far_share: float = 0.25
+    look_rad: float = 0.15
+    span_rad: float = 0.25
+    search_rad: float = 1.5
+    slope_prior: float = 2.0
+    farthest_m: float = 30.0
+    fade_rad: float = 0.1
+    wall_colours: int = 24
+    level_colours: int = 40
+    floor_opacity: float = 1.0
+    ceiling_opacity: float = 0.6
+    beside_opacity: float = 0.6
+    least_opacity: float = 0.2
+    opacity_fade_rad: float = 0.37
 
 
-def continued_walls(upright: Floats, wall: NDArray[np.bool_], hole: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Walls behind near surfaces.
+CONFIG = ContinuationConfig()
+
+
+@dataclass(frozen=True)
+class HiddenSurfaces:
+    """Walls behind the hidden pixels of a panorama.
+
+    Attributes:
+        hole: hidden pixels, (h, w).
+        upright: inverse horizontal distance of the visible surfaces, 1/m, (h, w).
+        far: inverse horizontal distance of the farthest wall of each column, (w,); 0 where there is none.
+        found: inverse horizontal distance of the wall behind each hidden pixel, (h, w); 0 where there is none.
+    """
+
+    hole: NDArray[np.bool_]
+    upright: Floats
+    far: Floats
+    found: Floats
+
+
+def continued_walls(upright: Floats, wall: NDArray[np.bool_], hole: NDArray[np.bool_]) -> HiddenSurfaces:
+    """Find the walls behind near surfaces.
 
     Args:
-        upright: inverse of the horizontal distance, (h, w) 1/m.
-        wall: (h, w) where that is of something upright; hole: (h, w) near surfaces.
-
-    Returns:
-        Inverse horizontal distance of the farthest wall of each column (w,) and of the wall behind each pixel of
-        ``hole`` (h, w), both 0 where there is none.
+        upright: inverse of the horizontal distance, 1/m, (h, w).
+        wall: pixels whose distance is of something upright, (h, w).
+        hole: near surfaces, (h, w).
     """
     from instant_ic.vspace import continuation_kernels as kernels
 
     height, width = hole.shape
     far, found = np.zeros(width, np.float32), np.zeros(hole.shape, np.float32)
-    kernels.farthest_walls(upright, wall, np.float32(_FAR_SHARE), far)
+    kernels.farthest_walls(upright, wall, np.float32(CONFIG.far_share), far)
     kernels.walls_behind(
-        upright, wall, hole, far, _pixels(_LOOK_RAD, height), _pixels(_SPAN_RAD, height),
-        *(np.float32(value) for value in (SAME, WALL_BEHIND, _SLOPE_PRIOR, _FARTHEST_M)), found,
+        upright, wall, hole, far, _pixels(CONFIG.look_rad, height), _pixels(CONFIG.span_rad, height),
+        *(np.float32(value) for value in (CONFIG.same, CONFIG.wall_behind, CONFIG.slope_prior, CONFIG.farthest_m)),
+        found,
     )  # fmt: skip
-    return far, found
+    return HiddenSurfaces(hole, upright, far, found)
 
 
 def continued_colours(
-    rgb: NDArray[np.uint8], planes: Floats, kind: NDArray[np.uint8], edge: NDArray[np.bool_], hole: NDArray[np.bool_],
-    upright: Floats, slope: Floats, far: Floats, found: Floats,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:  # fmt: skip
-    """Colours of the surfaces behind near ones.
+    rgb: NDArray[np.uint8],
+    planes: Floats,
+    kind: NDArray[np.uint8],
+    edge: NDArray[np.bool_],
+    slope: Floats,
+    walls: HiddenSurfaces,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Colour the surfaces behind near ones.
 
     Args:
-        rgb: (h, w, 3).
-        planes: inverse depth of walls, floor and ceiling where they lie behind, (3, h, w), 0 where they do not.
-        kind: which of them a pixel shows, (h, w).
-        edge: (h, w) pixels beside a depth edge, which have colours of both sides.
-        hole, upright: as in ``continued_walls``; far, found: of it; slope: tangent of the elevation, (h, w).
+        rgb: panorama, (h, w, 3).
+        planes: inverse depth of walls, floor and ceiling where they lie behind, (3, h, w); 0 where they do not.
+        kind: the one of them that a pixel shows, (h, w).
+        edge: pixels beside a depth edge, which have colours of both sides, (h, w).
+        slope: tangent of the elevation, (h, w).
+        walls: walls of ``continued_walls``.
 
     Returns:
-        The panorama with ``hole`` in the colours of what lies behind, (h, w, 3), and how sure that is, (h, w) 0..255.
+        The panorama with hidden pixels in the colours of what lies behind, (h, w, 3), and their opacity, (h, w) uint8.
     """
-    from instant_ic.vspace import continuation_kernels as kernels
-
-    height, width = hole.shape
-    reach = _pixels(_SEARCH_RAD, height)
+    hole, upright = walls.hole, walls.upright
     total, covered, sure = np.zeros(rgb.shape, np.float32), np.zeros(hole.shape, np.float32), np.zeros_like(upright)
     weight = np.maximum(upright, np.float32(1e-3)) ** np.float32(-4)  # what is far goes on behind what is near
     for number, plane in enumerate(planes):
@@ -82,22 +133,7 @@ def continued_colours(
         coverage = (np.clip(np.float32(0.5) + ahead / step, 0, 1) * (hole & (plane > 0))).astype(np.float32)
         if not coverage.any():
             continue
-        colour = np.full(rgb.shape, -1, np.float32)
-        if number == 0:
-            source = (kind == 0) & ~edge
-            columns, own = np.empty((width, 3), np.float32), np.zeros(hole.shape, np.float32)
-            kernels.wall_colours(rgb, source, upright, far, np.float32(SAME), columns)
-            kernels.continue_walls(
-                rgb, source, hole, coverage, slope, upright, far, found, columns, np.float32(SAME),
-                np.float32(_pixels(_FADE_RAD, height)), reach, _WALL_COLOURS, np.float32(BESIDE_SURE),
-                np.float32(_pixels(_SURE_FADE_RAD, height)), colour, own,
-            )  # fmt: skip
-            own = np.maximum(own, np.float32(LEAST_SURE))
-        else:
-            # Skirting and the feet of furniture are within the floor's tolerance, but not of its colour.
-            source = ~grown(grown(kind != number)) & ~edge
-            kernels.continue_level(rgb, source, hole, coverage, reach, _LEVEL_COLOURS, colour)
-            own = np.full(hole.shape, FLOOR_SURE if number == 1 else CEILING_SURE, np.float32)
+        source, colour, own = _continued_surface(number, rgb, kind, edge, coverage, slope, walls)
         lost = (coverage > 0) & (colour[..., 0] < 0)
         if lost.any():
             source = source if source.any() else ~hole
@@ -109,6 +145,43 @@ def continued_colours(
     share = np.maximum(covered, np.float32(1e-6))
     filled = np.where((covered > 0)[..., None], np.rint(total / share[..., None]), rgb).astype(np.uint8)
     return filled, np.rint(255 * sure / share).astype(np.uint8)
+
+
+def _continued_surface(
+    number: int,
+    rgb: NDArray[np.uint8],
+    kind: NDArray[np.uint8],
+    edge: NDArray[np.bool_],
+    coverage: Floats,
+    slope: Floats,
+    walls: HiddenSurfaces,
+) -> tuple[NDArray[np.bool_], Floats, Floats]:
+    """Continue the colours of one surface: walls (0), floor (1) or ceiling (2).
+
+    Returns:
+        Pixels that show the surface (h, w), colours (h, w, 3), −1 where none was found, and their opacity (h, w).
+    """
+    from instant_ic.vspace import continuation_kernels as kernels
+
+    hole, upright = walls.hole, walls.upright
+    height, width = hole.shape
+    reach, same = _pixels(CONFIG.search_rad, height), np.float32(CONFIG.same)
+    colour = np.full(rgb.shape, -1, np.float32)
+    if number:
+        # Skirting and the feet of furniture are within the floor's tolerance, but not of its colour.
+        source = ~grown(grown(kind != number)) & ~edge
+        kernels.continue_level(rgb, source, hole, coverage, reach, CONFIG.level_colours, colour)
+        opacity = CONFIG.floor_opacity if number == 1 else CONFIG.ceiling_opacity
+        return source, colour, np.full(hole.shape, opacity, np.float32)
+    source = (kind == 0) & ~edge
+    columns, own = np.empty((width, 3), np.float32), np.zeros(hole.shape, np.float32)
+    kernels.wall_colours(rgb, source, upright, walls.far, same, columns)
+    kernels.continue_walls(
+        rgb, source, hole, coverage, slope, upright, walls.far, walls.found, columns, same,
+        np.float32(_pixels(CONFIG.fade_rad, height)), reach, CONFIG.wall_colours, np.float32(CONFIG.beside_opacity),
+        np.float32(_pixels(CONFIG.opacity_fade_rad, height)), colour, own,
+    )  # fmt: skip
+    return source, colour, np.maximum(own, np.float32(CONFIG.least_opacity))
 
 
 def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

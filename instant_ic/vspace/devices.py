@@ -31,18 +31,18 @@ class KernelError(DeviceError):
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Whether torch raised this because the GPU has too little memory; does not import torch."""
+    """Return whether torch raised this because the GPU has too little memory; does not import torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(error, torch.OutOfMemoryError)
 
 
 def is_device_fault(error: Exception) -> bool:
-    """Whether an error has its cause in the device and not in this software."""
+    """Return whether an error has its cause in the device and not in this software."""
     return isinstance(error, DeviceError) or is_out_of_memory(error)
 
 
 def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
-    """The backend for ``config.device``, and a warning (empty when there is none).
+    """Return the backend for ``config.device``, and a warning (empty when there is none).
 
     Raises:
         DeviceError: a device was asked for that is not there, or does not work.
@@ -160,7 +160,7 @@ class FallbackDevice:
 
 
 def _may_have_cuda() -> bool:
-    """Whether the machine has an NVIDIA device. Importing torch to find out would take seconds."""
+    """Return whether the machine has an NVIDIA device. Importing torch to find out would take seconds."""
     return any(Path(place).exists() for place in ("/dev/nvidiactl", "/dev/nvmap", "/dev/dxg"))
 
 
@@ -218,7 +218,7 @@ def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfi
 
 
 def _scratch(field: FieldConfig) -> tuple[TrainingScene, Rays]:
-    """A striped sphere of 2 m seen from its middle, and a view from aside."""
+    """Return a striped sphere of 2 m seen from its middle, and the rays of a view from aside."""
     rgb = np.zeros((32, 64, 3), np.uint8)
     rgb[:, ::8] = (250, 120, 30)
     geometry = GeometryConfig(cell_m=0.2)

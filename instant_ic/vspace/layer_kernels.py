@@ -57,7 +57,7 @@ def lattice_errors(corners, directions, alone, tile):  # type: ignore[no-untyped
     split first, then the middles of the sides, then the centres of its quarters. So the error of a corner is at least
     that of the corners split after it.
 
-    Args:
+    Arrays and parameters:
         corners: inverse depth (h + 1, w); directions: (h + 1, w, 3).
         alone: (h, w) pixels that are squares of their own: their corners are never left out.
         tile: side of the largest squares, in pixels, a power of two.
@@ -154,7 +154,7 @@ def _leaves(errors, alone, tile, limit, out):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def count_triangles(errors, alone, shown, tile, limit):  # type: ignore[no-untyped-def]
-    """Number of vertices (an upper limit) and of triangles."""
+    """Return the number of vertices (an upper limit) and of triangles."""
     triangles = _leaves(errors, alone, tile, limit, np.empty((0, 6), np.int32))
     squares = 0
     for v in range(alone.shape[0]):

@@ -87,7 +87,7 @@ def layer_mesh(
 
 @functools.lru_cache(maxsize=4)
 def _directions(height: int, width: int) -> NDArray[np.float32]:
-    """Unit vectors at the pixels' corners, (height + 1, width, 3)."""
+    """Return the unit vectors at the pixels' corners, (height + 1, width, 3)."""
     azimuth = np.pi - np.arange(width) * (2 * np.pi / width)
     directions = directions_at(azimuth, np.pi / 2 - np.arange(height + 1) * (np.pi / height))
     directions[[0, -1], :, :2] = 0

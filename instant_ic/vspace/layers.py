@@ -145,7 +145,7 @@ class DecodedLayer:
 
 
 def decode_layer(layer: Layer) -> DecodedLayer:
-    """The arrays of a whole layer.
+    """Decode the arrays of a whole layer.
 
     Raises:
         LayersError: an image cannot be decoded, or is no panorama.

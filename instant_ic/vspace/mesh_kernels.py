@@ -12,7 +12,7 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 
 @njit(**_OPTIONS)
 def _add_bilinear(texels, start, height, width, u, v, weight, rgb):  # type: ignore[no-untyped-def]
-    """Adds ``weight`` × the bilinear colour at (u, v) in repeats of the image."""
+    """Add ``weight`` × the bilinear colour at (u, v) in repeats of the image."""
     x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
     x0, y0 = math.floor(x), math.floor(y)
     fx, fy = x - x0, y - y0
@@ -32,7 +32,7 @@ def shade(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Colours where rays meet the mesh: texture (trilinear, by the pixel's footprint) or vertex colours.
 
-    Args:
+    Arrays and parameters:
         triangles ... levels: of the ``ScannedMesh``.
         origin: (3,); directions: (P, 3); range_m, face: (P,), what each ray meets, face −1 for nothing.
         pixel_rad: angle of a pixel.

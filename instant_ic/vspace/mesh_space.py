@@ -166,7 +166,7 @@ class MeshSpace(RayRenderer):
         )
 
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
-        """Expected PSNR of a view: the mesh's at the newest keyframe, reduced by the parts of the view beyond the mesh.
+        """Return the expected PSNR of a view: the mesh's at the newest keyframe, less for parts beyond the mesh.
 
         NaN before the first keyframe: nothing is known of how alike mesh and place are.
         """

@@ -76,8 +76,12 @@ class PanoramaPrior:
         return np.asarray(np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3]))
 
     def sees(self, local: NDArray[np.float32], distance: NDArray[np.float32], share: float) -> NDArray[np.bool_]:
-        """Whether points (N, 3) of the camera's frame, at ``distance`` (N,) from it, lie within a share of this of a
-        surface that the keyframe knows, beside no depth edge.
+        """Return which points the keyframe sees: those near a surface of known depth that is beside no depth edge.
+
+        Args:
+            local: points in the camera's frame, (N, 3).
+            distance: distance of each point, (N,).
+            share: largest distance from the surface, as a share of ``distance``.
         """
         height, width = self.inverse_depth.shape
         u, v = equirect_pixels(local, width, height)
@@ -91,7 +95,7 @@ class PanoramaPrior:
         return self.rgb[nearest_pixels(local, width, height)].astype(np.float32)
 
     def without(self, moved: NDArray[np.bool_]) -> PanoramaPrior:
-        """The keyframe with what has ``moved`` (h, w) left out, and nothing else that was left out for that before."""
+        """Return the keyframe without the pixels that have ``moved`` (h, w); those left out before count again."""
         content = np.where(self.content == MOVED, ROOM, self.content)
         content[moved & (content == ROOM)] = MOVED
         return self if np.array_equal(content, self.content) else replace(self, content=content.astype(np.uint8))
@@ -112,7 +116,7 @@ def prepare(
     panorama_width: int,
     robot: NDArray[np.bool_] | None = None,
 ) -> PanoramaPrior:
-    """Checks a keyframe and makes its prior.
+    """Check a keyframe and build its prior.
 
     Args:
         rgb: equirect panorama (H, W, 3) uint8, W = 2 H.
@@ -214,7 +218,7 @@ def _checked_depth(
 
 
 def robot_region(height: int, below_deg: float, robot: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """Where a panorama of ``height`` rows shows the robot itself, (h, 2 h).
+    """Return the pixels at which a panorama of ``height`` rows shows the robot itself, (h, 2 h).
 
     Raises:
         KeyframeError: the mask ``robot`` is no panorama.
@@ -259,7 +263,7 @@ def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.boo
 
 
 def shrunk(rgb: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    """A panorama (H, 2 H, 3) area-averaged to ``width`` where it is wider."""
+    """Area-average a panorama (H, 2 H, 3) to ``width`` if it is wider."""
     return rgb if rgb.shape[1] <= width else area_average(rgb, width // 2, width)
 
 
@@ -294,7 +298,7 @@ def area_average(image: NDArray[np.uint8], height: int, width: int) -> NDArray[n
 def fill_holes(
     values: NDArray[np.float32], valid: NDArray[np.bool_], weight: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """Fills what is not valid from its surroundings by a pyramid of weighted means (pull, then push).
+    """Fill invalid pixels from their surroundings by a pyramid of weighted means (pull, then push).
 
     Args:
         values: (H, W) or (H, W, C).
@@ -333,7 +337,7 @@ def edge_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.u
 
 
 def _torn_pairs(line: list[NDArray[np.float32]], ratio: float) -> NDArray[np.bool_]:
-    """Whether there is an edge between the third and the fourth of six pixels in a row."""
+    """Return whether there is an edge between the third and the fourth of six pixels in a row."""
     first, before, a, b, after, last = line
     jump, nearest = np.abs(a - b), np.minimum(a, b)
     limit = 0.5 * jump

@@ -38,7 +38,7 @@ class Texture:
 
     @classmethod
     def of(cls, rgb: NDArray[np.uint8]) -> Texture:
-        """Of a panorama (H, 2 H, 3), over the middle third of its rows, where a turn moves pixels by its own angle."""
+        """Measure a panorama (H, 2 H, 3), in its middle third, where a turn moves pixels by its own angle."""
         height, whole = min(_ROWS, rgb.shape[0]), rgb.shape[0]
         band = rgb[whole // 3 : whole - whole // 3]
         averaged = area_average(band, max(1, round(len(band) * height / whole)), 2 * height)
@@ -48,7 +48,7 @@ class Texture:
         return cls(angles.astype(np.float32), np.array([0.0, *mse], np.float32), float(small.var(axis=(0, 1)).mean()))
 
     def cost(self, angle_rad: Floats) -> Floats:
-        """Expected squared difference at shifts of so many radians."""
+        """Return the expected squared difference at shifts in radians."""
         return np.interp(angle_rad, self.angle_rad, self.mse).astype(np.float32)
 
 

@@ -385,7 +385,7 @@ class VirtualSpace(RayRenderer):
         return min(self.config.readiness.max_radius_m, PARALLAX_RAD * prior.median_depth_m / sigma)
 
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
-        """Expected PSNR of a view, estimated without ground truth (``readiness``); −inf without a keyframe.
+        """Estimate the PSNR of a view without ground truth (``readiness``); −inf without a keyframe.
 
         From the depth's error, the distance to the keyframes, what they have not seen, and the error in training.
         """

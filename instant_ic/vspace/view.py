@@ -62,7 +62,7 @@ class View:
         return float(self.confidence.mean(axis=1) @ weight / weight.sum())
 
     def softened(self) -> NDArray[np.uint8]:
-        """The flat image as it is shown to people, (H, W, 3): blurred and paler where it is a guess."""
+        """Return the image as it is shown to people, (H, W, 3): blurred and paler where it is an estimate."""
         import cv2
 
         if (self.confidence >= 1).all():
@@ -78,13 +78,13 @@ class View:
 
 
 def check_size(width: int, height: int) -> None:
-    """Raises ValueError for an image that is too small or too large to render."""
+    """Check that a view is neither too small nor too large to render (else ValueError)."""
     if not (MIN_VIEW <= width <= MAX_VIEW and MIN_VIEW <= height <= MAX_VIEW):
         raise ValueError(f"view must have {MIN_VIEW} to {MAX_VIEW} pixels a side (got {width} x {height})")
 
 
 def checked_pose(map_from_camera: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The pose as float64; ValueError where it is none."""
+    """Return the pose as float64; ValueError if it is not a finite (4, 4) matrix."""
     pose = np.asarray(map_from_camera, np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise ValueError("pose of the view must be a finite 4x4 matrix")
@@ -148,12 +148,13 @@ def equirect_rays(pose: NDArray[np.float64], width: int) -> Rays:
 
 
 def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: bool = False) -> Floats:
-    """Fill unknown pixels from their surroundings, more from the far side than from the near one: gaps open behind
-    nearer surfaces.
+    """Fill unknown pixels from their surroundings, mostly from the far side: gaps open behind nearer surfaces.
 
     Args:
-        image: (H, W, 3); depth_m, confidence: (H, W).
-        wraps: the left edge is the right edge's neighbour, as in a panorama.
+        image: image, (H, W, 3).
+        depth_m: depth, (H, W).
+        confidence: confidence, (H, W); 0 is unknown.
+        wraps: the left edge borders on the right edge, as in a panorama.
     """
     seen = confidence > 0
     if seen.all() or not seen.any():  # where nothing is known there is nothing to continue
@@ -174,7 +175,7 @@ class RayRenderer(abc.ABC):
         """Render the rays, (H, W); unknown parts are filled from their surroundings."""
 
     def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
-        """A perspective image along the camera's x axis with the horizontal field of view ``fov_rad``.
+        """Render a perspective view along the camera's x axis with the horizontal field of view ``fov_rad``.
 
         Raises:
             NotReadyError: no keyframe yet, where one is needed.
@@ -184,7 +185,7 @@ class RayRenderer(abc.ABC):
         return self._view(perspective_rays(checked_pose(map_from_camera), width, height, fov_rad), "perspective")
 
     def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View:
-        """A panorama, ``width`` × ``width / 2``. Raises as ``render``."""
+        """Render a panorama, ``width`` × ``width / 2``. Raises as ``render``."""
         check_size(width, width // 2)
         if width % 2:
             raise ValueError(f"a panorama's width must be even (got {width})")

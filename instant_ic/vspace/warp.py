@@ -55,11 +55,12 @@ class Pyramid:
         """Blend the panorama's colour, averaged over each pixel's footprint, into that of a view's surfaces.
 
         Args:
-            camera_from_map: of the panorama, (4, 4) float32.
-            rays: of the view; depth: along them, (P,), 0 where nothing is met.
-            wanted: (P,) over 0 where a colour is wanted.
-            share: of the panorama in the result, 0..1.
-            colour: in and out, (P, 3) in 0..1.
+            camera_from_map: inverse pose of the panorama, (4, 4) float32.
+            rays: P rays of the view.
+            depth: metres along the rays, (P,); 0 where nothing is met.
+            wanted: over 0 where a colour is wanted, (P,).
+            share: weight of the panorama in the result, 0 to 1.
+            colour: RGB of the view, 0 to 1, (P, 3); updated in place.
         """
         from instant_ic.vspace import warp_kernels
 
@@ -123,7 +124,7 @@ class PanoramaWarp:
         self._outside = np.empty((height + 2, width), np.uint8)
 
     def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
-        """A perspective image along the camera's x axis with the horizontal field of view ``fov_rad``.
+        """Render a perspective view along the camera's x axis with the horizontal field of view ``fov_rad``.
 
         Confidence is 1 where the panorama has seen the place, 0.5 where its depth was filled from around, 0 elsewhere.
 
@@ -182,7 +183,7 @@ def pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
 
 @functools.lru_cache(maxsize=2)  # a keyframe is as large as the one before
 def _half_step_directions(width: int, height: int) -> NDArray[np.float32]:
-    """Unit directions at every half pixel of a panorama with a row more above and below, (2 height + 3, 2 width, 3).
+    """Return unit directions at every half pixel, a row more above and below, (2 height + 3, 2 width, 3).
 
     Entry (2 v + 2, 2 u) is pixel (v, u)'s own; rows beyond a pole are the pole.
     """

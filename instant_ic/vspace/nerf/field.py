@@ -38,11 +38,11 @@ RAW_LIMITS = -10.0, 6.0
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where the hash grid's cells lie. It has no border: every place of the map has its cells.
+    """Position and size of the hash grid's cells. It has no border: every place of the map has its cells.
 
     Attributes:
-        origin: map frame, metres, (3,) float32.
-        cells_per_m: of each level, coarse to fine, (levels,) float32.
+        origin: corner of a cell in the map, metres, (3,) float32.
+        cells_per_m: cells per metre of each level, coarse to fine, (levels,) float32.
     """
 
     origin: Floats
@@ -60,7 +60,7 @@ class Lattice:
         return cls(origin.astype(np.float32), np.geomspace(coarse, fine, config.levels).astype(np.float32))
 
     def suits(self, other: Lattice) -> bool:
-        """Whether a scene that asks for ``other`` can go on with this one: scales within a factor of 2."""
+        """Return whether a scene that asks for ``other`` can go on with this one: scales within a factor of 2."""
         ratio = self.cells_per_m[[0, -1]] / other.cells_per_m[[0, -1]]
         return bool(np.all((ratio > 0.5) & (ratio < 2.0)))
 
@@ -113,7 +113,7 @@ class TrainingScene:
     gains: Floats | None = None
 
     def __post_init__(self) -> None:
-        """Raises ValueError where there is no keyframe, or their sizes or the gains' do not fit."""
+        """Check that there is a keyframe, and that the sizes of keyframes and gains fit (else ValueError)."""
         if not self.priors:
             raise ValueError("a scene needs a keyframe")
         sizes = {(prior.rgb.shape, prior.inverse_depth.shape) for prior in self.priors}
@@ -222,7 +222,7 @@ class Rays:
     stride: int = 4
 
     def some(self, chosen: NDArray[np.integer]) -> Rays:
-        """The rays of some pixels, as one column."""
+        """Return the rays of some pixels, as one column."""
         return Rays(self.origin, self.directions[chosen], self.axial[chosen], (len(chosen), 1))
 
 
@@ -261,7 +261,7 @@ class Device(Protocol):
         """
 
     def parameters(self) -> FieldParameters:
-        """A copy of the present parameters."""
+        """Return a copy of the present parameters."""
 
 
 @dataclass

@@ -23,7 +23,7 @@ from instant_ic.vspace.nerf.vectors import adam2, adam4, gather2, gather4, scatt
 
 BLOCK = 64
 MARKED = 4
-"""So many table entries share a mark: 64 bytes with four features, a cache line."""
+"""Number of table entries that share a mark: 64 bytes with four features, a cache line."""
 _P1 = 2654435761
 _P2 = 805459861
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
@@ -31,7 +31,7 @@ forget_stale(Path(__file__).parent)
 
 
 def no_marks(table: np.ndarray) -> np.ndarray:
-    """Marks of a table's touched entries, (levels, size / MARKED) uint8, all 0."""
+    """Allocate the marks of a table's touched entries, (levels, size / MARKED) uint8, all 0."""
     return np.zeros((table.shape[0], table.shape[1] // MARKED), np.uint8)
 
 
@@ -52,11 +52,11 @@ def pixel_block(points, start, count, focus, pixel):  # type: ignore[no-untyped-
 
 @njit(**_OPTIONS)
 def cells_block(points, start, count, origin, scale, size, pixel, entries, weights):  # type: ignore[no-untyped-def]
-    """Where a block's points lie in one level: table entries of their cells' corners, and trilinear weights.
+    """Find the table entries of a block's points in one level, at their cells' corners, and the trilinear weights.
 
     A level counts whole while its cells are wider than the keyframe's pixel there, not at all from half of it.
 
-    Args:
+    Arrays and parameters:
         size: entries of a level, a power of two; pixel: (BLOCK,), of ``pixel_block``.
         entries: out, (8, BLOCK) uint32; weights: out, (8, BLOCK) float32.
     """
@@ -120,7 +120,7 @@ def encode_block(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def encode_backward_block(table_grad, touched, entries, weights, count, dx):  # type: ignore[no-untyped-def]
-    """Adds the gradient of a block's features ``dx`` to ``table_grad`` and marks the entries in ``touched``.
+    """Add the gradient of a block's features ``dx`` to ``table_grad`` and marks the entries in ``touched``.
 
     ``entries``, ``weights``: of ``encode_block``; ``touched``: of ``no_marks``.
     """
@@ -207,7 +207,7 @@ def network_backward_block(w1, w2, x, h, dy, g1, gb1, g2, gb2, dh, dx):  # type:
 
 @njit(**_OPTIONS)
 def query(table, w1, b1, w2, b2, cells_per_m, origin, focus, points, out):  # type: ignore[no-untyped-def]
-    """The field at ``points`` (N, 3) into ``out`` (N, 4): colour minus 0.5, signed distance."""
+    """Write the field at ``points`` (N, 3) to ``out`` (N, 4): colour minus 0.5, signed distance."""
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
     h = np.zeros((w1.shape[0], BLOCK), np.float32)
     y = np.zeros((4, BLOCK), np.float32)
@@ -228,11 +228,11 @@ def gradient(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, origin, focus, points, target, colour_weight, distance_weight,
     table_grad, touched, g1, gb1, g2, gb2
 ):  # fmt: skip
-    """Adds the gradient of the training loss to the ``*_grad`` arrays.
+    """Add the gradient of the training loss to the ``*_grad`` arrays.
 
     Loss: ``Σ colour_weight[i] · |colour_i − target_i[:3]|² + distance_weight[i] · (distance_i − target_i[3])²``.
 
-    Args:
+    Arrays and parameters:
         points: (N, 3); target: (N, 4), colour minus 0.5 and signed distance; both weights: (N,).
 
     Returns:

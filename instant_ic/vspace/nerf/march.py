@@ -40,7 +40,7 @@ def prior_inverse_depth(inverse, depth_edge, u, v):  # type: ignore[no-untyped-d
 def _bilinear_colour(rgb, gain, turn, fall, target, surface, near):  # type: ignore[no-untyped-def]
     """Write a panorama's colour, in the newest's exposure and minus 0.5, to two samples.
 
-    Args:
+    Arrays and parameters:
         rgb: panorama, (H, W, 3); gain: (3,).
         turn, fall: place in it as shares of its width and height.
         target: (2 N, 4), rows ``surface`` and ``near`` are written.
@@ -68,7 +68,7 @@ def sample_rays(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Sample one ray in each of ``columns × rows`` strata of equal solid angle, with two samples a ray.
 
-    Args:
+    Arrays and parameters:
         uniform: (N, 3) in [0, 1): place in the stratum (azimuth, height) and in the band; N = columns · rows.
         sources: (N / 64,): the keyframe that each tile of 8 × 8 strata looks from.
         rgb, inverse, depth_edge, usable, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
@@ -118,9 +118,9 @@ def sample_rays(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def prior_agrees(x, y, z, inverse, depth_edge, known, tolerance):  # type: ignore[no-untyped-def]
-    """Whether a point of the camera frame lies on a surface of the prior: 0 no, 1 on filled depth, 2 on known depth.
+    """Return 2 for a point of the camera frame on a surface of known depth, 1 on filled depth, else 0.
 
-    Returns the code as an int. ``tolerance`` is relative to the distance.
+    ``tolerance`` is relative to the distance.
     """
     height, width = inverse.shape
     flat = math.sqrt(x * x + y * y)
@@ -157,9 +157,9 @@ def prior_distance(x, y, z, inverse, depth_edge, band):  # type: ignore[no-untyp
 
 @njit(**_OPTIONS)
 def nearest_prior(x, y, z, inverse, depth_edge, known, camera_from_map, band, all_agree):  # type: ignore[no-untyped-def]
-    """The keyframe whose surface is nearest to a point of the map frame, of those that no newer one has looked through.
+    """Find the keyframes' surface nearest to a point of the map, except those that a newer keyframe has looked through.
 
-    Args: as in ``trace``; all_agree: whether to compute the agreement (0 otherwise).
+    Arguments as in ``trace``; ``all_agree``: compute the agreement (0 otherwise).
 
     Returns:
         Signed distance in units of the newest's band, and what ``prior_agrees`` says (the best of all keyframes).
@@ -183,7 +183,7 @@ def nearest_prior(x, y, z, inverse, depth_edge, known, camera_from_map, band, al
 
 @njit(**_OPTIONS)
 def prior_known(x, y, z, known):  # type: ignore[no-untyped-def]
-    """Whether the depth is known in the direction of a point of the camera frame."""
+    """Return whether the depth is known in the direction of a point of the camera frame."""
     height, width = known.shape
     u = (math.pi - math.atan2(y, x)) * (width / (2 * math.pi))
     v = (math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi)
@@ -192,7 +192,7 @@ def prior_known(x, y, z, known):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def grid_span(origin, direction, low, cell, shape):  # type: ignore[no-untyped-def]
-    """Where a ray enters and leaves the grid; entry > exit when it misses it."""
+    """Return the lengths at which a ray enters and leaves the grid; entry > exit if it misses it."""
     enter, leave = 0.0, 1e9
     for axis in range(3):
         a, b = low[axis], low[axis] + cell * shape[axis]
@@ -226,20 +226,20 @@ def next_occupied(origin, direction, t, leave, grid, low, cell):  # type: ignore
 
 @njit(**_OPTIONS)
 def at_length(origin, direction, t):  # type: ignore[no-untyped-def]
-    """The place ``t`` along a ray."""
+    """Return the place ``t`` along a ray."""
     return origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
 
 
 @njit(**_OPTIONS)
 def along(target_from_source, origin, direction, t):  # type: ignore[no-untyped-def]
-    """The place ``t`` along a ray, in another frame."""
+    """Return the place ``t`` along a ray, in another frame."""
     x, y, z = at_length(origin, direction, t)
     return transformed(target_from_source, x, y, z)
 
 
 @njit(**_OPTIONS)
 def transformed(target_from_source, x, y, z):  # type: ignore[no-untyped-def]
-    """A point in another frame."""
+    """Transform a point to another frame."""
     m = target_from_source
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
@@ -286,7 +286,7 @@ def _skip_empty_cells(  # type: ignore[no-untyped-def]
 def _ends_here(n, value, cell, keyframes, share, origin, direction, state, pixel, depth, confidence):  # type: ignore[no-untyped-def]
     """Test a ray at its present sample, and move it on; return True if it ends on a surface.
 
-    Args:
+    Arrays and parameters:
         n: index of the ray; value: the field's signed distance there, in bands.
         keyframes: arrays ``inverse``, ``depth_edge``, ``known``, ``camera_from_map`` and ``band`` of ``trace``.
         state: arrays of ``trace``, by ray.
@@ -330,7 +330,7 @@ def trace(  # type: ignore[no-untyped-def]
 
     The distance is the field's and the prior's own, mixed: a young field's surfaces are rough.
 
-    Args:
+    Arrays and parameters:
         grid, low, cell: of the ``Occupancy``.
         inverse, depth_edge, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4) float32.
@@ -386,7 +386,7 @@ def trace(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def panorama_pixels(x, y, z, height, width):  # type: ignore[no-untyped-def]
-    """The four pixels of a panorama round a direction: rows and the lower's weight, columns and the right one's."""
+    """Return the pixels around a direction: two rows, the lower's weight, two columns, the right one's weight."""
     u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
     v = np.float32((math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi) - 0.5)
     v = min(max(v, np.float32(0)), np.float32(height - 1))
@@ -398,9 +398,9 @@ def panorama_pixels(x, y, z, height, width):  # type: ignore[no-untyped-def]
 def mix_panorama(  # type: ignore[no-untyped-def]
     rgb, inverse, depth_edge, known, camera_from_map, gains, band, origin, directions, depth, confidence, share, colour
 ):
-    """Mixes the panorama's colour into that of surfaces which a keyframe has seen: of the newest that has.
+    """Mix the panorama's colour into that of surfaces which a keyframe has seen: of the newest that has.
 
-    Args:
+    Arrays and parameters:
         rgb, inverse, depth_edge, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4); gains: (K, 3).
         depth, confidence: (P,), of ``trace``; nothing happens where either is 0.
@@ -426,7 +426,7 @@ def mix_panorama(  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def interpolate_depth(depth, confidence, stride, tolerance, pixels):  # type: ignore[no-untyped-def]
-    """Fills the pixels at multiples of ``stride`` from their traced neighbours at multiples of ``2·stride``.
+    """Fill the pixels at multiples of ``stride`` from their traced neighbours at multiples of ``2·stride``.
 
     ``depth`` (H, W) is measured along the view's axis, so that its inverse is linear over a plane. Pixels whose
     neighbours differ by more than ``tolerance``, or meet nothing, are listed in ``pixels`` and have to be traced.

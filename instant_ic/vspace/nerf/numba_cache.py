@@ -9,7 +9,7 @@ _SOURCES = ("*kernels.py", "march.py", "volume.py", "vectors.py")
 
 
 def forget_stale(folder: Path) -> list[Path]:
-    """Deletes the indices of code that is older than any of a folder's kernels; numba then compiles again.
+    """Delete the indices of code that is older than any of a folder's kernels; numba then compiles again.
 
     numba compares a function with its own file alone. A function that has another module's inlined would run old code
     after a change there, with array shapes that the new code no longer has.

@@ -80,12 +80,12 @@ class TorchGrid:
 
 @dataclass
 class TrainState:
-    """What training changes between steps.
+    """State of training between steps.
 
     Attributes:
-        moments: Adam's two moments of each parameter.
+        moments: two moments of Adam for each parameter.
         level_rates: learning rate of each level against the coarsest's, (levels, 1, 1).
-        steps: steps so far.
+        steps: number of steps so far.
     """
 
     moments: list[tuple[Tensor, Tensor]]
@@ -250,7 +250,7 @@ def sample_rays(
 def _sample_rays(
     uniform: Tensor, n: Tensor, columns: int, rows: int, prior: TorchPrior, newest: TorchPrior
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The rays of number ``n`` (N,) of a batch, all of one keyframe."""
+    """Return the rays of number ``n`` (N,) of a batch, all of one keyframe."""
     height, width = prior.rgb.shape[:2]
     h, w = prior.inverse_depth.shape
     tile, inside = n // 64, n % 64

@@ -29,7 +29,7 @@ RAYS_AT_ONCE = 1 << 18
 
 
 def torch_priors(scene: TrainingScene, device: str) -> list[TorchPrior]:
-    """A scene's keyframes as tensors, newest first."""
+    """Return a scene's keyframes as tensors, newest first."""
 
     def tensor(array: Any, kind: torch.dtype = torch.float32) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(device=device, dtype=kind)
@@ -125,7 +125,7 @@ class TorchDevice:
         return colour, depth, confidence
 
     def _directions(self, rays: Rays) -> Tensor:
-        """Of a view, in the map, (P, 3); a lens is uploaded once, and turned on the device."""
+        """Return the directions of a view in the map, (P, 3); a lens is uploaded once, and turned on the device."""
         if not isinstance(rays, LensRays):
             return torch.from_numpy(rays.directions).to(self._device)
         if self._newest_lens is None or self._newest_lens[0] is not rays.lens:

@@ -287,5 +287,5 @@ class TritonDevice:
 
 
 def _power_of_two(number: int) -> int:
-    """The least that is no smaller."""
+    """Return the smallest power of two that is no smaller."""
     return 1 << (number - 1).bit_length()

@@ -256,7 +256,7 @@ def gradient(
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Adds the gradient of ``reference.loss`` of ``reference.query`` to ``table_grad`` and ``network_grad``.
+    """Add the gradient of ``reference.loss`` of ``reference.query`` to ``table_grad`` and ``network_grad``.
 
     ``sums`` (4,): adds weighted squared colour error, weighted squared distance error, and the two weights' sums.
     """
@@ -509,7 +509,7 @@ def draw(
 
     ``reference.trace``, ``reference.query`` and ``reference.mix_panorama`` in one.
 
-    Args:
+    Arrays and parameters:
         camera: position of the newest keyframe's camera, (3,).
         eye: position of the view, (3,); turn: map_from_view rotation (3, 3); directions: rays in it, (P, 3).
         colour (P, 3), depth (P,), confidence (P,): out.

@@ -28,9 +28,9 @@ _RAYS = BLOCK // SAMPLES
 
 @njit(**_OPTIONS)
 def band_samples(camera, surface, jitter, band, newest, newest_band, points, first, offset, span):  # type: ignore[no-untyped-def]
-    """Samples of one ray through the band round its surface.
+    """Place the samples of one ray through the band around its surface.
 
-    Args:
+    Arrays and parameters:
         camera, surface: (3,); jitter: place in the strata, 0..1; band: half width, share of the depth.
         newest: the newest keyframe's camera, (3,); newest_band: its band.
         points: out, rows ``first``… of (…, 3).
@@ -71,7 +71,7 @@ def ray_weights(raw, first, span, weight, left):  # type: ignore[no-untyped-def]
 def _ray_gradient(y, first, target, weight, w, left, offset, span, losses, each, pull, dy):  # type: ignore[no-untyped-def]
     """Write the gradient of one ray's loss by the network's outputs, and return its colour and depth errors.
 
-    Args:
+    Arrays and parameters:
         y, dy: outputs of the network and their gradient, (4, BLOCK); the ray's samples begin at ``first``.
         target: colour of the ray, (3,) and more; weight: of colour and depth, (2,).
         w, left, offset, span: weights of ``ray_weights`` and places of ``band_samples``, (SAMPLES,).
@@ -115,13 +115,13 @@ def volume_gradient(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, origin, focus, points, target, weight, jitter, sources, cameras, band,
     losses, table_grad, touched, g1, gb1, g2, gb2
 ):  # fmt: skip
-    """Adds the gradient of the training loss of composited rays to the ``*_grad`` arrays.
+    """Add the gradient of the training loss of composited rays to the ``*_grad`` arrays.
 
     Loss of a ray, times its weight, mean over the rays: ``|Σ w c − colour|² / 3 + losses[0] · depth + losses[1] ·
     opacity + losses[2] · distortion`` with ``depth = (Σ w o)²``, ``opacity = (1 − Σ w)²`` and ``distortion =
     Σᵢⱼ wᵢ wⱼ |oᵢ − oⱼ| + ⅓ Σ wᵢ² · step`` (Barron et al., 2022), o in bands behind the surface.
 
-    Args:
+    Arrays and parameters:
         points, target, weight: of ``march.sample_rays``: of each tile's 128 rows the first 64 are used.
         jitter: (N,) place of each ray's samples in their strata, 0..1.
         sources: (N / 64,) each tile's keyframe; cameras: (K, 3); band: (K,).
@@ -171,7 +171,7 @@ def volume_gradient(  # type: ignore[no-untyped-def]
 def _guided_samples(origin, direction, depth, newest, band, points, first, offset, span):  # type: ignore[no-untyped-def]
     """Place a view's samples around the depth of one ray, and return the half width of their band.
 
-    Args:
+    Arrays and parameters:
         origin, direction: (3,); depth: metres along the ray.
         newest, band, points, first, offset, span: as in ``band_samples``.
     """
@@ -189,7 +189,7 @@ def _guided_samples(origin, direction, depth, newest, band, points, first, offse
 def _composited(y, first, w, offset, colour):  # type: ignore[no-untyped-def]
     """Write the colour of a ray (3,), and return the mean place of its samples in the band.
 
-    Args:
+    Arrays and parameters:
         y: outputs of the network, (4, BLOCK); the ray's samples begin at ``first``.
         w, offset: weights and places of the samples, (SAMPLES,).
         colour: out, 0..1, (3,).
@@ -212,9 +212,9 @@ def _composited(y, first, w, offset, colour):  # type: ignore[no-untyped-def]
 def composite(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, band, depth_share, origin, directions, depth, colour
 ):
-    """Renders rays by compositing round the depth that they were guided to: hash grid, network and sums in one pass.
+    """Render rays by compositing around their guiding depth: hash grid, network and sums in one pass.
 
-    Args:
+    Arrays and parameters:
         band: of the newest keyframe, whose camera is ``focus[0, :3]``.
         depth_share: of the guiding depth in the depth that comes out; the rest is the mean over the samples.
         origin: (3,); directions: (P, 3).

@@ -36,7 +36,11 @@ def volume_loss(
     """Colour, depth, opacity and distortion errors, means over the rays; see ``volume.volume_gradient``.
 
     Args:
-        output: (N, S, 4) of ``query``; target: (N, 3); weight: (N, 2).
+        output: output of ``query``, (N, S, 4).
+        offset: places of the samples, in bands behind the surface, (N, S).
+        span: lengths that the samples stand for, (N, S).
+        target: colours of the rays, (N, 3).
+        weight: weights of colour and depth, (N, 2).
     """
     w = ray_weights(output[..., 3], span)
     colour = ((w[..., None] * output[..., :3]).sum(dim=1) - target) ** 2
