@@ -11,7 +11,6 @@ from rosbags.rosbag2 import Reader
 
 from instant_ic.bag import BagError, BagReader, BagWriter
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.compare import compare
 from instant_ic.bag.recorder import Recorder
 from instant_ic.bag.recover import recover
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
@@ -23,7 +22,6 @@ from instant_ic.msg import (
     compressed_image_message,
     header,
     image_message,
-    message_type,
     pose_message,
     scan_message,
     serialize,
@@ -102,18 +100,6 @@ def test_type_hash_is_that_of_ros(tmp_path: Path) -> None:
     assert digests[KEYFRAME] == typestore().hash_rihs01(KEYFRAME)
     # Published hash of std_msgs/msg/Bool in ROS 2 Jazzy.
     assert digests[BOOL] == "RIHS01_feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9"
-
-
-def test_own_reader(tmp_path: Path) -> None:
-    with BagReader(make_bag(tmp_path / "bag")) as reader:
-        assert (reader.count, reader.start_ns, reader.end_ns) == (22, 1_000_000_000, 2_900_000_000)
-        assert [(t.topic, t.count, t.qos.name) for t in reader.topics] == [
-            ("/keyframe", 1, "latched"),
-            ("/operator/estop", 1, "latched"),
-            ("/scan", 20, "sensor"),
-        ]
-        stamps = [m.stamp_ns for m in reader.messages({"/scan"}, 1_200_000_000, 1_500_000_000)]
-        assert stamps == [1_200_000_000, 1_300_000_000, 1_400_000_000]
 
 
 def test_bare_mcap_file_opens_too(tmp_path: Path) -> None:
@@ -203,24 +189,6 @@ def get_index(data: bytes) -> list[ChunkIndex]:
     return summary.chunk_indexes
 
 
-def test_a_whole_bag_is_recovered_whole(tmp_path: Path) -> None:
-    bag = make_bag(tmp_path / "bag")
-    assert recover(bag, tmp_path / "copy").stopped_by == ""
-    assert all(topic.same for topic in compare(bag, tmp_path / "copy"))
-
-
-def test_compare_names_the_first_field(tmp_path: Path) -> None:
-    a, b = make_bag(tmp_path / "a"), make_bag(tmp_path / "b", value=1.5)
-    c = make_bag(tmp_path / "c", count=19)
-    assert all(topic.same for topic in compare(a, a))
-    found = {topic.topic: topic.first for topic in compare(a, b)}
-    assert found["/keyframe"] == ""
-    assert found["/scan"].startswith("message 1: ranges[0] is")
-    assert found["/scan"].endswith("(8 of 8 entries differ)")
-    assert {t.topic: t.first for t in compare(a, c)}["/scan"] == "20 and 19 messages"
-    assert [t.topic for t in compare(a, b, ignore=("/scan",))] == ["/keyframe", "/operator/estop"]
-
-
 class Losses:
     def __init__(self) -> None:
         self.lost = 0
@@ -273,7 +241,3 @@ def test_recorder_on_simulated_time_gives_foreign_stamps_its_own(tmp_path: Path)
             (49_900_000_000, b"follows the clock"),
             (50_000_000_000, b"wall time"),
         ]
-
-
-def test_velodyne_type_is_in_the_store() -> None:
-    assert message_type(VELODYNE).__msgtype__ == VELODYNE

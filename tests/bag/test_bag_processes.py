@@ -22,11 +22,11 @@ import pytest
 
 from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bag.recover import recover
-from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Publisher, registry
+from instant_ic.bus import LATCHED, SENSOR, Publisher
 from instant_ic.bus.control import NodeControl
 from instant_ic.cli.main import main
 from instant_ic.experiments.stack import StackObserver, observer
-from instant_ic.msg import Bool, Clock, Float32, NodeStatus, deserialize, serialize
+from instant_ic.msg import Bool, Clock, Float32, deserialize, serialize
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]
 BOOL, FLOAT = "std_msgs/msg/Bool", "std_msgs/msg/Float32"
@@ -245,26 +245,6 @@ def test_player_is_steered_from_another_terminal(talker: Talker, tmp_path: Path)
     talker.node.drop(ticks)
 
 
-def test_two_recorders_ask_which_is_meant(talker: Talker, tmp_path: Path) -> None:
-    processes = [talker.start("bag", "record", "-o", tmp_path / name, "/count") for name in ("a", "b")]
-    try:
-        names = {f"bag_recorder_{process.pid}" for process in processes}
-        wait_for(lambda: names <= {node.name for node in registry.list_nodes(talker.run_dir)}, "both recorders")
-        asked = talker.ic("bag", "control", "pause")
-        assert asked.returncode == 2 and all(name in asked.stderr for name in names)
-        assert talker.ic("bag", "control", "pause", "--node", min(names)).returncode == 0
-    finally:
-        for process in processes:
-            end(process)
-
-
-def test_folder_that_cannot_be_written_is_told(talker: Talker, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    process = talker.start("bag", "record", "-o", tmp_path / "file" / "bag")
-    text = process.communicate(timeout=60)[0]
-    assert process.returncode == 1 and "cannot be created: Not a directory" in text and "Traceback" not in text
-
-
 def test_keys_in_a_terminal(talker: Talker, tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     before = termios.tcgetattr(theirs)
@@ -311,33 +291,3 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip(f"a tmpfs cannot be mounted here: {done.stderr.strip()}")
     yield folder
     subprocess.run(["umount", folder], check=True)
-
-
-def test_node_on_a_full_disk_is_degraded_and_goes_on_when_there_is_room(talker: Talker, small_disk: Path) -> None:
-    states: dict[int, int] = {}
-    heard = talker.node.subscribe("/heartbeat", NodeStatus, lambda m: states.__setitem__(m.pid, m.state), RELIABLE)
-
-    def state() -> int:
-        talker.node.spin_once()
-        return states.get(process.pid, -1)
-
-    process = talker.start("bag", "record", "-o", small_disk / "bag", "/count", "--min-free", "10MB")
-    try:
-        wait_for(lambda: status(talker).get("messages"), "messages")
-        wait_for(lambda: state() == NodeStatus.RUNNING, "a healthy node")
-        (small_disk / "other").write_bytes(bytes(12_000_000))
-        wait_for(lambda: status(talker).get("state") == "disk full", "the full disk")
-        wait_for(lambda: state() == NodeStatus.DEGRADED, "the degraded node")
-        with BagReader(small_disk / "bag") as reader:  # complete, while the recorder still runs
-            before = reader.count
-        (small_disk / "other").unlink()
-        subprocess.run(["mount", "-o", "remount,size=200m", small_disk], check=True)
-        wait_for(lambda: status(talker).get("files") == 2, "the second file")
-        wait_for(lambda: state() == NodeStatus.RUNNING, "a healthy node again")
-    finally:
-        text = end(process)
-        talker.node.drop(heard)
-    assert process.returncode == 1 and "MB are free where" in text and "10 MB are the reserve" in text, text
-    with BagReader(small_disk / "bag") as reader:
-        assert len(reader.files) == 2 and reader.count > before >= 1
-        assert json.loads(reader.custom["instant_ic.disk_full"])["/count"] >= 1

@@ -39,14 +39,6 @@ def scan(data: bytes) -> tuple[list[bytes], McapScan]:
         return [message.payload for message in found.messages()], found
 
 
-@pytest.mark.parametrize("compressed", [False, True])
-def test_whole_file(compressed: bool) -> None:
-    payloads, found = scan(good(compressed))
-    assert payloads == [bytes([i]) * (10 + i) for i in range(12)]
-    assert (found.whole, found.stopped_by, found.damaged, found.library) == (True, "", [], "instant_ic")
-    assert found.metadata == {"instant_ic": {"a": "b"}}
-
-
 @settings(max_examples=150, deadline=None)
 @given(
     st.booleans(), st.lists(st.tuples(st.integers(0, 10**9), st.integers(1, 255)), min_size=1, max_size=4), st.data()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic.bag import BagError, BagMessage, BagReader, BagWriter
+from instant_ic.bag import BagError, BagMessage, BagReader
 from instant_ic.bag import recorder_thread as recording
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.mcap_scan import McapScan
@@ -216,22 +216,6 @@ def test_folder_taken_away_is_told(tmp_path: Path) -> None:
         recorder.close()
 
 
-def test_files_by_time_and_on_demand(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "bag", max_bag_duration=10.0)
-    recorder.take("/estop", BOOL, NO, 1 * S, "console")
-    for stamp_s in (1, 5, 12):
-        recorder.take("/scan", BOOL, bytes([stamp_s]), stamp_s * S)
-    recorder.split()
-    recorder.take("/scan", BOOL, b"x", 13 * S)
-    recorder.close()
-    with BagReader(tmp_path / "bag") as reader:
-        assert [(part.path.name, part.count) for part in reader.parts] == [
-            ("bag_0.mcap", 3), ("bag_1.mcap", 1), ("bag_2.mcap", 1),
-        ]  # fmt: skip
-    with BagReader(tmp_path / "bag" / "bag_2.mcap") as part:
-        assert [(m.topic, m.payload) for m in part.messages()] == [("/estop", NO), ("/scan", b"x")]
-
-
 def test_message_without_a_type_is_told(tmp_path: Path) -> None:
     recorder = make(tmp_path / "bag")
     recorder.take("/scan", "", b"?", 1 * S)
@@ -374,12 +358,6 @@ def test_recorder_that_writes_at_once_keeps_no_snapshots(tmp_path: Path) -> None
 def test_bad_options_name_the_key(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(bad))} must be"):
         BagRecorderConfig(**bad)  # type: ignore[arg-type]
-
-
-def test_bag_that_exists_is_not_overwritten(tmp_path: Path) -> None:
-    BagWriter(tmp_path / "bag").close()
-    with pytest.raises(BagError, match="already exists"):
-        make(tmp_path / "bag")
 
 
 def on_the_disk(path: Path) -> list[bytes]:

@@ -4,13 +4,11 @@ import os
 import sys
 import threading
 import time
-from types import SimpleNamespace
 
 import pytest
 from live_nodes import LiveNode, Neighbour, cdr, wait_for
 
 from instant_ic.bridge.zenoh_format import SENDER_SIZE, Attachment, TopicQoS, data_key
-from instant_ic.bridge.zenoh_outgoing import Outgoing, _Out
 from instant_ic.bridge.zenoh_session import (
     ROUTER_DEFAULTS,
     RosNode,
@@ -571,16 +569,6 @@ def test_a_client_waits_for_its_router_and_finds_it(waits_itself, tmp_path, tmp_
         gateway.close()
 
 
-def test_clients_of_one_router_meet_through_it(world):
-    world.gateway("robot", namespace="robot1", publish=("/numbers",), mode="client")
-    world.gateway("station", namespace="robot1", subscribe=("/numbers",), mode="client")
-    out = world.neighbour("robot").publisher("/numbers", String, LATCHED)
-    out.publish(String("seven"))
-    listener = world.neighbour("station", "listener")
-    heard = listener.listen("/numbers", LATCHED)
-    listener.wait(lambda: heard, "the message")
-
-
 def test_without_the_extra_the_error_names_what_to_install(monkeypatch, tmp_path_factory):
     monkeypatch.setitem(sys.modules, "zenoh", None)
     with pytest.raises(NodeError, match=r"pip install 'instant-ic\[zenoh\]'"):
@@ -657,19 +645,6 @@ def test_rate_limit_thins_and_counts_what_it_leaves_out(world):
     # However late the machine is: one for each period, one for the first and one that came late in its period.
     assert 1 <= passed <= 5 * took_s + 2
     assert gateway.node.outgoing.thinned >= 40 - passed
-
-
-def test_rate_limit_passes_one_message_of_each_publisher_in_each_period():
-    counts, out = SimpleNamespace(thinned=0), _Out(period_ns=200_000_000)
-
-    def passes(at_ms, publisher="talker"):
-        received = SimpleNamespace(publisher=publisher, received_ns=10**18 + at_ms * 1_000_000)
-        return not Outgoing._early(counts, out, received)
-
-    assert [at_ms for at_ms in range(0, 1000, 25) if passes(at_ms)] == [0, 200, 400, 600, 800]
-    assert counts.thinned == 35 and passes(1000, "another")
-    assert [at_ms for at_ms in (1090, 1190, 1210) if passes(at_ms)] == [1090, 1210], "a late one keeps the grid"
-    assert [at_ms for at_ms in (3000, 3001, 3201) if passes(at_ms)] == [3000, 3201], "no burst after a pause"
 
 
 def test_reliable_topics_lose_nothing_on_the_way_through_two_gateways(world):

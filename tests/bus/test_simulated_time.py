@@ -103,14 +103,3 @@ def test_time_that_goes_back_stalls_no_timer_and_keeps_nothing_of_the_future(nod
     player.show(501 * S)
     wait_for(lambda: bool(listener.ticks), listener)
     assert listener.ticks == [501 * S]
-
-
-def test_time_that_jumps_forward_fires_a_timer_once_not_for_every_period(nodes: tuple[Listener, Player]) -> None:
-    listener, player = nodes
-    player.show(1000 * S)
-    wait_for(lambda: listener.clock.now_ns() == 1000 * S, listener)
-    listener.ticks.clear()
-    player.show(1600 * S)
-    wait_for(lambda: bool(listener.ticks), listener)
-    listener.spin_once()
-    assert listener.ticks == [1600 * S]
