@@ -57,25 +57,25 @@ class LocalPublisher:
         self._lock = threading.RLock()  # publish may be called from any thread; the bus thread serves subscriptions
         self._name = topic.encode()
         self._type_hash = type_digest(type_name)
-        self._id = os.urandom(8)
-        self._sequence = 0
+        self.identity = os.urandom(8)
+        self.sequence = 0
         self._copies = 0  # subscribers that want large messages inline
         self._progress: dict[bytes, PeerProgress] = {}
-        self._pool = SlotPool(self._id)
-        self._inlined: deque[tuple[int, int]] = deque()  # sequence and size of large messages through the socket
+        self.pool = SlotPool(self.identity)
+        self.inlined: deque[tuple[int, int]] = deque()  # sequence and size of large messages through the socket
         self._no_memory_until_s = 0.0
         self._last: _Message | None = None  # the latched value
         self.closed = False
-        self._claim, self._path = registry.claim_socket(host.run_dir, topic, host.node)
+        self._claim, self.path = registry.claim_socket(host.run_dir, topic, host.node)
         self._socket = host.context.socket(zmq.XPUB)
         try:
             self._socket.setsockopt(zmq.LINGER, int(LINGER_S * 1000))
             self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)  # each subscription is seen here, not only a key's first
             # For good: libzmq can stall a connection for ever when the limit is lowered on a socket in use.
             self._socket.setsockopt(zmq.SNDHWM, _QUEUE_BYTES // SHARED_FROM_BYTES)
-            self._socket.bind(f"ipc://{self._path}")
-            self._path.chmod(0o600)
-            registry.announce(self._claim, topic, type_name, qos.name, host.node, self._path, self._id)
+            self._socket.bind(f"ipc://{self.path}")
+            self.path.chmod(0o600)
+            registry.announce(self._claim, topic, type_name, qos.name, host.node, self.path, self.identity)
         except registry.RegistryError:
             self._leave()
             raise
@@ -124,22 +124,22 @@ class LocalPublisher:
             if self.closed:
                 return
             if not self.subscriber_count and not self.qos.latched:
-                self._sequence += 1
+                self.sequence += 1
             elif (slot := self._slot(size)) is not None:
                 try:
                     with slot.begin(size) as target:
                         fill(target)
-                    slot.finish(self._sequence + 1)
+                    slot.finish(self.sequence + 1)
                 finally:
                     slot.unlock()
-                reference = REFERENCE.pack(os.getpid(), slot.fd, slot.number, self._pool.oldest)
+                reference = REFERENCE.pack(os.getpid(), slot.fd, slot.number, self.pool.oldest)
                 self._send(size, reference, publish_ns, slot)
             elif self.qos.latched or self._has_room(size):
                 body = bytearray(size)
                 fill(memoryview(body))
                 self._send(size, body, publish_ns)
             else:
-                self._sequence += 1  # readers count the gap
+                self.sequence += 1  # readers count the gap
         self.stats.add(self._steady_ns())
 
     def serve(self) -> None:
@@ -164,26 +164,26 @@ class LocalPublisher:
             if self.closed:
                 return
             deadline = time.monotonic() + LINGER_S
-            newest = max((slot.written for slot in self._pool.slots), default=0)
+            newest = max((slot.written for slot in self.pool.slots), default=0)
             # A slot can be opened only as long as this process keeps it.
             while self.subscriber_count and self._read_by_all()[1] < newest and time.monotonic() < deadline:
                 time.sleep(0.002)
                 self.serve()
             self.closed = True
             self._leave()
-            self._pool.close()
+            self.pool.close()
 
     # -- under the lock --------------------------------------------------------------------------
 
     def _leave(self) -> None:
         """Close the socket and free the name; libzmq leaves its file in place."""
         self._socket.close()
-        self._path.unlink(missing_ok=True)
+        self.path.unlink(missing_ok=True)
         self._claim.release()
 
     def _send(self, size: int, body: Buffer, publish_ns: int | None, slot: Slot | None = None) -> None:
-        self._sequence += 1
-        message = self._sequence, self._now_ns() if publish_ns is None else publish_ns, size, body, slot
+        self.sequence += 1
+        message = self.sequence, self._now_ns() if publish_ns is None else publish_ns, size, body, slot
         if self.subscriber_count:
             self._emit(message)
         if slot is not None and self._copies:
@@ -197,17 +197,17 @@ class LocalPublisher:
         name, kind = self._name, INLINE if slot is None else SHARED
         if slot is not None and copy:
             name, kind, body = KEY_COPY + name, INLINE, slot.view(size)
-        self._send_part(name + HEADER.pack(kind, MARK, sequence, publish_ns, self._id, self._type_hash, size), _MORE)
+        self._send_part(name + HEADER.pack(kind, MARK, sequence, publish_ns, self.identity, self._type_hash, size), _MORE)
         self._send_part(body)
 
     def _has_room(self, size: int) -> bool:
         """Return whether a large message may go through the socket; the limit counts messages, not bytes."""
-        seen = min((progress.sequence() for progress in self._progress.values()), default=self._sequence)
-        while self._inlined and self._inlined[0][0] <= seen:
-            self._inlined.popleft()
-        if self._inlined and sum(waiting for _, waiting in self._inlined) + size > _QUEUE_BYTES:
+        seen = min((progress.sequence() for progress in self._progress.values()), default=self.sequence)
+        while self.inlined and self.inlined[0][0] <= seen:
+            self.inlined.popleft()
+        if self.inlined and sum(waiting for _, waiting in self.inlined) + size > _QUEUE_BYTES:
             return False
-        self._inlined.append((self._sequence + 1, size))
+        self.inlined.append((self.sequence + 1, size))
         return True
 
     def _slot(self, size: int) -> Slot | None:
@@ -218,7 +218,7 @@ class LocalPublisher:
             why, most = self.stats.not_shared_why, 0
         try:
             keep = self._last[4] if self._last else None
-            if (slot := self._pool.acquire(size, most, *self._read_by_all(), keep)) is not None:
+            if (slot := self.pool.acquire(size, most, *self._read_by_all(), keep)) is not None:
                 return slot
         except OSError as error:
             why = f"no shared memory for {size} bytes: {error.strerror or error}"
@@ -230,7 +230,7 @@ class LocalPublisher:
 
     def _read_by_all(self) -> tuple[int, int]:
         """Sequences up to which all readers that want every message, and all readers, have looked at the messages."""
-        must = self._sequence
+        must = self.sequence
         should = must if self.subscriber_count <= len(self._progress) else 0  # others announce no progress
         for progress in self._progress.values():
             sequence = progress.sequence()
@@ -254,8 +254,8 @@ class LocalPublisher:
         if not begins:
             self._progress.pop(announcement, None)
             return
-        joined = self._sequence - (self._last is not None)
+        joined = self.sequence - (self._last is not None)
         try:
-            self._progress[announcement] = PeerProgress(announcement, self._id, joined)
+            self._progress[announcement] = PeerProgress(announcement, self.identity, joined)
         except (OSError, ValueError, OverflowError) as error:
             log.debug("%s: progress of a reader cannot be read: %s", self.topic, error)

@@ -82,23 +82,23 @@ class LocalSubscription:
         self._name = self.topic.encode()
         self._digest = type_digest(type_name) if type_name else None
         self._lock = threading.Lock()
-        self._queue: deque[Received] = deque()
+        self.queue: deque[Received] = deque()
         self._depth = qos.depth
         self._now_ns, self._steady_ns, self._next_order = host.now_ns, host.steady_ns, host.next_order
         folder = registry.topic_dir(host.run_dir, topic)
         registry.own_folder(folder)
-        self._folder = registry.TopicFolder(folder)
-        self._sources: dict[bytes, _Source] = {}  # by identity; a connection to each
+        self.folder = registry.TopicFolder(folder)
+        self.sources: dict[bytes, _Source] = {}  # by identity; a connection to each
         self._next_search_s = 0.0
         self._told: set[object] = set()
         self._page, self._announcement = progress_page(newest_only=qos.depth == 1)
-        self._socket = host.context.socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, _QUEUE)
-        self._socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
-        self._socket.setsockopt(zmq.SUBSCRIBE, self._announcement)
-        self._socket.setsockopt(zmq.SUBSCRIBE, self._name)
-        self.fd = int(self._socket.getsockopt(zmq.FD))
+        self.socket = host.context.socket(zmq.SUB)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.setsockopt(zmq.RCVHWM, _QUEUE)
+        self.socket.setsockopt(zmq.RECONNECT_IVL, _RECONNECT_MS)
+        self.socket.setsockopt(zmq.SUBSCRIBE, self._announcement)
+        self.socket.setsockopt(zmq.SUBSCRIBE, self._name)
+        self.fd = int(self.socket.getsockopt(zmq.FD))
         host.readers[self.fd] = self
         host.inputs.register(self.fd, select.EPOLLIN)
 
@@ -110,37 +110,37 @@ class LocalSubscription:
         Raises:
             OSError: the run directory is gone.
         """
-        if self._folder.look():
+        if self.folder.look():
             self._connect()
         now = time.monotonic()
-        for identity, source in list(self._sources.items()):
+        for identity, source in list(self.sources.items()):
             if source.left_s and now - source.left_s > _GRACE_S:
-                del self._sources[identity]
+                del self.sources[identity]
                 if not self._connected(source.address):
-                    self._socket.disconnect(source.address)
+                    self.socket.disconnect(source.address)
 
     def _connected(self, address: str) -> bool:
-        return any(source.address == address for source in self._sources.values())
+        return any(source.address == address for source in self.sources.values())
 
     def _connect(self) -> None:
         """Connect to the publishers that are new in the registry, and note which have left it."""
-        present = {bytes.fromhex(info.id): info for info in self._folder.publishers}
-        for identity in present.keys() - self._sources.keys():
-            taken = {source.place for source in self._sources.values()}
+        present = {bytes.fromhex(info.id): info for info in self.folder.publishers}
+        for identity in present.keys() - self.sources.keys():
+            taken = {source.place for source in self.sources.values()}
             source = _Source(present[identity], next(place for place in itertools.count() if place not in taken))
             if not self._connected(source.address):
                 try:
-                    self._socket.connect(source.address)
+                    self.socket.connect(source.address)
                 except zmq.ZMQError as error:
                     self._complain(source.address, f"{source.address} cannot be connected: {error}")
                     continue
-            self._sources[identity] = source  # its messages are known from now on, also after it has left
-        for identity, source in self._sources.items():
+            self.sources[identity] = source  # its messages are known from now on, also after it has left
+        for identity, source in self.sources.items():
             source.left_s = 0.0 if identity in present else source.left_s or time.monotonic()
 
     def read(self, one: bool = False) -> None:
         """Read all messages that have arrived, or only ``one``: looking for more would delay it, but must follow."""
-        socket = self._socket
+        socket = self.socket
         receive = socket.recv
         while one or int(socket.getsockopt(_EVENTS)) & _POLLIN:
             try:
@@ -167,7 +167,7 @@ class LocalSubscription:
 
     def _message(self, header: Header, body: bytes | memoryview) -> None:
         kind, _, sequence, publish_ns, publisher, digest, size = header
-        source = self._sources.get(publisher) or self._met(publisher)
+        source = self.sources.get(publisher) or self._met(publisher)
         gap = sequence - source.expected if source.expected else 0
         if gap < 0:  # a latched value, sent again
             return
@@ -194,10 +194,10 @@ class LocalSubscription:
             (self.topic, source.type_name, payload, publish_ns, self._now_ns(), order, node, steady, publisher),
         )
         with self._lock:
-            queue = self._queue
+            queue = self.queue
             waiting = len(queue)
             if waiting and self._depth == 1:
-                queue = self._queue = deque(other for other in queue if other.publisher != node)
+                queue = self.queue = deque(other for other in queue if other.publisher != node)
             elif waiting >= self._depth:
                 self.stats.lose(queue.popleft().publisher, 1)
             queue.append(message)
@@ -213,10 +213,10 @@ class LocalSubscription:
         """
         now = time.monotonic()
         if now >= self._next_search_s:
-            self._folder.read()
+            self.folder.read()
             self._connect()
-            if publisher in self._sources:
-                return self._sources[publisher]
+            if publisher in self.sources:
+                return self.sources[publisher]
             self._next_search_s = now + _SEARCH_S
         raise FrameError(f"message of a publisher that is not in the registry (identity {publisher.hex()})")
 
@@ -264,9 +264,9 @@ class LocalSubscription:
             self._told.add(KEY_COPY)
             source.expected = source.expected or sequence  # the last value comes again
             for wanted in (self._name + bytes([INLINE]), KEY_COPY + self._name):
-                self._socket.setsockopt(zmq.SUBSCRIBE, wanted)
+                self.socket.setsockopt(zmq.SUBSCRIBE, wanted)
             for unwanted in (self._name, self._announcement):
-                self._socket.setsockopt(zmq.UNSUBSCRIBE, unwanted)
+                self.socket.setsockopt(zmq.UNSUBSCRIBE, unwanted)
         raise FrameError(
             f"shared memory of {source.node} cannot be used ({error.strerror or error}); asking for large messages "
             "through the socket, which is slower"
@@ -291,11 +291,11 @@ class LocalSubscription:
     # -- on the node's thread --------------------------------------------------------------------
 
     def take(self) -> list[Received]:
-        if not self._queue:
+        if not self.queue:
             return []
         with self._lock:
-            messages = list(self._queue)
-            self._queue.clear()
+            messages = list(self.queue)
+            self.queue.clear()
         return messages
 
     def close(self) -> None:
@@ -304,5 +304,5 @@ class LocalSubscription:
             if self._host.readers.get(self.fd) is self:  # not closed before
                 del self._host.readers[self.fd]
                 self._host.inputs.unregister(self.fd)
-                self._socket.close()
+                self.socket.close()
                 self._page.close()

@@ -42,7 +42,7 @@ def test_messages_in_the_sockets_at_the_end_are_in_the_bag(
 
         def arrived() -> bool:
             with transport.read_lock:
-                return bool(int(subscription._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+                return bool(int(subscription.socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
 
         wait_for(arrived)
     finally:

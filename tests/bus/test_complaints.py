@@ -73,7 +73,7 @@ def test_ros_comm_536_buff_size_lag_a_slow_node_works_on_the_newest(bus: Bus, si
         if len(worked_on) == 1:
             for i in range(2, 51):
                 out.send(numbered(i, size))
-            wait_for(lambda: number(subscription.raw._queue[-1]) == 50 if subscription.raw._queue else False)
+            wait_for(lambda: number(subscription.raw.queue[-1]) == 50 if subscription.raw.queue else False)
         else:
             node.stop()
 
@@ -93,7 +93,7 @@ def test_a_slow_callback_does_not_age_what_waits_behind_it(bus: Bus) -> None:
     worked_on: list[int] = []
 
     def last() -> int:
-        queue = quick_in.raw._queue
+        queue = quick_in.raw.queue
         return number(queue[-1]) if queue else 0
 
     def work(_) -> None:
@@ -160,7 +160,7 @@ def test_losses_stand_in_heartbeat_and_diagnostics_by_publisher(bus: Bus, monkey
     node.start()
     wait_for(lambda: out.subscriber_count == 1)
     out.send(numbered(1))
-    out._sequence += 3  # three messages that never reached the wire
+    out.sequence += 3  # three messages that never reached the wire
     out.send(numbered(5))
     wait_for(lambda: subscription.raw.stats.count == 2)
     told: list = []
@@ -182,7 +182,7 @@ def test_foxglove_bridge_329_stale_flood_after_a_stall(bus: Bus) -> None:
     with reader.transport.read_lock:
         for i in range(1, 201):
             out.send(numbered(i, 20_000))  # 4 MB: more than its socket holds
-    wait_for(lambda: reader.raw._queue and number(reader.raw._queue[-1]) == 200)
+    wait_for(lambda: reader.raw.queue and number(reader.raw.queue[-1]) == 200)
     assert reader.numbers() == [200]
     assert reader.stats.lost == 0
 
@@ -194,7 +194,7 @@ def test_zeromq_conflate_gives_a_piece_of_a_message(bus: Bus) -> None:
     with reader.transport.read_lock:
         for i in range(1, 101):
             out.send(numbered(i, 90_000))  # through the socket, which takes it in parts
-    wait_for(lambda: reader.raw._queue and number(reader.raw._queue[-1]) == 100)
+    wait_for(lambda: reader.raw.queue and number(reader.raw.queue[-1]) == 100)
     (message,) = reader.poll()
     assert len(message.payload) == 90_000 and whole(message)
 
@@ -237,10 +237,10 @@ def holder(bus: Bus, *arguments: str) -> subprocess.Popen[str]:
 
 def leased(out) -> int:
     """Number of slots that a reader has locked."""
-    free = [slot for slot in out._pool.slots if slot.lock()]
+    free = [slot for slot in out.pool.slots if slot.lock()]
     for slot in free:
         slot.unlock()
-    return len(out._pool.slots) - len(free)
+    return len(out.pool.slots) - len(free)
 
 
 def test_reader_killed_gives_its_buffers_back_and_is_back_when_restarted(bus: Bus) -> None:
@@ -438,13 +438,13 @@ def test_writing_over_a_lent_buffer_is_seen_and_told(bus: Bus, caplog: pytest.Lo
     wait_for(lambda: out.subscriber_count == 1)
     out.send(numbered(1, LARGE))
     wait_for(reader.poll)
-    out._pool.slots[0].finish(99)
+    out.pool.slots[0].finish(99)
     reader.received.clear()
     gc.collect()
     wait_for(lambda: reader.stats.overwritten == 1)
     with reader.transport.read_lock:
         out.send(numbered(2, LARGE))
-        out._pool.slots[-1].finish(98)
+        out.pool.slots[-1].finish(98)
     wait_for(lambda: reader.stats.lost_by == {"sender": 1})
     assert reader.poll() == [] and reader.stats.overwritten == 1
     assert "sender overwrote a message that was still in use" in caplog.text
@@ -457,12 +457,12 @@ def test_a_recorder_that_collects_does_not_starve_the_publisher(bus: Bus) -> Non
     for i in range(1, 101):
         out.send(numbered(i, LARGE))
         # Of both: a reader whose thread has not run yet holds what lies in its socket, too.
-        wait_for(lambda i=i: collector.stats.count == i and other.raw._queue and number(other.raw._queue[-1]) == i)
+        wait_for(lambda i=i: collector.stats.count == i and other.raw.queue and number(other.raw.queue[-1]) == i)
     assert collector.numbers() == list(range(1, 101))
     assert all(whole(message) for message in collector.received)
     assert collector.stats.lost == 0
     assert out.stats.not_shared == 0
-    assert len(out._pool.slots) <= 8
+    assert len(out.pool.slots) <= 8
 
 
 @pytest.mark.parametrize("qos", [SENSOR, RELIABLE], ids=["sensor", "reliable"])
@@ -527,7 +527,7 @@ def test_message_that_does_not_fit_its_type_leaves_the_topic_usable(bus: Bus) ->
             out.publish(wrong)
     out.publish(message)
     wait_for(reader.poll)
-    assert reader.stats.lost == 0 and len(out.raw._pool.slots) == 1
+    assert reader.stats.lost == 0 and len(out.raw.pool.slots) == 1
 
 
 def test_large_messages_through_the_socket_after_many_small_ones(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -539,7 +539,7 @@ def test_large_messages_through_the_socket_after_many_small_ones(bus: Bus, monke
         out.send(numbered(i, 100))
         if i % 100 == 0:
             wait_for(lambda i=i: reader.poll() is not None and len(reader.received) >= i)
-    monkeypatch.setattr(out._pool, "acquire", lambda *_: None)  # readers hold all slots
+    monkeypatch.setattr(out.pool, "acquire", lambda *_: None)  # readers hold all slots
     for i in range(801, 821):
         out.send(numbered(i, LARGE))
     wait_for(lambda: reader.poll() is not None and len(reader.received) == 820)
@@ -550,11 +550,11 @@ def test_large_messages_through_the_socket_are_bounded_in_bytes(bus: Bus, monkey
     out = bus.publisher()
     bus.reader()
     wait_for(lambda: out.subscriber_count == 1)
-    monkeypatch.setattr(out._pool, "acquire", lambda *_: None)
+    monkeypatch.setattr(out.pool, "acquire", lambda *_: None)
     monkeypatch.setattr(out, "_progress", {b"": SimpleNamespace(sequence=lambda: 0, newest_only=False)})  # stopped
     for i in range(1, 200):
         out.send(numbered(i, 1 << 20))
-    assert sum(size for _, size in out._inlined) <= 128 << 20
+    assert sum(size for _, size in out.inlined) <= 128 << 20
 
 
 def test_dora_2152_a_node_exits_though_its_reader_stands_still(bus: Bus) -> None:

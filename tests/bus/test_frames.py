@@ -41,7 +41,7 @@ class Stranger:
         with self.reader.transport.read_lock:
             self._socket = raw._host.context.socket(zmq.PUB)
             self._socket.bind("inproc://stranger")
-            raw._socket.connect("inproc://stranger")
+            raw.socket.connect("inproc://stranger")
             raw.read()
 
     def send(self, *parts: bytes) -> None:
@@ -62,7 +62,7 @@ def stranger(bus: Bus):
 
 def good(stranger: Stranger) -> bytes:
     """A header as the good publisher would send it."""
-    return HEADER.pack(INLINE, MARK, 1, 5, stranger.out._id, type_digest(BYTES), 3)
+    return HEADER.pack(INLINE, MARK, 1, 5, stranger.out.identity, type_digest(BYTES), 3)
 
 
 @settings(max_examples=200, deadline=None)
@@ -81,7 +81,7 @@ def test_frame_of_another_version_says_so() -> None:
 
 def test_a_publisher_of_wire_format_3_is_refused_in_words_that_say_what_to_do(stranger: Stranger, caplog) -> None:
     """A node of the release before, still running: topic, header of 48 bytes and body were parts of their own."""
-    header = struct.pack("<4sBBHQq8s8sQ", MAGIC, 3, 0, 0, 1, 5, stranger.out._id, type_digest(BYTES), 3)
+    header = struct.pack("<4sBBHQq8s8sQ", MAGIC, 3, 0, 0, 1, 5, stranger.out.identity, type_digest(BYTES), 3)
     for _ in range(2):
         stranger.send(b"/x\0", header, b"abc")
     assert stranger.reader.stats.rejected == 2 and stranger.reader.poll() == []
@@ -96,7 +96,7 @@ def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Strange
         [b"/x", b"no header"],
         [b"/x" + header],
         [b"/x" + header, b"four"],
-        [b"/x" + HEADER.pack(SHARED, MARK, 1, 5, stranger.out._id, type_digest(BYTES), 3), b"abc"],
+        [b"/x" + HEADER.pack(SHARED, MARK, 1, 5, stranger.out.identity, type_digest(BYTES), 3), b"abc"],
         [b"/x" + HEADER.pack(INLINE, MARK, 1, 5, b"nobody..", type_digest(BYTES), 3), b"abc"],
         [b"/xyz", b"", b"", b"", b""],
     ]
@@ -115,7 +115,7 @@ def test_garbage_is_counted_told_and_followed_by_good_messages(stranger: Strange
 def test_reference_to_something_else_is_not_opened(stranger: Stranger, caplog) -> None:
     """A descriptor that is no memory of the bus, here a pipe nobody writes to: opening it would block."""
     pipe = os.pipe()
-    header = HEADER.pack(SHARED, MARK, 1, 5, stranger.out._id, type_digest(BYTES), 3)
+    header = HEADER.pack(SHARED, MARK, 1, 5, stranger.out.identity, type_digest(BYTES), 3)
     stranger.send(b"/x" + header, REFERENCE.pack(os.getpid(), pipe[0], 1, 1))
     assert "shared memory of sender cannot be used (no shared memory of the bus)" in caplog.text
     assert stranger.reader.poll() == []
@@ -127,7 +127,7 @@ def test_stranger_at_a_publishers_socket_disturbs_nobody(bus: Bus) -> None:
     out, reader = bus.publisher(), bus.reader()
     wait_for(lambda: out.subscriber_count == 1)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
-        other.connect(str(out._path))
+        other.connect(str(out.path))
         other.send(b"GET / HTTP/1.1\r\n\r\n" * 10)
         out.send(numbered(1))
         wait_for(lambda: reader.numbers() == [1])
@@ -261,9 +261,9 @@ def test_larger_and_larger_messages_reach_the_reader(bus: Bus) -> None:
         message = wait_for(reader.poll).pop()
         assert struct.unpack_from("<q", message.payload)[0] == i and whole(message) and len(message.payload) == size
         del message  # unlocks the slot
-    assert len(out._pool.slots) == 1
-    (source,) = reader.raw._sources.values()
-    assert list(source.slots) == [out._pool.slots[0].number]  # it let go of what was retired
+    assert len(out.pool.slots) == 1
+    (source,) = reader.raw.sources.values()
+    assert list(source.slots) == [out.pool.slots[0].number]  # it let go of what was retired
 
 
 def test_stopped_reader_costs_bounded_memory_and_loses_nothing_up_to_there(bus: Bus) -> None:
@@ -272,6 +272,6 @@ def test_stopped_reader_costs_bounded_memory_and_loses_nothing_up_to_there(bus: 
     with reader.transport.read_lock:
         for i in range(1, 41):
             out.send(numbered(i, LARGE))
-        assert len(out._pool.slots) <= 9 and out.stats.not_shared >= 30
+        assert len(out.pool.slots) <= 9 and out.stats.not_shared >= 30
     wait_for(lambda: reader.poll() and number(reader.received[-1]) == 40)
     assert reader.numbers() == list(range(1, 41)) and all(whole(message) for message in reader.received)

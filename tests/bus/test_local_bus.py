@@ -139,7 +139,7 @@ def test_publisher_that_leaves_the_registry_long_after_the_last_look_is_heard_fo
         wait_for(lambda: inbox.poll() == said_before)
         ahead_s = 1000.0
         next(run_dir.glob("topics/chatter/*.json")).unlink()
-        wait_for(lambda: inbox.raw._folder.publishers == [])
+        wait_for(lambda: inbox.raw.folder.publishers == [])
         say("late")
         wait_for(lambda: inbox.poll() == [*said_before, "late"])
         assert inbox.raw.stats.rejected == 0
@@ -156,7 +156,7 @@ def test_killed_publisher_is_noticed_without_a_look_at_its_lock(transport, talke
     wait_for(lambda: len(inbox.poll()) >= 3)
     process.kill()
     process.wait(10)
-    wait_for(lambda: inbox.raw._folder.publishers == [])
+    wait_for(lambda: inbox.raw.folder.publishers == [])
 
 
 def test_folder_that_just_changed_is_not_settled():

@@ -78,7 +78,7 @@ def test_subscriber_of_inline_messages_needs_no_shared_memory(bus: Bus) -> None:
         socket.rcvtimeo = 30_000
         socket.subscribe(b"/x\0")
         socket.subscribe(b"=/x")
-        socket.connect(f"ipc://{out._path}")
+        socket.connect(f"ipc://{out.path}")
         assert socket.recv_multipart()[1] == numbered(1, LARGE)
         for value, size in ((2, 10), (3, LARGE)):
             out.send(numbered(value, size))
@@ -108,7 +108,7 @@ def c_peer(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_c_program_subscribes_small_and_shared_messages(bus: Bus, c_peer: Path) -> None:
     out = bus.publisher()
-    process = start(c_peer, "sub", out._path, "/x", 2)
+    process = start(c_peer, "sub", out.path, "/x", 2)
     try:
         wait_for(lambda: out.subscriber_count == 1)
         messages = numbered(7, 1000), numbered(9, LARGE)
