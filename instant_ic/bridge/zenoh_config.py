@@ -22,7 +22,7 @@ class ZenohGatewayConfig:
         connect: routers to connect to; empty: tcp/localhost:7447, or those of the session file.
         session_file: Zenoh configuration (JSON5), path or file of config/, which replaces mode; empty: none.
         publish: topics to send: NAME or PATTERN, optionally followed by rate_hz=N for at most N messages per second.
-        subscribe: topics to receive: NAME, PATTERN, or "NAME TYPE" to create it before it has a publisher.
+        subscribe: topics to receive, names or patterns.
         commands: operators' commands to accept: /operator/cmd_vel, /operator/estop. Only over TLS with certificates on
             both sides (session_file); without it only pressing the emergency stop.
         insecure_loopback_commands: accept commands without TLS where every link stays within this machine, as in a

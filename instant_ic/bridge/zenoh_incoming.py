@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -9,9 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from instant_ic.bridge.commands import COMMANDS, DRIVE, STOP
-from instant_ic.bridge.zenoh_format import Attachment, Token, TopicQoS
+from instant_ic.bridge.zenoh_format import Attachment, FormatError, Token, TopicQoS, data_key
 from instant_ic.bridge.zenoh_outgoing import Outgoing
-from instant_ic.bridge.zenoh_session import RosNode, RosSubscription
+from instant_ic.bridge.zenoh_session import RosNode, zenoh
 from instant_ic.bridge.zenoh_topics import (
     ACTED_ON,
     GRACE_S,
@@ -30,6 +31,88 @@ from instant_ic.msg import MessageError, deserialize, message_type, serialize, t
 _TF = "tf2_msgs/msg/TFMessage"
 MAX_TOPICS, MAX_SOURCES, MAX_NAME = 512, 64, 200
 """Most imported topics, publishers per topic, and characters of a name: limits against a hostile ROS graph."""
+
+
+MAX_PUBLISHERS = 256
+"""Most publishers per topic whose gaps are counted; needed because senders choose their ids freely."""
+
+log = logging.getLogger(__name__)
+
+
+class RosSubscription:
+    """A subscription in the ROS graph. It receives only from other sessions, so our own messages do not return.
+
+    Messages of another definition have another key and are not received. A latched subscription requests earlier
+    messages from the publishers.
+
+    Args:
+        node, topic, type_name, type_hash, qos: as for :class:`RosPublisher`.
+        on_message: called with ``(payload, attachment)``, in order per publisher, on a Zenoh thread.
+
+    Attributes:
+        count: messages passed on.
+        lost: messages lost on the way.
+        malformed: messages refused because they have no readable attachment.
+    """
+
+    def __init__(
+        self,
+        node: RosNode,
+        topic: str,
+        type_name: str,
+        type_hash: str,
+        qos: TopicQoS,
+        on_message: Callable[[bytes, Attachment], None],
+    ) -> None:
+        package = zenoh()
+        session = node.session
+        self.topic = topic
+        self.count = 0
+        self.lost = 0
+        self.malformed = 0
+        self._sequences: dict[bytes, int] = {}
+        self._on_message = on_message
+        key = data_key(session.domain, topic, type_name, type_hash)
+        remote = package.Locality.REMOTE
+        if qos.latched:
+            self._subscriber = package.ext.declare_advanced_subscriber(
+                session.zenoh,
+                key,
+                self._heard,
+                allowed_origin=remote,
+                history=package.ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth or 1),
+                recovery=package.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                subscriber_detection=True,
+            )
+        else:
+            self._subscriber = session.zenoh.declare_subscriber(key, self._heard, allowed_origin=remote)
+        self._token = node.endpoint("MS", topic, type_name, type_hash, qos)
+
+    def _heard(self, sample: Any) -> None:
+        try:
+            if sample.attachment is None:
+                raise FormatError("no attachment")
+            attachment = Attachment.unpack(sample.attachment.to_bytes())
+        except FormatError as error:
+            self.malformed += 1
+            if self.malformed == 1:
+                log.error("%s: refused a message not made by rmw_zenoh: %s", self.topic, error)
+            return
+        last = self._sequences.pop(attachment.gid, None)
+        if last is not None:
+            if attachment.sequence <= last:  # duplicate
+                self._sequences[attachment.gid] = last
+                return
+            self.lost += attachment.sequence - last - 1
+        self._sequences[attachment.gid] = attachment.sequence
+        if len(self._sequences) > MAX_PUBLISHERS:  # the publisher not heard from for the longest time
+            del self._sequences[next(iter(self._sequences))]
+        self.count += 1
+        self._on_message(sample.payload.to_bytes(), attachment)
+
+    def close(self) -> None:
+        self._token.undeclare()
+        self._subscriber.undeclare()
 
 
 class StaticTransforms:
@@ -69,14 +152,13 @@ class Incoming:
     Args:
         namespace: namespace of the topics in the ROS graph.
         own: the gateway itself in the ROS graph.
-        subscribe: ``TOPIC``, ``PATTERN`` or ``TOPIC TYPE``, by local names. With a type the topic exists immediately,
-            otherwise once a publisher appears.
+        subscribe: names or patterns of topics, by local names; a topic exists once a publisher appears.
         commands: those of :data:`COMMANDS` that are accepted.
         gate: checks commands.
         no_commands: why only an emergency stop is accepted as a command; empty if the link is secure.
 
     Raises:
-        ValueError: a type or topic in the lists is wrong.
+        ValueError: a topic in the list is wrong.
     """
 
     def __init__(
@@ -98,12 +180,11 @@ class Incoming:
         self._refusing: set[str] = set()
         self._driver = ""  # sender of the newest drive command, as the arbiter knows it
         self._count_before = 0
-        self._patterns, self._types = parse_subscribe(subscribe)
+        self._patterns = parse_subscribe(subscribe)
         self._commands = set(commands) & {STOP} if no_commands else set(commands)
-        self._types.update({topic: COMMANDS[topic] for topic in self._commands})
         self._own = own
-        for topic, name in self._types.items():
-            self._open(topic, name, TopicQoS(latched=topic == STOP, depth=1), always=True)
+        for topic in self._commands:
+            self._open(topic, COMMANDS[topic], TopicQoS(latched=topic == STOP, depth=1), always=True)
 
     @property
     def topics(self) -> list[str]:
@@ -115,10 +196,10 @@ class Incoming:
         held = [entry.subscription for entry in self._topics.values() if entry.subscription is not None]
         return self._count_before + sum(subscription.count for subscription in held)
 
-    def lost_by(self) -> dict[str, dict[str, int]]:
-        """Return the lost messages: topic → publisher's id → count."""
+    def lost(self) -> dict[str, int]:
+        """Return the lost messages by topic."""
         held = {topic: entry.subscription for topic, entry in self._topics.items()}
-        return {topic: dict(s.lost_by) for topic, s in held.items() if s is not None and s.lost_by}
+        return {topic: s.lost for topic, s in held.items() if s is not None and s.lost}
 
     def malformed(self) -> int:
         return sum(entry.subscription.malformed for entry in self._topics.values() if entry.subscription is not None)
@@ -143,7 +224,7 @@ class Incoming:
             self._node.diagnose(
                 "names",
                 ERROR,
-                f"{topic!r:.60} is not brought in: at most {MAX_TOPICS} topics, {MAX_SOURCES} publishers of each, "
+                f"{topic!r:.60} is not imported: at most {MAX_TOPICS} topics, {MAX_SOURCES} publishers of each, "
                 f"{MAX_NAME} characters a name; narrow `subscribe`",
             )
             return
@@ -167,19 +248,18 @@ class Incoming:
     def _same_type(self, topic: str, token: Token, entry: _In | None) -> bool:
         """Check that a ROS publisher's type is that of the local topic; report a mismatch."""
         wanted = entry.type_name if entry is not None else token.type_name
-        who = f"{token.node} there sends {token.type_name}"
+        ours = known_hash(wanted)
         if token.type_name != wanted:
-            self._node.diagnose(f"in {topic}", ERROR, f"{who}, {wanted} expected; it is not brought in")
-            return False
-        if (ours := known_hash(wanted)) is None:
-            self._node.diagnose(f"in {topic}", ERROR, f"{who}, which is not known here; it is not brought in")
-            return False
-        if token.type_hash != ours:
-            self._node.diagnose(
-                f"in {topic}", ERROR, f"{who} by another definition ({token.type_hash}, ours is {ours}); not brought in"
-            )
-            return False
-        return True
+            why = f"{wanted} expected"
+        elif ours is None:
+            why = "which is not known here"
+        elif token.type_hash != ours:
+            why = f"by another definition ({token.type_hash}, ours is {ours})"
+        else:
+            return True
+        text = f"{token.node} there sends {token.type_name}, {why}; it is not imported"
+        self._node.diagnose(f"in {topic}", ERROR, text)
+        return False
 
     def _open(self, topic: str, type_name: str, qos: TopicQoS, always: bool) -> _In:
         """Import a topic; if it is already imported, replace it with the new quality of service."""
@@ -281,12 +361,10 @@ class Incoming:
 
 def topic_counts(outgoing: Outgoing, incoming: Incoming) -> tuple[str, int, dict[str, int]]:
     """Return the traffic in both directions: text, number of lost messages, and values of the diagnosis."""
-    lost_by = incoming.lost_by()
-    values = {f"lost {topic} from {gid[:8]}": n for topic, by in lost_by.items() for gid, n in by.items()}
-    lost = sum(count for by in lost_by.values() for count in by.values())
+    lost = incoming.lost()
     text = (
         f"{outgoing.count} messages out on {len(outgoing.topics)} topics, {incoming.count} in on {len(incoming.topics)}"
     )
     if lost:
-        text += f"; lost: {', '.join(f'{topic} {sum(by.values())}' for topic, by in sorted(lost_by.items()))}"
-    return text, lost, {"thinned": outgoing.thinned, "malformed": incoming.malformed(), **values}
+        text += f"; lost: {', '.join(f'{topic} {count}' for topic, count in sorted(lost.items()))}"
+    return text, sum(lost.values()), {"thinned": outgoing.thinned, "malformed": incoming.malformed()}

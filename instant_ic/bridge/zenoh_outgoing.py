@@ -2,17 +2,75 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from instant_ic.bridge.zenoh_session import RosNode, RosPublisher, RosSession
+from instant_ic.bridge.zenoh_format import GID_SIZE, SENDER_SIZE, Attachment, TopicQoS, data_key
+from instant_ic.bridge.zenoh_session import RosNode, RosSession, ZenohError, zenoh
 from instant_ic.bridge.zenoh_topics import GRACE_S, Namespace, known_hash, parse_publish, ros_qos, takes
 from instant_ic.bus import ERROR, RELIABLE, Node, QoS, Subscription
 from instant_ic.bus.qos import PRESETS
 from instant_ic.bus.registry import PublisherInfo, TopicInfo
 from instant_ic.bus.transport import Received
+
+_HEARTBEAT_S = 0.5  # lets a late reader of a latched topic, or one with losses, find what it missed, as in rmw_zenoh
+
+
+class RosPublisher:
+    """A publisher in the ROS graph; :meth:`put` may be called from any thread.
+
+    Args:
+        node: node of the publisher.
+        topic: full name, including the namespace.
+        type_name: ``std_msgs/msg/String``.
+        type_hash: RIHS01 hash of the type.
+        qos: quality of service; a latched topic keeps its last ``depth`` messages for late subscribers.
+    """
+
+    def __init__(self, node: RosNode, topic: str, type_name: str, type_hash: str, qos: TopicQoS) -> None:
+        package = zenoh()
+        session = node.session
+        key = data_key(session.domain, topic, type_name, type_hash)
+        reliability = package.Reliability.RELIABLE if qos.reliable else package.Reliability.BEST_EFFORT
+        # As in rmw_zenoh: a link that cannot keep up loses messages, which the reader counts, but never blocks us.
+        options = {"congestion_control": package.CongestionControl.DROP, "reliability": reliability}
+        if qos.latched:
+            self._publisher = package.ext.declare_advanced_publisher(
+                session.zenoh,
+                key,
+                cache=package.ext.CacheConfig(max_samples=qos.depth or 1),
+                publisher_detection=True,
+                sample_miss_detection=package.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+                **options,
+            )
+        else:
+            self._publisher = session.zenoh.declare_publisher(key, **options)
+        self._token = node.endpoint("MP", topic, type_name, type_hash, qos)
+        self._lock = threading.Lock()
+        self.gid = session.gid_head + os.urandom(GID_SIZE - SENDER_SIZE)
+        self.count = 0
+
+    def put(self, payload: bytes | memoryview, source_ns: int) -> None:
+        """Send CDR bytes unchanged, with their time of publication.
+
+        Raises:
+            ZenohError: the session is closed.
+        """
+        with self._lock:
+            self.count += 1
+            attachment = Attachment(self.count, source_ns, self.gid).pack()
+            try:
+                self._publisher.put(bytes(payload), attachment=attachment)
+            except zenoh().ZError as error:
+                raise ZenohError(f"Zenoh: {error}") from None
+
+    def close(self) -> None:
+        self._token.undeclare()
+        self._publisher.undeclare()
 
 
 @dataclass

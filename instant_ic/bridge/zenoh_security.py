@@ -23,13 +23,13 @@ def command_security(config: Any, loopback_allowed: bool) -> tuple[int, str]:
     """
     why = insecurity(config)
     if not why:
-        return OK, "taken over TLS, from hosts with a certificate"
+        return OK, "accepted over TLS, from hosts with a certificate"
     if loopback_allowed:
         beyond = beyond_loopback(config)
         if not beyond:
-            return WARN, "taken without TLS from every program of this machine"
+            return WARN, "accepted without TLS from every program of this machine"
         why = f"insecure_loopback_commands: {beyond}"
-    return ERROR, f"no commands are taken but emergency stops: {why} (docs/fleet.md, TLS and access control)"
+    return ERROR, f"only emergency stops are accepted as commands: {why} (docs/fleet.md, TLS and access control)"
 
 
 def insecurity(config: Any) -> str:

@@ -18,24 +18,18 @@ from typing import Any
 
 from instant_ic.bridge.zenoh_format import (
     ADMIN_SPACE,
-    GID_SIZE,
     SENDER_SIZE,
-    Attachment,
     FormatError,
     Kind,
     Token,
     TopicQoS,
-    data_key,
 )
 from instant_ic.util.closing import Closing
 from instant_ic.util.paths import shipped_file
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
-MAX_PUBLISHERS = 256
-"""Most publishers per topic whose gaps are counted; needed because senders choose their ids freely."""
 
 _OPEN_S = 10.0
-_HEARTBEAT_S = 0.5  # lets a late reader of a latched topic, or one with losses, find what it missed, as in rmw_zenoh
 
 SESSION_DEFAULTS = {
     "mode": '"peer"',
@@ -249,137 +243,3 @@ class RosNode:
 
     def close(self) -> None:
         self._declaration.undeclare()
-
-
-class RosPublisher:
-    """A publisher in the ROS graph; :meth:`put` may be called from any thread.
-
-    Args:
-        node: node of the publisher.
-        topic: full name, including the namespace.
-        type_name: ``std_msgs/msg/String``.
-        type_hash: RIHS01 hash of the type.
-        qos: quality of service; a latched topic keeps its last ``depth`` messages for late subscribers.
-    """
-
-    def __init__(self, node: RosNode, topic: str, type_name: str, type_hash: str, qos: TopicQoS) -> None:
-        package = zenoh()
-        session = node.session
-        key = data_key(session.domain, topic, type_name, type_hash)
-        reliability = package.Reliability.RELIABLE if qos.reliable else package.Reliability.BEST_EFFORT
-        # As in rmw_zenoh: a link that cannot keep up loses messages, which the reader counts, but never blocks us.
-        options = {"congestion_control": package.CongestionControl.DROP, "reliability": reliability}
-        if qos.latched:
-            self._publisher = package.ext.declare_advanced_publisher(
-                session.zenoh,
-                key,
-                cache=package.ext.CacheConfig(max_samples=qos.depth or 1),
-                publisher_detection=True,
-                sample_miss_detection=package.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
-                **options,
-            )
-        else:
-            self._publisher = session.zenoh.declare_publisher(key, **options)
-        self._token = node.endpoint("MP", topic, type_name, type_hash, qos)
-        self._lock = threading.Lock()
-        self.gid = session.gid_head + os.urandom(GID_SIZE - SENDER_SIZE)
-        self.count = 0
-
-    def put(self, payload: bytes | memoryview, source_ns: int) -> None:
-        """Send CDR bytes unchanged, with their time of publication.
-
-        Raises:
-            ZenohError: the session is closed.
-        """
-        with self._lock:
-            self.count += 1
-            attachment = Attachment(self.count, source_ns, self.gid).pack()
-            try:
-                self._publisher.put(bytes(payload), attachment=attachment)
-            except zenoh().ZError as error:
-                raise ZenohError(f"Zenoh: {error}") from None
-
-    def close(self) -> None:
-        self._token.undeclare()
-        self._publisher.undeclare()
-
-
-class RosSubscription:
-    """A subscription in the ROS graph. It receives only from other sessions, so our own messages do not return.
-
-    Messages of another definition have another key and are not received. A latched subscription requests earlier
-    messages from the publishers.
-
-    Args:
-        node, topic, type_name, type_hash, qos: as for :class:`RosPublisher`.
-        on_message: called with ``(payload, attachment)``, in order per publisher, on a Zenoh thread.
-
-    Attributes:
-        count: messages passed on.
-        lost_by: publisher's id (hex) → lost messages.
-        malformed: messages refused because they have no readable attachment.
-    """
-
-    def __init__(
-        self,
-        node: RosNode,
-        topic: str,
-        type_name: str,
-        type_hash: str,
-        qos: TopicQoS,
-        on_message: Callable[[bytes, Attachment], None],
-    ) -> None:
-        package = zenoh()
-        session = node.session
-        self.topic = topic
-        self.count = 0
-        self.lost_by: dict[str, int] = {}
-        self.malformed = 0
-        self._sequences: dict[bytes, int] = {}
-        self._on_message = on_message
-        key = data_key(session.domain, topic, type_name, type_hash)
-        remote = package.Locality.REMOTE
-        if qos.latched:
-            self._subscriber = package.ext.declare_advanced_subscriber(
-                session.zenoh,
-                key,
-                self._heard,
-                allowed_origin=remote,
-                history=package.ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth or 1),
-                recovery=package.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-                subscriber_detection=True,
-            )
-        else:
-            self._subscriber = session.zenoh.declare_subscriber(key, self._heard, allowed_origin=remote)
-        self._token = node.endpoint("MS", topic, type_name, type_hash, qos)
-
-    def _heard(self, sample: Any) -> None:
-        try:
-            if sample.attachment is None:
-                raise FormatError("no attachment")
-            attachment = Attachment.unpack(sample.attachment.to_bytes())
-        except FormatError as error:
-            self.malformed += 1
-            if self.malformed == 1:
-                log.error("%s: refused a message not made by rmw_zenoh: %s", self.topic, error)
-            return
-        last = self._sequences.pop(attachment.gid, None)
-        if last is not None:
-            if attachment.sequence <= last:  # duplicate
-                self._sequences[attachment.gid] = last
-                return
-            missing = attachment.sequence - last - 1
-            if missing:
-                gid = attachment.gid.hex()
-                self.lost_by = {**self.lost_by, gid: self.lost_by.get(gid, 0) + missing}
-        self._sequences[attachment.gid] = attachment.sequence
-        if len(self._sequences) > MAX_PUBLISHERS:  # the publisher not heard from for the longest time
-            oldest = next(iter(self._sequences))
-            del self._sequences[oldest]
-            self.lost_by = {gid: lost for gid, lost in self.lost_by.items() if gid != oldest.hex()}
-        self.count += 1
-        self._on_message(sample.payload.to_bytes(), attachment)
-
-    def close(self) -> None:
-        self._token.undeclare()
-        self._subscriber.undeclare()

@@ -94,18 +94,15 @@ def known_hash(type_name: str) -> str | None:
         return None
 
 
-def parse_subscribe(entries: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """Parse lines such as ``/scan`` and ``/x std_msgs/msg/String``; return the patterns, and the types by topic.
+def parse_subscribe(entries: Sequence[str]) -> tuple[str, ...]:
+    """Check names and patterns such as ``/scan`` and ``/robot*/pose``.
 
     Raises:
-        RegistryError, MessageError: a name is invalid, a type is unknown, or the topic is one of ACTED_ON.
+        RegistryError: a name does not begin with a slash, or names a topic that moves a robot.
     """
-    patterns, types = [], {}
-    for entry in entries:
-        topic, _, name = entry.partition(" ")
-        if name:
-            if takes(ACTED_ON, topic):
-                raise RegistryError(f"subscribe: {topic} moves a robot; list it under commands, or rename it there")
-            types[check_topic(topic)] = message_type(name.strip()).__msgtype__
-        patterns.append(topic)
-    return patterns, types
+    for topic in entries:
+        if not topic.startswith("/") or " " in topic:
+            raise RegistryError(f"subscribe: {topic!r} must be /TOPIC or a pattern")
+        if not {"*", "?", "["} & set(topic) and takes(ACTED_ON, topic):
+            raise RegistryError(f"subscribe: {topic} moves a robot; list it under commands, or rename it there")
+    return tuple(entries)

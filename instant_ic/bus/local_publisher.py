@@ -197,7 +197,9 @@ class LocalPublisher:
         name, kind = self._name, INLINE if slot is None else SHARED
         if slot is not None and copy:
             name, kind, body = KEY_COPY + name, INLINE, slot.view(size)
-        self._send_part(name + HEADER.pack(kind, MARK, sequence, publish_ns, self.identity, self._type_hash, size), _MORE)
+        self._send_part(
+            name + HEADER.pack(kind, MARK, sequence, publish_ns, self.identity, self._type_hash, size), _MORE
+        )
         self._send_part(body)
 
     def _has_room(self, size: int) -> bool:

@@ -10,12 +10,12 @@ import pytest
 from live_nodes import LiveNode, Neighbour, wait_for
 
 from instant_ic.bridge.zenoh_format import TopicQoS
+from instant_ic.bridge.zenoh_outgoing import RosPublisher
 from instant_ic.bridge.zenoh_security import beyond_loopback, insecurity
 from instant_ic.bridge.zenoh_session import (
     CLIENT_DEFAULTS,
     SESSION_DEFAULTS,
     RosNode,
-    RosPublisher,
     RosSession,
     ZenohError,
     load_config,
@@ -281,7 +281,7 @@ def test_commands_come_in_over_tls_with_certificates(secure, certificates, tmp_p
     run_dir = tmp_path_factory.mktemp("r")
     config = ZenohGatewayConfig("robot1", session_file=str(file), commands=("/operator/cmd_vel", "/operator/estop"))
     gateway = secure.keep(LiveNode(run_dir, ZenohGatewayNode, config, "zenoh_gateway"))
-    wait_for(lambda: "taken over TLS" in gateway.told("commands"), "the diagnosis")
+    wait_for(lambda: "accepted over TLS" in gateway.told("commands"), "the diagnosis")
     listener = secure.keep(Neighbour(run_dir, "listener"))
     driven = listener.listen("/operator/cmd_vel")
     name = "geometry_msgs/msg/TwistStamped"

@@ -9,15 +9,8 @@ import pytest
 from live_nodes import LiveNode, Neighbour, cdr, wait_for
 
 from instant_ic.bridge.zenoh_format import SENDER_SIZE, Attachment, TopicQoS, data_key
-from instant_ic.bridge.zenoh_session import (
-    ROUTER_DEFAULTS,
-    RosNode,
-    RosPublisher,
-    RosSession,
-    ZenohError,
-    load_config,
-    open_zenoh,
-)
+from instant_ic.bridge.zenoh_outgoing import RosPublisher
+from instant_ic.bridge.zenoh_session import ROUTER_DEFAULTS, RosNode, RosSession, ZenohError, load_config, open_zenoh
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
 from instant_ic.control.robot_lease import Verdict
 from instant_ic.experiments.stack import free_port
@@ -54,8 +47,10 @@ def router():
 
 
 @pytest.fixture
-def world(router, tmp_path_factory):
+def world(router, tmp_path_factory, monkeypatch):
     """Makes gateways, neighbours on the bus and sessions, each in the run directory of its name, and ends them all."""
+    for module in ("incoming", "outgoing"):
+        monkeypatch.setattr(f"instant_ic.bridge.zenoh_{module}.GRACE_S", 0.3)
     open_things = []
     run_dirs = {}
 
@@ -234,9 +229,10 @@ def test_independent_clients_messages_come_in_byte_for_byte(world, sdk):
     wait_for(lambda: "/chatter" not in world.topics("robot"), "the end of the topic")
 
 
-def test_gaps_are_counted_by_publisher_and_told(world):
-    gateway = world.gateway("station", subscribe=("/robot1/chatter std_msgs/msg/String",))
+def test_gaps_are_counted_and_reported(world):
+    gateway = world.gateway("station", subscribe=("/robot1/chatter",))
     robot = world.session()
+    token = RosNode(robot, "/robot1", "talker").endpoint("MP", "/robot1/chatter", STRING, type_hash(STRING), TopicQoS())
     key = data_key(0, "/robot1/chatter", STRING, type_hash(STRING))
     publisher = robot.zenoh.declare_publisher(key)
     one, other = os.urandom(16), os.urandom(16)
@@ -246,7 +242,7 @@ def test_gaps_are_counted_by_publisher_and_told(world):
     publisher.put(cdr(String("no attachment")))
     publisher.put(cdr(String("cut")), attachment=b"123")
     wait_for(lambda: gateway.node.incoming.malformed() == 2, "the refused ones")
-    assert gateway.node.incoming.lost_by() == {"/robot1/chatter": {one.hex(): 2, other.hex(): 1}}
+    assert gateway.node.incoming.lost() == {"/robot1/chatter": 3} and token is not None
     assert gateway.node.incoming.count == 7  # the repeated one is not handed on
     wait_for(lambda: "lost: /robot1/chatter 3" in gateway.told("topics"), "the words")
 
@@ -427,7 +423,7 @@ def test_without_tls_no_command_comes_in_but_the_pressing_of_the_emergency_stop(
     gateway = world.gateway(
         "robot", namespace="robot1", commands=COMMANDS, subscribe=("/*",), insecure_loopback_commands=loopback
     )
-    assert "no commands are taken but emergency stops" in gateway.told("commands")
+    assert "only emergency stops are accepted as commands" in gateway.told("commands")
     assert gateway.node.diagnoses()["commands"][0] == 2
     listener = world.neighbour("robot", "listener")
     driven, stops = listener.listen("/operator/cmd_vel", SENSOR), listener.listen("/operator/estop", LATCHED)
@@ -453,7 +449,7 @@ def stop_node(world):
 
 def test_names_that_others_make_are_limited(world, monkeypatch):
     monkeypatch.setattr("instant_ic.bridge.zenoh_incoming.MAX_TOPICS", 5)
-    monkeypatch.setattr("instant_ic.bridge.zenoh_session.MAX_PUBLISHERS", 5)
+    monkeypatch.setattr("instant_ic.bridge.zenoh_incoming.MAX_PUBLISHERS", 5)
     gateway = world.gateway("robot", namespace="robot1", subscribe=("/*",))
     outside = RosNode(world.session(), "/robot1", "stranger")
     kept = [
@@ -469,10 +465,9 @@ def test_names_that_others_make_are_limited(world, monkeypatch):
     for sequence in (1, 3):
         for number in range(20):
             raw.put(cdr(String("x")), attachment=Attachment(sequence, 1, bytes([number] * 16)).pack())
-    entry = gateway.node.incoming._topics[topic]
     # The router knows the subscription a moment before the gateway has stored it.
-    wait_for(lambda: entry.subscription is not None and entry.subscription.count >= 40, "all messages")
-    assert len(entry.subscription._sequences) == 5 and len(entry.subscription.lost_by) <= 5
+    wait_for(lambda: gateway.node.incoming.count >= 40, "all messages")
+    assert gateway.node.incoming.lost() == {}  # whose gaps are counted is limited too
 
 
 def test_robot_is_told_to_stand_when_the_last_driver_leaves(operator):
@@ -483,7 +478,7 @@ def test_robot_is_told_to_stand_when_the_last_driver_leaves(operator):
 
 
 def test_commands_do_not_come_in_where_they_are_not_configured(world):
-    gateway = world.gateway("robot", namespace="robot1", subscribe=("/*", "/operator/cmd_vel"))
+    gateway = world.gateway("robot", namespace="robot1", subscribe=("/*", "/operator/*"))
     outside = RosNode(world.session(), "/robot1", "station")
     drive = RosPublisher(outside, "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST), TopicQoS())
     chat = RosPublisher(outside, "/robot1/chatter", STRING, type_hash(STRING), TopicQoS())
@@ -603,10 +598,9 @@ def test_wrong_files_types_and_endpoints_are_named(tmp_path, tmp_path_factory):
         load_config(None, ("localhost",))
     for parameters, words in [
         ({"session_file": "nothing.json5"}, "nothing.json5 does not exist"),
-        ({"subscribe": ("/chatter std_msgs/msg/Strin",)}, "no message type"),
-        ({"subscribe": (f"/operator/cmd_vel {TWIST}",)}, "/operator/cmd_vel moves a robot"),
-        ({"subscribe": (f"/robot1/cmd_vel {TWIST}",)}, "/robot1/cmd_vel moves a robot"),
-        ({"subscribe": ("chatter std_msgs/msg/String",)}, "topic name 'chatter' is not legal"),
+        ({"subscribe": ("/operator/cmd_vel",)}, "/operator/cmd_vel moves a robot"),
+        ({"subscribe": ("/robot1/cmd_vel",)}, "/robot1/cmd_vel moves a robot"),
+        ({"subscribe": ("chatter",)}, "'chatter' must be /TOPIC"),
     ]:
         with pytest.raises(NodeError, match=words):
             LiveNode(tmp_path_factory.mktemp("r"), ZenohGatewayNode, ZenohGatewayConfig(**parameters), "zenoh_gateway")
@@ -614,7 +608,7 @@ def test_wrong_files_types_and_endpoints_are_named(tmp_path, tmp_path_factory):
 
 def test_nothing_of_a_gateway_is_left_running(world):
     before = threading.active_count()
-    gateway = world.gateway("robot", publish=("/chatter",), subscribe=("/x std_msgs/msg/String",))
+    gateway = world.gateway("robot", publish=("/chatter",), subscribe=("/x",))
     gateway.close()
     wait_for(lambda: threading.active_count() <= before, "the end of its threads")
     assert world.topics("robot") == set()
