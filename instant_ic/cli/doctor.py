@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import grp
-import importlib.metadata
 import importlib.util
 import os
 import pwd
@@ -11,21 +10,36 @@ import shutil
 import socket
 import stat
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from instant_ic.cli.finding import FAIL, OK, WARN, Finding
-
+OK, WARN, FAIL = "ok", "warn", "fail"
 MIN_CORES = 2
 MIN_MEMORY_GB = 4.0
 MIN_DISK_GB = 2.0
 MIN_SHM_MB = 64.0
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
-
-
 TCP_PORTS = {8080: "operator's page", 8089: "simulated Theta"}
 UDP_PORTS = {2368: "VLP-16 data"}
+_LONGEST_SOCKET_NAME = 107
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Result of a check.
+
+    Attributes:
+        level: OK, WARN (a function will be missing or slow) or FAIL (the stack will not work).
+        subject: what was checked.
+        text: what was found.
+        advice: what to do about it; empty where all is well.
+    """
+
+    level: str
+    subject: str
+    text: str
+    advice: str = ""
 
 
 def run_checks(
@@ -41,19 +55,17 @@ def run_checks(
         listen_s: how long to wait for LiDAR packets.
         missing: level of a missing device: FAIL or WARN.
     """
+    from instant_ic.cli.doctor_running import check_running
+
     yield from check_machine(run_dir)
-    yield from check_packages()
     yield from check_configuration()
     yield from check_models()
     yield from check_ports(TCP_PORTS, UDP_PORTS)
     yield from check_gpu()
-    yield from check_browser()
     yield from check_network_filter()
     yield from check_serial(serial_port, missing)
     yield from check_camera(camera_url, missing)
     yield from check_lidar(lidar_port, listen_s, missing)
-    from instant_ic.cli.doctor_running import check_running  # its packages may be missing
-
     yield from check_running(run_dir)
 
 
@@ -61,14 +73,11 @@ def check_machine(run_dir: Path) -> Iterator[Finding]:
     """Check Python, cores, memory, disk, shared memory and run directory."""
     import psutil
 
-    version = ".".join(map(str, sys.version_info[:3]))
-    yield Finding(OK, "python", version)
+    yield Finding(OK, "python", ".".join(map(str, sys.version_info[:3])))
     cores = len(os.sched_getaffinity(0))
     yield _at_least("cores", cores, MIN_CORES, "", "the stack will run at lower rates")
     memory_gb = psutil.virtual_memory().total / 1e9
-    yield _at_least(
-        "memory", memory_gb, MIN_MEMORY_GB, " GB", "close other programs, or run station.yaml on another machine"
-    )
+    yield _at_least("memory", memory_gb, MIN_MEMORY_GB, " GB", "run station.yaml on another machine")
     disk_gb = shutil.disk_usage(Path.cwd()).free / 1e9
     yield _at_least("disk", disk_gb, MIN_DISK_GB, " GB free here", "free disk space before recording bags")
     if Path("/dev/shm").is_dir():
@@ -80,10 +89,10 @@ def check_machine(run_dir: Path) -> Iterator[Finding]:
 
 
 def _at_least(subject: str, value: float, least: float, unit: str, advice: str) -> Finding:
-    words = f"{value:.0f}{unit}" if value >= 10 or float(value).is_integer() else f"{value:.1f}{unit}"
+    text = f"{value:.0f}{unit}" if value >= 10 or float(value).is_integer() else f"{value:.1f}{unit}"
     if value >= least:
-        return Finding(OK, subject, words)
-    return Finding(WARN, subject, f"{words}, at least {least:g} recommended", advice)
+        return Finding(OK, subject, text)
+    return Finding(WARN, subject, f"{text}, at least {least:g} recommended", advice)
 
 
 def _check_run_dir(run_dir: Path) -> Finding:
@@ -95,85 +104,53 @@ def _check_run_dir(run_dir: Path) -> Finding:
     except RegistryError as error:
         advice = "set INSTANT_IC_RUN_DIR to a folder that only you can write to"
         return Finding(FAIL, "run directory", str(error), advice)
-    if len(os.fsencode(longest)) > 107:
+    if len(os.fsencode(longest)) > _LONGEST_SOCKET_NAME:
         advice = "set INSTANT_IC_RUN_DIR to a shorter path"
         return Finding(FAIL, "run directory", f"{run_dir} is too long for sockets", advice)
     nodes = registry.list_nodes(run_dir)
     return Finding(OK, "run directory", f"{run_dir}, {len(nodes)} nodes running")
 
 
-def check_packages() -> Iterator[Finding]:
-    """Check that every package required by the installed distribution is present."""
-    from packaging.requirements import Requirement
-
-    try:
-        requirements = importlib.metadata.requires("instant-ic") or []
-    except importlib.metadata.PackageNotFoundError:
-        yield Finding(FAIL, "package", "instant-ic is not installed", "make run, or pip install -e .")
-        return
-    missing = []
-    for requirement in map(Requirement, requirements):
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
-            continue
-        try:
-            importlib.metadata.version(requirement.name)
-        except importlib.metadata.PackageNotFoundError:
-            missing.append(requirement.name)
-    if missing:
-        yield Finding(FAIL, "packages", f"missing: {', '.join(missing)}", f"pip install {' '.join(missing)}")
-    else:
-        version = importlib.metadata.version("instant-ic")
-        yield Finding(OK, "packages", f"instant-ic {version} with all its dependencies")
-
-
 def check_configuration() -> Iterator[Finding]:
     """Check every shipped launch file and the parameters of its nodes."""
     from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
     from instant_ic.launch.parameters import check_parameters
-    from instant_ic.util import paths
 
-    try:
-        files = sorted(paths.share_dir("launch").glob("*.yaml"))
-    except FileNotFoundError as error:
-        yield Finding(FAIL, "launch files", str(error), "install the package again")
-        return
-    for file in files:
+    for file in _shipped("launch", "*.yaml"):
+        problems: Sequence[object]
         try:
             needed = {a.name: "placeholder" for a in read_arguments(file) if a.default is None}
-            description = read_launch_file(file, needed)
-            problems = check_parameters(description.nodes)
+            problems = check_parameters(read_launch_file(file, needed).nodes)
         except LaunchFileError as error:
-            problems = [str(problem) for problem in error.problems]
+            problems = error.problems
         if problems:
             more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-            yield Finding(FAIL, f"launch/{file.name}", problems[0] + more, f"ic launch {file.stem} --check")
+            yield Finding(FAIL, f"launch/{file.name}", f"{problems[0]}{more}", f"ic launch {file.stem} --check")
         else:
-            yield Finding(OK, f"launch/{file.name}", f"{len(description.nodes)} nodes, parameters are valid")
+            yield Finding(OK, f"launch/{file.name}", "no errors")
 
 
 def check_models() -> Iterator[Finding]:
     """Check that every model file loads."""
-    from instant_ic.util import paths
-
-    try:
-        models = sorted(paths.share_dir("models").glob("*.onnx"))
-    except FileNotFoundError:
-        models = []
-    if not models:
-        advice = "install the package again, or train one with ic depth train"
-        yield Finding(FAIL, "models", "no model file found", advice)
-        return
     import onnxruntime
 
+    models = _shipped("models", "*.onnx")
+    if not models:
+        yield Finding(FAIL, "models", "no model file found", "install the package again")
     for model in models:
-        size = f"{model.stat().st_size / 1e6:.1f} MB"
         try:
             session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
         except Exception as error:  # noqa: BLE001 - onnxruntime's errors share no base class
             yield Finding(FAIL, f"models/{model.name}", str(error).splitlines()[0], "install the package again")
             continue
         shape = "x".join(str(size) for size in session.get_inputs()[0].shape)
-        yield Finding(OK, f"models/{model.name}", f"{size}, input {shape}")
+        yield Finding(OK, f"models/{model.name}", f"{model.stat().st_size / 1e6:.1f} MB, input {shape}")
+
+
+def _shipped(folder: str, pattern: str) -> list[Path]:
+    from instant_ic.util import paths
+
+    return sorted(paths.share_dir(folder).glob(pattern))
 
 
 def check_ports(tcp: Mapping[int, str], udp: Mapping[int, str]) -> Iterator[Finding]:
@@ -207,15 +184,6 @@ def check_gpu() -> Iterator[Finding]:
         yield Finding(OK, "gpu", "none: the virtual space is trained on the CPU")
 
 
-def check_browser() -> Iterator[Finding]:
-    """Look for a browser for the operator's page."""
-    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
-    if found:
-        yield Finding(OK, "browser", found)
-    else:
-        yield Finding(WARN, "browser", "none found", "open the operator's page from another machine (docs/console.md)")
-
-
 def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterator[Finding]:
     """Check reverse-path filtering: strict filtering silently drops packets of a sensor in another subnet."""
     strict = []
@@ -226,9 +194,9 @@ def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterat
         except OSError:
             continue
     if strict:
-        words = f"strict on {', '.join(strict)}: packets of a VLP-16 in another subnet are dropped"
+        text = f"strict on {', '.join(strict)}: packets of a VLP-16 in another subnet are dropped"
         advice = f"sysctl -w net.ipv4.conf.{strict[-1]}.rp_filter=2, or give the interface an address in its subnet"
-        yield Finding(WARN, "rp_filter", words, advice)
+        yield Finding(WARN, "rp_filter", text, advice)
     else:
         yield Finding(OK, "rp_filter", "not strict")
 
@@ -267,8 +235,10 @@ def check_camera(url: str, missing: str) -> Iterator[Finding]:
             reply = session.get(f"{url}/osc/info", timeout=2.0)
         info = reply.json() if reply.status_code == 200 else {}
     except (requests.RequestException, ValueError) as error:
+        unreachable = isinstance(error, requests.Timeout | requests.ConnectionError)
+        text = "is unreachable" if unreachable else f"no Web API at this address ({type(error).__name__})"
         advice = "join the camera's wireless network, or set camera_url:=... (not needed for sim.yaml)"
-        yield Finding(missing, f"camera {url}", _short(error), advice)
+        yield Finding(missing, f"camera {url}", text, advice)
         return
     if reply.status_code != 200:
         advice = "something else answers there: set camera_url:=... to the camera's address"
@@ -300,14 +270,3 @@ def check_lidar(port: int, listen_s: float, missing: str) -> Iterator[Finding]:
         else:
             advice = "another device sends to this port; stop it, or set another port"
             yield Finding(missing, subject, f"{len(packet)} bytes from {sender[0]} are not a VLP-16 packet", advice)
-
-
-def _short(error: Exception) -> str:
-    from requests.exceptions import ConnectionError as RequestsConnectionError
-    from requests.exceptions import Timeout
-
-    if isinstance(error, Timeout):
-        return "no answer in 2 s"
-    if isinstance(error, RequestsConnectionError):
-        return "is unreachable"
-    return f"no Web API at this address ({type(error).__name__})"

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from instant_ic.bus import ERROR, OK, registry
-from instant_ic.cli.finding import FAIL, Finding
-from instant_ic.cli.finding import OK as FINE
-from instant_ic.cli.finding import WARN as DOUBTFUL
+from instant_ic.cli import doctor
+from instant_ic.cli.doctor import FAIL, Finding
 from instant_ic.control.states import Reason
 from instant_ic.msg import DiagnosticArray, DiagnosticStatus, deserialize
 from instant_ic.util import pace
@@ -49,7 +48,7 @@ ADVICE: dict[Reason, str] = {
 
 
 def check_running(run_dir: Path, seconds: float = 2.5) -> Iterator[Finding]:
-    """Faults that running nodes report within some seconds of the stack's time; nothing where no node runs."""
+    """Yield the faults that running nodes report within some seconds of the stack's time; nothing if no node runs."""
     from instant_ic.cli.observer import TopicObserver
 
     nodes = registry.list_nodes(run_dir)
@@ -69,12 +68,15 @@ def check_running(run_dir: Path, seconds: float = 2.5) -> Iterator[Finding]:
     faults = {name: status for name, status in found.items() if status.level > OK}
     if not found:
         yield Finding(
-            DOUBTFUL, "running stack", f"none of its {len(nodes)} nodes publishes diagnostics", "see ic log and ic top"
+            doctor.WARN,
+            "running stack",
+            f"none of its {len(nodes)} nodes publishes diagnostics",
+            "see ic log and ic top",
         )
     elif not faults:
-        yield Finding(FINE, "running stack", f"{len(nodes)} nodes, no faults")
+        yield Finding(doctor.OK, "running stack", f"{len(nodes)} nodes, no faults")
     for name, status in sorted(faults.items()):
-        yield Finding(FAIL if status.level >= ERROR else DOUBTFUL, name, status.message, _advice(status))
+        yield Finding(FAIL if status.level >= ERROR else doctor.WARN, name, status.message, _advice(status))
 
 
 def _advice(status: DiagnosticStatus) -> str:

@@ -9,13 +9,11 @@ import platform
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 from instant_ic.launch.process import dies_with_us
 from instant_ic.util import paths
@@ -23,7 +21,7 @@ from instant_ic.util import paths
 PARTS = {
     "control": ("warmup",),
     "vspace": ("warm_up",),
-    "slam": ("grid_slam", "loop_search"),
+    "slam": ("start", "loop_search"),
     "sim": ("simulation",),
     "mapping": ("local_model",),
     "lidar": ("flatscan",),
@@ -36,10 +34,10 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def are_compiled() -> bool:
-    """Whether :func:`compile_all` has finished for these sources, this numba and this CPU."""
+    """Return whether :func:`compile_all` has finished for these sources, this numba and this CPU."""
     try:
         # The key first: it imports, and Python can lose a Ctrl-C during an import. The caller reports its start later.
-        return _key() == (_folder() / "kernels.txt").read_text()
+        return source_key() == (cache_folder() / "kernels.txt").read_text()
     except OSError:
         return False
 
@@ -55,61 +53,36 @@ def compile_all(report: Callable[[float], None]) -> list[str]:
     Returns:
         A text for each part that cannot be compiled. The nodes that need it try again at their start.
     """
-    with (_folder() / "kernels.lock").open("w") as file:
+    with (cache_folder() / "kernels.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         if are_compiled():
             return []
-        key = _key()
+        key = source_key()
         problems = _compile_parts(report)
         if not problems:
-            (_folder() / "kernels.txt").write_text(key)
+            (cache_folder() / "kernels.txt").write_text(key)
         return problems
 
 
 def _compile_parts(report: Callable[[float], None]) -> list[str]:
-    waiting, running = list(PARTS), list[_Compiler]()
-    shares = dict.fromkeys(PARTS, 0.0)
-    problems = []
+    waiting, running, problems = list(PARTS), dict[str, subprocess.Popen[str]](), list[str]()
     while waiting or running:
         while waiting and len(running) < len(os.sched_getaffinity(0)):
-            running.append(_Compiler(waiting.pop(0)))
+            command = (*dies_with_us(), sys.executable, "-m", "instant_ic.cli.kernels", part := waiting.pop(0))
+            running[part] = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
         time.sleep(0.1)
-        for compiler in list(running):
-            status = compiler.process.poll()
-            shares[compiler.part] = compiler.share() if status is None else 1.0
-            if status is not None:
-                running.remove(compiler)
-                if status != 0:
-                    problems.append(f"the kernels of {compiler.part} cannot be compiled: {compiler.last_line()}")
-        report(sum(shares.values()) / len(shares))
+        for part, process in list(running.items()):
+            if process.poll() is not None:
+                lines = process.communicate()[0].strip().splitlines() or [""]
+                del running[part]
+                if process.returncode != 0:
+                    problems.append(f"the kernels of {part} cannot be compiled: {lines[-1]}")
+        report(1.0 - (len(waiting) + len(running)) / len(PARTS))
     return problems
 
 
-class _Compiler:
-    """A process that compiles one part. Its output is a line for each kernel, with the share completed."""
-
-    def __init__(self, part: str) -> None:
-        self.part = part
-        self._output = tempfile.TemporaryFile("w+")  # noqa: SIM115 - as long as the process
-        self.process = subprocess.Popen(
-            (*dies_with_us(), sys.executable, "-m", "instant_ic.cli.kernels", part),
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-        )
-
-    def last_line(self) -> str:
-        self._output.seek(0)
-        return (self._output.read().strip().splitlines() or [""])[-1]
-
-    def share(self) -> float:
-        try:
-            return float(self.last_line())
-        except ValueError:  # no kernel yet, half a line, or a warning
-            return 0.0
-
-
-def _folder() -> Path:
-    """Folder of the lock and the note; numba chooses the folder of its cache by the same rule."""
+def cache_folder() -> Path:
+    """Return the folder of the lock and the note; numba chooses the folder of its cache by the same rule."""
     beside = _PACKAGE / "__pycache__"
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         folder = Path(given)
@@ -119,10 +92,10 @@ def _folder() -> Path:
     return folder
 
 
-def _key() -> str:
-    """Text that changes with whatever makes numba compile again: a kernel's source file, numba, Python, the CPU."""
-    digest = hashlib.sha256(f"{_PACKAGE} {version('numba')} {sys.version} {platform.machine()}".encode())
-    for file in sorted(_PACKAGE.rglob("*.py")):
+def source_key(package: Path = _PACKAGE) -> str:
+    """Return a text that changes with whatever makes numba compile again: a kernel's source file, numba, Python, the CPU."""
+    digest = hashlib.sha256(f"{package} {version('numba')} {sys.version} {platform.machine()}".encode())
+    for file in sorted(package.rglob("*.py")):
         if b"numba" in (source := file.read_bytes()):
             digest.update(f"{file} {file.stat().st_mtime_ns}".encode() + source)
     for line in Path("/proc/cpuinfo").read_text().splitlines():
@@ -134,30 +107,11 @@ def _key() -> str:
 
 
 def main() -> None:
-    """Entry point of a compiling process: ``python -m instant_ic.cli.kernels PART``."""
+    """Compile one part, in a process of its own: ``python -m instant_ic.cli.kernels PART``."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it, even inside the compiler
-    from numba.core import event
-    from numba.core.dispatcher import Dispatcher
-
-    finished = 0
-
-    class Counter(event.Listener):
-        def on_start(self, event: Any) -> None:
-            pass
-
-        def on_end(self, event: Any) -> None:
-            nonlocal finished
-            finished += 1
-            modules = [module for name, module in sys.modules.items() if name.startswith("instant_ic.")]
-            kernels = {
-                id(value) for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)
-            }
-            print(min(1.0, finished / len(kernels)), flush=True)
-
-    with event.install_listener("numba:compile", Counter()):
-        part = sys.argv[1]
-        for module in PARTS[part]:
-            import_module(f"instant_ic.{part}.{module}").warm_up()
+    part = sys.argv[1]
+    for module in PARTS[part]:
+        import_module(f"instant_ic.{part}.{module}").warm_up()
 
 
 if __name__ == "__main__":

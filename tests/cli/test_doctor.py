@@ -14,7 +14,7 @@ import pytest
 from cli_helpers import talking
 
 from instant_ic.cli import doctor
-from instant_ic.cli.finding import FAIL, OK, WARN, Finding
+from instant_ic.cli.doctor import FAIL, OK, WARN, Finding
 from instant_ic.cli.main import main
 from instant_ic.util import paths
 
@@ -56,14 +56,14 @@ def free_port(kind: socket.SocketKind) -> int:
 
 def test_camera_that_answers(theta: str) -> None:
     found = one(doctor.check_camera(theta, WARN))
-    assert (found.level, found.words) == (OK, "RICOH THETA Z1, firmware 2.21.1")
+    assert (found.level, found.text) == (OK, "RICOH THETA Z1, firmware 2.21.1")
 
 
 @pytest.mark.parametrize(("status", "advice"), [(404, "something else answers"), (401, "user and password")])
 def test_camera_that_refuses(status: int, advice: str, theta: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Theta, "status", status)
     found = one(doctor.check_camera(theta, WARN))
-    assert found.words == f"HTTP status {status}" and advice in found.advice
+    assert found.text == f"HTTP status {status}" and advice in found.advice
 
 
 @pytest.mark.parametrize("level", [WARN, FAIL])
@@ -71,9 +71,9 @@ def test_devices_that_are_missing(level: str, tmp_path: Path) -> None:
     camera = one(doctor.check_camera(f"http://127.0.0.1:{free_port(socket.SOCK_STREAM)}", level))
     lidar = one(doctor.check_lidar(free_port(socket.SOCK_DGRAM), 0.05, level))
     assert camera.level == lidar.level == level and camera.advice and lidar.advice
-    assert "is unreachable" in camera.words
+    assert "is unreachable" in camera.text
     serial = one(doctor.check_serial(tmp_path / "ttyACM7", level, list))
-    assert serial.level == level and "does not exist (available: none)" in serial.words
+    assert serial.level == level and "does not exist (available: none)" in serial.text
 
 
 @pytest.mark.parametrize(("size", "level"), [(1206, OK), (100, WARN)])
@@ -91,7 +91,7 @@ def test_lidar_packets(size: int, level: str) -> None:
     found = one(doctor.check_lidar(port, 20.0, WARN))
     stop.set()
     thread.join()
-    assert found.level == level and "127.0.0.1" in found.words
+    assert found.level == level and "127.0.0.1" in found.text
 
 
 def test_serial_port_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,7 +109,7 @@ def test_port_in_use() -> None:
         taken.listen()
         port = taken.getsockname()[1]
         found = one(doctor.check_ports({port: "operator's page"}, {}))
-    assert found.level == WARN and found.words == "operator's page: Address already in use"
+    assert found.level == WARN and found.text == "operator's page: Address already in use"
     assert one(doctor.check_ports({port: "page"}, {})).level == OK
 
 
@@ -118,7 +118,7 @@ def test_strict_reverse_path_filter(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "rp_filter").write_text(value + "\n")
     found = one(doctor.check_network_filter(tmp_path))
-    assert found.level == WARN and "strict on eth1:" in found.words
+    assert found.level == WARN and "strict on eth1:" in found.text
     (tmp_path / "eth1" / "rp_filter").write_text("0\n")
     assert one(doctor.check_network_filter(tmp_path)).level == OK
 
@@ -127,12 +127,12 @@ def test_run_directory_of_somebody_else(tmp_path: Path, monkeypatch: pytest.Monk
     uid = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: uid + 1)
     found = [f for f in doctor.check_machine(tmp_path / "run") if f.subject == "run directory"]
-    assert [f.level for f in found] == [FAIL] and "belongs to" in found[0].words
+    assert [f.level for f in found] == [FAIL] and "belongs to" in found[0].text
 
 
 def test_models_and_launch_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for folder in ("launch", "models"):
-        (tmp_path / folder).mkdir()
+    for name in ("launch", "models"):
+        (tmp_path / name).mkdir()
     (tmp_path / "nodes").symlink_to(paths.share_dir("nodes"))
     monkeypatch.setattr("instant_ic.util.paths.share_dir", lambda name: tmp_path / name)
     assert one(doctor.check_models()).level == FAIL
@@ -142,7 +142,7 @@ def test_models_and_launch_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "launch" / "bad.yaml").write_text(node.replace("KEY", "bagg"))
     (tmp_path / "launch" / "good.yaml").write_text(node.replace("KEY", "bag"))
     bad, good = doctor.check_configuration()
-    assert bad.level == FAIL and "bad.yaml:3" in bad.words and "did you mean 'bag'" in bad.words
+    assert bad.level == FAIL and "bad.yaml:3" in bad.text and "did you mean 'bag'" in bad.text
     assert (good.level, good.subject) == (OK, "launch/good.yaml")
 
 
@@ -200,7 +200,7 @@ def test_faults_of_a_running_stack_are_told_with_what_to_do() -> None:
         teller = threading.Thread(target=tell)
         teller.start()
         try:
-            assert one(check_running(run_dir, 1.5)).words == "1 nodes, no faults"
+            assert one(check_running(run_dir, 1.5)).text == "1 nodes, no faults"
             level[0] = 1
             found = one(check_running(run_dir, 1.5))
         finally:
@@ -208,7 +208,7 @@ def test_faults_of_a_running_stack_are_told_with_what_to_do() -> None:
             teller.join()
             transport.close()
     shutil.rmtree(run_dir)
-    assert (found.level, found.subject, found.words) == (WARN, "arbiter: control", words)
+    assert (found.level, found.subject, found.text) == (WARN, "arbiter: control", words)
     assert "VLP-16" in found.advice
     # Whatever the arbiter may miss, there is something to do about it.
     assert {source.reason for source in SOURCES} <= set(ADVICE)

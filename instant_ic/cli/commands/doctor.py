@@ -26,8 +26,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from instant_ic.cli.doctor import run_checks
-    from instant_ic.cli.finding import FAIL, OK, WARN
+    from instant_ic.cli.doctor import FAIL, OK, WARN, run_checks
     from instant_ic.util import paths
 
     colours = {OK: "32", WARN: "33", FAIL: "31"} if sys.stdout.isatty() else {}
@@ -41,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         level = f"{finding.level:<4}"
         if finding.level in colours:
             level = f"\033[{colours[finding.level]}m{level}\033[0m"
-        text = visible(masked(f"{finding.subject}: {finding.words}"))
+        text = visible(masked(f"{finding.subject}: {finding.text}"))
         print(f"{level}  {text}", file=direct(sys.stdout), flush=True)
         if finding.advice and finding.level != OK:
             print(f"      → {finding.advice}", flush=True)
@@ -50,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _shipped(node: str, key: str, default: Any) -> Any:
-    """Value of a parameter in the shipped config/robot.yaml."""
+    """Return a parameter of the shipped config/robot.yaml."""
     from instant_ic.config.params import ParameterError, load_file
     from instant_ic.util import paths
 

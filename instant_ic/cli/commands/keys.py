@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli.arguments import group, verb
+from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
     from instant_ic.bridge.host_keys import KeyStore
 
 
 def add_parser(subparsers: Any) -> None:
+    """Add the command with its verbs."""
     verbs = group(
         subparsers, "keys", "manage keys of the link between robot and station",
         "Create this host's key, and set which other hosts may connect to it (docs/bridge.md).", "ic keys new",
@@ -49,7 +51,7 @@ def _store(args: argparse.Namespace) -> KeyStore:
 
 
 def host_name() -> str:
-    """Host name of this machine in the form that the link accepts."""
+    """Return the host name of this machine in the form that the link accepts."""
     import re
     import socket
 
@@ -57,54 +59,54 @@ def host_name() -> str:
     return name if name[:1].isalpha() else f"host_{name}"[:63]
 
 
-def make(args: argparse.Namespace) -> int:
+def _create(store: KeyStore, name: str, force: bool = False) -> None:
     from instant_ic.bridge.host_keys import key_text
 
-    store = _store(args)
-    identity = store.create(args.name or host_name(), args.force)
+    identity = store.create(name, force)
     print(f"created the key of {identity.name} in {store.folder} (fingerprint {identity.fingerprint})")
     print(f"on the other host run:\n\n  ic keys allow {identity.name} {key_text(identity.public_key)}\n")
+
+
+def make(args: argparse.Namespace) -> int:
+    """Create this host's key."""
+    _create(_store(args), args.name or host_name(), args.force)
     return 0
 
 
 def show(args: argparse.Namespace) -> int:
+    """Print this host's key and the allowed hosts."""
     from instant_ic.bridge.host_keys import key_text
+    from instant_ic.cli.tables import print_table
 
     store = _store(args)
+    rows = [("allowed", p.name, p.role, p.fingerprint, key_text(p.public_key)) for p in store.peers()]
     if store.identity_path.exists():
-        identity = store.identity()
-        print(f"this host: {identity.name}  {identity.fingerprint}  {key_text(identity.public_key)}")
+        own = store.identity()
+        rows.insert(0, ("this host", own.name, "", own.fingerprint, key_text(own.public_key)))
     else:
         print("this host: no key yet (ic keys new)")
-    peers = store.peers()
-    width = max([len(peer.name) for peer in peers], default=0)
-    for peer in peers:
-        print(f"allowed:   {peer.name:<{width}}  {peer.role}  {peer.fingerprint}  {key_text(peer.public_key)}")
-    if not peers:
-        print("allowed:   none yet (ic keys allow NAME KEY)")
+    if rows:
+        print_table(rows, ("", "HOST", "ROLE", "FINGERPRINT", "KEY"))
     return 0
 
 
 def let_in(args: argparse.Namespace) -> int:
     """Allow a host; also create this host's own key where it has none, since the link needs it."""
-    from instant_ic.bridge.host_keys import Peer, check_name, key_text, parse_key
+    from instant_ic.bridge.host_keys import Peer, check_name, parse_key
 
     store = _store(args)
     peer = Peer(check_name(args.name), args.role, parse_key(args.key))
     if store.identity_path.exists() and store.identity().public_key == peer.public_key:
-        from instant_ic.cli.errors import UserError
-
         raise UserError("this is this host's own key: allow it on the other host, and the other host's key here")
     done = store.allow(peer)
     print(f"{peer.name} ({peer.role}, fingerprint {peer.fingerprint}): {done}")
     if not store.identity_path.exists():
-        identity = store.create(host_name())
-        print(f"this host had no key: created the key of {identity.name}; on the other host run:\n")
-        print(f"  ic keys allow {identity.name} {key_text(identity.public_key)}\n")
+        _create(store, host_name())
     return 0
 
 
 def shut_out(args: argparse.Namespace) -> int:
+    """Remove a host from the allowed ones."""
     peer = _store(args).revoke(args.name)
     print(f"{peer.name} (fingerprint {peer.fingerprint}) is no longer allowed")
     return 0

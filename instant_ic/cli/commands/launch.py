@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
+    """Add the command."""
     parser = verb(
         subparsers, "launch", "start a stack from a launch file", run,
         "ic launch sim console_port:=9000 record:=drive",
@@ -49,6 +50,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Check and start a launch file, or show its arguments."""
     from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
     from instant_ic.util import paths
 
@@ -56,9 +58,8 @@ def run(args: argparse.Namespace) -> int:
     if args.show_args:
         _show(file.name, read_arguments(file))
         return 0
-    values = launch_values(args.arguments)
     run_dir = (args.run_dir or paths.run_dir()).absolute()
-    description = read_launch_file(file, values, run_dir)
+    description = read_launch_file(file, launch_values(args.arguments), run_dir)
     if args.check or not args.no_check:
         from instant_ic.launch.parameters import check_parameters_quickly, existing_bags
 
@@ -78,24 +79,20 @@ def run(args: argparse.Namespace) -> int:
     return run_stack(description, run_dir, False if args.plain else None, args.pace, verbose=args.verbose)
 
 
-def _pace(word: str) -> float | None:
+def _pace(text: str) -> float | None:
     """Read the value of ``--pace``; None is auto."""
     from instant_ic.util.pace import PaceError, check_factor
 
-    if word == "auto":
-        return None
     try:
-        return check_factor(float(word))
+        return None if text == "auto" else check_factor(float(text))
     except PaceError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a number or auto (got {word!r})") from None
+        raise argparse.ArgumentTypeError(f"must be a number or auto (got {text!r})") from None
 
 
 def _show(name: str, arguments: Sequence[LaunchArgument]) -> None:
-    print(f"arguments of {name}:")
-    if not arguments:
-        print("  none")
+    print(f"arguments of {name}:{'' if arguments else ' none'}")
     for argument in arguments:
         default = "required" if argument.default is None else f"default: {argument.default!r}"
         print(f"  {argument.name}: {argument.type} ({default})")
