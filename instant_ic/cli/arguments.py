@@ -43,6 +43,7 @@ def verb(
         run: its function, or MODULE.FUNCTION in ``instant_ic.cli``, which is then imported when it runs.
         example: a command line.
         description: the first paragraph of its help.
+        **options: other options of ``add_parser``.
     """
 
     def imported(args: argparse.Namespace) -> int:
@@ -70,7 +71,7 @@ def check_files(*files: Path | None, suffix: str = "") -> None:
 
 
 def positive(text: str) -> float:
-    """A number > 0."""
+    """Read a number > 0."""
     value = float(text)
     if not value > 0:
         raise argparse.ArgumentTypeError(f"must be > 0 (got {text})")
@@ -78,7 +79,7 @@ def positive(text: str) -> float:
 
 
 def positive_int(text: str) -> int:
-    """A whole number > 0."""
+    """Read a whole number > 0."""
     value = int(text)
     if value <= 0:
         raise argparse.ArgumentTypeError(f"must be > 0 (got {text})")
@@ -86,7 +87,7 @@ def positive_int(text: str) -> int:
 
 
 def not_negative(text: str) -> int:
-    """A whole number >= 0."""
+    """Read a whole number >= 0."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"must be >= 0 (got {text})")
@@ -94,7 +95,7 @@ def not_negative(text: str) -> int:
 
 
 def numbers(form: str) -> Callable[[str], list[float]]:
-    """Type of an argument such as ``x,y,z,yaw``: so many finite numbers."""
+    """Return the type of an argument such as ``x,y,z,yaw``: as many finite numbers as names."""
 
     def parse(text: str) -> list[float]:
         try:
@@ -109,7 +110,7 @@ def numbers(form: str) -> Callable[[str], list[float]]:
 
 
 def size(text: str) -> tuple[int, int]:
-    """``640x360``."""
+    """Read a size in pixels, ``640x360``."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if not match:
         raise argparse.ArgumentTypeError(f"must look like 640x360 (got {text!r})")
@@ -117,7 +118,7 @@ def size(text: str) -> tuple[int, int]:
 
 
 def seconds(text: str) -> float:
-    """A duration in seconds: ``90``, ``90s``, ``10m``, ``2h``, ``1d``."""
+    """Read a duration in seconds: ``90``, ``90s``, ``10m``, ``2h``, ``1d``."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", text)
     if not match:
         raise argparse.ArgumentTypeError(f"must look like 90, 30s, 10m, 2h or 1d (got {text})")
@@ -125,7 +126,7 @@ def seconds(text: str) -> float:
 
 
 def launch_values(words: Sequence[str]) -> dict[str, str]:
-    """Values of a launch file's arguments, given as ``KEY:=VALUE``.
+    """Return the values of a launch file's arguments, given as ``KEY:=VALUE``.
 
     Raises:
         UserError: an argument has another form.

@@ -72,7 +72,7 @@ def info(args: argparse.Namespace) -> int:
 
 
 def _bookmarks(reader: BagReader) -> list[dict[str, Any]]:
-    """Bookmarks set by the operator, with their offset from the start of the bag."""
+    """Return the operator's bookmarks, with their offset from the start of the bag."""
     if not any(topic.topic == BOOKMARKS and topic.type_name == _STRING for topic in reader.topics):
         return []
     try:
@@ -140,7 +140,7 @@ def diff(args: argparse.Namespace) -> int:
 
 
 def tolerance_of(args: argparse.Namespace) -> Tolerance:
-    """Tolerances given on the command line.
+    """Return the tolerances given on the command line.
 
     Raises:
         UserError: a tolerance is not a number.

@@ -173,7 +173,7 @@ def _call(node: NodeControl, command: str, **arguments: Any) -> Any:
 
 
 def _node(kinds: tuple[str, ...], name: str, *, keeps_snapshots: bool = False) -> NodeInfo:
-    """Node that a command is for; of several recorders, the one that supports the command."""
+    """Return the node that a command is for; of several recorders, the one that supports the command."""
     running = [node for node in list_nodes(run_dir()) if node.executable in kinds]
     chosen = [node for node in running if not name or node.name == name]
     if len(chosen) > 1:
@@ -193,5 +193,5 @@ def _megabytes(size: int) -> int:
 
 
 def _parameters(**values: Any) -> list[str]:
-    """Parameter arguments for a node's command line (JSON is valid YAML)."""
+    """Return parameter arguments for a node's command line (JSON is valid YAML)."""
     return [word for key, value in values.items() for word in ("-p", f"{key}:={json.dumps(value)}")]

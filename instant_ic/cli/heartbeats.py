@@ -34,7 +34,7 @@ class Heartbeats(TopicObserver):
 
 
 def hear(run_dir: Path, nodes: Collection[str], seconds: float = 2.5) -> dict[str, Heartbeat]:
-    """Heartbeats of the given nodes, without those that send none within ``seconds``."""
+    """Return the heartbeats of the given nodes, without those that send none within ``seconds``."""
     if not nodes:
         return {}
     with Heartbeats(run_dir) as heartbeats:

@@ -93,7 +93,7 @@ def cache_folder() -> Path:
 
 
 def source_key(package: Path = _PACKAGE) -> str:
-    """Return a text that changes with whatever makes numba compile again: a kernel's source file, numba, Python, the CPU."""
+    """Return a text that changes when numba compiles again: for another source file, numba, Python or CPU."""
     digest = hashlib.sha256(f"{package} {version('numba')} {sys.version} {platform.machine()}".encode())
     for file in sorted(package.rglob("*.py")):
         if b"numba" in (source := file.read_bytes()):

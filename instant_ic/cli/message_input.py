@@ -46,7 +46,7 @@ def parse(text: str, name: str) -> Any:
 
 
 def fields(name: str) -> list[tuple[str, Any]]:
-    """Fields of a message type, with their types as rosbags describes them.
+    """Return the fields of a message type, with their types as rosbags describes them.
 
     Raises:
         UserError: there is no such type.

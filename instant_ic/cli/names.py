@@ -11,18 +11,18 @@ from instant_ic.util import paths
 
 
 def absolute(topic: str) -> str:
-    """A topic's name with its leading slash."""
+    """Return a topic's name with its leading slash."""
     return topic if topic.startswith("/") else f"/{topic}"
 
 
 def near(name: str, known: Iterable[str], otherwise: str) -> str:
-    """``did you mean 'x'?`` where a known name is similar, else ``otherwise``."""
+    """Return ``did you mean 'x'?`` where a known name is similar, else ``otherwise``."""
     close = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
 
 
 def topic_types() -> dict[str, str]:
-    """Every published or subscribed topic → its type (``any`` where all its subscribers accept any type)."""
+    """Return every published or subscribed topic → its type (``any`` where all its subscribers accept any type)."""
     run_dir = paths.run_dir()
     types = {info.topic: info.type_name for info in registry.list_topics(run_dir)}
     for node in registry.list_nodes(run_dir):
@@ -33,12 +33,12 @@ def topic_types() -> dict[str, str]:
 
 
 def unknown_topic(topic: str, known: Iterable[str]) -> str:
-    """Message for a topic that no node publishes."""
+    """Return the message for a topic that no node publishes."""
     return f"{topic} has no publisher ({near(topic, known, 'see ic topic list')})"
 
 
 def nobody_runs() -> str:
-    """Message for a run directory without running nodes; it names stacks in its subfolders (robots of a fleet)."""
+    """Return the message for a run directory without running nodes; it names stacks in its subfolders (of a fleet)."""
     run_dir = paths.run_dir()
     inside = [folder.parent for folder in sorted(run_dir.glob("*/nodes")) if registry.list_nodes(folder.parent)]
     hint = f"; nodes are running in {', '.join(map(str, inside))}: ic --run-dir {inside[0]} ..." if inside else ""
@@ -46,7 +46,7 @@ def nobody_runs() -> str:
 
 
 def find_node(name: str) -> registry.NodeInfo:
-    """A running node.
+    """Return a running node.
 
     Raises:
         UserError: no running node has that name.
@@ -61,7 +61,7 @@ def find_node(name: str) -> registry.NodeInfo:
 
 
 def find_type(name: str) -> str:
-    """Full name of a message type, from its full or short name.
+    """Return the full name of a message type, from its full or short name.
 
     Raises:
         UserError: there is no such type.

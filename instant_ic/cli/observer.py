@@ -61,7 +61,7 @@ class TopicObserver(Closing):
         self.transport.close()
 
     def lost_by(self, topic: str) -> dict[str, int]:
-        """Publisher → messages of a topic that were lost before they arrived here."""
+        """Return publisher → messages of a topic that were lost before they arrived here."""
         return self.subscriptions[topic].stats.lost_by
 
     def batches(self, duration_s: float, period_s: float) -> Iterator[list[Received]]:
@@ -89,7 +89,7 @@ class TopicObserver(Closing):
                 print(f"ic: {unknown_topic(topic, known)}; waiting for it", file=sys.stderr)
 
     def too_few(self, seconds: float) -> UserError:
-        """Error for a command that received no message, or fewer than it needs, with the likely reason."""
+        """Return the error for a command that received no message, or fewer than it needs, with the likely reason."""
         known = {info.topic for info in registry.list_topics(self._run_dir)}
         missing = [topic for topic in self.topics if topic not in known]
         silent = [topic for topic in self.topics if topic in known]
@@ -105,6 +105,6 @@ class TopicObserver(Closing):
 
 
 def newest(topic: str, timeout_s: float) -> Received | None:
-    """The next message of a topic; None without one within ``timeout_s``."""
+    """Return the next message of a topic; None without one within ``timeout_s``."""
     with TopicObserver(topic) as observer:
         return next((received for batch in observer.batches(timeout_s, 0.1) for received in batch), None)

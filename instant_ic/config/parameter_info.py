@@ -39,14 +39,15 @@ class ParameterInfo:
 
 
 def is_live(key: str, live: Iterable[str]) -> bool:
-    """Whether a key is live; ``live`` may also name whole groups, or everything by ``*``."""
+    """Return whether a key is live; ``live`` may also name whole groups, or everything by ``*``."""
     return any(entry in ("*", key) or key.startswith(f"{entry}.") for entry in live)
 
 
 def parameter_infos(config_class: type[Any], config: Any = None, live: Iterable[str] = ()) -> list[ParameterInfo]:
-    """All parameters of a configuration, in the order of its fields.
+    """Return all parameters of a configuration, in the order of its fields.
 
     Args:
+        config_class: the configuration's class.
         config: configuration that gives the present values; None uses the defaults.
         live: keys and groups that can be changed while the node runs.
     """
@@ -54,7 +55,7 @@ def parameter_infos(config_class: type[Any], config: Any = None, live: Iterable[
 
 
 def _infos(config_class: type[Any], config: Any, defaults: Any, prefix: str) -> list[ParameterInfo]:
-    """Parameters of one group; ``defaults`` is the group as its parent creates it, None at the top."""
+    """Return the parameters of one group; ``defaults`` is the group as its parent creates it, None at the top."""
     infos: list[ParameterInfo] = []
     meanings = attributes(config_class)  # type: ignore[arg-type]
     hints, bounds = get_type_hints(config_class), ranges(config_class)  # type: ignore[arg-type]
@@ -81,7 +82,7 @@ def _type_words(hint: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON: tuples become lists, paths become strings; passwords of addresses are masked."""
+    """Return a value as JSON: tuples become lists, paths become strings; passwords of addresses are masked."""
     if isinstance(value, (tuple, list)):
         return [plain(part) for part in value]
     return masked(str(value)) if isinstance(value, str | Path) else value
@@ -89,7 +90,7 @@ def plain(value: Any) -> Any:
 
 @functools.cache
 def attributes(config_class: type[Any]) -> Mapping[str, str]:
-    """Entries of the "Attributes:" sections of a class and its bases; ``a, b: text`` describes both."""
+    """Return the "Attributes:" entries of a class and its bases; ``a, b: text`` describes both."""
     found: dict[str, str] = {}
     for kind in reversed(config_class.__mro__):
         part = inspect.cleandoc(kind.__dict__.get("__doc__") or "").partition("Attributes:\n")[2].split("\n\n")[0]

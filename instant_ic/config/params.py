@@ -52,7 +52,7 @@ class Problem:
     key: str = ""
 
     def __str__(self) -> str:
-        """``where: text``."""
+        """Return ``where: text``."""
         return f"{self.where}: {self.text}" if self.where else self.text
 
 
@@ -110,9 +110,11 @@ PROCESS_KEYS = ("use_sim_time", "nice")
 def gather(
     node: str, files: Sequence[Path], overrides: Sequence[str], places: Mapping[str, str] | None = None
 ) -> Values:
-    """All values given to a node: the files in their order, then the ``key:=value`` overrides.
+    """Return all values given to a node: the files in their order, then the ``key:=value`` overrides.
 
     Args:
+        node: name of the node.
+        files: parameter files.
         overrides: ``key:=value`` texts.
         places: place of an override, if it has a better one than the command line (a launch file's line).
 
@@ -139,7 +141,7 @@ def gather(
 
 
 def configure(config_class: type[ConfigT], values: Mapping[str, Value]) -> tuple[ConfigT, ProcessParameters]:
-    """Typed configuration of a node, and the parameters of its process.
+    """Return the typed configuration of a node, and the parameters of its process.
 
     Raises:
         ParameterError: all values that are refused.
@@ -270,11 +272,13 @@ def parse_override(word: str) -> tuple[str, Value]:
 
 
 def build(config_class: type[ConfigT], values: Mapping[str, Value], base: ConfigT | None = None) -> ConfigT:
-    """Typed configuration from flat values.
+    """Return a typed configuration from flat values.
 
     A shared value that the node does not have is for other nodes, and skipped.
 
     Args:
+        config_class: the configuration's class.
+        values: dotted key → value.
         base: source of all other values; None uses the defaults.
 
     Raises:
@@ -308,7 +312,7 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
 
 
 def typed_value(config_class: type[Any], key: str, given: Any) -> Any:
-    """A parameter's value by its declared type and range.
+    """Return a parameter's value by its declared type and range.
 
     Raises:
         ValueError: there is no such parameter, or the value does not fit it.
@@ -373,7 +377,7 @@ def _assemble(config_class: type[ConfigT], typed: Mapping[str, Any], base: Confi
 
 
 def _culprit(config_class: type[Any], typed: Mapping[str, Any], base: Any, error: ValueError) -> str:
-    """The first value without which the error disappears or changes; empty if there is none."""
+    """Return the key of the first value without which the error disappears or changes; empty if there is none."""
     for key in typed:
         try:
             _assemble(config_class, {other: value for other, value in typed.items() if other != key}, base)
@@ -385,7 +389,7 @@ def _culprit(config_class: type[Any], typed: Mapping[str, Any], base: Any, error
 
 
 def field_default(field: dataclasses.Field[Any]) -> Any:
-    """Default of a configuration's field; None if it has none."""
+    """Return the default of a configuration's field; None if it has none."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return None if field.default is dataclasses.MISSING else field.default
@@ -439,7 +443,7 @@ def _coerce_sequence(value: list[Any], origin: Any, arguments: tuple[Any, ...], 
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Configuration as nested plain values for ``ic param``, registry and bags; passwords of addresses are masked."""
+    """Return a configuration as nested plain values; passwords of addresses are masked."""
     masked_config: dict[str, Any] = masked_values(_plain_dict(config))
     return masked_config
 
@@ -454,6 +458,7 @@ def change(
     """Apply new values to a configuration and check it as a whole; returns it with what differs (flat).
 
     Args:
+        config: the present configuration.
         values: flat or nested keys; unchanged values are allowed.
         is_live: whether a key may be changed while the node runs.
         where: prefix of the error messages.

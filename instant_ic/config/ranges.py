@@ -49,7 +49,7 @@ class Range:
         )
 
     def __str__(self) -> str:
-        """Short form for display: ``0..19``, ``> 0``."""
+        """Return the short form for display: ``0..19``, ``> 0``."""
         if self.low is not None and self.high is not None:
             return f"{self.low:g}..{self.high:g}"
         bounds = ((">=", self.low), (">", self.above), ("<=", self.high), ("<", self.below))
@@ -61,9 +61,10 @@ class Range:
         return f"must lie in {self}" if ".." in str(self) else f"must be {str(self).replace(', ', ' and ')}"
 
     def refusal(self, value: float, shown: object = None) -> str:
-        """Text of the error for a value outside: ``must lie in 0..19 (got 33)``.
+        """Return the text of the error for a value outside: ``must lie in 0..19 (got 33)``.
 
         Args:
+            value: the value.
             shown: the value in its spelling; None: as Python writes it.
         """
         return f"{self.words} (got {value if shown is None else shown})"
@@ -95,7 +96,7 @@ Percent: TypeAlias = Annotated[int, Range(1, 100)]
 
 
 def range_of(hint: Any) -> Range | None:
-    """The range in a type's annotation, also inside ``X | None``; None if there is none."""
+    """Return the range in a type's annotation, also inside ``X | None``; None if there is none."""
     if get_origin(hint) is Annotated:
         return next((extra for extra in get_args(hint)[1:] if isinstance(extra, Range)), None)
     found = (range_of(part) for part in get_args(hint) if get_origin(hint) is not tuple)
@@ -104,13 +105,13 @@ def range_of(hint: Any) -> Range | None:
 
 @functools.cache
 def ranges(config_class: type[Any]) -> dict[str, Range]:
-    """Field → range for a dataclass's own fields (not those of nested groups)."""
+    """Return field → range for a dataclass's own fields (not those of nested groups)."""
     hints = get_type_hints(config_class, include_extras=True)
     return {f.name: bounds for f in dataclasses.fields(config_class) if (bounds := _element(hints[f.name])) is not None}
 
 
 def _element(hint: Any) -> Range | None:
-    """Range of a value, or of every element of a sequence."""
+    """Return the range of a value, or of every element of a sequence."""
     return range_of(hint) or next((r for part in get_args(hint) if (r := range_of(part)) is not None), None)
 
 
@@ -153,9 +154,10 @@ class Checked:
 
 
 def require_protection(unprotected: bool, off: Sequence[str], danger: str) -> None:
-    """Raise ValueError where a protection is off and ``unprotected`` does not say that this is meant.
+    """Refuse protections that are off unless ``unprotected`` says that this is intended.
 
     Args:
+        unprotected: whether the missing protection is intended.
         off: names of the parameters that switch a protection off.
         danger: what may happen.
     """
@@ -166,6 +168,6 @@ def require_protection(unprotected: bool, off: Sequence[str], danger: str) -> No
 
 
 def require(config: Any, name: str, condition: bool, rule: str) -> None:
-    """Raise ValueError unless a condition between fields holds; for ``__post_init__`` after :func:`check_ranges`."""
+    """Check a condition between fields; for ``__post_init__`` after :func:`check_ranges`."""
     if not condition:
         raise ValueError(f"{name} must be {rule} (got {getattr(config, name)!r})")

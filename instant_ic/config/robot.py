@@ -13,9 +13,9 @@ from instant_ic.config.ranges import Checked, Plausible, Range, check_ranges
 from instant_ic.geometry.twists import clip_twist
 
 MOST_STOPPING_M = 3.0
-"""Longest way on which a robot may come to a stand: farther away low obstacles are not seen."""
+"""Longest stopping distance of a robot: low obstacles farther away are not seen."""
 MOST_STOPPING_RAD = math.pi
-"""Largest turn in which a robot that turns on the spot may come to a stand."""
+"""Largest angle in which a robot that turns on the spot may stop."""
 Metres = Annotated[float, Plausible(-5, 5)]
 Degrees = Annotated[float, Range(-360, 360)]
 
@@ -67,7 +67,7 @@ class MotionLimits(Checked):
             )
 
     def clip(self, linear: float, angular: float) -> tuple[float, float]:
-        """The twist within the speed limits, with the same curvature; zero if it is not finite."""
+        """Return the twist within the speed limits, with the same curvature; zero if it is not finite."""
         return clip_twist(linear, angular, self.max_linear_m_s, self.max_angular_rad_s)
 
 

@@ -29,11 +29,11 @@ class Scalar:
     text: str
 
     def __str__(self) -> str:
-        """The spelling."""
+        """Return the spelling."""
         return self.text
 
     def __repr__(self) -> str:
-        """The spelling, in quotes unless it looks like a number."""
+        """Return the spelling, in quotes unless it looks like a number."""
         return self.text if _NUMBER_LIKE.fullmatch(self.text) else repr(self.text)
 
 
@@ -43,7 +43,7 @@ def is_null(value: Any) -> bool:
 
 
 def to_bool(value: Any) -> bool:
-    """A truth value: ``true``, ``yes``, ``on`` and their opposites, as in YAML 1.1 and ROS 2."""
+    """Return a truth value: ``true``, ``yes``, ``on`` and their opposites, as in YAML 1.1 and ROS 2."""
     found = _BOOLS.get(value.text.lower()) if isinstance(value, Scalar) else value
     if not isinstance(found, bool):
         raise ValueError("must be bool")
@@ -51,7 +51,7 @@ def to_bool(value: Any) -> bool:
 
 
 def to_whole_number(value: Any) -> int:
-    """A whole number of any size: ``1_000``, ``0x1F`` and ``0b11`` too, but nothing with a leading zero."""
+    """Return a whole number of any size: ``1_000``, ``0x1F`` and ``0b11`` too, but nothing with a leading zero."""
     number = value
     if isinstance(value, Scalar):
         with suppress(ValueError):
@@ -64,7 +64,7 @@ def to_whole_number(value: Any) -> int:
 
 
 def to_int(value: Any) -> int:
-    """A whole number of at most 64 bits."""
+    """Return a whole number of at most 64 bits."""
     number = to_whole_number(value)
     if not -(1 << 63) <= number < 1 << 63:
         raise ValueError("must have at most 64 bits, as in ROS 2")
@@ -72,7 +72,7 @@ def to_int(value: Any) -> int:
 
 
 def to_float(value: Any) -> float:
-    """A finite number in any spelling: ``5e-06``, ``.5``, ``1_000``, ``0123`` (123), ``0x10``."""
+    """Return a finite number in any spelling: ``5e-06``, ``.5``, ``1_000``, ``0123`` (123), ``0x10``."""
     number = _number(value.text) if isinstance(value, Scalar) else value
     if not isinstance(number, (int, float)) or isinstance(number, bool):
         raise ValueError("must be float")
@@ -92,7 +92,7 @@ def _number(text: str) -> int | float | None:
 
 
 def to_text(value: Any) -> str:
-    """Text in its spelling, ``no`` and ``0123`` too. Nothing at all is refused: empty text is ``""``."""
+    """Return a text in its spelling, ``no`` and ``0123`` too. Nothing at all is refused: empty text is ``""``."""
     if isinstance(value, Scalar) and value.text:
         return value.text
     if isinstance(value, (str, int, float)) and not isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Reading YAML whose errors are all of one type, and which stays small when its aliases are followed."""
+"""YAML with one type of error, and limits on what aliases expand to."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import yaml
 from instant_ic.config.scalars import Scalar
 
 T = TypeVar("T")
-# What PyYAML lets through for a value that does not fit its type, such as `!!int "_"`.
+# Errors that PyYAML raises for a value that does not fit its type, such as `!!int "_"`.
 _STRAY = (ValueError, TypeError, AttributeError, IndexError, KeyError, OverflowError)
 _MOST_FAST = 8192
 """Levels of nesting up to which the C parser's recursion is sure to fit into a stack."""
@@ -20,7 +20,7 @@ _MOST_LEVELS = 100
 _MOST_VALUES = 100_000
 """Values of a document with each alias counted where it is used: 300 bytes of aliases can stand for billions."""
 _MOST_BITS = 10_000
-"""Of a whole number. Python prints no number of 4300 digits, not even in the error that refuses it."""
+"""Most bits of a whole number. Python prints no number of 4300 digits, not even in the error that refuses it."""
 _TEXT = yaml.resolver.BaseResolver.DEFAULT_SCALAR_TAG
 _TOO_DEEP = "lists or mappings are nested too deeply, or an anchor contains itself"
 
@@ -61,7 +61,7 @@ _RESOLVER = yaml.SafeLoader("")
 
 
 def read_yaml(text: str) -> Any:
-    """The plain value of a YAML document.
+    """Return the plain value of a YAML document.
 
     Raises:
         yaml.YAMLError: the text is not YAML, a value does not fit its type, or see :func:`compose_yaml`.
@@ -71,7 +71,7 @@ def read_yaml(text: str) -> Any:
 
 
 def read_spelled(text: str) -> Any:
-    """The value of a YAML document whose unquoted scalars keep their spelling; see :func:`spelled`.
+    """Return the value of a YAML document whose unquoted scalars keep their spelling; see :func:`spelled`.
 
     Raises:
         yaml.YAMLError: see :func:`read_yaml`.
@@ -81,9 +81,9 @@ def read_spelled(text: str) -> Any:
 
 
 def compose_yaml(text: str) -> yaml.Node | None:
-    """Nodes of a YAML text, with their lines; None if it is empty.
+    """Return the nodes of a YAML text, with their lines; None if it is empty.
 
-    By the C parser where there is one: that takes a tenth of the time.
+    The C parser, where there is one, takes a tenth of the time.
 
     Raises:
         yaml.YAMLError: the text is not YAML, it is nested too deeply, or its aliases stand for too many values.
@@ -96,7 +96,7 @@ def compose_yaml(text: str) -> yaml.Node | None:
 
 
 def construct(node: yaml.Node) -> Any:
-    """The plain value of a node.
+    """Return the plain value of a node.
 
     Raises:
         yaml.YAMLError: a value does not fit its type.
@@ -105,7 +105,7 @@ def construct(node: yaml.Node) -> Any:
 
 
 def spelled(node: yaml.Node) -> Any:
-    """The value of a node: lists, mappings with text as keys, :class:`Scalar`, and plain values of what is quoted.
+    """Return a node's value: lists, mappings with text as keys, :class:`Scalar`, and plain values of quoted scalars.
 
     Raises:
         yaml.YAMLError: a value does not fit its tag.
@@ -121,7 +121,7 @@ def _constructed(node: yaml.Node, loader: _Loader) -> Any:
 
 
 def resolved(value: Any) -> Any:
-    """A spelled value with the types that YAML 1.1 gives its scalars.
+    """Return a spelled value with the types that YAML 1.1 gives its scalars.
 
     Raises:
         yaml.YAMLError: a scalar does not fit its type, such as a date in month 13.
@@ -134,7 +134,7 @@ def resolved(value: Any) -> Any:
 
 
 def dump_yaml(value: object, **style: Any) -> str:
-    """``yaml.safe_dump`` with keys in their order; by the C emitter where there is one. Scalars keep their spelling."""
+    """Return YAML with keys in their order, by the C emitter where there is one. Scalars keep their spelling."""
     try:
         return str(yaml.dump(value, Dumper=_FastDumper, sort_keys=False, **style))
     except UnicodeEncodeError:  # half a surrogate pair, from a file name that is not UTF-8; Python escapes it
@@ -156,13 +156,13 @@ for _dumper in (_Dumper, _FastDumper):
 
 
 def one_line(value: object) -> str:
-    """A value as one line of YAML."""
+    """Return a value as one line of YAML."""
     text = dump_yaml(value, default_flow_style=True, allow_unicode=True, width=1 << 20)
     return text.rstrip("\n").removesuffix("\n...").rstrip("\n")
 
 
 def _most_levels(text: str) -> int:
-    """Upper bound of the levels of nesting in a text."""
+    """Return an upper bound of the levels of nesting in a text."""
     if len(text) <= _MOST_FAST:
         return len(text)
     # A block opens at a column of its own, which a list may share with its mapping, or behind a sign on the line.
@@ -171,9 +171,10 @@ def _most_levels(text: str) -> int:
 
 
 def _measure(node: yaml.Node, depth: int, known: dict[int, tuple[int, int]]) -> tuple[int, int]:
-    """Number of values and levels of a node, each alias counted where it is used.
+    """Return the number of values and levels of a node, each alias counted where it is used.
 
     Args:
+        node: the node.
         depth: level of the node.
         known: results by ``id`` of the node.
 

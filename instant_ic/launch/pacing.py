@@ -120,7 +120,7 @@ class PaceChooser:
 
 
 def machine_pace() -> float:
-    """Pace that this machine could hold at this moment, from its cores, their speed and their load; takes 30 ms."""
+    """Return the pace that this machine could hold now, from its cores, their speed and their load; takes 30 ms."""
     began_s, count = time.thread_time(), 0
     while (cpu_s := time.thread_time() - began_s) < _MEASURE_S:
         for _ in range(10_000):
@@ -130,9 +130,10 @@ def machine_pace() -> float:
 
 
 def pace_of(cores: int, loops_per_s: float, load: float) -> float:
-    """Pace that a stack could hold beside other processes.
+    """Return the pace that a stack could hold beside other processes.
 
     Args:
+        cores: number of cores.
         loops_per_s: iterations of an empty loop on one of them.
         load: mean number of processes that already run.
     """
@@ -153,7 +154,7 @@ class CoreLoad:
         self._before = self._look()
 
     def idle_cores(self) -> float:
-        """Mean number of idle cores since the last call."""
+        """Return the mean number of idle cores since the last call."""
         before, self._before = self._before, self._look()
         seconds = self._before[0] - before[0]
         return max(0.0, self._before[1] - before[1]) / self._ticks_per_s / seconds if seconds > 0 else 0.0

@@ -37,7 +37,7 @@ class Driving:
     meant: Collection[str] = ()
 
     def value(self, key: str) -> Any:
-        """Value of a dotted key; None if the node has no such parameter."""
+        """Return the value of a dotted key; None if the node has no such parameter."""
         found = self.config
         for name in key.split("."):
             found = getattr(found, name, None)
@@ -68,7 +68,7 @@ _SIMULATED = (
 
 
 def disagreements(robot: Mapping[str, Sequence[Driving]]) -> Iterator[str]:
-    """Contradictions between the nodes of one robot, one text each.
+    """Yield the contradictions between the nodes of one robot, one text each.
 
     Args:
         robot: node → configuration of each such node; a node that is elsewhere is missing.
@@ -108,7 +108,7 @@ def _between(robot: Mapping[str, Driving]) -> Iterator[str]:
 
 
 def _open_doors(robot: Mapping[str, Driving]) -> Iterator[str]:
-    """Doors that need no token because every robot is simulated, beside a base on a serial device."""
+    """Yield nodes that need no token because every robot is simulated, beside a base on a serial device."""
     port = robot["crawler_base"].value("roboclaw.port") if "crawler_base" in robot else ""
     if not port.startswith("/dev/") or port.startswith("/dev/shm/"):  # the simulator's is in its run directory
         return

@@ -212,7 +212,7 @@ class StackScreen:
         self._told_faults = faults
 
     def table(self, view: StackView) -> RenderableType:
-        """The table of nodes with a status line below."""
+        """Return the table of nodes with a status line below."""
         table = Table(box=None, pad_edge=False, expand=False, header_style="dim")
         # Minimum widths, or a long message in the last column would squeeze the others.
         for name, justify, width in (

@@ -20,7 +20,7 @@ class Contradiction(IntEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> Contradiction:
-        """A report of another version, or a damaged one, is no reason to drive on."""
+        """Take a report of another version, or a damaged one, as slipping, which stops the robot."""
         return cls.SLIPPING
 
     @property

@@ -58,7 +58,7 @@ class RecentCount:
         return self.count(now_ns)
 
     def count(self, now_ns: int) -> int:
-        """Number of events in the window that ends at ``now_ns``."""
+        """Return the number of events in the window that ends at ``now_ns``."""
         oldest_ns = now_ns - int(self.window_s * 1e9)
         while self._events and self._events[0][0] <= oldest_ns:
             self._events.popleft()

@@ -45,9 +45,9 @@ class KeptStop:
 
 
 def state_dir(run_dir: Path) -> Path:
-    """Folder of the state files: the run directory, except for the default one, which a power cut or sign-out empties.
+    """Return the folder of the state files: the run directory, unless a power cut or sign-out empties it.
 
-    For the default one, the folder lies below ``XDG_STATE_HOME/instant_ic`` (``~/.local/state/instant_ic``).
+    They empty the default one, whose folder lies below ``XDG_STATE_HOME/instant_ic`` (``~/.local/state/instant_ic``).
     """
     default = paths.default_run_dir()
     if run_dir == default or default in run_dir.parents:
@@ -57,7 +57,7 @@ def state_dir(run_dir: Path) -> Path:
 
 
 def read(run_dir: Path) -> KeptStop | None:
-    """The emergency stop that nobody released, or None. An unreadable file counts as an emergency stop."""
+    """Return the emergency stop that nobody released, or None. An unreadable file counts as an emergency stop."""
     file = state_dir(run_dir) / "estop.json"
     try:
         fields = json.loads(file.read_text(encoding="utf-8"))

@@ -26,7 +26,7 @@ def check_whole(data: bytes | bytearray) -> None:
 
 
 def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:
-    """(width, height) from the frame header.
+    """Return (width, height) from the frame header.
 
     Raises:
         JpegError: there is no frame header before the image data.

@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_PIXELS = 32 << 20
-"""For images received over a network or from a bag. The Theta's largest photo (6720x3360) has 22.6 million pixels."""
+"""Limit for images from a network or a bag. The Theta's largest photo (6720x3360) has 22.6 million pixels."""
 MOST_FILE_PIXELS = 160 << 20
-"""For image files that an operator names: panoramas of 16384x8192."""
+"""Limit for image files that an operator names: panoramas of 16384x8192."""
 MOST_ARRAY_BYTES = 4 << 30
-"""For all arrays of an ``.npz`` file together, decompressed."""
+"""Limit for all arrays of an ``.npz`` file together, decompressed."""
 
 _MOST_CHUNKS = 20_000
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -105,7 +105,7 @@ def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
 
 
 def _chunks_fit(data: bytes | bytearray) -> bool:
-    """Whether a PNG contains its chunks in full: OpenCV allocates what a chunk declares, up to 1 GB for 40 bytes."""
+    """Return whether a PNG contains its chunks in full: OpenCV allocates the declared size, up to 1 GB for 40 bytes."""
     view, at = memoryview(data), len(_PNG)
     for _ in range(_MOST_CHUNKS):
         kind = bytes(view[at + 4 : at + 8])

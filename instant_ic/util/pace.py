@@ -55,11 +55,11 @@ class Stretch:
     steady_ns: int
 
     def since_begin_ns(self, monotonic_ns: int) -> int:
-        """Nanoseconds of the stack from the begin until an instant of the machine's steady clock."""
+        """Return the stack's nanoseconds from the begin until an instant of the machine's steady clock."""
         return round(self.factor * (monotonic_ns - self.monotonic_ns))
 
     def followed_by(self, factor: float, monotonic_ns: int) -> Stretch:
-        """The stretch with another factor that begins where this one is at an instant."""
+        """Return the stretch with another factor that begins where this one is at an instant."""
         ns = self.since_begin_ns(monotonic_ns)
         return Stretch(factor, monotonic_ns, self.epoch_ns + ns, self.steady_ns + ns)
 
@@ -83,7 +83,7 @@ class Pace:
 
     @classmethod
     def from_now(cls, factor: float) -> Pace:
-        """A pace that starts now and does not change.
+        """Return a pace that starts now and does not change.
 
         Raises:
             PaceError: the factor is out of range.
@@ -92,7 +92,7 @@ class Pace:
 
     @property
     def real(self) -> bool:
-        """Whether this is the machine's own time, now and later."""
+        """True if this is the machine's own time, now and later."""
         return self._stretches is None
 
     @property
@@ -106,7 +106,7 @@ class Pace:
         return describe(self.factor, self.adapts)
 
     def now_ns(self) -> int:
-        """Nanoseconds since the epoch."""
+        """Return nanoseconds since the epoch."""
         if self._stretches is None:
             return time.time_ns()
         now_ns = time.monotonic_ns()
@@ -114,7 +114,7 @@ class Pace:
         return stretch.epoch_ns + stretch.since_begin_ns(now_ns)
 
     def steady_ns(self) -> int:
-        """Nanoseconds since an arbitrary origin; only differences are meaningful."""
+        """Return nanoseconds since an arbitrary origin; only differences are meaningful."""
         now_ns = time.monotonic_ns()
         if self._stretches is None:
             return now_ns
@@ -122,7 +122,7 @@ class Pace:
         return stretch.steady_ns + stretch.since_begin_ns(now_ns)
 
     def steady_s(self) -> float:
-        """Seconds since an arbitrary origin; only differences are meaningful."""
+        """Return seconds since an arbitrary origin; only differences are meaningful."""
         return self.steady_ns() * 1e-9
 
     def wait_s(self, seconds: float) -> float:
@@ -161,7 +161,7 @@ class Pace:
         return stretch.epoch_ns + stretch.since_begin_ns(then_ns)
 
     def _at(self, monotonic_ns: int) -> Stretch:
-        """The stretch of an instant; read the clock before the call, so that no change can come in between."""
+        """Return the stretch of an instant; read the clock before the call, so that no change can come in between."""
         if self._words[0] != self._number and self._record is not None:
             self._take(self._record[:])
         assert self._stretches is not None
@@ -244,7 +244,7 @@ def check_factor(factor: float) -> float:
 
 
 def describe(factor: float, adapts: bool) -> str:
-    """The pace for the operator; empty in real time. A pace that adapts is rounded, so that the text changes rarely."""
+    """Return the pace for the operator; empty in real time. One that adapts is rounded, so that it changes rarely."""
     factor = round(factor, 1) if adapts else factor
     if factor == 1.0:
         return ""
@@ -255,7 +255,7 @@ _current = Pace()
 
 
 def current() -> Pace:
-    """This process's pace."""
+    """Return this process's pace."""
     return _current
 
 
@@ -266,7 +266,7 @@ def use(pace: Pace) -> None:
 
 
 def suspended_ns() -> int:
-    """Nanoseconds for which this machine was suspended since it started; too few if the process is held up meanwhile.
+    """Return the nanoseconds for which this machine was suspended; too few if the process is held up meanwhile.
 
     A paused virtual machine does not see its pause.
     """
@@ -290,7 +290,7 @@ def _create(file: Path, content: bytes) -> mmap.mmap:
 
 
 def read(run_dir: Path) -> Pace:
-    """The pace of a run directory; it follows the launcher's changes. Without a file it is the machine's own.
+    """Return the pace of a run directory; it follows the launcher's changes. Without a file it is the machine's own.
 
     Raises:
         PaceError: its file is damaged.

@@ -9,7 +9,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def share_dir(name: str) -> Path:
-    """Folder ``nodes``, ``launch``, ``config`` or ``models``.
+    """Return the folder ``nodes``, ``launch``, ``config`` or ``models``.
 
     Raises:
         FileNotFoundError: the installation lacks it.
@@ -21,7 +21,7 @@ def share_dir(name: str) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is there; false also for a name that no file can have (``Path.is_file`` raises for a long one)."""
+    """Return whether a file is there; false also for a name that is too long, for which ``Path.is_file`` raises."""
     try:
         return path.is_file()
     except OSError:
@@ -29,7 +29,7 @@ def is_file(path: Path) -> bool:
 
 
 def shipped_file(folder: str, name: str) -> Path:
-    """Path of a file in ``launch``, ``config`` or ``models``; a missing file raises an error that lists the others."""
+    """Return the path of a file in ``launch``, ``config`` or ``models``; the error for a missing one lists them."""
     path = share_dir(folder) / name
     if not is_file(path):
         have = ", ".join(sorted(entry.name for entry in share_dir(folder).iterdir())) or "nothing"
@@ -38,17 +38,17 @@ def shipped_file(folder: str, name: str) -> Path:
 
 
 def node_names() -> list[str]:
-    """Names of the shipped nodes."""
+    """Return the names of the shipped nodes."""
     return sorted(file.stem for file in share_dir("nodes").glob("[a-z]*.py"))
 
 
 def node_file(name: str) -> Path:
-    """Path of the shipped node of this name, whether it exists or not."""
+    """Return the path of the shipped node of this name, whether it exists or not."""
     return share_dir("nodes") / f"{name}.py"
 
 
 def run_dir() -> Path:
-    """The run directory: registry of the bus, logs, simulated devices.
+    """Return the run directory: registry of the bus, logs, simulated devices.
 
     ``INSTANT_IC_RUN_DIR``, else ``XDG_RUNTIME_DIR/instant_ic``, else ``/tmp/instant_ic-UID``.
     """
@@ -58,17 +58,17 @@ def run_dir() -> Path:
 
 
 def default_run_dir() -> Path:
-    """The run directory used when none is given; it does not survive the machine's shutdown."""
+    """Return the run directory used when none is given; it does not survive the machine's shutdown."""
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "instant_ic"
     return Path(f"/tmp/instant_ic-{os.getuid()}")
 
 
 def sign_in_file(run_dir: Path, node: str) -> Path:
-    """File with a console's address and token, readable by its user only, unlike the log."""
+    """Return the file with a console's address and token, readable by its user only, unlike the log."""
     return run_dir / f"{node}.sign_in"
 
 
 def cache_dir() -> Path:
-    """Folder for recreatable files: ``XDG_CACHE_HOME/instant_ic``, else ``~/.cache/instant_ic``; may not exist yet."""
+    """Return the folder for recreatable files: ``XDG_CACHE_HOME/instant_ic``, else ``~/.cache/instant_ic``."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "instant_ic"

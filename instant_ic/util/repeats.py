@@ -21,7 +21,7 @@ class RepeatWatch:
         self._known: deque[int] = deque(maxlen=REMEMBERED)
 
     def is_new(self, *parts: bytes) -> bool:
-        """Whether a measurement, given in one or more parts, differs from those before."""
+        """Return whether a measurement, given in one or more parts, differs from those before."""
         digest = 0
         for part in parts:
             digest = zlib.crc32(part, digest)
@@ -33,6 +33,6 @@ class RepeatWatch:
         return True
 
     def forget(self) -> None:
-        """Take no measurement so far for an earlier one."""
+        """Forget the measurements before."""
         self._known.clear()
         self.copies = 0

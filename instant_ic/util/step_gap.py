@@ -14,7 +14,7 @@ BRIEF_S = 0.3
 SETTLE_S = 0.3
 """Time after a gap in which nothing moves: what waited meanwhile is then read, and a source that has ended is stale."""
 _SUSPENDED_NS = 50_000_000
-"""A machine was suspended if its two clocks differ by so much more than before."""
+"""A machine was suspended if the difference between its two clocks has grown by more than this."""
 
 
 class StepGap:
@@ -46,5 +46,5 @@ class StepGap:
         self._stepped_ns = None
 
     def settles(self, steady_ns: int) -> bool:
-        """Whether a gap ended less than ``SETTLE_S`` ago."""
+        """Return whether a gap ended less than ``SETTLE_S`` ago."""
         return self._ended_ns is not None and steady_ns - self._ended_ns < SETTLE_S * 1e9

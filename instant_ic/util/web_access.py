@@ -22,7 +22,7 @@ class AccessError(ValueError):
 
 
 def sign_in_needed(sign_in: str, host: str, simulated: bool) -> bool:
-    """Whether a server asks for a token. Other users of this machine may not drive a real robot either.
+    """Return whether a server asks for a token. Other users of this machine may not drive a real robot either.
 
     Args:
         sign_in: one of ``SIGN_IN``; ``auto`` asks unless the server is on loopback and its robots are simulated.
@@ -53,7 +53,7 @@ def offer_sign_in(address: str, file: Path) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a host name or address is reachable only from this machine; only localhost is recognised by name."""
+    """Return whether a host is reachable only from this machine; only localhost is recognised by name."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -61,7 +61,7 @@ def is_loopback(host: str) -> bool:
 
 
 def host_allowed(host: str, allowed: Sequence[str]) -> bool:
-    """Whether a Host header names this machine: an address, ``localhost`` or one of ``allowed``.
+    """Return whether a Host header names this machine: an address, ``localhost`` or one of ``allowed``.
 
     A foreign site can point its own name at this machine (DNS rebinding); then its Origin equals its Host. But it
     cannot make a browser send an address or ``localhost``.
@@ -119,7 +119,7 @@ class TokenBucket:
         self._tokens = min(self.burst, self._tokens + 1.0)
 
     def wait_s(self) -> float:
-        """Seconds from the last :meth:`take` until one token is available."""
+        """Return the seconds from the last :meth:`take` until one token is available."""
         return max(0.0, 1.0 - self._tokens) / self.rate
 
 

@@ -48,7 +48,7 @@ def test_list_shows_keys_and_roles_but_no_secret(hosts, capsys):
     assert hosts("robot", "list") == 0
     out = capsys.readouterr().out
     secret = hosts.store("robot").identity_path.read_text().split()[2]
-    assert "this host: robot" in out and "tablet" in out and "viewer" in out and words[2] in out
+    assert "this host  robot" in out and "tablet" in out and "viewer" in out and words[2] in out
     assert secret not in out
 
 

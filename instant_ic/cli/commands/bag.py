@@ -174,12 +174,12 @@ def _seconds(text: str) -> float:
 
 
 def topic_names(names: list[str]) -> list[str]:
-    """Topic names with their leading slash, which is optional on the command line."""
+    """Return topic names with their leading slash, which is optional on the command line."""
     return [name if name.startswith(("/", "*")) else f"/{name}" for name in names]
 
 
 def pairs(words: list[str], separator: str, option: str) -> dict[str, str]:
-    """Arguments of the form ``a:=b`` as a dictionary.
+    """Return arguments of the form ``a:=b`` as a dictionary.
 
     Raises:
         UserError: an argument has another form.
@@ -194,7 +194,7 @@ def pairs(words: list[str], separator: str, option: str) -> dict[str, str]:
 
 
 def argument_of(command: str, value: float | None) -> dict[str, Any]:
-    """Arguments of a control command for a node.
+    """Return the arguments of a control command for a node.
 
     Raises:
         UserError: a value is missing, or the command takes none.

@@ -79,7 +79,7 @@ def camera_lidar(args: argparse.Namespace) -> int:
 
 
 def _guess(values: list[float]) -> Matrix:
-    """``camera_from_lidar`` from the camera's pose in the LiDAR frame: metres and degrees."""
+    """Return ``camera_from_lidar`` from the camera's pose in the LiDAR frame: metres and degrees."""
     import numpy as np
 
     from instant_ic.geometry.poses import inverse, pose_matrix
@@ -88,7 +88,7 @@ def _guess(values: list[float]) -> Matrix:
 
 
 def _xyz_rpy(pose: Matrix) -> tuple[list[float], list[float]]:
-    """Metres, and roll, pitch, yaw in degrees about fixed axes, rounded."""
+    """Return metres, and roll, pitch, yaw in degrees about fixed axes, rounded."""
     from scipy.spatial.transform import Rotation
 
     rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", degrees=True)
@@ -124,7 +124,7 @@ def _summary(bag: Path, recording: CalibrationRecording, given: Matrix, result: 
 
 
 def _lidar_mount() -> Matrix:
-    """base_from_lidar of config/robot.yaml, for a bag without it."""
+    """Return base_from_lidar of config/robot.yaml, for a bag without it."""
     from instant_ic.bus.node_files import node_class
     from instant_ic.config import params
     from instant_ic.geometry.poses import pose_matrix

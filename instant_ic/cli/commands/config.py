@@ -75,7 +75,7 @@ def _found(text: str) -> Path:
 
 
 def _is_launch_file(file: Path) -> bool:
-    """Whether the top level has the key ``launch``; False also for what is not YAML, which the check then reports."""
+    """Return whether the top level has the key ``launch``; False also if it is not YAML, which the check reports."""
     import yaml
 
     from instant_ic.config.yaml_text import compose_yaml
