@@ -1,4 +1,4 @@
-"""The table of ``ic top``: a row per node, from its heartbeat, its process and the nominal rates of its topics."""
+"""Rows of ``ic top``, from the heartbeats of the nodes and their processes; the live table."""
 
 from __future__ import annotations
 
@@ -9,69 +9,16 @@ import select
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.bus.heartbeat import EVERY_NODES, Flow, Heartbeat
-from instant_ic.launch.topics import TopicRate, nominal_rate
-from instant_ic.util.safe_text import direct, visible
+from instant_ic.bus.heartbeat import Heartbeat
+from instant_ic.launch.node_table import NodeRow, node_table, topic_rows
+from instant_ic.util.safe_text import direct
 
 if TYPE_CHECKING:
     from rich.console import Group
-    from rich.text import Text
 
     from instant_ic.bus.registry import NodeInfo
-
-_STATE_STYLES = {"running": "green", "starting": "yellow", "degraded": "dark_orange", "stopping": "dim"}
-_RIGHT = ("PID", "CPU%", "MEM MB", "THR", "LOST")
-_KEYS = {"c": "cpu", "m": "memory", "n": "name", "l": "lost"}
-
-
-@dataclass(frozen=True)
-class TopicRow:
-    """An input or output topic of a node.
-
-    Attributes:
-        age_s: time since the newest message; inf before the first.
-        nominal_hz: expected rate; None where unknown.
-        fault: text of the fault; empty where there is none.
-    """
-
-    topic: str
-    rate_hz: float
-    age_s: float
-    nominal_hz: float | None = None
-    fault: str = ""
-
-    @property
-    def rate(self) -> str:
-        """Measured and nominal rate as text: ``9.8/10``, ``9.8``, or ``-`` where the rate is zero."""
-        measured = f"{self.rate_hz:.0f}" if self.rate_hz >= 19.5 else f"{self.rate_hz:.1f}" if self.rate_hz > 0 else "-"
-        return measured if self.nominal_hz is None else f"{measured}/{self.nominal_hz:g}"
-
-
-@dataclass
-class NodeRow:
-    """One node.
-
-    Attributes:
-        state: from its heartbeat; ``silent`` or ``busy`` where there is none.
-        message: its worst diagnosis, else the faults of its rates.
-        cpu_percent: percent of one core since the last measurement; nan if unknown.
-        rss_mb: resident memory; nan if unknown.
-    """
-
-    node: str
-    pid: int
-    state: str
-    message: str = ""
-    cpu_percent: float = math.nan
-    rss_mb: float = math.nan
-    threads: int = 0
-    outputs: list[TopicRow] = field(default_factory=list)
-    inputs: list[TopicRow] = field(default_factory=list)
-    lost: int = 0
-
 
 SORT_KEYS: dict[str, Callable[[NodeRow], Any]] = {
     "cpu": lambda row: -row.cpu_percent if row.cpu_percent == row.cpu_percent else 0.0,
@@ -79,18 +26,19 @@ SORT_KEYS: dict[str, Callable[[NodeRow], Any]] = {
     "name": lambda row: row.node,
     "lost": lambda row: (-row.lost, row.node),
 }
+_KEYS = {"c": "cpu", "m": "memory", "n": "name", "l": "lost"}
 
 
 class Processes:
-    """CPU, memory and threads of processes, read from the operating system: also available for a hanging node."""
+    """CPU and memory of processes, read from the operating system: also available for a hanging node."""
 
     def __init__(self) -> None:
         self._known: dict[int, Any] = {}
 
-    def look(self, pid: int) -> tuple[float, float, int]:
-        """Return CPU in percent of one core since the last call, memory in MB, and number of threads.
+    def look(self, pid: int) -> tuple[float, float]:
+        """Return CPU in percent of one core since the last call, and memory in MB.
 
-        The CPU is nan at the first call; the result is (nan, nan, 0) when there is no such process.
+        The CPU is nan at the first call; both are nan when there is no such process.
         """
         import psutil
 
@@ -99,36 +47,31 @@ class Processes:
             process = self._known.setdefault(pid, psutil.Process(pid))
             with process.oneshot():
                 cpu = process.cpu_percent()
-                return math.nan if first else cpu, process.memory_info().rss / 1e6, process.num_threads()
+                return math.nan if first else cpu, process.memory_info().rss / 1e6
         except psutil.Error:
             self._known.pop(pid, None)
-            return math.nan, math.nan, 0
-
-
-def expected_rate(topic: str) -> TopicRate | None:
-    """Return the nominal rate of a topic, with or without a namespace; None where unknown."""
-    return nominal_rate(topic) or nominal_rate(topic, topic.split("/")[1])
+            return math.nan, math.nan
 
 
 def make_rows(
-    infos: Sequence[NodeInfo], beats: Mapping[str, Heartbeat], look: Callable[[int], tuple[float, float, int]]
+    infos: Sequence[NodeInfo], beats: Mapping[str, Heartbeat], look: Callable[[int], tuple[float, float]]
 ) -> list[NodeRow]:
     """Return the rows of the running nodes.
 
     Args:
         infos: nodes listed in the registry.
         beats: newest heartbeat of each node.
-        look: returns CPU, memory and threads of a process.
+        look: returns CPU and memory of a process.
     """
     rows = []
     for info in infos:
-        cpu, rss, threads = look(info.pid)
-        row = NodeRow(info.name, info.pid, "silent", "", cpu, rss, threads)
+        cpu, rss = look(info.pid)
+        row = NodeRow(info.name, "silent", "", cpu, rss)
         beat = beats.get(info.name)
         if beat is None or beat.pid != info.pid:
             row.message = "no heartbeat yet"
         else:
-            row.outputs, row.inputs = _topic_rows(beat.outputs), _topic_rows(beat.inputs)
+            row.outputs = topic_rows(beat.outputs)
             row.lost = sum(beat.lost.values())
             if beat.silent:
                 row.message = f"no heartbeat for {time.monotonic() - beat.seen_s:.0f} s"
@@ -140,48 +83,16 @@ def make_rows(
     return rows
 
 
-def _topic_rows(flows: Mapping[str, Flow]) -> list[TopicRow]:
-    rows = []
-    for topic, flow in sorted(flows.items()):
-        if not topic.endswith(EVERY_NODES):
-            expected = expected_rate(topic)
-            fault = expected.fault(flow.rate_hz, flow.age_s) if expected else ""
-            rows.append(TopicRow(topic, flow.rate_hz, flow.age_s, expected.rate_hz if expected else None, fault))
-    return rows
-
-
-def table(rows: Sequence[NodeRow], sort: str, inputs: bool = False) -> Group:
+def table(rows: Sequence[NodeRow], sort: str) -> Group:
     """Return the table of the nodes, with a summary above.
 
     Args:
         rows: the nodes.
         sort: a key of ``SORT_KEYS``.
-        inputs: also show the rates of the inputs.
     """
     from rich.console import Group
-    from rich.table import Table
     from rich.text import Text
 
-    shown = Table(box=None, pad_edge=False, header_style="bold reverse", expand=True)
-    headings = ["NODE", "PID", "STATE", "CPU%", "MEM MB", "THR", "LOST", "OUT Hz", *["IN Hz"] * inputs, "MESSAGE"]
-    for heading in headings:
-        wide = heading in ("OUT Hz", "IN Hz", "MESSAGE")
-        shown.add_column(
-            heading, justify="right" if heading in _RIGHT else "left", no_wrap=not wide, ratio=2 if wide else None
-        )
-    for row in sorted(rows, key=SORT_KEYS[sort]):
-        shown.add_row(
-            row.node,
-            str(row.pid),
-            Text(row.state, style=_STATE_STYLES.get(row.state, "bold red")),
-            Text(_number(row.cpu_percent), style="bold" if row.cpu_percent > 80 else ""),
-            _number(row.rss_mb),
-            str(row.threads or "-"),
-            Text(str(row.lost), style="" if row.lost else "dim"),  # a total: the start-up's losses count too
-            _rates(row.outputs),
-            *([_rates(row.inputs)] if inputs else []),
-            Text(visible(row.message), style="yellow" if row.message else ""),
-        )
     cpu = sum(row.cpu_percent for row in rows if row.cpu_percent == row.cpu_percent)
     memory = sum(row.rss_mb for row in rows if row.rss_mb == row.rss_mb)
     head = Text(
@@ -189,22 +100,7 @@ def table(rows: Sequence[NodeRow], sort: str, inputs: bool = False) -> Group:
         f"load {os.getloadavg()[0]:.1f}, sorted by {sort}",
         style="bold",
     )
-    return Group(head, shown)
-
-
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.0f}"
-
-
-def _rates(rows: Sequence[TopicRow]) -> Text:
-    from rich.text import Text
-
-    text = Text()
-    for row in rows:
-        if row.rate_hz > 0 or row.fault:
-            rate = f"\u00a0{row.rate}"  # a no-break space keeps the rate beside its topic
-            text.append(visible(row.topic), style="dim").append(rate, style="red" if row.fault else "").append("  ")
-    return text
+    return Group(head, node_table(sorted(rows, key=SORT_KEYS[sort])))
 
 
 def as_json(rows: Sequence[NodeRow]) -> list[dict[str, Any]]:
@@ -234,16 +130,15 @@ def show_live(rows: Callable[[float], list[NodeRow]], period_s: float, sort: str
 
     from instant_ic.cli.terminal import single_keys
 
-    inputs, next_s, newest = False, 0.0, rows(0.7)
-    keys = Text("q quit   c CPU   m memory   n name   l losses   i inputs", style="dim")
+    next_s, newest = 0.0, rows(0.7)
+    keys = Text("q quit   c CPU   m memory   n name   l losses", style="dim")
     with single_keys(), Live(console=Console(file=direct(sys.stdout)), screen=True, auto_refresh=False) as live:
         while True:
             if time.monotonic() >= next_s:
                 newest, next_s = rows(0.05), time.monotonic() + period_s
-            live.update(Group(table(newest, sort, inputs), keys), refresh=True)
+            live.update(Group(table(newest, sort), keys), refresh=True)
             ready, _, _ = select.select([sys.stdin], [], [], max(0.0, min(0.2, next_s - time.monotonic())))
             key = os.read(sys.stdin.fileno(), 1).decode(errors="replace") if ready else ""
             if key in ("q", "Q", "\x1b", "\x03", "\x04"):
                 return
-            inputs ^= key == "i"
             sort = _KEYS.get(key, sort)

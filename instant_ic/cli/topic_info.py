@@ -29,7 +29,7 @@ def info(args: argparse.Namespace) -> int:
     beats: Mapping[str, Heartbeat] = {}
     if args.verbose:
         from instant_ic.cli.heartbeats import hear
-        from instant_ic.cli.top import expected_rate
+        from instant_ic.launch.topics import expected_rate
 
         # Commands such as ic topic pub publish too, but have no heartbeat.
         beats = hear(run_dir, {p.node for p in publishers if p.node in nodes} | {node.name for node in readers})

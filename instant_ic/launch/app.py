@@ -10,16 +10,15 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from instant_ic.bus import registry
-from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.launch.description import LaunchDescription
 from instant_ic.launch.health import HealthMonitor, TopicFault
+from instant_ic.launch.node_table import NodeRow, topic_rows
 from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.pacing import Pacing
 from instant_ic.launch.process import ManagedProcess, ProcessState
 from instant_ic.launch.rundir import stack_lock
-from instant_ic.launch.screen import ScreenRow, StackScreen, StackView
+from instant_ic.launch.screen import StackScreen, StackView
 from instant_ic.launch.supervisor import Supervisor
-from instant_ic.launch.topics import nominal_rate
 from instant_ic.util.estop_state import RunMark
 from instant_ic.util.pace import PaceFiles, describe, remove_files
 
@@ -132,7 +131,7 @@ class StackOutput:
         """Return the present state for the screen; also publish it for other tools."""
         health = self.health
         if health is None:
-            rows = tuple(screen_row(process, None, []) for process in processes)
+            rows = tuple(node_row(process, None, []) for process in processes)
             return StackView(rows, looked=False, ending=self._ending)
         faults = health.topic_faults()
         if not self._ending:
@@ -142,7 +141,7 @@ class StackOutput:
         over = (ProcessState.FAILED, ProcessState.ENDED)
         gone = {p.spec.label for p in processes if p.state in over and not p.spec.respawn}
         return StackView(
-            rows=tuple(screen_row(process, health, faults) for process in processes),
+            rows=tuple(node_row(process, health, faults) for process in processes),
             missing=tuple(label for label in health.nodes_missing() if label not in gone),
             waiting=tuple(health.waiting_for()),
             # Only a terminal gets the token: others may read the file or pipe that standard output goes to.
@@ -163,24 +162,18 @@ class StackOutput:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def screen_row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequence[TopicFault]) -> ScreenRow:
+def node_row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequence[TopicFault]) -> NodeRow:
     """Return a node's row in the table, from its process, its heartbeat and the faults of its topics."""
-    label, starts = process.spec.label, process.limit.retries
+    label, restarts = process.spec.label, process.limit.retries
     if process.state is not ProcessState.RUNNING:
-        return ScreenRow(label, process.state.value, starts=starts, text=process.reason)
+        return NodeRow(label, process.state.value, process.reason, restarts=restarts)
     if process.ending:
-        return ScreenRow(label, "stopping", starts=starts, text=process.reason)
+        return NodeRow(label, "stopping", process.reason, restarts=restarts)
     health = monitor.nodes.get(label) if monitor is not None else None
     if health is None or health.seen_s < process.started_s:
-        return ScreenRow(label, "starting", starts=starts)
-    own = {fault.topic: fault for fault in faults if fault.label == label}
+        return NodeRow(label, "starting", restarts=restarts)
+    own = [fault for fault in faults if fault.label == label]
     state = "silent" if health.silent else "slow" if health.state == "running" and own else health.state
-    text = health.message or ", ".join(f"{f.topic.lstrip('/')} {f.text}" for f in own.values() if f.stopped)
-    sends = [
-        (topic, flow.rate_hz, topic not in own)
-        for topic, flow in health.outputs.items()
-        if flow.rate_hz > 0 and not topic.endswith(EVERY_NODES)
-    ]
-    # Faulty topics first, then those with a nominal rate: the least important ones may not fit into the line.
-    sends.sort(key=lambda send: (send[2], nominal_rate(send[0], process.spec.namespace) is None))
-    return ScreenRow(label, state, health.cpu_percent, health.rss_mb, starts, text, tuple(sends))
+    text = health.message or ", ".join(f"{f.topic.lstrip('/')} {f.text}" for f in own if f.stopped)
+    lost, outputs = sum(health.lost.values()), topic_rows(health.outputs)
+    return NodeRow(label, state, text, health.cpu_percent, health.rss_mb, restarts, lost, outputs)

@@ -11,49 +11,17 @@ from dataclasses import dataclass, field
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.rule import Rule
-from rich.table import Table
 from rich.text import Text
 
+from instant_ic.launch.node_table import STATE_STYLES, NodeRow, node_table
 from instant_ic.util.safe_text import direct, masked, visible
 
 _COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_green", "bright_magenta")
-_STATE_STYLES = {
-    "running": ("●", "green"),
-    "starting": ("◌", "yellow"),
-    "waiting to start": ("◌", "yellow"),
-    "degraded": ("●", "yellow"),
-    "slow": ("●", "yellow"),
-    "stopping": ("◌", "dim"),
-    "ended": ("○", "dim"),
-}
 _LINE_STYLES = {" WARNING ": "yellow", " ERROR ": "red", " CRITICAL ": "bold red"}
-_BAD_STYLE = ("●", "bold red")
 _LOGGED = re.compile(r"(?:\x1b\[[\d;]*m)*\d\d:\d\d:\d\d\.\d{3} ([A-Z]+) +(.*)")
 """A line that a node logs: time, level, text."""
 _HOLDS_BACK_S = 30.0
 """Warnings wait for "ready" for this long, since most of a start's end with it."""
-
-
-@dataclass(frozen=True)
-class ScreenRow:
-    """A node in the table.
-
-    Attributes:
-        state: in one or two words.
-        cpu_percent: of one core; None if unknown.
-        rss_mb: resident memory; None if unknown.
-        starts: number of restarts.
-        text: its worst diagnosis, or the fault of its topics; empty when all is well.
-        sends: topic, rate, and whether the rate is right, for each active topic.
-    """
-
-    label: str
-    state: str
-    cpu_percent: float | None = None
-    rss_mb: float | None = None
-    starts: int = 0
-    text: str = ""
-    sends: tuple[tuple[str, float, bool], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,7 +39,7 @@ class StackView:
         pace: of the simulation, as text; empty in real time.
     """
 
-    rows: tuple[ScreenRow, ...] = ()
+    rows: tuple[NodeRow, ...] = ()
     missing: tuple[str, ...] = ()
     waiting: tuple[str, ...] = ()
     addresses: Mapping[str, str] = field(default_factory=dict)
@@ -108,9 +76,9 @@ class StackScreen:
         self._progress_period_s = progress_period_s
         self._started_s = time.monotonic()
         self._next_progress_s = self._started_s + progress_period_s
-        self._told_nodes = self._told_ready = False
+        self._all_up = self._ready = False
         self._addresses: dict[str, str] = {}
-        self._told_faults: tuple[str, ...] = ()
+        self._reported_faults: tuple[str, ...] = ()
         self._verbose = verbose
         self._shows = dict.fromkeys(nodes, True)
         """Whether a node's last log line was shown; the lines of a traceback follow it."""
@@ -118,10 +86,12 @@ class StackScreen:
         self._held_back: list[tuple[str, str]] = []
 
     def start(self) -> None:
+        """Begin the table."""
         if self._live is not None:
             self._live.start()
 
     def stop(self) -> None:
+        """Remove the table."""
         if self._live is not None:
             self._live.stop()
 
@@ -145,7 +115,7 @@ class StackScreen:
 
     @property
     def _starting(self) -> bool:
-        return not self._told_ready and time.monotonic() - self._started_s < _HOLDS_BACK_S
+        return not self._ready and time.monotonic() - self._started_s < _HOLDS_BACK_S
 
     def _print_line(self, node: str, text: str) -> None:
         prefix = (f"{node:>{self._width}} │ ", self._colours.get(node, "white"))
@@ -154,19 +124,20 @@ class StackScreen:
         self._console.print(Text.assemble(prefix, Text.from_ansi(shown, style=style)))
 
     def event(self, text: str, bad: bool = False) -> None:
+        """Print an event of the launcher."""
         self._console.print(Text(f"{'launch':>{self._width}} │ {visible(text)}", style="bold red" if bad else "bold"))
 
     def refresh(self, view: StackView) -> None:
         """Print what has changed since the last view, and render the table again."""
         now = time.monotonic()
         if view.looked and not view.ending:
-            self._tell_progress(view, now)
+            self._report_progress(view, now)
         if self._live is not None:
             self._live.update(self.table(view), refresh=True)
 
-    def _tell_progress(self, view: StackView, now: float) -> None:
-        if not view.missing and not self._told_nodes:
-            self._told_nodes = True
+    def _report_progress(self, view: StackView, now: float) -> None:
+        if not view.missing and not self._all_up:
+            self._all_up = True
             count = sum(row.state not in ("failed", "ended") for row in view.rows) or len(self._colours)
             up = "the node is up" if count == 1 else f"all {count} nodes are up"
             self.event(f"{up} after {now - self._started_s:.1f} s")
@@ -174,14 +145,14 @@ class StackScreen:
             if self._addresses.setdefault(node, "") != address:
                 self._addresses[node] = address
                 self.event(f"{node}: {address}")
-        if self._told_nodes and not view.waiting and not self._told_ready:
-            self._told_ready = True
+        if self._all_up and not view.waiting and not self._ready:
+            self._ready = True
             at = f": {self._page}" if self._page else ""
             self.event(f"ready after {now - self._started_s:.1f} s{at}")
             self._held_back.clear()  # the start's; what is still wrong is in the nodes' own reports
             for row in view.rows:
-                if row.text and not self._verbose:
-                    self.event(f"{row.label}: {row.text}", bad=row.state not in _STATE_STYLES)
+                if row.message and not self._verbose:
+                    self.event(f"{row.node}: {row.message}", bad=row.state not in STATE_STYLES)
         if not self._starting:
             for node, text in self._held_back:
                 self._print_line(node, text)
@@ -190,62 +161,30 @@ class StackScreen:
             return  # the table shows the rest
         if now >= self._next_progress_s:
             self._next_progress_s = now + self._progress_period_s
-            if not self._told_ready:
+            if not self._ready:
                 running = len(self._colours) - len(view.missing)
                 progress = f"{running} of {len(self._colours)} nodes are up, " if view.missing else ""
                 self.event(f"{progress}waiting for {', '.join(view.missing or view.waiting)}")
-            self._tell_faults(view.faults)
+            self._report_faults(view.faults)
 
     @property
     def _page(self) -> str | None:
         """Address of the operator's page."""
         return next((url for node, url in self._addresses.items() if node.rpartition("/")[2] == "console"), None)
 
-    def _tell_faults(self, faults: tuple[str, ...]) -> None:
+    def _report_faults(self, faults: tuple[str, ...]) -> None:
         """Report a topic when it becomes faulty and when it recovers; changing numbers are not reported again."""
-        before = {fault.partition(":")[0] for fault in self._told_faults}
+        before = {fault.partition(":")[0] for fault in self._reported_faults}
         now = {fault.partition(":")[0] for fault in faults}
         if new := [fault for fault in faults if fault.partition(":")[0] not in before]:
             self.event(f"too slow: {', '.join(new)}", bad=True)
         if over := sorted(before - now):
             self.event(f"back to the right rate: {', '.join(over)}")
-        self._told_faults = faults
+        self._reported_faults = faults
 
     def table(self, view: StackView) -> RenderableType:
         """Return the table of nodes with a status line below."""
-        table = Table(box=None, pad_edge=False, expand=False, header_style="dim")
-        # Minimum widths, or a long message in the last column would squeeze the others.
-        for name, justify, width in (
-            ("node", "left", self._width),
-            ("state", "left", 10),
-            ("CPU %", "right", 5),
-            ("MB", "right", 5),
-        ):
-            table.add_column(name, justify=justify, no_wrap=True, min_width=width)  # type: ignore[arg-type]
-        table.add_column("sends, Hz", no_wrap=True, overflow="ellipsis")
-        for row in view.rows:
-            table.add_row(*self._cells(row))
-        return Group(Rule(style="dim"), table, self._footer(view))
-
-    def _cells(self, row: ScreenRow) -> tuple[Text, ...]:
-        sign, style = _STATE_STYLES.get(row.state, _BAD_STYLE)
-        state = Text(f"{sign} {row.state}", style=style)
-        if row.starts:
-            state.append(f" ↻{row.starts}", style="yellow")
-        last = Text()
-        if row.text:
-            last.append(visible(row.text), style="yellow" if row.state in _STATE_STYLES else "red")
-        for topic, rate_hz, right in row.sends:
-            last.append("  " if last else "")
-            last.append(f"{visible(topic).lstrip('/')} ", style="dim")
-            last.append(f"{rate_hz:.1f}", style="" if right else "yellow")
-        return (
-            Text(row.label, style=self._colours.get(row.label, "white")),
-            state,
-            Text("" if row.cpu_percent is None else f"{row.cpu_percent:.0f}"),
-            Text("" if row.rss_mb is None else f"{row.rss_mb:.0f}"),
-            last,
-        )
+        return Group(Rule(style="dim"), node_table(view.rows, self._colours), self._footer(view))
 
     def _footer(self, view: StackView) -> Text:
         words = Text(overflow="ellipsis", no_wrap=True)

@@ -106,3 +106,8 @@ def nominal_rate(topic: str, namespace: str = "") -> TopicRate | None:
     if topic in rates:
         return rates[topic]
     return rates.get(topic[len(prefix) - 1 :]) if prefix and topic.startswith(prefix) else None
+
+
+def expected_rate(topic: str) -> TopicRate | None:
+    """Return the expected rate of a topic whose namespace, if any, is its first part; None where unknown."""
+    return nominal_rate(topic, topic.split("/")[1])

@@ -13,8 +13,9 @@ from instant_ic.bus import SENSOR
 from instant_ic.bus.process import SafeFormatter
 from instant_ic.cli.logs import LogLine
 from instant_ic.cli.main import main
-from instant_ic.cli.top import NodeRow, table
-from instant_ic.launch.screen import ScreenRow, StackScreen, StackView
+from instant_ic.cli.top import table
+from instant_ic.launch.node_table import NodeRow, TopicRow
+from instant_ic.launch.screen import StackScreen, StackView
 from instant_ic.msg import Bool, message_type, serialize
 
 EVIL = "\x1b]0;owned\x07\x1b[2J\x1bc\x9b31m\rgone"
@@ -77,7 +78,8 @@ def test_the_launchers_screen_and_top_show_escapes_of_nodes():
     screen = StackScreen(["slam"], live=False, console=console, verbose=True)
     screen.node_line("slam", f"{EVIL} rtsp://me:secret@h/")
     screen.event(EVIL)
-    console.print(screen.table(StackView((ScreenRow("slam", "running", text=EVIL, sends=((EVIL, 1.0, True),)),))))
-    console.print(table([NodeRow("slam", 1, "running", EVIL)], "cpu"))
+    row = NodeRow("slam", "running", EVIL, outputs=[TopicRow(EVIL, 1.0, 0.1)])
+    console.print(screen.table(StackView((row,))))
+    console.print(table([row], "cpu"))
     assert RAW.findall(out.getvalue()) == [] and "secret" not in out.getvalue()
-    assert out.getvalue().count("owned") == 5
+    assert out.getvalue().count("owned") == 6

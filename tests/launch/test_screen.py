@@ -15,10 +15,11 @@ from instant_ic.bus.heartbeat import Flow, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.launch import NodeSpec
-from instant_ic.launch.app import StackOutput, screen_row
+from instant_ic.launch.app import StackOutput, node_row
 from instant_ic.launch.health import HealthMonitor, TopicFault, console_address
+from instant_ic.launch.node_table import NodeRow, TopicRow
 from instant_ic.launch.process import ProcessState
-from instant_ic.launch.screen import ScreenRow, StackScreen, StackView
+from instant_ic.launch.screen import StackScreen, StackView
 from instant_ic.msg import NodeStatus, header, serialize
 
 
@@ -78,7 +79,7 @@ def test_a_nodes_warnings_are_shown_once_and_after_the_start_only(out: io.String
     with screen_on(out, live=False, period_s=60.0) as screen:
         screen.node_line("slam", "12:00:00.000 INFO    slam: running")
         screen.node_line("slam", "12:00:00.000 ERROR   slam: scan: none yet")
-        screen.refresh(StackView((ScreenRow("page", "degraded", text="no camera"), ScreenRow("slam", "running"))))
+        screen.refresh(StackView((NodeRow("page", "degraded", "no camera"), NodeRow("slam", "running"))))
         screen.node_line("slam", WARNED)
         screen.node_line("slam", "  a line that belongs to it")
         screen.node_line("slam", WARNED.replace("3", "4").replace("12:", "13:"))
@@ -113,18 +114,18 @@ def test_verbose_shows_every_line(out: io.StringIO) -> None:
 
 def test_table_of_nodes(out: io.StringIO) -> None:
     rows = (
-        ScreenRow("slam", "running", 12.3, 99.6, sends=(("/pose", 9.96, True),)),
-        ScreenRow("page", "silent", 1.0, 10.0, starts=2),
-        ScreenRow("gone", "failed", text="hangs: no heartbeat for 10 s"),
-        ScreenRow("new", "starting"),
+        NodeRow("slam", "running", "", 12.3, 99.6, outputs=[TopicRow("/pose", 9.96, 0.1, 10.0)]),
+        NodeRow("page", "silent", "", 1.0, 10.0, restarts=2, lost=7),
+        NodeRow("gone", "failed", "hangs: no heartbeat for 10 s"),
+        NodeRow("new", "starting"),
     )
     with screen_on(out, live=True) as screen:
         screen.refresh(StackView(rows, missing=("new",), pace="simulation at 0.6 of real time"))
     text = out.getvalue()
     assert " · simulation at 0.6 of real time · " in text
     found = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line and line[0].isalpha()}
-    assert found["slam"] == ["●", "running", "12", "100", "pose", "10.0"]
-    assert found["page"] == ["●", "silent", "↻2", "1", "10"]
+    assert found["slam"] == ["●", "running", "12", "100", "pose", "10.0/10"]
+    assert found["page"] == ["●", "silent", "↻2", "1", "10", "7"]
     assert found["gone"] == ["●", "failed", "hangs:", "no", "heartbeat", "for", "10", "s"]
     assert found["new"] == ["◌", "starting"]
     assert found["waiting"][:2] == ["for", "new"]
@@ -319,16 +320,17 @@ def test_row_of_a_node_from_its_process_its_heartbeat_and_its_topics() -> None:
     health = Heartbeat("lidar", 1, "running", "", 7.0, 180.0, outputs=outputs, seen_s=now_s)
     monitor: Any = SimpleNamespace(nodes={"lidar": health})
     slow = TopicFault("lidar", "/scan", "5.0 of 10 Hz", stopped=False)
-    row = screen_row(process, monitor, [slow, TopicFault("other", "/pose", "stopped 3.0 s ago", stopped=True)])
-    assert (row.state, row.starts, row.text) == ("slow", 1, "")
+    row = node_row(process, monitor, [slow, TopicFault("other", "/pose", "stopped 3.0 s ago", stopped=True)])
+    assert (row.state, row.restarts, row.message) == ("slow", 1, "")
     # Wrong ones first, then those whose rate is known.
-    assert row.sends == (("/scan", 5.0, False), ("/lidar/points", 10.0, True), ("/unknown", 3.0, True))
-    stopped = screen_row(process, monitor, [TopicFault("lidar", "/scan", "stopped 3.0 s ago", stopped=True)])
-    assert (stopped.state, stopped.text) == ("slow", "scan stopped 3.0 s ago")
+    assert [output.topic for output in row.outputs] == ["/scan", "/lidar/packets", "/lidar/points", "/unknown"]
+    assert row.outputs[0].fault == "5.0 of 10 Hz"
+    stopped = node_row(process, monitor, [TopicFault("lidar", "/scan", "stopped 3.0 s ago", stopped=True)])
+    assert (stopped.state, stopped.message) == ("slow", "scan stopped 3.0 s ago")
     process.started_s = now_s + 1.0  # started again: what its predecessor said counts no more
-    assert screen_row(process, monitor, []).state == "starting"
+    assert node_row(process, monitor, []).state == "starting"
     process.ending, process.reason = True, "hangs: no heartbeat for 10 s"
-    assert (screen_row(process, monitor, []).state, screen_row(process, monitor, []).text) == (
+    assert (node_row(process, monitor, []).state, node_row(process, monitor, []).message) == (
         "stopping",
         process.reason,
     )
