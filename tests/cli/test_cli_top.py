@@ -63,7 +63,9 @@ def test_table_and_json():
     console.print(table(rows(), "cpu"))
     lines = console.file.getvalue().splitlines()
     assert lines[0].startswith("3 nodes, 116 %") and lines[0].endswith("sorted by cpu")
-    assert lines[3].split()[:6] == ["slam", "●", "degraded", "30", "51", "5"] and lines[3].rstrip().endswith("pose 4.0/10")
+    assert lines[3].split()[:6] == ["slam", "●", "degraded", "30", "51", "5"] and lines[3].rstrip().endswith(
+        "pose 4.0/10"
+    )
 
 
 def test_nominal_rate_of_a_namespace():
