@@ -45,7 +45,7 @@ class Finding:
 def run_checks(
     run_dir: Path, serial_port: Path, camera_url: str, lidar_port: int, listen_s: float, missing: str
 ) -> Iterator[Finding]:
-    """Run every check, the slow ones last.
+    """Run every check but that of a running stack, the slow ones last.
 
     Args:
         run_dir: run directory of the stack.
@@ -55,8 +55,6 @@ def run_checks(
         listen_s: how long to wait for LiDAR packets.
         missing: level of a missing device: FAIL or WARN.
     """
-    from instant_ic.cli.doctor_running import check_running
-
     yield from check_machine(run_dir)
     yield from check_configuration()
     yield from check_models()
@@ -66,7 +64,6 @@ def run_checks(
     yield from check_serial(serial_port, missing)
     yield from check_camera(camera_url, missing)
     yield from check_lidar(lidar_port, listen_s, missing)
-    yield from check_running(run_dir)
 
 
 def check_machine(run_dir: Path) -> Iterator[Finding]:

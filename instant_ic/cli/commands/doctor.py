@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from instant_ic.cli.doctor import FAIL, OK, WARN, run_checks
+    from instant_ic.cli.doctor_running import check_running
     from instant_ic.util import paths
 
     colours = {OK: "32", WARN: "33", FAIL: "31"} if sys.stdout.isatty() else {}
@@ -35,7 +37,8 @@ def run(args: argparse.Namespace) -> int:
     camera_url = args.camera_url or _shipped("theta_camera", "url", "http://192.168.1.1")
     lidar_port = args.lidar_port or _shipped("vlp16_driver", "port", 2368)
     missing = FAIL if args.robot else WARN
-    for finding in run_checks(paths.run_dir(), serial_port, camera_url, lidar_port, args.listen, missing):
+    checks = run_checks(paths.run_dir(), serial_port, camera_url, lidar_port, args.listen, missing)
+    for finding in itertools.chain(checks, check_running(paths.run_dir())):
         counts[finding.level] += 1
         level = f"{finding.level:<4}"
         if finding.level in colours:
