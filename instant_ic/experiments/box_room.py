@@ -24,12 +24,12 @@ class RoomPicture:
 
 
 def panorama(map_from_camera: NDArray[np.floating], height: int = 256) -> RoomPicture:
-    """Equirect image (height, 2 · height) from a pose inside the room."""
+    """Render an equirect image (height, 2 · height) from a pose inside the room."""
     return _draw(map_from_camera, equirect_directions(2 * height, height))
 
 
 def perspective(map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> RoomPicture:
-    """Pinhole image from a pose inside the room."""
+    """Render a pinhole image from a pose inside the room."""
     directions = perspective_directions(width, height, fov_rad)
     return _draw(map_from_camera, directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
@@ -56,7 +56,7 @@ def _draw(map_from_camera: NDArray[np.floating], directions: NDArray[np.float32]
 def _paint(
     across: NDArray[np.floating], up: NDArray[np.floating], axis: NDArray[np.intp], on_box: NDArray[np.bool_]
 ) -> NDArray[np.uint8]:
-    """Smooth waves of several lengths and soft-edged tiles, with a tint per wall direction and for the box."""
+    """Render smooth waves and soft-edged tiles, with a tint for each wall direction and for the box."""
     waves = 0.5 + 0.18 * np.sin(5.1 * across + 2.0 * up) + 0.14 * np.sin(9.7 * up - 3.3 * across)
     tiles = np.tanh(6 * np.sin(2 * np.pi * across) * np.sin(2 * np.pi * up))
     base = waves + 0.14 * tiles

@@ -144,7 +144,7 @@ class ColourOnlyField:
 
 
 def density(raw: Floats) -> Floats:
-    """Density, 1/m, from the network's fourth output: a bounded exponential as in instant-ngp."""
+    """Return the density in 1/m from the network's fourth output: a bounded exponential as in instant-ngp."""
     return np.asarray(np.exp(np.clip(raw, -10, 6)), np.float32)
 
 
@@ -158,10 +158,12 @@ def _samples(rays: int, samples: int, place: NDArray[np.floating]) -> tuple[Floa
 
 
 def composite_gradient(field: Floats, step: Floats, target: Floats) -> tuple[float, Floats]:
-    """Mean squared colour error of composited rays, and its gradient with respect to the field's outputs.
+    """Return the mean squared colour error of composited rays, and its gradient by the field's outputs.
 
     Args:
-        field: (N, S, 4), colours minus 0.5 and raw density; step: (N, S) metres; target: (N, 3), minus 0.5.
+        field: colours minus 0.5 and raw density of the samples, (N, S, 4).
+        step: lengths of the samples' intervals in metres, (N, S).
+        target: colours of the rays minus 0.5, (N, 3).
 
     Returns:
         The error, and the gradient (N, S, 4).

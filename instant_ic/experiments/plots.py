@@ -24,7 +24,7 @@ Image: TypeAlias = NDArray[np.uint8]
 def perspective_crop(
     panorama: NDArray[np.uint8], camera_from_view: NDArray[np.float64], width: int, height: int, hfov_rad: float
 ) -> NDArray[np.uint8]:
-    """Pinhole view from the centre of a panorama (H, W, 3).
+    """Crop a pinhole view from the centre of a panorama (H, W, 3).
 
     ``camera_from_view`` is the rotation (3, 3) of the view, which looks along its own x.
     """
@@ -33,7 +33,7 @@ def perspective_crop(
 
 
 def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Pearson correlation of two images' values, −1..1; 0 if one of them is uniform."""
+    """Return the Pearson correlation of two images' values, −1..1; 0 if one of them is uniform."""
     x, y = (picture.astype(np.float64).ravel() - float(picture.mean()) for picture in (a, b))
     norm = float(np.sqrt((x @ x) * (y @ y)))
     return float(x @ y) / norm if norm > 0 else 0.0
@@ -130,7 +130,7 @@ def save_map(
 
 
 def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, NDArray[Any]]:
-    """A figure of ``size`` inches and its axes (rows, columns); needs no display."""
+    """Create a figure of ``size`` inches and its axes (rows, columns); no display is needed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -165,7 +165,7 @@ _COLOURS = (
 
 
 def curves_svg(panels: Sequence[tuple[str, str, Series]]) -> str:
-    """Line plots as SVG text, one a panel, that follow the page's light or dark colours.
+    """Plot lines as SVG text, one plot for each panel, that follow the page's light or dark colours.
 
     Args:
         panels: label of x, label of y, and the curves; the same name has the same colour in all panels.
@@ -190,12 +190,12 @@ def _curves_svg(x_label: str, y_label: str, series: Series, colours: dict[str, s
 
 
 def series_colour(number: int) -> str:
-    """Colour of a curve or a group, by its number."""
+    """Return the colour of a curve or a group, by its number."""
     return _COLOURS[number % len(_COLOURS)]
 
 
 def figure_svg(figure: Any, axis: Any) -> str:
-    """A figure with one pair of axes as SVG text that follows the page's light or dark colours."""
+    """Write a figure with one pair of axes as SVG text that follows the page's light or dark colours."""
     import matplotlib
 
     axis.yaxis.label.set_color(_INK)
@@ -211,7 +211,7 @@ def figure_svg(figure: Any, axis: Any) -> str:
 
 
 def image_strip(columns: Sequence[str], rows: Sequence[tuple[str, Sequence[NDArray[np.uint8]]]], tile: int) -> Image:
-    """Rows of a label and an image a column, all of one shape, under the columns' names; RGB, ready to be encoded.
+    """Join rows of a label and an image for each column, under the columns' names, to one RGB image.
 
     ``tile`` is the width of an image in pixels.
     """

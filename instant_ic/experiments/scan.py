@@ -90,7 +90,7 @@ class Station:
     rgb: NDArray[np.uint8]
 
     def pixels(self, points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
-        """Row and column in ``range_m``, and distance, of points (N, 3) in the map."""
+        """Return the row and column in ``range_m``, and distance, of points (N, 3) in the map."""
         local = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         distance = np.linalg.norm(local, axis=1)
         u, v = _equirect_uv(local)
@@ -99,7 +99,7 @@ class Station:
 
 
 def aged(world: World, quality: ScanQuality, rng: np.random.Generator) -> World:
-    """The world when it was scanned: other light and colours, objects elsewhere, other posters."""
+    """Return the world at the time of its scan: other light, colours and posters, objects elsewhere."""
     drift = np.exp(rng.normal(0, 0.5 * quality.colour, (int(world.texture.max()) + 1, 3)))[world.texture]
     light = np.exp(rng.normal(0, quality.colour, 3) + rng.normal(0, 2 * quality.colour))
     tint, emission = world.tint * drift * light, world.emission * np.float32(light.mean())
@@ -117,7 +117,7 @@ def aged(world: World, quality: ScanQuality, rng: np.random.Generator) -> World:
 
 
 def station_places(world: World, start: Sequence[float], spacing_m: float, rng: np.random.Generator) -> Floats:
-    """Positions (N, 2) on the free floor around a start, no two nearer than the spacing; the first is near the start.
+    """Choose positions (N, 2) on the free floor around a start, no two nearer than the spacing.
 
     Raises:
         ValueError: there is no free floor at the start.
@@ -162,7 +162,7 @@ def take_station(world: World, place: Floats, quality: ScanQuality, rng: np.rand
 
 
 def fuse(stations: Sequence[Station], cell_m: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Mesh of the stations' ranges: vertices (V, 3) and faces (F, 3); holes where nothing was measured.
+    """Mesh the stations' ranges: vertices (V, 3) and faces (F, 3), with holes where nothing was measured.
 
     Raises:
         ValueError: nothing was measured.
@@ -203,7 +203,7 @@ def fuse(stations: Sequence[Station], cell_m: float) -> tuple[Floats, NDArray[np
 
 
 def best_stations(triangles: Floats, stations: Sequence[Station], tolerance_m: float) -> NDArray[np.intp]:
-    """Station that sees each triangle (F, 3, 3) nearest and most squarely, (F,); -1 where none sees it."""
+    """Return the station (F,) that sees each triangle (F, 3, 3) nearest and most squarely; -1 if none does."""
     centre = triangles.mean(axis=1)
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
@@ -278,7 +278,7 @@ def scan_world(
 
 
 def _points(station: Station) -> NDArray[np.float64]:
-    """Every measured point in the map, (N, 3)."""
+    """Return every measured point in the map, (N, 3)."""
     directions = _directions(station.range_m.shape[1])
     met = station.range_m > 0
     local = directions[met] * station.range_m[met][:, None]
@@ -292,7 +292,7 @@ def _directions(width: int) -> NDArray[np.float32]:
 
 
 def _equirect_uv(local: Floats) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Texture coordinates in 0..1 of points (N, 3) in a panorama's frame, v downwards."""
+    """Return the texture coordinates in 0..1 of points (N, 3) in a panorama's frame, v downwards."""
     x, y, z = np.asarray(local, np.float64).T
     u = 0.5 - np.arctan2(y, x) / (2 * math.pi)
     return u, 0.5 - np.arctan2(z, np.hypot(x, y)) / math.pi

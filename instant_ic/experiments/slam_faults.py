@@ -67,7 +67,7 @@ class CleanRun:
     slam: GridSlam
 
     def errors(self, poses: FloatArray, source: NDArray[np.intp], anchor: int | None) -> FloatArray:
-        """Distance (n,) of ``poses`` (n, 3) from the reference.
+        """Return the distance (n,) of ``poses`` (n, 3) from the reference.
 
         The map may have been optimised since the reference was published, and be optimised again in the run with the
         fault. The nearest of the reference online, at the end, and relative to the pose of scan ``anchor`` therefore
@@ -81,7 +81,7 @@ class CleanRun:
 
 
 def _part(entries: Sequence[LogEntry], at: int) -> range:
-    """Indices of the scans from ``at`` for the time that a fault is followed."""
+    """Return the indices of the scans from ``at`` for the time that a fault is followed."""
     end_ns = entries[at].scan.stamp_ns + int(HORIZON_S * 1e9)
     last = at
     while last < len(entries) and last - at < MOST_SCANS:
@@ -96,7 +96,7 @@ def _moved_odometry(entry: LogEntry, moved: FloatArray) -> LogEntry:
 
 
 def heading_jump(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
-    """Odometry turns by 85° between two scans, and stays so."""
+    """Turn the odometry by 85° between two scans, for good."""
     before = entries[at - 1].odom_pose
     moved = np.zeros(3)
     if before is not None:
@@ -107,14 +107,14 @@ def heading_jump(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.
 
 
 def gap(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
-    """No scans for ten seconds; odometry goes on."""
+    """Leave out the scans of ten seconds; odometry goes on."""
     until_ns = entries[at - 1].scan.stamp_ns + int(GAP_S * 1e9)
     part = [k for k in range(at, end) if entries[k].scan.stamp_ns >= until_ns]
     return Faulted([entries[k] for k in part], np.array(part, dtype=np.intp))
 
 
 def blind(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generator) -> Faulted:
-    """Scans without a return for ten seconds; odometry goes on."""
+    """Remove all returns from the scans of ten seconds; odometry goes on."""
     until_ns = entries[at - 1].scan.stamp_ns + int(GAP_S * 1e9)
     shown = [_with_ranges(e, np.full(len(e.scan.ranges), np.inf)) if e.scan.stamp_ns < until_ns else e
              for e in entries[at:end]]  # fmt: skip
@@ -122,7 +122,7 @@ def blind(entries: Sequence[LogEntry], at: int, end: int, rng: np.random.Generat
 
 
 def kidnap(entries: Sequence[LogEntry], at: int, end: int, there: int, rng: np.random.Generator) -> Faulted:
-    """The robot of scan ``at`` − 1 is put down where scan ``there`` was taken; its odometry stands meanwhile."""
+    """Put the robot of scan ``at`` − 1 down where scan ``there`` was taken; its odometry stands meanwhile."""
     part = _part(entries, there)[: end - at]
     odometry, here = entries[at - 1].odom_pose, entries[there].odom_pose
     moved = np.zeros(3) if odometry is None or here is None else compose2(odometry, relative2(here, np.zeros(3)))
@@ -171,7 +171,7 @@ class FaultRun:
     time_s: FloatArray
 
     def figures(self) -> dict[str, float | int | None]:
-        """Figures of one place; None where it never happened."""
+        """Return the figures of one place; None for what never happened."""
         wrong = self.error_m > WRONG_M
         right = self.trusted & ~wrong
         onset = int(np.argmax(wrong)) if wrong.any() else None
@@ -205,7 +205,7 @@ def _run(slam: GridSlam, faulted: Faulted, clean: CleanRun, anchor: int | None, 
 
 
 def summary(runs: Sequence[dict[str, float | int | None]]) -> dict[str, object]:
-    """Figures of one fault over its places."""
+    """Return the figures of one fault over its places."""
     wrong = [run for run in runs if run["wrong_scans"]]
     scans = [run["detected_after_scans"] for run in wrong if run["detected_after_scans"] is not None]
     seconds = [run["recovered_after_s"] for run in wrong if run["recovered_after_s"] is not None]
@@ -308,7 +308,7 @@ def _run_at(
 def relocalizations(
     entries: Sequence[LogEntry], config: SlamConfig | None, starts: int, rng: np.random.Generator
 ) -> dict[str, object]:
-    """Figures of robots that are switched on at ``starts`` places of a map.
+    """Return the figures of robots that are switched on at ``starts`` places of a map.
 
     Every second scan makes the map; the others are what the robots see. Their odometry starts anywhere.
     """
@@ -355,7 +355,7 @@ def relocalizations(
 def _clean_run(
     entries: Sequence[LogEntry], config: SlamConfig | None, at: Sequence[int]
 ) -> tuple[CleanRun, list[tuple[int, GridSlam]]]:
-    """The run without a fault, and copies of the SLAM before the scans ``at``."""
+    """Run without a fault; return the run, and copies of the SLAM before the scans ``at``."""
     slam = GridSlam(config)
     before: list[tuple[int, GridSlam]] = []
     online, trusted, anchored = [], [], []

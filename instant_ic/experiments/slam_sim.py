@@ -84,7 +84,7 @@ def round_trip(
 
 
 def _steer(pose: NDArray[np.floating], targets: list[tuple[float, float]]) -> tuple[float, float]:
-    """Speed and yaw rate to the first of ``targets``; targets already reached are removed."""
+    """Return speed and yaw rate to the first of ``targets``, and remove the targets already reached."""
     while targets and math.hypot(targets[0][0] - pose[0], targets[0][1] - pose[1]) < 0.15:
         targets.pop(0)
     if not targets:

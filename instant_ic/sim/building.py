@@ -42,7 +42,7 @@ class Zone:
         return 0.5 * (self.x0 + self.x1), 0.5 * (self.y0 + self.y1)
 
     def side(self, name: str) -> tuple[Point, Point]:
-        """Ends of a wall, left to right as viewed from inside: ``north`` is the wall at y1, ``east`` at x1."""
+        """Return the ends of a wall, left to right from inside; ``north`` is the wall at y1, ``east`` at x1."""
         return {
             "north": ((self.x0, self.y1), (self.x1, self.y1)),
             "south": ((self.x1, self.y0), (self.x0, self.y0)),
@@ -51,7 +51,7 @@ class Zone:
         }[name]
 
     def beyond(self, side: str, low: float, high: float, depth: float) -> tuple[float, float, float, float]:
-        """Rectangle x0, y0, x1, y1 behind a wall, from ``low`` to ``high`` in x (north, south) or y."""
+        """Return the rectangle x0, y0, x1, y1 behind a wall, from ``low`` to ``high`` in x (north, south) or y."""
         return {
             "north": (low, self.y1, high, self.y1 + depth),
             "south": (low, self.y0 - depth, high, self.y0),
@@ -85,7 +85,7 @@ class Building:
         return self.add(Zone(*rect, height=DOOR_M, finish=finish, doorway=True))
 
     def openings(self, zone: Zone, side: str) -> list[tuple[float, float, Zone]]:
-        """Parts of a wall, in metres from its start, where another zone touches it."""
+        """Return the parts of a wall, in metres from its start, where another zone touches it."""
         start, end = zone.side(side)
         found = []
         along = np.sign(np.asarray(end) - np.asarray(start))
@@ -105,7 +105,7 @@ class Building:
         return sorted(found, key=lambda o: o[0])
 
     def free_runs(self, zone: Zone, side: str, margin: float = 0.15) -> list[tuple[float, float]]:
-        """Parts of a wall without openings, shortened by ``margin`` at each end."""
+        """Return the parts of a wall without openings, shortened by ``margin`` at each end."""
         length = math.dist(*zone.side(side))
         runs, at = [], 0.0
         for low, high, _ in self.openings(zone, side):

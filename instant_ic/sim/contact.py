@@ -24,15 +24,15 @@ class OccupancyMask:
     cell_m: float
 
     def centre(self, rows_columns: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
-        """Centres (N, 2), x and y, of cells (N, 2), row and column."""
+        """Return the centres (N, 2), x and y, of cells (N, 2), row and column."""
         return np.asarray((rows_columns[:, ::-1] + 0.5) * self.cell_m + self.origin, np.float64)
 
     def index(self, xy: FloatArray) -> npt.NDArray[np.int64]:
-        """Cells (N, 2), row and column, of points (N, 2); may lie outside the mask."""
+        """Return the cells (N, 2), row and column, of points (N, 2); they may lie outside the mask."""
         return np.floor((np.asarray(xy) - self.origin) / self.cell_m).astype(np.int64)[:, ::-1]
 
     def at(self, xy: FloatArray) -> npt.NDArray[np.bool_]:
-        """Whether points (N, 2) lie in occupied cells; everything outside the mask is free."""
+        """Return which points (N, 2) lie in occupied cells; everything outside the mask is free."""
         index = self.index(xy)
         inside = ((index >= 0) & (index < self.cells.shape)).all(axis=1)
         result = np.zeros(len(index), bool)
@@ -40,14 +40,14 @@ class OccupancyMask:
         return result
 
     def distance_m(self) -> npt.NDArray[np.float32]:
-        """Distance (H, W) from each cell to the nearest occupied cell, metres."""
+        """Return the distance (H, W) from each cell to the nearest occupied cell, metres."""
         import cv2
 
         free = np.ascontiguousarray((~self.cells).astype(np.uint8))
         return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) * self.cell_m, np.float32)
 
     def reachable(self, start_xy: tuple[float, float], clearance_m: float) -> npt.NDArray[np.int64]:
-        """Cells (N, 2), row and column, with this clearance that connect to the one nearest to ``start_xy``."""
+        """Return the cells (N, 2) with this clearance that connect to the one nearest to ``start_xy``."""
         import cv2
 
         free = self.distance_m() >= clearance_m
@@ -131,7 +131,7 @@ def _fill(
 def occupied_mask(
     vertices: FloatArray, faces: npt.NDArray[np.integer], low_m: float, high_m: float, cell_m: float
 ) -> OccupancyMask:
-    """Mask of the cells over which the mesh has a surface between two heights."""
+    """Return a mask of the cells over which the mesh has a surface between two heights."""
     triangles = np.ascontiguousarray(np.asarray(vertices, np.float64)[faces])
     margin = 4 * cell_m
     origin = triangles[..., :2].reshape(-1, 2).min(axis=0) - margin

@@ -58,7 +58,7 @@ def kept(kind: str, parts: Iterable[str | npt.NDArray[np.generic]], make: Callab
 
 @cache
 def _code() -> bytes:
-    """Hash of this package's code and the numpy version."""
+    """Return a hash of this package's code and the numpy version."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files) + np.__version__.encode()).digest()
 

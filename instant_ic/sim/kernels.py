@@ -90,13 +90,13 @@ _inlined = numba.njit(_nrt=False, inline="always", **_FLAGS)
 
 @_bare
 def _along(forms: F32, s: int, k: int, d: tuple[Scalar, Scalar, Scalar]) -> Scalar:
-    """Rate of change of form ``k`` of surface ``s`` along ``d``."""
+    """Return the rate of change of form ``k`` of surface ``s`` along ``d``."""
     return forms[s, k, 0] * d[0] + forms[s, k, 1] * d[1] + forms[s, k, 2] * d[2]
 
 
 @_bare
 def _border(forms: F32, s: int, k: int, q: Any, ray: Any, by_row: Any, by_column: Any) -> tuple[Scalar, Scalar, Scalar]:
-    """Position relative to border ``k`` divided by the range: at a pixel's centre, per row and per column."""
+    """Return the position from border ``k`` over the range: at the pixel's centre, per row and per column."""
     w = forms[s, k, 3] + _GAP_M
     return (
         w * q[0] + _along(forms, s, k, ray),
@@ -107,7 +107,7 @@ def _border(forms: F32, s: int, k: int, q: Any, ray: Any, by_row: Any, by_column
 
 @_bare
 def _hit(forms: F32, s: int, dx: Scalar, dy: Scalar, dz: Scalar) -> Scalar:
-    """Distance along a ray to surface ``s``, in units of the direction's length; infinite if the ray misses it."""
+    """Return the distance along a ray to surface ``s`` in units of the direction's length; inf if it misses."""
     along = forms[s, 0, 0] * dx + forms[s, 0, 1] * dy + forms[s, 0, 2] * dz
     t = -forms[s, 0, 3] / along
     if not t > 0:
@@ -186,7 +186,7 @@ def unknown(surface: I32, step: int, whole: bool, out: I64) -> int:
 
 @_bare
 def rays(pixels: I64, width: int, across: F32, down: F32, scale: F32, out: F32) -> None:
-    """Unit directions (N, 3) of pixels (N,), flat indices."""
+    """Enter the unit directions (N, 3) of pixels (N,), flat indices."""
     for i in range(pixels.shape[0]):
         row, column = pixels[i] // width + 1, pixels[i] % width + 1
         x = scale[row] * across[0, column] + down[0, row]
@@ -206,7 +206,7 @@ def place(surface: I32, pixels: I64, face: I32, face_surface: I32) -> None:
 
 @_bare
 def ranges(surface: I32, across: F32, down: F32, scale: F32, forms: F32, out: F32) -> None:
-    """Radial distance (H, W) of every pixel's surface, 0 for the sky."""
+    """Enter the radial distance (H, W) of every pixel's surface, 0 for the sky."""
     height, width = surface.shape
     for row in range(height):
         c, bx, by, bz = scale[row + 1], down[0, row + 1], down[1, row + 1], down[2, row + 1]
@@ -233,7 +233,7 @@ def ranges(surface: I32, across: F32, down: F32, scale: F32, forms: F32, out: F3
 def _light_texel(
     light: F32, first: int, width: int, height: int, a: Scalar, b: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Bilinear lookup of a light map at texel coordinates (a, b)."""
+    """Look up a light map bilinearly at texel coordinates (a, b)."""
     a = min(max(a, np.float32(0.0)), np.float32(width) - np.float32(1.001))
     b = min(max(b, np.float32(0.0)), np.float32(height) - np.float32(1.001))
     i = np.int32(a)
@@ -256,7 +256,7 @@ def _light_texel(
 
 @_bare
 def _light(s: int, x: Scalar, y: Scalar, z: Scalar, scene: Scene) -> tuple[Scalar, Scalar, Scalar]:
-    """Tone index per lookup unit (square root of light · tint) at o + (x, y, z), with o the camera."""
+    """Return the tone index per lookup unit (square root of light · tint) at (x, y, z) from the camera."""
     forms, looks, owns = scene.forms, scene.looks, scene.owns
     e = looks[s, 4]
     if e == 0:
@@ -270,7 +270,7 @@ def _light(s: int, x: Scalar, y: Scalar, z: Scalar, scene: Scene) -> tuple[Scala
 
 @_bare
 def _lookup(texels: U32, first: int, width: int, height: int, u: Scalar, v: Scalar) -> Any:
-    """Bilinear lookup at texture coordinates 0..1: three lanes of 16 bits (red, blue, green), see ``_PER_LOOKUP``."""
+    """Look up a texture bilinearly at 0..1: three lanes of 16 bits (red, blue, green), see ``_PER_LOOKUP``."""
     # Sixteenths of a texel: the weights of the four texels sum to 256.
     x = np.int64(u * np.float32(16 * width) + np.float32(8.5))
     y = np.int64(v * np.float32(16 * height) + np.float32(8.5))
@@ -296,7 +296,7 @@ def _lookup(texels: U32, first: int, width: int, height: int, u: Scalar, v: Scal
 
 @_bare
 def _texel(texture: tuple[Any, Any, bool], fine: Scalar, u: Scalar, v: Scalar, levels: I64, texels: U32) -> Any:
-    """Filtered lookup in a texture (number, last level, clamped) at the level of texels of size sqrt(``fine``)."""
+    """Look up a texture (number, last level, clamped) at the level of texels of size sqrt(``fine``)."""
     one = np.float32(1)
     number, last, clamped = texture
     level = np.uint64(min(max(np.int64(np.float32(fine).view(np.int32) >> 23) - 127, 0), last))
@@ -311,7 +311,7 @@ def _texel(texture: tuple[Any, Any, bool], fine: Scalar, u: Scalar, v: Scalar, l
 def _albedo(
     texture: tuple[Any, Any, bool], fine: Scalar, u: Scalar, v: Scalar, du: Scalar, dv: Scalar, levels: I64, texels: U32
 ) -> Any:
-    """Lookup averaged over a footprint: at (u, v), or along its long axis at (u ± du, v ± dv)."""
+    """Look up a texture averaged over a footprint: at (u, v), or along its long axis at (u ± du, v ± dv)."""
     lanes = _texel(texture, fine, u + du, v + dv, levels, texels)
     if du != 0 or dv != 0:
         mask = 0x7FFF7FFF7FFF
@@ -321,13 +321,13 @@ def _albedo(
 
 @_bare
 def _texture(scene: Scene, s: int) -> tuple[Any, Any, bool]:
-    """Texture of surface ``s``: number, last level, whether it is clamped."""
+    """Return the texture of surface ``s``: number, last level, whether it is clamped."""
     return np.uint64(scene.owns[s, 0]), scene.owns[s, 1], scene.owns[s, 2] != 0
 
 
 @_bare
 def _plane(s: int, f: F32) -> Any:
-    """Coefficients of surface ``s``: normal and distance, texture coordinates u and v, from ``Scene.forms``."""
+    """Return the coefficients of surface ``s``: normal and distance, texture coordinates u and v."""
     return (
         f[s, 0, 0], f[s, 0, 1], f[s, 0, 2], -f[s, 0, 3],
         f[s, 1, 0], f[s, 1, 1], f[s, 1, 2], f[s, 1, 3],
@@ -337,7 +337,7 @@ def _plane(s: int, f: F32) -> Any:
 
 @_bare
 def _meet(plane: Any, size: Scalar, footprint: Scalar, x: Scalar, y: Scalar, z: Scalar) -> Any:
-    """Where a ray meets a plane: range, texture coordinates, half the footprint's long axis, squared texel size.
+    """Intersect a ray with a plane: range, texture coordinates, half the footprint's long axis, squared texel size.
 
     The long axis is 0 at steep view angles, where one lookup covers the footprint. ``size`` is the footprint in texels
     at 1 m.
@@ -364,7 +364,7 @@ def _meet(plane: Any, size: Scalar, footprint: Scalar, x: Scalar, y: Scalar, z: 
 
 @_bare
 def _sky(z: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Tone indices of the open sky, for worlds that are not closed."""
+    """Return the tone indices of the open sky, for worlds that are not closed."""
     up = max(z, np.float32(0.0))
     return (
         _ROOT * np.sqrt(np.float32(0.62) - np.float32(0.30) * up),
@@ -375,7 +375,7 @@ def _sky(z: Scalar) -> tuple[Scalar, Scalar, Scalar]:
 
 @_bare
 def _shade(s: int, first: int, end: int, ray: F32, footprint: Scalar, scene: Scene, work: F32, out: F32) -> None:
-    """Tone indices of rays ``first`` to ``end`` of ``ray`` (3, N), which hit surface ``s``, into ``out`` (3, N).
+    """Enter tone indices of rays ``first`` to ``end`` of ``ray`` (3, N), which hit surface ``s``, into ``out`` (3, N).
 
     The texture is averaged over the angle ``footprint``; ``work`` holds six values for each of ``_SPAN`` rays.
     """
@@ -418,7 +418,7 @@ def _shade(s: int, first: int, end: int, ray: F32, footprint: Scalar, scene: Sce
 
 @_bare
 def _point(s: int, footprint: Scalar, x: Scalar, y: Scalar, z: Scalar, scene: Scene) -> tuple[Scalar, Scalar, Scalar]:
-    """Tone indices of one ray, which hits surface ``s``."""
+    """Return the tone indices of one ray, which hits surface ``s``."""
     if s < 0:
         return _sky(z)
     t, u, v, du, dv, fine = _meet(_plane(s, scene.forms), footprint * scene.looks[s, 0], footprint, x, y, z)
@@ -429,7 +429,7 @@ def _point(s: int, footprint: Scalar, x: Scalar, y: Scalar, z: Scalar, scene: Sc
 
 @_bare
 def _is_edge(s: int, o: int, dx: Scalar, dy: Scalar, dz: Scalar, forms: F32, owns: I64) -> bool:
-    """Whether surfaces ``s`` and ``o`` of two neighbouring pixels look different.
+    """Return whether surfaces ``s`` and ``o`` of two neighbouring pixels look different.
 
     Adjoining surfaces of the same texture (one wall in two pieces, the triangles of a smooth mesh) do not.
     """
@@ -511,7 +511,7 @@ def _add_adjoining(forms: F32, adjoining: I32, near: I32, known: int) -> int:
 
 @_bare
 def _sample(row: int, first: int, dr: Scalar, dc: Scalar, projection: Projection) -> tuple[Scalar, Scalar, Scalar]:
-    """Direction at ``dr`` rows and ``dc`` strides from the centre of pixel (``row``, ``first`` strides)."""
+    """Return the direction at ``dr`` rows and ``dc`` strides from the centre of pixel (``row``, ``first`` strides)."""
     across, down, scale, strides, wraps = projection
     stride, half = strides[row], np.float32(0.5)
     k = first * stride + 1
@@ -530,7 +530,7 @@ def _sample(row: int, first: int, dr: Scalar, dc: Scalar, projection: Projection
 
 @_jit
 def edge_rays(surface: I32, projection: Projection, subpixels: F32, forms: F32, owns: I64, out: F32) -> int:
-    """Directions (N, 3) of the samples of all edge pixels, in the order of ``compose``; return N.
+    """Enter the directions (N, 3) of the samples of all edge pixels, in the order of ``compose``; return N.
 
     Nothing is written beyond the end of ``out``.
     """
@@ -551,7 +551,7 @@ def edge_rays(surface: I32, projection: Projection, subpixels: F32, forms: F32, 
 def _cover(
     row: int, first: int, projection: Projection, forms: F32, near: I32, known: int, inverse: F32, shown: I32
 ) -> None:
-    """Index in ``near`` of the nearest surface at each sample of pixel (``row``, ``first`` strides) into ``shown``.
+    """Enter the index in ``near`` of the nearest surface at each sample of a pixel into ``shown``.
 
     Over a pixel, the inverse of the range and the position relative to each border, divided by the range, are affine.
     """
@@ -804,7 +804,7 @@ def light_at_hits(
     surface: I32, range_m: F32, origins: F32, directions: F32, light_at: I64, light_uv: F32, light: F32, albedo: F32,
     out: F32,
 ) -> None:  # fmt: skip
-    """Light (N, 3) reflected by the rectangles that rays hit (irradiance · albedo); zero where the range is negative.
+    """Enter the light (N, 3) that surfaces reflect where rays hit; zero where the range is negative.
 
     The irradiance is bilinear in each surface's light map.
     """

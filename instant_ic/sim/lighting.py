@@ -25,7 +25,7 @@ _AMBIENT_REACH_M = 1.6
 
 
 def _texel_points(world: World) -> tuple[F32, npt.NDArray[np.int32]]:
-    """Centres (L, 3) of all light texels, inset by 15 mm from the border, and their surfaces (L,)."""
+    """Return the centres (L, 3) of all light texels, inset by 15 mm from the border, and their surfaces (L,)."""
     points: list[F32] = []
     owner: list[npt.NDArray[np.int32]] = []
     corners = world.vertices.reshape(-1, 4, 3).astype(np.float64)
@@ -42,7 +42,7 @@ def _texel_points(world: World) -> tuple[F32, npt.NDArray[np.int32]]:
 
 
 def _emitter_pieces(world: World) -> tuple[F32, F32, F32]:
-    """Points (E, 3), normals (E, 3) and power (E, 3) (radiance · area) of the pieces of all emitters."""
+    """Return the points (E, 3), normals (E, 3) and power (E, 3) (radiance · area) of the pieces of all emitters."""
     points, normals, powers = [], [], []
     corners = world.vertices.reshape(-1, 4, 3)
     for s in np.flatnonzero(world.emission > 0):
@@ -97,7 +97,7 @@ def _pairs(
 
 
 def _cosine_directions(count: int) -> npt.NDArray[np.float64]:
-    """Directions (count, 3) about +z, cosine-weighted and evenly spread (golden angle)."""
+    """Return the directions (count, 3) about +z, cosine-weighted and evenly spread (golden angle)."""
     k = np.arange(count)
     radius = np.sqrt((k + 0.5) / count)
     angle = k * math.pi * (3 - math.sqrt(5))
@@ -105,7 +105,7 @@ def _cosine_directions(count: int) -> npt.NDArray[np.float64]:
 
 
 def _frames(normals: F32) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Two unit vectors (N, 3) perpendicular to each of the normals (N, 3)."""
+    """Return two unit vectors (N, 3) perpendicular to each of the normals (N, 3)."""
     n = normals.astype(np.float64)
     helper = np.where(np.abs(n[:, 2:3]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     tangent = np.cross(helper, n)
@@ -114,7 +114,7 @@ def _frames(normals: F32) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float
 
 
 def _direct(world: World, points: F32, normals: F32) -> F32:
-    """Direct irradiance / pi (L, 3) from lamps and windows."""
+    """Return the direct irradiance / pi (L, 3) from lamps and windows."""
     light = np.zeros((len(points), 3), np.float32)
     emitter, emitter_normal, power = _emitter_pieces(world)
     if len(emitter) == 0:
@@ -134,7 +134,7 @@ def _direct(world: World, points: F32, normals: F32) -> F32:
 
 
 def _gather(world: World, points: F32, normals: F32, rays: int) -> tuple[F32, npt.NDArray[np.bool_]]:
-    """Light of one bounce plus ambient light (L, 3), and whether a texel is visible at all (L,)."""
+    """Return the light of one bounce plus ambient light (L, 3), and which texels are visible at all (L,)."""
     count = len(points)
     result = np.zeros((count, 3), np.float32)
     inside = np.zeros(count, np.int32)

@@ -67,7 +67,8 @@ class TrackMotors:
         Args:
             setpoint_m_s: set points of the speed loops (2,), or with ``closed_loop`` False the speeds that the power
                 gives without load.
-            dt_s: seconds.
+            dt_s: duration of the step in seconds.
+            closed_loop: True while the speed loops regulate.
 
         Returns:
             Mean speeds of the tracks during the step, m/s, (2,).
@@ -97,7 +98,7 @@ class TrackMotors:
         return mean
 
     def _follow(self, speeds: FloatArray, wanted: FloatArray, dt_s: float) -> FloatArray:
-        """Speeds after ``dt_s`` of tracks that follow ``wanted``; at zero, friction ends the motion."""
+        """Return the speeds after ``dt_s`` of tracks that follow ``wanted``; at zero, friction ends the motion."""
         most = self.acceleration * dt_s
         follow = (wanted - speeds) * (1 - math.exp(-dt_s / self.lag_s))
         followed = speeds + np.clip(follow, -most, most)

@@ -95,7 +95,7 @@ class SimulatedDevices:
                 device.close()
 
     def _see(self, width: int, height: int) -> npt.NDArray[np.uint8]:
-        """Camera's view; not rendered again if the robot has not moved visibly."""
+        """Return the camera's view; it is not rendered again if the robot has not moved visibly."""
         pose, rgb = self._simulation.robot.pose, self._seen
         if rgb.shape != (height, width, 3) or np.abs(pose - self._seen_from).max() > _VISIBLE_MOTION:
             self._seen, self._seen_from = self._simulation.panorama(width, height).rgb, pose
@@ -133,12 +133,12 @@ class RealTimeLoop:
         self._thread.join(_MAX_WAIT_S)
 
     def take_paused_s(self) -> float:
-        """Seconds for which the simulation has paused since the last call, because the machine stalled."""
+        """Return the seconds for which the simulation has paused since the last call, because the machine stalled."""
         paused, self._paused_s = self._paused_s, 0.0
         return paused
 
     def take_lag_s(self) -> float:
-        """Largest lag behind the stack's time since the last call."""
+        """Return the largest lag behind the stack's time since the last call."""
         lag, self._lag_s = self._lag_s, 0.0
         return lag
 

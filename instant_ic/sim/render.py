@@ -40,7 +40,7 @@ class RenderedFrame:
 
 @lru_cache(maxsize=1)
 def _tone_table() -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
-    """Tone table from the square root of radiance to sRGB, and the mean radiance of each sRGB value (256,).
+    """Return the table from square roots of radiance to sRGB, and the mean radiance of each sRGB value (256,).
 
     Linear up to 0.6, then a soft shoulder, so that lamps turn white gradually.
     """
@@ -72,7 +72,7 @@ class _Lens:
         return 2 * math.tan(0.5 * self.hfov_rad) / self.width
 
     def tables(self, rotation: FloatArray) -> _Tables:
-        """Tables ``across`` (3, W + 2), ``down`` (3, H + 2) and ``scale`` (H + 2,) for a camera's rotation (3, 3)."""
+        """Return ``across`` (3, W + 2), ``down`` (3, H + 2) and ``scale`` (H + 2,) for a camera's rotation (3, 3)."""
         columns, rows = np.arange(-1, self.width + 1), np.arange(-1, self.height + 1)
         if self.hfov_rad is None:
             azimuth = math.pi - (columns + 0.5) * (2 * math.pi / self.width)
@@ -88,7 +88,7 @@ class _Lens:
 
 @lru_cache(maxsize=8)
 def _strides(lens: _Lens) -> npt.NDArray[np.int32]:
-    """Number of columns per shaded pixel in each row; columns lie close together near the poles of a panorama.
+    """Return the columns per shaded pixel in each row; near the poles of a panorama columns lie close together.
 
     A stride covers at most the width of a pixel on the horizon.
     """
@@ -131,8 +131,9 @@ class EquirectRenderer:
         """Render an equirect panorama: centre column along x, rows from +90° to −90°.
 
         Args:
-            map_from_camera: (4, 4) pose of the camera (x forward, y left, z up).
-            width, height: pixels; usually 2:1.
+            map_from_camera: pose of the camera (x forward, y left, z up), (4, 4).
+            width: columns of the image.
+            height: rows of the image; usually half as many.
             supersample: render at this multiple of the size and area-average; depth is taken at the centre instead.
         """
         return self._picture(np.asarray(map_from_camera), _Lens(width, height), supersample)
@@ -148,7 +149,7 @@ class EquirectRenderer:
     def cast(
         self, origins: FloatArray, directions: FloatArray
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-        """Ranges (N,) in metres (inf = no hit) and faces (N,) (-1 = no hit) of rays in the world's frame."""
+        """Return the ranges (N,) in metres (inf = no hit) and faces (N,) (-1 = no hit) of rays in the world's frame."""
         return self._caster.cast(origins, directions)
 
     def _picture(self, map_from_camera: FloatArray, lens: _Lens, supersample: int) -> RenderedFrame:
@@ -201,7 +202,7 @@ class EquirectRenderer:
         forms: npt.NDArray[np.float32],
         lens: _Lens,
     ) -> npt.NDArray[np.int32]:
-        """Surface (H, W) of every pixel, SKY = no hit."""
+        """Return the surface (H, W) of every pixel; SKY where nothing is hit."""
         width = lens.width
         surface = np.full((lens.height, width), kernels.UNKNOWN, np.int32)
         todo = np.empty(surface.size, np.int64)

@@ -211,7 +211,7 @@ class RoboclawEmulator:
         self.acceleration_pps2 = acceleration_pps2
 
     def _read(self, command: int) -> bytes | None:
-        """Data of the reply to a read command; None for an unknown command."""
+        """Return the data of the reply to a read command; None for an unknown command."""
         if command == Command.READ_TIMEOUT:
             return bytes((round(self.timeout_s * 10),))
         if command == Command.READ_ENCODERS:

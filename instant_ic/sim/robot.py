@@ -104,7 +104,7 @@ class TrackedRobot:
         return self.kinematics.motors_from_tracks(self.motors.encoders * self.motors.speeds)
 
     def touches(self, pose: npt.ArrayLike) -> bool:
-        """Whether the footprint's outline at a pose (x, y, yaw) touches something."""
+        """Return whether the footprint's outline at a pose (x, y, yaw) touches something."""
         x, y, yaw = np.asarray(pose, float)
         c, s = math.cos(yaw), math.sin(yaw)
         points = self._outline @ np.asarray([[c, s], [-s, c]]) + (x, y)
@@ -160,7 +160,7 @@ class TrackedRobot:
 
 
 def _outline(length: float, width: float, step: float) -> FloatArray:
-    """(N, 2) points on the border of a rectangle, at most ``step`` apart."""
+    """Return points (N, 2) on the border of a rectangle, at most ``step`` apart."""
     along = np.linspace(-0.5, 0.5, int(length / step) + 2) * length
     across = np.linspace(-0.5, 0.5, int(width / step) + 2) * width
     half = np.full_like

@@ -106,7 +106,7 @@ class Simulation:
         self.scanner = Vlp16(config.lidar, self.world, self.poses_at, self.epoch_ns, config.seed, config.lidar_mount)
 
     def epoch_ns(self, time_s: float) -> int:
-        """Epoch time of a simulated time; ``start_ns`` may be shifted after a pause of the simulation."""
+        """Return the epoch time of a simulated time; ``start_ns`` is shifted after a pause of the simulation."""
         return self.start_ns + round(time_s * 1e9)
 
     def step(self, dt_s: float) -> None:
@@ -144,13 +144,13 @@ class Simulation:
             self.robot.put_down(pose)
 
     def poses_at(self, times_s: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Interpolated x, y, yaw (N, 3) of base_link in the world at simulated times (N,), clamped at the ends."""
+        """Interpolate x, y, yaw (N, 3) of base_link in the world at simulated times (N,), clamped at the ends."""
         times = np.asarray(times_s, float)
         history = self._history
         return np.stack([np.interp(times, history[:, 0], history[:, k]) for k in (1, 2, 3)], axis=-1)
 
     def world_from_base(self, time_s: float | None = None) -> npt.NDArray[np.float64]:
-        """Pose (4, 4) of base_link at a simulated time, by default the current one."""
+        """Return the pose (4, 4) of base_link at a simulated time, by default the current one."""
         x, y, yaw = self.robot.pose if time_s is None else self.poses_at([time_s])[0]
         return pose_matrix(x, y, 0.0, 0.0, 0.0, yaw)
 

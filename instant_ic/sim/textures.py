@@ -66,7 +66,7 @@ def _halve(image: FloatArray) -> npt.NDArray[np.float32]:
 
 
 def pyramid(albedo: FloatArray) -> list[npt.NDArray[np.float32]]:
-    """Mip levels of a linear-light image (H, W, 3), two an octave, down to one texel."""
+    """Return the mip levels of a linear-light image (H, W, 3), two an octave, down to one texel."""
     import cv2
 
     levels = [np.asarray(albedo, np.float32)]
@@ -133,7 +133,7 @@ def texture_set(sources: list[str | FloatArray], clamped: list[bool]) -> Texture
 
 
 def _noise(rng: np.random.Generator, size: int, beta: float, lowest: float = 1.0) -> npt.NDArray[np.float32]:
-    """Periodic noise of unit variance whose amplitude falls as frequency^-beta above ``lowest`` cycles."""
+    """Make periodic noise of unit variance whose amplitude falls as frequency^-beta above ``lowest`` cycles."""
     f = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :]) * size
     spectrum = np.where(f >= lowest, np.maximum(f, 1.0) ** -beta, 0.0)
     white = rng.standard_normal((size, size)).astype(np.float32)
@@ -146,7 +146,7 @@ def _grey(field: FloatArray, colour: tuple[float, float, float] = (1.0, 1.0, 1.0
 
 
 def _paint(rng: np.random.Generator) -> FloatArray:
-    """Roller-painted plaster: faint blotches, fine grain, some scuffs."""
+    """Make roller-painted plaster: faint blotches, fine grain, some scuffs."""
     n = 512
     field = 0.84 + 0.022 * _noise(rng, n, 1.3, 2) + 0.024 * _noise(rng, n, 0.5, 24)
     scuff = np.clip(_noise(rng, n, 1.1, 3) - 2.0, 0, 1.5)
@@ -172,7 +172,7 @@ def _wallpaper(rng: np.random.Generator) -> FloatArray:
 def _courses(
     rng: np.random.Generator, n: int, rows: int, tones: tuple[float, float], joint: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Masonry of stones twice as long as high: the stones' tones (n, n), and 0 in their joints to 1 on them (n, n)."""
+    """Make masonry: the tones of stones twice as long as high, and 0 in their joints to 1 on them, (n, n) each."""
     columns = rows // 2
     y, x = np.mgrid[0:n, 0:n] / n
     row = np.floor(y * rows).astype(int)
@@ -192,7 +192,7 @@ def _brick(rng: np.random.Generator) -> FloatArray:
 
 
 def _blocks(rng: np.random.Generator) -> FloatArray:
-    """Concrete blocks with a coat of paint."""
+    """Make concrete blocks with a coat of paint."""
     n = 512
     tone, stones = _courses(rng, n, 10, (0.70, 0.78), 0.05)
     return _grey((tone + 0.035 * _noise(rng, n, 0.6, 16)) * (0.72 + 0.28 * stones))
@@ -211,7 +211,7 @@ def _floor_tiles(rng: np.random.Generator) -> FloatArray:
 
 
 def _lino(rng: np.random.Generator) -> FloatArray:
-    """Speckled linoleum / terrazzo: small chips of several tones."""
+    """Make speckled linoleum / terrazzo: small chips of several tones."""
     n = 512
     base = 0.46 + 0.03 * _noise(rng, n, 1.2, 2)
     image = _grey(base, (0.80, 0.86, 0.84))
@@ -262,7 +262,7 @@ def _ceiling_tiles(rng: np.random.Generator) -> FloatArray:
 
 
 def _wood(rng: np.random.Generator) -> FloatArray:
-    """Veneer with vertical grain (v runs along the grain)."""
+    """Make veneer with vertical grain (v runs along the grain)."""
     n = 256
     column = _noise(rng, n, 0.9, 2)[0]
     wave = _noise(rng, n, 2.0, 1) * 5
@@ -272,7 +272,7 @@ def _wood(rng: np.random.Generator) -> FloatArray:
 
 
 def _white(rng: np.random.Generator) -> FloatArray:
-    """White board or box: almost no contrast (the obstacle of the paper's Fig. 9)."""
+    """Make a white board or box: almost no contrast (the obstacle of the paper's Fig. 9)."""
     return _grey(0.84 + 0.006 * _noise(rng, 256, 0.8, 4))
 
 
@@ -299,7 +299,7 @@ def _cardboard(rng: np.random.Generator) -> FloatArray:
 
 
 def _books(rng: np.random.Generator) -> FloatArray:
-    """Front of a bookcase: five shelves of spines."""
+    """Make the front of a bookcase: five shelves of spines."""
     height, width, shelves = 512, 256, 5
     image = np.full((height, width, 3), 0.05, np.float32)
     each = height // shelves
@@ -320,7 +320,7 @@ def _books(rng: np.random.Generator) -> FloatArray:
 
 
 def _door(rng: np.random.Generator) -> FloatArray:
-    """One door leaf with two recessed fields and a handle; not periodic."""
+    """Make one door leaf with two recessed fields and a handle; not periodic."""
     height, width = 512, 224
     wood = np.tile(_wood(rng), (2, 1, 1))[:height, :width]
     image = wood * np.asarray((1.05, 1.0, 0.95))
@@ -335,7 +335,7 @@ def _door(rng: np.random.Generator) -> FloatArray:
 
 
 def _poster(rng: np.random.Generator) -> FloatArray:
-    """Printed sheet: a title, an image of coloured shapes, lines of text."""
+    """Make a printed sheet: a title, an image of coloured shapes, lines of text."""
     height, width = 384, 272
     paper = np.asarray(rng.uniform(0.62, 0.86, 3), np.float32)
     image = np.ones((height, width, 3), np.float32) * paper
@@ -369,7 +369,7 @@ def _poster(rng: np.random.Generator) -> FloatArray:
 
 
 def _notices(rng: np.random.Generator) -> FloatArray:
-    """Notice board with pinned sheets."""
+    """Make a notice board with pinned sheets."""
     height, width = 256, 448
     cork = _grey(0.40 + 0.06 * _noise(rng, 512, 0.3, 16), (1.0, 0.70, 0.42))[:height, :width].copy()
     for _ in range(16):
@@ -386,7 +386,7 @@ def _notices(rng: np.random.Generator) -> FloatArray:
 
 
 def _window(rng: np.random.Generator) -> FloatArray:
-    """View through a sash window: sky, distant houses, trees."""
+    """Make the view through a sash window: sky, distant houses, trees."""
     height, width = 320, 384
     y = np.arange(height)[:, None] / height
     sky = np.stack([0.62 + 0.3 * y, 0.76 + 0.2 * y, np.full_like(y, 0.98)], axis=-1)
@@ -415,7 +415,7 @@ def _window(rng: np.random.Generator) -> FloatArray:
 
 
 def _lamp(rng: np.random.Generator) -> FloatArray:
-    """Diffuser of a ceiling light: a grid of prisms."""
+    """Make the diffuser of a ceiling light: a grid of prisms."""
     n = 128
     y, x = np.mgrid[0:n, 0:n] / n
     return _grey(0.94 + 0.05 * np.sin(2 * np.pi * 16 * x) * np.sin(2 * np.pi * 16 * y))
@@ -448,5 +448,5 @@ def make_texture(name: str) -> npt.NDArray[np.float32]:
 
 
 def is_clamped(name: str) -> bool:
-    """Whether a procedural texture ends at its border instead of repeating."""
+    """Return whether a procedural texture ends at its border instead of repeating."""
     return name.partition(":")[0] in CLAMPED

@@ -70,7 +70,7 @@ PictureSource = Callable[[int, int], npt.NDArray[np.uint8]]
 
 
 def panorama_file(path: str | Path) -> PictureSource:
-    """Source that always returns one panorama file, area-averaged to the requested size.
+    """Return a source that always gives one panorama file, area-averaged to the requested size.
 
     Raises:
         ValueError: the file cannot be decoded as an image.
@@ -157,7 +157,7 @@ class ThetaServer:
 
     @property
     def watched(self) -> bool:
-        """Whether a client reads the preview."""
+        """True while a client reads the preview."""
         return self._viewers > 0
 
     def close(self) -> None:
@@ -232,7 +232,7 @@ class ThetaServer:
                 self._changed.wait(current().wait_s(left))
 
     def next_frame(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
-        """Number and JPEG of the newest image after number ``after``; None on a time-out or at shutdown."""
+        """Return number and JPEG of the newest image after number ``after``; None on a time-out or at shutdown."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while (self._number <= after or self._frame is None) and not self.stopping:
@@ -247,7 +247,7 @@ class ThetaServer:
     # --- Web API ------------------------------------------------------------------------------------
 
     def authorised(self, header: str | None, method: str, path: str) -> bool:
-        """Whether an Authorization header answers this camera's digest challenge correctly (RFC 7616, MD5)."""
+        """Return whether an Authorization header answers the digest challenge correctly (RFC 7616, MD5)."""
         if not self.config.user:
             return True
         if not header or not header.lower().startswith("digest "):
@@ -375,7 +375,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(_ApiError(404, "invalidParameterValue", f"{self.path} does not exist"))
 
     def do_POST(self) -> None:
-        """POST end points: state and commands."""
+        """Reply to POST requests: state and commands."""
         length = int(self.headers.get("Content-Length") or 0)
         body = self.rfile.read(length) if 0 <= length < 1_000_000 else b""
         if not self._authorised():

@@ -52,14 +52,15 @@ class Vlp16Config(Checked):
 def _place_beams(
     beams: F32, azimuth_rad: FloatArray, pose: FloatArray, base_from_lidar: FloatArray, origins: F32, directions: F32
 ) -> None:
-    """World origins and directions (P · B, 3) of the beams of P packets.
+    """Enter the world origins and directions (P · B, 3) of the beams of P packets.
 
     Args:
-        beams: (B, 5) direction in the sensor's frame at azimuth 0, share of the packet's time, height over the origin.
-        azimuth_rad: (P,) azimuth at the start of each packet.
-        pose: (P + 1, 3) x, y, yaw of base_link at the start of each packet and the end of the last one.
-        base_from_lidar: (4, 4) mount.
-        origins, directions: output.
+        beams: direction in the sensor's frame at azimuth 0, share of the packet's time, height over the origin, (B, 5).
+        azimuth_rad: azimuth at the start of each packet, (P,).
+        pose: x, y, yaw of base_link at the start of each packet and the end of the last one, (P + 1, 3).
+        base_from_lidar: mount, (4, 4).
+        origins: result, (P · B, 3).
+        directions: result, (P · B, 3).
     """
     mount = base_from_lidar.astype(np.float32)
     for p in range(azimuth_rad.shape[0]):
@@ -181,7 +182,7 @@ class Vlp16:
         return skipped
 
     def due(self, time_s: float) -> int:
-        """Number of packets that are complete at a time and not yet made."""
+        """Return the number of packets that are complete at a time and not yet made."""
         return max(0, math.floor(time_s / (wire.PACKET_PERIOD_US * 1e-6)) - self.packets)
 
     def make(self, count: int) -> list[bytes]:

@@ -115,7 +115,7 @@ class World:
         return np.asarray(others, np.int32)
 
     def occupied(self, low_m: float = 0.03, high_m: float = 0.9, cell_m: float = 0.02) -> OccupancyMask:
-        """Floor plan cells with a surface between two heights; cached after the first call."""
+        """Return the floor plan cells with a surface between two heights; they are kept after the first call."""
         key = (low_m, high_m, cell_m)
         if key not in self._masks:
             self._masks[key] = occupied_mask(self.vertices, self.faces, low_m, high_m, cell_m)
@@ -126,7 +126,7 @@ class World:
         return {}
 
     def sample_free_poses(self, rng: np.random.Generator, n: int, clearance_m: float = 0.35) -> npt.NDArray[np.float64]:
-        """Random poses (n, 3), x, y, yaw, that are reachable from the spawn pose.
+        """Sample random poses (n, 3), x, y, yaw, that are reachable from the spawn pose.
 
         Objects between 0.03 m and 1.9 m above the floor are at least ``clearance_m`` away.
 

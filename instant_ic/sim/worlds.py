@@ -18,7 +18,7 @@ _WALL_M = 0.16
 
 
 def corridor_world(seed: int = 0, obstacle: bool = True, light_cell_m: float = 0.1) -> World:
-    """L-shaped office corridor with side rooms, and the white obstacle of the experiments.
+    """Make an L-shaped office corridor with side rooms, and the white obstacle of the experiments.
 
     The corridor is 2.4 m wide and 2.7 m high. It runs 14 m along x from x = -2, then 9 m along +y at its far end. The
     robot starts at the origin and faces +x. The obstacle is a box of 0.5 x 0.5 x 0.8 m, nearly in the colour of the
@@ -171,7 +171,7 @@ def random_finish(rng: np.random.Generator) -> Finish:
 
 
 def plan(rng: np.random.Generator, building: Building, kind: str = "") -> list[Zone]:
-    """Zones of one of five kinds of floor plan (empty: random); the first zone has the spawn point at its centre."""
+    """Add zones of one of five kinds of floor plan (empty: random); the spawn point is the first zone's centre."""
     drawn = rng.choice(["room", "hall", "corridor", "corner", "crossing"], p=[0.28, 0.12, 0.26, 0.18, 0.16])
     kind = kind or str(drawn)
     finish, height = random_finish(rng), rng.uniform(2.3, 3.4)
