@@ -293,7 +293,7 @@ def free_place(room: Room, rng: np.random.Generator) -> FloatArray:
 
 
 def walk(room: Room, person: Person, robot: FloatArray, dt_s: float, rng: np.random.Generator) -> None:
-    """Move a person by ``dt_s``. One who looks stops half a metre before the robot, and turns around after 3 s."""
+    """Move a person by ``dt_s``. A person who looks stops 0.5 m before the robot, and turns around after 3 s."""
     way = person.target - person.place
     distance = float(np.linalg.norm(way))
     if distance < 0.2 or person.waited_s > 3.0:

@@ -1,4 +1,4 @@
-"""``ic evaluate illusion``: how far is what the operator sees inside and behind an obstacle from the truth?
+"""``ic evaluate illusion``: the operator's views inside and behind an obstacle, compared with the truth.
 
 The drive is that of ``ic evaluate teleop`` with illusory control. ``illusion_stack`` compares the frames of the page.
 """

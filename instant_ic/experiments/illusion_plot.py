@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
 from instant_ic.experiments.illusion import Film
 from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, TRUE_FILL
@@ -35,43 +33,21 @@ def save_strip(path: Path, films: Sequence[Film]) -> None:
 
 
 def save_plot(path: Path, report: dict[str, Any]) -> None:
-    """Save PSNR against distance for all sources, and the expected PSNR against the live one."""
-    figure, axes = new_figure(1, 2, (12.0, 4.6))
-    left, right = axes[0]
-    each = report["each"]
+    """Save PSNR against distance for all sources: each frame, and the means."""
+    figure, axes = new_figure(1, 1, (7.0, 4.6))
+    axis = axes[0, 0]
+    known = [frame for frame in report["each"] if frame["distance_m"] is not None]
     for source in SOURCES:
-        label, colour = _COLUMNS[source], _COLOURS[source]
-        known = [frame for frame in each if frame["distance_m"] is not None]
-        left.plot(
-            [frame["distance_m"] for frame in known],
-            [frame["scores"][source]["psnr_db"] for frame in known],
-            ".",
-            color=colour,
-            alpha=0.25,
-            markersize=4,
-        )
+        colour = _COLOURS[source]
+        psnr_db = [frame["scores"][source]["psnr_db"] for frame in known]
+        axis.plot([frame["distance_m"] for frame in known], psnr_db, ".", color=colour, alpha=0.25, markersize=4)
         rows = (report if source == LIVE else report[source])["by_distance"]
-        left.plot([r["distance_m"] for r in rows], [r["psnr_mean_db"] for r in rows], color=colour, label=label)
-    left.axvline(0.0, color="0.6", linewidth=0.8)
-    left.set_xlabel("metres behind the obstacle's near face")
-    left.set_ylabel("PSNR, dB")
-    left.grid(alpha=0.3)
-    left.legend(fontsize=8)
-    alone = [frame for frame in each if frame["blend"] == 1] or each
-    live = np.array([frame["scores"][LIVE]["psnr_db"] for frame in alone])
-    expected = np.array([np.nan if f["expected_psnr_db"] is None else f["expected_psnr_db"] for f in alone])
-    ends = _ends(live, expected)
-    right.fill_between(ends, ends - 2, ends + 2, color="0.9", label="within 2 dB")
-    right.plot(live, expected, ".", color="tab:red", alpha=0.5)
-    right.set_xlabel("live PSNR, dB")
-    right.set_ylabel("expected PSNR, dB")
-    right.grid(alpha=0.3)
-    right.legend(fontsize=8)
+        means_db = [row["psnr_mean_db"] for row in rows]
+        axis.plot([row["distance_m"] for row in rows], means_db, color=colour, label=_COLUMNS[source])
+    axis.axvline(0.0, color="0.6", linewidth=0.8)
+    axis.set(xlabel="metres behind the obstacle's near face", ylabel="PSNR, dB")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
     name = Path(str(report["world"])).name
     figure.suptitle(f"{name}, {report['episodes']} episode(s), {report['frames']} frames", fontsize=10)
     save_figure(figure, path)
-
-
-def _ends(*values: NDArray[np.float64]) -> NDArray[np.float64]:
-    together = np.concatenate(values)
-    return np.array([np.nanmin(together) - 1, np.nanmax(together) + 1])

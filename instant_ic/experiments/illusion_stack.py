@@ -52,8 +52,8 @@ class IllusionFrame:
         blend: 1 where the view is shown alone, less while it dissolves into the camera's image or out of it.
         distance_m: position behind the near face of the obstacle that is passed, negative before it; None without any.
         with_obstacle: the truth is the world with the obstacle.
-        scores: of each source against that truth.
-        unseen_share: of each source's view.
+        scores: score of each source against that truth.
+        unseen_share: share of each source's view that no keyframe has seen.
         expected_psnr_db: estimate of the virtual space for the live view.
     """
 

@@ -1,4 +1,4 @@
-"""V.D from a recording: states over time, trajectories on the map, and what the operator saw, without any truth."""
+"""V.D from a recording: states over time, trajectories on the map, and the operator's images, without any truth."""
 
 from __future__ import annotations
 

@@ -41,7 +41,8 @@ class Shown:
         pose: (3,) of the robot from which the image was taken, in the world's frame; the true pose for a camera image.
         place: (2,) its position, as the stack knows it.
         heading: yaw at which it is shown: the page rotates the camera's image to the newest heading.
-        jpeg, fov_rad: of a rendered view.
+        jpeg: encoded image of a rendered view; empty for the camera's.
+        fov_rad: horizontal field of view of a rendered view.
     """
 
     time_s: float

@@ -80,9 +80,9 @@ class StackConfig:
         depth: depth source, ``completed``, ``fused`` or ``lidar``.
         seed: seed of the robot's slip, the LiDAR's noise and the delays.
         camera_hz: images per second.
-        camera_latency_s: from the exposure to the page, as for the simulated camera.
-        depth_latency_s: from the exposure to the keyframe.
-        command_latency_s: minimum and maximum from the arbiter to the base; one value is drawn per stack.
+        camera_latency_s: delay from the exposure to the page, as for the simulated camera.
+        depth_latency_s: delay from the exposure to the keyframe.
+        command_latency_s: least and largest delay from the arbiter to the base; each stack has one value.
         overrides: further parameters ``node.key:=value``; the images for depth and virtual space have the size of
             ``theta_camera.theta``.
     """

@@ -45,7 +45,7 @@ class Course:
     """A world with the operator's goals.
 
     Attributes:
-        world: what the devices see; the robot starts at its ``spawn``.
+        world: world of the simulated devices; the robot starts at its ``spawn``.
         goals: (N, 2) positions to visit in order, in the world's frame.
         obstacles: objects on the operator's path.
         way_m: metres from the start over the goals.

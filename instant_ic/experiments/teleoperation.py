@@ -31,7 +31,7 @@ _BESIDE_S = 1.0
 
 
 class _Recorded(FilmedStack):
-    """Keeps what the operator sees, beside the map."""
+    """A stack that keeps the operator's screen beside the map."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
