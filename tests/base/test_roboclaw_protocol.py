@@ -88,15 +88,6 @@ def test_emulator_waits_for_a_whole_frame_and_drops_it_after_a_gap() -> None:
     assert emulator.feed(read_request(0x80, Command.READ_MAIN_BATTERY)) == bytes.fromhex("00 f1 c8 c4")
 
 
-@given(st.binary(max_size=64))
-def test_emulator_outlives_noise(noise: bytes) -> None:
-    emulator = RoboclawEmulator()
-    emulator.feed(noise)
-    emulator.advance(0.02)
-    reply = emulator.feed(read_request(0x80, Command.READ_MAIN_BATTERY))
-    assert reply == bytes.fromhex("00 f1 c8 c4")
-
-
 def test_emulator_ramps_counts_and_stops_by_its_watchdog() -> None:
     emulator = RoboclawEmulator()
     emulator.feed(write_frame(0x80, Command.SET_TIMEOUT, bytes((5,))))

@@ -14,7 +14,7 @@ from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bus.node_files import node_class
 from instant_ic.calibration.bag import read_recording
 from instant_ic.calibration.edges import CUES, FloorPlane, find_floor, lidar_edges, picture_edges
-from instant_ic.calibration.mount import AXES, CalibrationError, CalibrationFrame, _correction, _moved, calibrate
+from instant_ic.calibration.mount import AXES, CalibrationError, CalibrationFrame, _correction, calibrate
 from instant_ic.calibration.overlay import before_and_after, overlay
 from instant_ic.cli.main import main
 from instant_ic.config.params import build, load_file
@@ -88,18 +88,6 @@ def test_picture_edges_of_a_door_at_the_seam():
     upright, lying = picture_edges(rgb, 1.0)
     assert upright[35, [127, 0, 23, 24]].min() > 4 * upright[35, [8, 12, 60, 100]].max()
     assert lying[[19, 20, 49, 50], 12].min() > 2 * lying[[5, 35, 60], 12].max()
-
-
-def test_small_motions_by_scipys_rotations():
-    pose = pose_matrix(0.3, -0.2, 0.6, 0.1, 0.2, 2.0)
-    units = np.array([3.0, -2.0, 1.0, 5.0, -4.0, 8.0])
-    moved = _moved(pose, units)
-    by_scipy = np.eye(4)
-    by_scipy[:3, :3] = Rotation.from_rotvec(np.radians(0.2) * units[3:]).as_matrix()
-    by_scipy[:3, 3] = 0.01 * units[:3]
-    np.testing.assert_allclose(moved, by_scipy @ pose, atol=1e-12)
-    np.testing.assert_allclose(_correction(pose, moved)[:3], 0.01 * units[:3], atol=1e-12)
-    np.testing.assert_allclose(_correction(pose, moved)[3:], np.radians(0.2) * units[3:], atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -211,19 +199,6 @@ def test_bad_bags_are_told(drive, tmp_path, capsys, without, shift_ns, words):
     assert main(["calibrate", "camera-lidar", str(bag), "-o", str(tmp_path / "mount.yaml")]) == 1
     assert words in capsys.readouterr().err
     assert not (tmp_path / "mount.yaml").exists()
-
-
-def test_bad_words_are_told(tmp_path, capsys):
-    base = ["calibrate", "camera-lidar", str(tmp_path / "none")]
-    assert main(base) == 1
-    assert "does not exist" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="2"):
-        main([*base, "--guess", "1,2,x"])
-    assert "6 numbers" in capsys.readouterr().err
-    assert main([*base, "-o", str(tmp_path / "no" / "mount.yaml")]) == 2
-    with pytest.raises(SystemExit, match="2"):
-        main([*base, "--frames", "0"])
-    assert "--frames: must be > 0" in capsys.readouterr().err
 
 
 def test_overlay_puts_points_where_they_belong():

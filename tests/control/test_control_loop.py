@@ -356,13 +356,6 @@ def test_the_vbot_waits_for_a_robot_that_cannot_follow() -> None:
     assert 2.5 < np.linalg.norm(made.vbot.pose[:2] - held[:2]) <= 3.0
 
 
-def test_commands_that_are_no_numbers_are_zero() -> None:
-    made = loop(None)
-    drive(made, 2.0, FORWARD)
-    assert made.step((math.nan, 0.0)).command == NOTHING
-    assert made.step((0.4, math.inf)).command == NOTHING
-
-
 def test_nothing_moves_before_everything_is_there() -> None:
     arbiter = Arbiter()
     decision = arbiter.step(ArbiterInputs(operator_command=FORWARD), 0)

@@ -24,7 +24,6 @@ from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.msg import (
     Bool,
-    CompressedImage,
     ControlState,
     PoseIntegrity,
     PoseWithCovariance,
@@ -279,25 +278,6 @@ def test_a_doubt_about_the_pose_holds_until_the_next_report() -> None:
     assert speed_m_s(1.0) == pytest.approx(0.4)
 
 
-def test_a_camera_at_5_hz_is_late_by_its_own_rhythm() -> None:
-    stack = Stack(np.zeros((0, 2, 2)))
-    stack.page = False
-    period_ns, next_ns = 200_000_000, stack.now
-    stack.silent.add("/camera/image/compressed")
-    for k in range(80):
-        if stack.now >= next_ns and k < 60:
-            next_ns += period_ns
-            stack.bus.publish("/camera/image/compressed", compressed_image_message(b"", "camera", stack.now))
-            last_ns = stack.now
-        state = stack.step((0.4, 0.0) if k > 30 else None)
-        age_s = (stack.now - last_ns) / 1e9
-        if k > 32 and age_s < 0.299:  # the step at 0.3 s commands zero
-            assert state.reason_code != Reason.CAMERA_STALE
-        if age_s > 0.31:
-            assert twist_values(state.applied_command) == (0.0, 0.0)
-    assert state.reason_code == Reason.CAMERA_STALE
-
-
 def test_pictures_that_do_not_reach_the_operator_stop_the_robot() -> None:
     """The camera goes on at the robot; on the way to the page its pictures are lost."""
     stack = Stack(np.zeros((0, 2, 2)))
@@ -309,22 +289,6 @@ def test_pictures_that_do_not_reach_the_operator_stop_the_robot() -> None:
         stack.picture_ns = frozen
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
     assert stack.bus.last("/ic/state").reason_code == Reason.CAMERA_STALE
-
-
-def test_both_robots_stand_when_the_views_stop_and_the_real_view_comes_back() -> None:
-    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
-    stack.drive(1.5, None)
-    states = stack.drive(6.0, (0.4, 0.0))
-    assert states[-1].mode == ControlState.VIRTUAL
-    assert {s.shown for s in states if s.mode in (ControlState.REAL, ControlState.ENTERING)} == {0}
-    stack.silent.add("views")
-    states = stack.drive(0.45, (0.4, 0.0))
-    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
-    assert states[-1].vbot_action == ControlState.VBOT_HELD
-    stack.drive(0.6, (0.4, 0.0))
-    assert twist_values(stack.bus.last("/vbot/odom")) == (0.0, 0.0)
-    states = stack.drive(1.0, (0.4, 0.0))
-    assert (states[-1].mode, states[-1].shown) == (ControlState.STOPPED, ControlState.SHOWN_REAL)
 
 
 def test_the_button_on_the_robot_stops_and_only_the_operator_ends_it_once_it_is_out() -> None:
@@ -533,37 +497,6 @@ def test_diagnoses_of_the_start_are_cleared() -> None:
         assert {name: d for name, d in node.diagnoses().items() if d[0] != OK} == {}, node.name
 
 
-def test_walls_are_looked_for_when_the_map_has_changed_and_not_more_often_than_set() -> None:
-    stack = Stack(np.zeros((0, 2, 2)))
-    nodes = [node for node in stack.bus.nodes if isinstance(node, ArbiterNode | VirtualRobotNode)]
-    first = [node.walls.found for node in nodes]
-    assert all(walls is not None and walls.mask.any() for walls in first)
-    grid = first[0].static.occupancy.copy()
-    origin = tuple(first[0].static.origin)
-
-    def publish() -> None:
-        stack.bus.publish("/map", grid_message(grid, 0.05, origin, "map", stack.now), latched=True)
-
-    publish()  # the same map again
-    stack.drive(2.5, None)
-    assert [node.walls.found for node in nodes] == first
-    stack.drive(1.45, None)
-    column = grid.shape[1] // 2
-    grid[:, column] = 100  # a new wall across the corridor
-    publish()
-    assert [node.walls.found for node in nodes] == first  # 3.95 s: due at 4 s
-    stack.drive(0.1, None)
-    for node, before in zip(nodes, first, strict=True):
-        assert node.walls.found is not before
-        assert node.walls.found.mask[grid.shape[0] // 2, column]
-
-
-def test_pictures_are_not_decoded() -> None:
-    stack = Stack(np.zeros((0, 2, 2)))
-    assert stack.drive(1.5, None)[-1].mode == ControlState.REAL  # with a payload that is no JPEG
-    assert isinstance(stack.bus.last("/camera/image/compressed"), CompressedImage)
-
-
 def test_the_arbiter_leaves_a_zero_behind() -> None:
     stack = Stack(np.zeros((0, 2, 2)))
     stack.drive(1.5, None)
@@ -649,20 +582,6 @@ def test_at_rest_the_arbiter_works_rarely_and_a_start_is_checked_against_what_st
     before = len(updates)
     stack.drive(1.0, (0.0, 0.5))
     assert len(updates) - before >= 19  # in motion, each timer
-
-
-def test_the_navigator_works_only_in_the_virtual_space() -> None:
-    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
-    navigator = next(node for node in stack.bus.nodes if isinstance(node, NavigatorNode))
-    stack.drive(2.0, None)
-    assert navigator.follow_timer is None and 5 <= len(stack.bus.records("/nav/cmd_vel")) <= 11
-    assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
-    assert navigator.follow_timer is not None
-    assert stack.drive(14.0, (0.4, 0.0))[-1].mode == ControlState.REAL
-    sent = len(stack.bus.records("/nav/cmd_vel"))
-    stack.drive(0.5, (0.4, 0.0))
-    rest = [twist_values(message) for message in stack.bus.messages("/nav/cmd_vel")[sent:]]
-    assert navigator.follow_timer is None and len(rest) <= 3 and set(rest) == {(0.0, 0.0)}
 
 
 def count_calls(thing: object, name: str) -> list[object]:

@@ -59,36 +59,9 @@ class TestLidar:
         top = ahead(worlds.look(room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.4)), [], np.array([2.0, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
         assert np.isclose(top[:, 0], 0.2 / math.tan(math.radians(3)), atol=1e-3).any()  # its top, 3.8 m off
 
-    def test_hanging_things_and_people(self) -> None:
-        person = Person(np.array([4.0, 4.0]), np.zeros(2), 0.0, True)
-        seen = ahead(
-            worlds.look(room((4.0, 6.0, 0.2, 0.2, 0.0, 0.9, 2.0)), [person], np.array([2.0, 4.0, 0.0]), Quiet())
-        )  # type: ignore[arg-type]
-        level = seen[np.argmin(np.abs(seen[:, 2]))]
-        assert level[0] == pytest.approx(2.0 - worlds.PERSON_M, abs=1e-3)
-        side = worlds.look(room((2.0, 6.5, 0.2, 0.2, 0.0, 0.9, 2.0)), [], np.array([2.0, 4.0, 0.0]), Quiet())  # type: ignore[arg-type]
-        left = side[np.abs(np.arctan2(side[:, 1], side[:, 0]) - math.pi / 2) < 0.01]
-        above = left[left[:, 2] > 0]
-        assert (above[:, 2] + 0.6).min() >= 0.9 - 1e-6  # rings under it pass through
-        assert above[:, 1].min() == pytest.approx(2.3, abs=1e-3)
-
-    def test_the_flat_scan_takes_the_nearest_of_its_band(self) -> None:
-        low, post = [1.0, 0.001, 0.05 - 0.6], [2.0, 0.001, 0.5 - 0.6]
-        ranges = worlds.flat_ranges(np.array([low, post]))
-        assert ranges[360] == pytest.approx(2.0, abs=1e-3)
-        assert np.isinf(np.delete(ranges, 360)).all()
-
 
 class TestPeople:
     robot = np.array([2.0, 4.0, 0.0])
-
-    def test_gap_to_the_footprint(self) -> None:
-        gap, towards = worlds.gap_to_robot(np.array([3.0, 4.1]), self.robot)  # 0.7 m from the nose
-        assert gap == pytest.approx(0.7 - worlds.PERSON_M)
-        np.testing.assert_allclose(towards, [-1.0, 0.0], atol=1e-9)
-        turned, _ = worlds.gap_to_robot(np.array([3.0, 4.0]), np.array([2.0, 4.0, math.pi / 2]))
-        assert turned == pytest.approx(0.75 - worlds.PERSON_M)
-        assert worlds.gap_to_robot(np.array([2.1, 4.0]), self.robot)[0] < 0
 
     @pytest.mark.parametrize(("looks", "nearest"), [(True, 0.5), (False, 0.0)])
     def test_who_looks_stops_before_the_robot_who_does_not_walks_into_it(self, looks: bool, nearest: float) -> None:
@@ -121,24 +94,11 @@ class TestPeople:
         assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 1)
 
 
-def test_a_hanging_thing_that_no_ring_reaches_from_the_start_counts_as_blind() -> None:
-    # Its lower edge is 0.375 m above the LiDAR; a ring of 15 degrees is that high at 0.375 / 0.268 = 1.40 m.
-    hanging = (0.0, 0.0, 0.05, 0.05, 0.0, 0.975, 2.0)
-    assert worlds.blind_distance_m(hanging, "hanging") == pytest.approx(1.40, abs=0.005)
-    assert worlds.blind_distance_m(hanging, "box") == 0.0
-
-
 class TestShortestWay:
     @staticmethod
     def way(*shapes: tuple[float, ...], margin: float = 0.0) -> np.ndarray | None:
         mask = worlds.filled(room(*shapes).shapes, np.array([10.0, 8.0]), 0.025, worlds.IN_THE_WAY_M)
         return worlds.shortest_way(mask, np.array([2.0, 4.0, 0.0]), np.array([8.0, 4.0, 0.0]), margin)
-
-    def test_straight_where_nothing_is_and_over_and_under_what_is_not_in_the_way(self) -> None:
-        flat, high = (5.0, 4.0, 0.3, 3.0, 0.0, 0.0, 0.04), (6.0, 4.0, 0.3, 3.0, 0.0, 1.4, 2.0)
-        way = self.way(flat, high)
-        assert way is not None
-        assert np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum() == pytest.approx(6.0, abs=0.1)
 
     def test_through_a_door_that_the_body_fits_and_no_other(self) -> None:
         def wall(door: float) -> list[tuple[float, ...]]:
@@ -190,20 +150,6 @@ def test_a_drive_reaches_its_goal_without_contact_and_is_told_in_full(drive: tup
         assert 0 < figures[f"{name}_ms_p50"] <= figures[f"{name}_ms_p99"]
     assert set(figures["targets"]) >= {"contacts == 0", "reached_share >= 0.97", "path_ratio_mean <= 1.2"}
     assert (out / "f.png").read_bytes()[:4] == b"\x89PNG"
-
-
-def test_the_same_seed_gives_the_same_drive(drive: tuple[dict, Path]) -> None:
-    again = follow.run_episode(3, 0)
-    (each,) = drive[0]["each"]
-    assert again.driven_m == pytest.approx(each["driven_m"], abs=1e-9)
-    assert (again.seconds, again.yaw_rate_changes) == (each["seconds"], each["yaw_rate_changes"])
-
-
-def test_what_cannot_be_done_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["evaluate", "follow", "--episodes", "0"]) == 1
-    assert "at least 1" in capsys.readouterr().err
-    assert main(["evaluate", "follow", "--json", str(tmp_path / "none" / "f.json")]) == 2
-    assert "does not exist" in " ".join(capsys.readouterr().err.split())
 
 
 def test_figures_of_episodes_by_hand() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from instant_ic.control.costmap import FREE, LETHAL, CostmapConfig, RollingCostmap, ScanRays
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.heights import HeightConfig, HeightLayer, SortedPoints, _angle, sort_points
+from instant_ic.control.heights import HeightConfig, HeightLayer, SortedPoints, sort_points
 
 CONFIG = HeightConfig()
 LIDAR_M = 0.6
@@ -79,12 +79,6 @@ def test_nearest_of_each_direction() -> None:
     sweep = sort(at((2.0, 0.001, 0.3), (1.5, 0.001, 1.0), (1.0, 0.001, 0.0), (0.0, 3.0, 0.5)))
     nearest = sweep.nearest[np.argsort(sweep.nearest[:, 1])]
     np.testing.assert_allclose(nearest, [[1.5, 0.001], [0.0, 3.0]], atol=1e-6)  # the ground point is none
-
-
-def test_fast_angle() -> None:
-    rng = np.random.default_rng(0)
-    for y, x in [*rng.normal(size=(200, 2)), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 0.0)]:
-        assert _angle(y, x) == pytest.approx(math.atan2(y, x), abs=2e-5)
 
 
 FIVE_BINS = [0.25, 0.75, 1.25, 1.75, 2.25]
@@ -273,16 +267,3 @@ def test_standing_beside_a_remembered_thing_does_not_wipe_it_out() -> None:
     assert len(beside.remembered) == 1
     on_it = rolling.update(np.array([0.5, 0.0, 0.0]), None, None)
     assert len(on_it.remembered) == 0
-
-
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"min_obstacle_height": 0.4, "max_obstacle_height": 0.3}, "min_obstacle_height must be below"),
-        ({"mark_threshold": 0}, "mark_threshold"),
-        ({"obstacle_max_range": -1.0}, "obstacle_max_range"),
-    ],
-)
-def test_bad_heights_are_named(values: dict[str, float], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        HeightConfig(**values)  # type: ignore[arg-type]

@@ -53,12 +53,6 @@ def test_a_bag_and_the_folders_made_for_it_are_private(tmp_path):
     assert_private(tmp_path / "runs")
 
 
-def test_every_file_of_a_split_bag_is_private(tmp_path):
-    write(tmp_path / "drive", max_bytes=1)
-    assert len(list((tmp_path / "drive").glob("*.mcap"))) > 1
-    assert_private(tmp_path / "drive")
-
-
 def test_what_the_recorder_writes_is_private(tmp_path):
     made = recorder(tmp_path / "runs" / "drive")
     made.take("/robot/estop", "std_msgs/msg/Bool", PAYLOAD, 1_000_000_000)

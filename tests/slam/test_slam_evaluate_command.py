@@ -14,7 +14,7 @@ from slam_planar_world import rectangle
 
 from instant_ic.bag import BagWriter
 from instant_ic.cli.main import main
-from instant_ic.experiments.slam_logs import LogError, read_bag
+from instant_ic.experiments.slam_logs import read_bag
 from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip
 from instant_ic.experiments.slam_worlds import Drive, Laser, drive
 from instant_ic.geometry.poses import compose2, matrix_from_pose2, pose_matrix, relative2
@@ -111,39 +111,6 @@ def test_a_bad_log_is_told_by_its_line(
     assert [file.name for file in tmp_path.iterdir()] == ["bad.log"]
 
 
-def test_bad_lines_are_counted_and_left_out(
-    log: Path, journey: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lines = gzip.decompress(log.read_bytes()).decode().splitlines(keepends=True)[:40]
-    good = len(lines)
-    lines.insert(3, lines[3].replace(lines[3].split()[2], "nan", 1))
-    lines.insert(9, lines[9][:200] + "\n")
-    lines.insert(20, lines[20].replace(lines[20].split()[5], "inf", 1))
-    cut = tmp_path / "cut.log.gz"
-    cut.write_bytes(gzip.compress("".join(lines).encode())[:-12])  # without its last bytes and its check sum
-    assert main(["evaluate", "slam", str(cut), "-o", str(tmp_path / "out")]) == 0
-    said = capsys.readouterr()
-    report = json.loads(said.out)
-    assert good - 2 <= report["scans"] <= good
-    assert report["bad_lines"] in (4, 5)  # three lines, the end of the file, and perhaps a line cut by it
-    assert "cut.log.gz:4: " in said.err and "the gzip file is cut" in said.err
-
-
-def test_what_is_missing_is_told(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "slam", str(tmp_path / "none.log")]) == 1
-    assert "none.log" in capsys.readouterr().err
-    assert main(["evaluate", "slam", str(log), "--stamps", "x"]) == 2
-    assert "--relations" in capsys.readouterr().err
-    assert main(["evaluate", "slam", str(log), "--json", str(tmp_path / "no" / "x.json")]) == 2
-    assert "does not exist" in capsys.readouterr().err
-    (tmp_path / "r").write_text("5 6 0 0 0 0 0 0\n")
-    assert main(["evaluate", "slam", str(log), "--relations", str(tmp_path / "r"), "-o", str(tmp_path / "t")]) == 1
-    assert "within the trajectory's time" in capsys.readouterr().err
-    (tmp_path / "b").mkdir()
-    assert main(["evaluate", "slam", str(tmp_path / "b")]) == 1
-    assert "metadata.yaml" in capsys.readouterr().err
-
-
 def write_bag(path: Path, journey: Drive, scan_topics: tuple[str, ...] = ("/scan",)) -> Path:
     with BagWriter(path) as bag:
         mount = transform_message(pose_matrix(x=0.1, z=0.6), "base_link", "laser", 0)
@@ -213,20 +180,6 @@ def test_a_bag_whose_scans_change_their_number_of_beams_gives_map_and_trajectory
     assert max(math.hypot(x, y) for x, y, _ in errors) < 0.05
     assert max(abs(yaw) for _, _, yaw in errors) < math.radians(1.0)
     assert (tmp_path / "out" / "map.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_bags_that_do_not_suit_are_told(journey: Drive, tmp_path: Path) -> None:
-    few = Drive(journey.entries[:3], journey.truth[:3])
-    with pytest.raises(LogError, match="no topic of type LaserScan"):
-        list(read_bag(write_bag(tmp_path / "none", few, ())))
-    two = write_bag(tmp_path / "two", few, ("/a", "/b"))
-    with pytest.raises(LogError, match=r"several LaserScan topics \(/a, /b\)"):
-        list(read_bag(two))
-    assert len(list(read_bag(two, "/b"))) == 3
-    with pytest.raises(LogError, match="no LaserScan topic /c"):
-        list(read_bag(two, "/c"))
-    with pytest.raises(LogError, match="does not exist"):
-        list(read_bag(tmp_path / "gone"))
 
 
 def test_the_simulated_crawler_on_slipping_tracks() -> None:

@@ -246,14 +246,3 @@ def test_a_heading_that_jumps_leaves_no_turned_map(log: list[LogEntry]) -> None:
     report = evaluate_faults(log, places=2, seed=1, faults=("heading_jump_85deg",))
     assert report["heading_jump_85deg"]["trusted_wrong_scans_max"] <= 10
     assert report["heading_jump_85deg"]["right_at_end"] == 2
-
-
-def test_relocalizations_are_counted(log: list[LogEntry]) -> None:
-    report = evaluate_faults(log[:300], places=2, faults=("relocalization",))
-    assert report["relocalization"]["starts"] == report["relocalization"]["found"] == 2
-    assert report["relocalization"]["wrong"] == 0
-
-
-def test_an_unknown_fault_is_named(log: list[LogEntry]) -> None:
-    with pytest.raises(ValueError, match="unknown fault 'flood'"):
-        evaluate_faults(log, faults=("flood",))

@@ -33,10 +33,6 @@ def run(journey: Drive, slam: GridSlam | None = None) -> tuple[GridSlam, list[Sl
     return slam, results
 
 
-def final_poses(results: list[SlamResult], relative: list[np.ndarray]) -> np.ndarray:
-    return np.array([compose2(r.anchor.pose(), there) for r, there in zip(results, relative, strict=True)])
-
-
 def loop_errors(slam: GridSlam, journey: Drive) -> np.ndarray:
     """How far each closed loop is from the truth, metres."""
     at = {entry.scan.stamp_ns: k for k, entry in enumerate(journey.entries)}
@@ -186,12 +182,6 @@ def test_a_corridor_has_no_shape_and_a_symmetric_room_two_answers() -> None:
     square = PlanarWorld(rectangle(-2, -2, 2, 2))
     found = find_place(field_of(square, [(0, 0, 0)]), seen_from(square, (0.5, 0, 0)), np.zeros(3), 1.0, 1.7)
     assert found is not None and found.runner_up > 0.95 * found.score  # 90° on, at (0, 0.5), it looks the same
-
-
-def test_nothing_to_find_is_no_answer() -> None:
-    empty = LikelihoodField(0.05, 6.0)
-    empty.rebuild(np.zeros(3), [])
-    assert find_place(empty, np.array([[1.0, 0.0]]), np.zeros(3), 1.0, 0.5) is None
 
 
 def test_pooled_cells_hold_the_best_near_them() -> None:

@@ -78,17 +78,6 @@ def test_a_heading_near_half_a_turn_is_wrapped() -> None:
     assert match.pose[2] == pytest.approx(-math.pi + 0.02, abs=0.003)
 
 
-def test_two_matches_are_the_same_bit_for_bit() -> None:
-    room = box_room()
-    results = []
-    for _ in range(2):
-        field = field_of(room, [0.0, 0.0, 0.0], [0.3, 0.0, 0.1], noise_m=0.02)
-        points = match_points(points_at(room, [0.2, 0.1, 0.1], 0.02, stamp=9))
-        match = match_scan(field, points, np.zeros(3), WIDE, SearchWindow(0.35, 0.35))
-        results.append((match.pose.tobytes(), match.covariance.tobytes(), match.score))
-    assert results[0] == results[1]
-
-
 def test_covariance_is_wide_along_a_corridor_and_narrow_across() -> None:
     world = corridor()
     field = field_of(world, [0.0, 0.0, 0.0], noise_m=0.01)

@@ -154,20 +154,6 @@ def test_no_wheel_odometry_at_all_is_told_and_bridged() -> None:
     assert max(rig.pose_errors()) < 0.02
 
 
-def test_wheels_that_fall_silent_and_return() -> None:
-    rig = Rig()
-    rig.wheel()
-    rig.scan()
-    rig.drive(0.3, 0.1, 10)
-    rig.drive(0.3, 0.1, 15, wheels=False)
-    rig.bus.advance(0.2)
-    assert rig.node.diagnoses()["odometry"][0] == WARN
-    assert rig.transforms("base_link")
-    rig.drive(0.3, 0.1, 10)
-    assert rig.node.diagnoses()["odometry"][0] == OK
-    assert max(rig.pose_errors()) < 0.02
-
-
 def test_scans_that_cannot_be_used_are_counted_and_told() -> None:
     rig = Rig()
     rig.wheel()
@@ -235,11 +221,6 @@ def test_two_runs_are_the_same_bit_for_bit() -> None:
 def test_the_shipped_parameters_are_the_defaults() -> None:
     path = Path(__file__).resolve().parents[2] / "config" / "slam.yaml"
     assert bus_params.build(GridSlamConfig, bus_params.load_file(path, "grid_slam")) == GridSlamConfig()
-
-
-def test_a_bad_parameter_is_named() -> None:
-    with pytest.raises(ValueError, match="map_period_s must be > 0"):
-        GridSlamConfig(map_period_s=0.0)
 
 
 def save_box_map(folder: Path) -> Path:

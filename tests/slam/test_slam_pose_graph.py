@@ -77,13 +77,3 @@ def test_a_large_true_loop_is_not_switched_off() -> None:
     assert (solution.weights > 0.5).all()
     rest = relative2(solution.poses[0], solution.poses[100])
     assert math.hypot(rest[0], rest[1]) < 0.15
-
-
-def test_faults_are_told() -> None:
-    poses = np.zeros((3, 3))
-    with pytest.raises(ValueError, match="not in the graph"):
-        optimise(poses, [Edge(0, 7, np.zeros(3), STEP)], index(3))
-    with pytest.raises(ValueError, match="not connected"):
-        optimise(poses, [Edge(0, 1, np.zeros(3), STEP)], index(3))
-    alone = optimise(poses[:1], [], index(1))
-    assert np.array_equal(alone.poses, poses[:1])

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from slam_planar_world import rectangle
 
 from instant_ic.experiments.slam_worlds import Drive, Laser, drive
@@ -117,15 +115,6 @@ def test_a_bad_map_is_told(tmp_path: Path, text: str, what: str) -> None:
     (tmp_path / "p.yaml").write_text(text)
     with pytest.raises(MapError, match=what):
         load_grid(tmp_path / "p")
-
-
-@settings(max_examples=60)
-@given(st.text(max_size=80))
-def test_no_text_raises_anything_but_a_map_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
-    path = tmp_path_factory.getbasetemp() / "fuzz.yaml"
-    path.write_text(text)
-    with pytest.raises(MapError):
-        load_grid(path)
 
 
 def test_faults_of_saving_and_loading(tmp_path: Path) -> None:
