@@ -15,9 +15,8 @@ All times start at the browser's time of the key event:
 - ``pixels_forward_ms``, ``pixels_turn_ms``: to the end of the first frame whose pixels, read back from the canvas,
   differ from those before the key. The CPU has rendered the frame by then; the compositor has not shown it yet.
 
-They include the robot's own acceleration: 2 mm take 71 ms at 0.8 m/s2. ``steps_ms`` has the time of single steps,
-``draws_hz`` the page's frame rate while the v-bot moved. Reading back delays the frames up to the first one that
-differs.
+They include the robot's own acceleration: 2 mm take 71 ms at 0.8 m/s2. Reading back delays the frames up to the first
+one that differs.
 """
 
 from __future__ import annotations
@@ -96,7 +95,7 @@ addEventListener("keydown", (event) => {
     if (event.repeat) return;
     const pressed = performance.timeOrigin + event.timeStamp, sign = signs[event.code] ?? 0;
     const unset = {forward: 0, first: 0, turn: 0, pixels: 0};
-    presses.push({code: event.code, sign, pressed, from: last, draws: [], ...unset});
+    presses.push({code: event.code, sign, pressed, from: last, ...unset});
 }, true);
 addEventListener("rendered", ({detail}) => {
     const now = performance.timeOrigin + performance.now(), press = presses.at(-1);
@@ -107,7 +106,6 @@ addEventListener("rendered", ({detail}) => {
     if (press?.from && detail.blend > 0.99) {
         const way = [0, 1].map((i) => detail.place[i] - press.from.place[i]), yaw = press.from.yaw;
         const ahead = press.sign * (way[0] * Math.cos(yaw) + way[1] * Math.sin(yaw));
-        press.draws.push(now);
         if (!press.forward && ahead >= 0.002) press.forward = now;
         if (!press.first && ahead >= 0.0005) press.first = now;
         if (!press.turn && Math.abs(detail.pose[2] - yaw) > 0.00087) press.turn = now;
@@ -123,8 +121,6 @@ class SimulatedInput:
     def __init__(self, stack: Stack) -> None:
         self.stack = stack
         self.error = ""
-        self.marks: dict[str, int] = {}
-        """Time at which each step was first seen since the last press, ns."""
         self.views = 0
         """Rendered views of the server, without those that are only judged."""
         self._vbot = np.eye(4)
@@ -158,12 +154,7 @@ class SimulatedInput:
         self._stop.set()
         self._thread.join(timeout=5.0)
 
-    def _mark(self, step: str, message: Any) -> None:
-        if any(twist_values(message)):
-            self.marks.setdefault(step, time.time_ns())
-
     def _on_operator(self, message: Any) -> None:
-        self._mark("operator", message)
         changed = twist_values(message) != twist_values(self._operator)
         self._operator, self._holder = message.twist, f"console/{message.header.frame_id}"
         if changed:
@@ -171,7 +162,6 @@ class SimulatedInput:
 
     def _on_vbot(self, message: Any) -> None:
         self._vbot = matrix_from_pose(message)
-        self._mark("vbot", message)
 
     def _on_view(self, message: Any) -> None:
         self.views += message.width > 2 * PROBE[0]
@@ -250,7 +240,7 @@ def measure(presses: int) -> dict[str, Any]:
         page.locator('body[data-driver="you"][data-blend="1.00"][data-image="live"]').wait_for(timeout=START_S * 1000)
         page.wait_for_timeout(2000)
         wait_for_layers(page, robot)
-        rows = press_keys(page, robot, presses)
+        rows = press_keys(page, presses)
         browser.close()
     return figures(rows)
 
@@ -286,18 +276,16 @@ def wait_for_layers(page: Any, robot: SimulatedInput) -> None:
         page.wait_for_timeout(3000)
 
 
-def press_keys(page: Any, robot: SimulatedInput, presses: int) -> list[dict[str, Any]]:
-    """Press the keys in turn; return what the page and the bus saw of each press."""
+def press_keys(page: Any, presses: int) -> list[dict[str, Any]]:
+    """Press the keys in turn; return what the page saw of each press."""
     rows, jitter = [], random.Random(1)
     for number in range(2 * presses):
-        robot.marks.clear()
         key = ("KeyW", "KeyA", "KeyS", "KeyD")[number % 4]
         page.keyboard.down(key)
         page.wait_for_timeout(500)
         page.keyboard.up(key)
         page.wait_for_timeout(900 + jitter.uniform(0, 100))  # not in phase with any timer
-        row = page.evaluate("presses.at(-1)")
-        rows.append(row | {"marks": dict(robot.marks)})
+        rows.append(page.evaluate("presses.at(-1)"))
     return rows
 
 
@@ -314,9 +302,6 @@ def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
             found["p95"] = round(statistics.quantiles(values, n=20, method="inclusive")[18], 1)
         return found
 
-    def marked(step: str) -> dict[str, Any]:
-        return since(straight, (row["marks"].get(step, 0) / 1e6 for row in straight))
-
     def rendered(chosen: list[dict[str, Any]], event: str) -> dict[str, Any]:
         return since(chosen, (row[event] for row in chosen))
 
@@ -326,14 +311,7 @@ def figures(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "shown_turn_ms": rendered(turns, "turn"),
         "pixels_forward_ms": rendered(straight, "pixels"),
         "pixels_turn_ms": rendered(turns, "pixels"),
-        "draws_hz": round(statistics.median(draws_hz(row) for row in straight), 1),
-        "steps_ms": {step: marked(step) for step in ("operator", "vbot")},
     }
-
-
-def draws_hz(row: dict[str, Any]) -> float:
-    """Return the frames per second in the half second of the press."""
-    return sum(0 <= at - row["pressed"] < 500 for at in row["draws"]) / 0.5
 
 
 def main() -> int:
