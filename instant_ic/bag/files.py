@@ -92,7 +92,7 @@ class BagReader(Closing):
         except (ValueError, LookupError, TypeError, AttributeError) as error:
             self._reader.close()
             raise BagError(
-                f"bag {path}: {REPEATED} in metadata.yaml is wrong ({error}): ic bag reindex {path}"
+                f"bag {path}: {REPEATED} in metadata.yaml is wrong ({error}): ic bag recover {path}"
             ) from None
 
     def close(self) -> None:
@@ -132,7 +132,7 @@ class BagReader(Closing):
             except (TypeError, ValueError, OverflowError):
                 raise BagError(
                     f"{self.path}: metadata.yaml: message_count of {connection.topic} is {connection.msgcount!r}, "
-                    "not a whole number; ic bag reindex writes the file again"
+                    "not a whole number; ic bag recover makes a new bag"
                 ) from None
         for topics in self._repeated.values():
             for key in counts:
@@ -294,7 +294,7 @@ class BagReader(Closing):
         if any(self.path.glob("*.mcap")):
             return (
                 f"{self.path} has no metadata.yaml: the recording was interrupted, or the file was lost. Run "
-                f"ic bag recover {self.path}, or ic bag reindex {self.path} if its files are complete"
+                f"ic bag recover {self.path}"
             )
         return f"{self.path} has no metadata.yaml and no MCAP files: it is not a bag"
 

@@ -1,4 +1,4 @@
-"""Recovers truncated bags (power loss, full disk, killed recorder) and rebuilds ``metadata.yaml``."""
+"""Recovers truncated bags (power loss, full disk, killed recorder)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from pathlib import Path
 
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_scan import McapScan
-from instant_ic.bag.mcap_writer import Schema
-from instant_ic.bag.metadata import PartInfo, Topic, preset_of_text, with_hash, write_metadata
+from instant_ic.bag.metadata import preset_of_text, with_hash
 from instant_ic.bag.writer import CUSTOM_RECORD, BagWriter
-from instant_ic.bus.qos import QoS
 
 
 @dataclass(frozen=True)
@@ -70,59 +68,6 @@ def recover(source: Path, target: Path) -> Recovered:
         target.rmdir()
         raise BagError(f"{source}: no message could be recovered ({why or '; '.join(damaged) or 'it contains none'})")
     return Recovered(count, why, damaged, skipped)
-
-
-def reindex(folder: Path) -> tuple[int, int]:
-    """Rebuild ``metadata.yaml`` of a folder from its MCAP files.
-
-    Returns:
-        Number of files and of messages.
-
-    Raises:
-        BagError: the folder has no MCAP files, or one is truncated (use :func:`recover`).
-    """
-    if not folder.is_dir():
-        raise BagError(f"{folder} is not a folder; a single file needs no metadata.yaml")
-    parts: list[PartInfo] = []
-    topics: dict[Topic, tuple[QoS, Schema]] = {}
-    custom: dict[str, str] = {}
-    for file in mcap_files(folder):
-        try:
-            parts.append(_part(file, topics, custom))
-        except ValueError as error:
-            raise BagError(f"{file} is incomplete: {error}; ic bag recover {folder}") from None
-    try:
-        write_metadata(folder, parts, topics, custom)
-    except OSError as error:
-        raise BagError(f"{folder}/metadata.yaml cannot be written: {error.strerror}") from None
-    return len(parts), sum(part.count - sum(part.repeated.values()) for part in parts)
-
-
-def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str, str]) -> PartInfo:
-    """Summarise one file; its topics and custom data are added to ``topics`` and ``custom``.
-
-    Raises:
-        ValueError: it is truncated or damaged.
-    """
-    part, scan = PartInfo(file.name), McapScan(file)
-    stamps: list[int] = []
-    for message in scan.messages():
-        topic = (message.topic, message.schema.name)
-        part.counts[topic] = part.counts.get(topic, 0) + 1
-        stamps.append(message.stamp_ns)
-        if message.repeated:
-            part.repeated[message.topic] = part.repeated.get(message.topic, 0) + 1
-            part.repeated_ns = message.stamp_ns
-    if problem := scan.stopped_by or "; ".join(scan.damaged):
-        raise ValueError(problem)
-    for channel in scan.channels.values():
-        schema = with_hash(scan.schema_of(channel))
-        qos = preset_of_text(channel.metadata.get("offered_qos_profiles", ""))
-        topics.setdefault((channel.topic, schema.name), (qos, schema))
-    if stamps:
-        part.start_ns, part.end_ns = min(stamps), max(stamps)
-    custom.update(scan.metadata.get(CUSTOM_RECORD, {}))
-    return part
 
 
 def mcap_files(source: Path) -> list[Path]:

@@ -331,5 +331,5 @@ class BagWriter(Closing):
         try:
             write_metadata(self.path, self._done, self._topics, self._custom)
         except OSError as error:
-            hint = f"; make room, then ic bag reindex {self.path}" if error.errno in _FULL else ""
+            hint = f"; make room, then ic bag recover {self.path}" if error.errno in _FULL else ""
             raise BagError(f"bag {self.path}: metadata.yaml cannot be written: {error.strerror}{hint}") from error

@@ -1,4 +1,4 @@
-"""``ic bag info``, ``diff``, ``convert``, ``recover`` and ``reindex``: the commands that work on files alone."""
+"""``ic bag info``, ``diff``, ``convert`` and ``recover``: the commands that work on files alone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from instant_ic.bag.compare import Tolerance, TopicDifference, compare
 from instant_ic.bag.convert import ConvertOptions
 from instant_ic.bag.convert import convert as convert_bags
 from instant_ic.bag.recover import recover as recover_bag
-from instant_ic.bag.recover import reindex as reindex_bag
 from instant_ic.cli.commands.bag import pairs, topic_names
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.progress import progress
@@ -201,10 +200,4 @@ def recover(args: argparse.Namespace) -> int:
         print(f"left out, damaged: {words}")
     for topic, why in sorted(result.skipped.items()):
         print(f"left out: {topic}, {why}")
-    return 0
-
-
-def reindex(args: argparse.Namespace) -> int:
-    files, messages = reindex_bag(Path(args.bag))
-    print(f"{args.bag}/metadata.yaml: {messages} messages in {files} files")
     return 0

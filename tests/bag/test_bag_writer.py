@@ -8,7 +8,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from instant_ic.bag import BagError, BagReader, BagWriter
-from instant_ic.bag.recover import recover, reindex
+from instant_ic.bag.recover import recover
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.msg import Bool, TFMessage, serialize, transform_message
 
@@ -126,8 +126,6 @@ def test_metadata_tells_complete_files_while_the_last_is_written(tmp_path: Path)
     with BagReader(tmp_path / "bag") as reader:
         assert [m.payload[0] for m in reader.messages()] == [0, 1, 2, 3]
         assert [file.name for file in reader.unlisted] == ["bag_2.mcap"]
-    with pytest.raises(BagError, match=r"bag_2.mcap is incomplete.*ic bag recover"):
-        reindex(tmp_path / "bag")
     result = recover(tmp_path / "bag", tmp_path / "saved")
     assert (result.count, "bag_2.mcap" in result.stopped_by) == (5, True)
     assert [m[2][0] for m in read(tmp_path / "saved")] == [0, 1, 2, 3, 4]
@@ -135,32 +133,29 @@ def test_metadata_tells_complete_files_while_the_last_is_written(tmp_path: Path)
 
 
 @pytest.mark.parametrize("damage", ["missing", "wrong", "no yaml"])
-def test_reindex_makes_the_same_metadata(tmp_path: Path, damage: str) -> None:
+def test_damaged_metadata_is_recovered(tmp_path: Path, damage: str) -> None:
     bag = split_bag(tmp_path / "bag", max_duration_s=3.0)
     before = (bag / "metadata.yaml").read_text()
     if damage == "missing":
         (bag / "metadata.yaml").unlink()
-        with pytest.raises(BagError, match="ic bag reindex"):
+        with pytest.raises(BagError, match="ic bag recover"):
             BagReader(bag)
     else:
         (bag / "metadata.yaml").write_text("{[" if damage == "no yaml" else before.replace("bag_1.mcap", "x.mcap"))
         with pytest.raises(BagError, match="cannot be read"):
             BagReader(bag)
-    assert reindex(bag) == (4, len(ONE))
-    assert read(bag) == ONE
-    assert (bag / "metadata.yaml").read_text() == before
+    assert recover(bag, tmp_path / "saved").count == len(ONE)
+    assert read(tmp_path / "saved") == ONE
 
 
-def test_custom_data_survives_reindex_and_recover(tmp_path: Path) -> None:
+def test_custom_data_survives_a_recovery(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as writer:
         writer.set_custom("instant_ic.lost", json.dumps({"/scan": 3}))
         writer.write("/scan", BOOL, b"x", 1, SENSOR)
     (tmp_path / "bag" / "metadata.yaml").unlink()
     recover(tmp_path / "bag", tmp_path / "saved")
-    reindex(tmp_path / "bag")
-    for name in ("bag", "saved"):
-        with BagReader(tmp_path / name) as reader:
-            assert json.loads(reader.custom["instant_ic.lost"]) == {"/scan": 3}
+    with BagReader(tmp_path / "saved") as reader:
+        assert json.loads(reader.custom["instant_ic.lost"]) == {"/scan": 3}
 
 
 def test_recover_leaves_out_a_damaged_chunk_and_goes_on(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str])
         },
         "ic node": {"list", "info"},
         "ic topic": {"list", "info", "echo", "hz", "bw", "delay", "pub", "find", "type"},
-        "ic bag": {"record", "play", "info", "diff", "recover", "convert", "reindex", "snapshot", "control"},
+        "ic bag": {"record", "play", "info", "diff", "recover", "convert", "snapshot", "control"},
         "ic param": {"list", "get", "set", "describe", "dump", "load"},
     }
     wanted = {f"{prefix} {verb}" for prefix, verbs in ours.items() for verb in verbs}

@@ -667,18 +667,6 @@ def _parse_metadata() -> Callable[[bytes], object]:
     return parse
 
 
-def _parse_reindex() -> Callable[[bytes], object]:
-    from instant_ic.bag.recover import reindex
-
-    def parse(path: Path) -> None:
-        folder = path.parent / "bag"
-        folder.mkdir(exist_ok=True)
-        path.replace(folder / "bag_0.mcap")
-        reindex(folder)
-
-    return _by_file("bag.mcap", parse)
-
-
 def _sqlite_bags() -> list[bytes]:
     from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -1008,7 +996,6 @@ TARGETS = {
         Target("mcap-scan", _mcaps, _parse_scan, _bag_errors(), fix=fix_chunk, share=800),
         Target("mcap-recover", _mcaps, _parse_recover, _bag_errors(), fix=fix_chunk, share=30),
         Target("mcap-read", _mcaps, _parse_bag, _bag_errors(), fix=fix_chunk, share=150),
-        Target("mcap-reindex", _mcaps, _parse_reindex, _bag_errors(), fix=fix_chunk, share=100),
         Target("bag-metadata", _metadata_files, _parse_metadata, _bag_errors(), _YAML_WORDS, share=20),
         Target("sqlite-bag", _sqlite_bags, _parse_sqlite, _bag_errors(), share=100),
         Target("parameters", _parameter_samples, _parse_parameters, _parameter_errors(), _YAML_WORDS, share=100),

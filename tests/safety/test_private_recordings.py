@@ -12,7 +12,7 @@ from instant_ic.bag.choice import EVERYTHING
 from instant_ic.bag.convert import convert
 from instant_ic.bag.on_demand import OnDemand
 from instant_ic.bag.recorder import BagRecorderConfig, Recorder
-from instant_ic.bag.recover import recover, reindex
+from instant_ic.bag.recover import recover
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bridge.host_keys import KeyStore
 from instant_ic.launch.outlet import NodeLog
@@ -78,12 +78,10 @@ def test_snapshots_are_private(tmp_path):
     assert_private(tmp_path / "snapshots")
 
 
-def test_converted_recovered_and_reindexed_bags_are_private(tmp_path):
+def test_converted_and_recovered_bags_are_private(tmp_path):
     source = write(tmp_path / "drive")
     convert([source], tmp_path / "converted")
     recover(source, tmp_path / "recovered")
-    (source / "metadata.yaml").unlink()
-    reindex(source)
     for bag in (source, tmp_path / "converted", tmp_path / "recovered"):
         assert_private(bag)
 

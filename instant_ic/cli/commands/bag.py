@@ -86,7 +86,7 @@ def _add_inspection(verbs: Any) -> None:
 
 
 def _add_conversion(verbs: Any) -> None:
-    """Add ``ic bag convert``, ``recover`` and ``reindex``."""
+    """Add ``ic bag convert`` and ``recover``."""
     text = "convert SQLite bags and bare files to a bag; filter, cut, merge, compress"
     converting = verb(verbs, "convert", text, "bag_look.convert", "ic bag convert old.bag -o drive")
     add = converting.add_argument
@@ -103,10 +103,6 @@ def _add_conversion(verbs: Any) -> None:
     rescuing = verb(verbs, "recover", text, "bag_look.recover", example)
     rescuing.add_argument("bag", metavar="BAG", completer=completion.bags)
     rescuing.add_argument("-o", "--output", default="", metavar="DIR", help="default: BAG_recovered")
-
-    text = "rebuild a bag's metadata.yaml from its complete files"
-    indexing = verb(verbs, "reindex", text, "bag_look.reindex", "ic bag reindex drive")
-    indexing.add_argument("bag", metavar="BAG", completer=completion.bags)
 
 
 def _add_control(verbs: Any) -> None:
