@@ -1,8 +1,15 @@
-"""Depth of the whole panorama from LiDAR points alone, by a structure of walls, floor and ceiling. numpy only.
+"""Depth of the whole panorama from the points of one LiDAR revolution, by a structure of walls, floor and ceiling.
 
-A VLP-16 covers 30 degrees of elevation, the panorama 180. Outside the LiDAR's range of elevations, a building's usual
-structure is assumed: the last surface in a column of the image is an upright wall on a level floor, under a level
-ceiling. Each pixel carries its origin and its uncertainty.
+A VLP-16 covers 30 degrees of elevation, the panorama 180. Elsewhere a building's usual structure is assumed: the last
+surface in a column of the image is an upright wall on a level floor, under a level ceiling. ``LidarStructure`` takes
+these steps:
+
+1. Level the points by ``level_from_camera``, and remove the lonely ones (``_confirmed``).
+2. ``plane_height``: find floor and ceiling, on which points that follow each other upwards are of one height.
+3. ``_Building``: fill the level image column by column. ``_walls`` interpolates upright surfaces between points and
+   continues them up (``_crown``) and down, ``_plates`` adds level surfaces between two points of one height,
+   ``_planes`` cuts all by floor and ceiling, and ``fill`` bridges narrow azimuths without a return.
+4. ``structure_sigma``: give each pixel the uncertainty of its ``Origin``, fitted on simulated rooms.
 """
 
 from __future__ import annotations
@@ -21,11 +28,29 @@ from instant_ic.geometry.projections import nearest_pixels, rays_of
 
 Floats = NDArray[np.floating]
 Indices = NDArray[np.signedinteger]
-_MIN_POINTS = 300
-_MAX_UNDER_FLOOR = 0.1  # a larger share of points there: height or tilt of the camera is wrong, or stairs go down
-_MAX_GAP_DEG = 8.0  # an azimuth without any return is bridged up to this width; a wider one is open: unknown
-_FLOOR_TOLERANCE_M = 0.08
-_SAME_SURFACE = 0.15  # share by which the horizontal ranges of two points of one upright surface differ at most
+
+
+@dataclass(frozen=True)
+class StructureTuning:
+    """Tuning of the structure.
+
+    Attributes:
+        min_points: fewest points from which a structure is built.
+        max_under_floor: largest share of points under the floor; more mean a wrong height or tilt of the camera, or
+            stairs that go down.
+        max_gap_deg: widest azimuth without any return that is bridged; a wider one is open, and unknown.
+        floor_tolerance_m: largest distance of a point from floor or ceiling that still counts as on it.
+        same_surface: largest relative difference of the horizontal ranges of two points of one upright surface.
+    """
+
+    min_points: int = 300
+    max_under_floor: float = 0.1
+    max_gap_deg: float = 8.0
+    floor_tolerance_m: float = 0.08
+    same_surface: float = 0.15
+
+
+TUNING = StructureTuning()
 
 
 class Origin(IntEnum):
@@ -48,8 +73,8 @@ class LidarDepthConfig:
 
     Attributes:
         min_range_m: points nearer than this to the camera are left out (the robot itself).
-        max_range_m: farther points are left out; what lies farther is unknown.
-        ceiling_height_m: of the ceiling over the floor, where no point was seen on it.
+        max_range_m: points farther than this are left out; farther surfaces are unknown.
+        ceiling_height_m: height of the ceiling over the floor where no point was seen on it.
         top_ring_deg: elevation of the LiDAR's uppermost ring.
     """
 
@@ -69,13 +94,13 @@ class LidarDepth:
     """Depth from points alone.
 
     Attributes:
-        depth_m: (H, W) float32 radial metres, 0 = unknown.
-        origin: (H, W) uint8, an ``Origin`` each.
-        gap_rad: (H, W) float32 angle to the next point above or below; pi where there is none.
+        depth_m: radial depth in metres, (H, W) float32; 0 is unknown.
+        origin: ``Origin`` of each pixel, (H, W) uint8.
+        gap_rad: angle to the next point above or below, (H, W) float32; pi where there is none.
         points: number of points used.
-        camera_height_m: of the camera over the floor, given or found; None where neither.
-        ceiling_height_m: of the ceiling over the camera, found from points; None where no ceiling was seen.
-        message: why ``depth_m`` is not to be trusted; empty where it is.
+        camera_height_m: height of the camera over the floor, given or found; None if neither.
+        ceiling_height_m: height of the ceiling over the camera, found from points; None if no ceiling was seen.
+        message: reason for not trusting ``depth_m``; empty if it is trusted.
     """
 
     depth_m: NDArray[np.float32]
@@ -88,7 +113,7 @@ class LidarDepth:
 
     @property
     def sigma(self) -> NDArray[np.float32]:
-        """(H, W) float32 relative standard deviation, inf where unknown."""
+        """Relative standard deviation, (H, W) float32; inf where unknown."""
         return structure_sigma(self.origin, self.gap_rad)
 
 
@@ -111,7 +136,7 @@ def level_from_camera(up: Floats) -> NDArray[np.float64]:
 
 
 def plane_height(z: Floats, across_m: Floats, columns: NDArray[np.intp], bin_m: float = 0.04) -> float | None:
-    """Height of the level plane that most points lie on; None where no plane stands out.
+    """Return the height of the level plane that most points lie on; None if no plane stands out.
 
     Points that follow each other upwards in a column of the image are of one height on a plane, and of one
     horizontal range on a wall.
@@ -145,7 +170,7 @@ _AROUND = [(row, column) for row in (-2, -1, 0, 1, 2) for column in (-2, -1, 1, 
 def lonely(
     measured: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], alike: float = 0.12
 ) -> NDArray[np.bool_]:
-    """Mask (N,) of points without neighbours that confirm them: dust, mixed pixels, mirrors.
+    """Return a mask (N,) of points without neighbours that confirm them: dust, mixed pixels, mirrors.
 
     Args:
         measured: (H, W) ranges, 0 where no point is.
@@ -194,7 +219,7 @@ class LidarStructure:
         size: tuple[int, int] = (256, 512),
         ceiling_m: float | None = None,
     ) -> LidarDepth:
-        """Depth of every pixel that the structure reaches.
+        """Estimate the depth of every pixel that the structure reaches.
 
         Args:
             points: (N, 3) in the camera's frame, metres; points that are not finite are left out.
@@ -211,10 +236,10 @@ class LidarStructure:
             raise ValueError(f"points must be (N, 3) (got {points.shape})")
         turn = level_from_camera(up)
         level = self._usable(points) @ turn.T
-        if len(level) < _MIN_POINTS:
+        if len(level) < TUNING.min_points:
             words = (
                 f"{len(level)} LiDAR points between {self.config.min_range_m} and {self.config.max_range_m} m, "
-                f"{_MIN_POINTS} are needed"
+                f"{TUNING.min_points} are needed"
             )
             nothing = np.zeros(size, np.float32), np.zeros(size, np.uint8), np.full(size, np.pi, np.float32)
             return LidarDepth(*nothing, len(level), camera_height_m, None, words)
@@ -237,7 +262,7 @@ class LidarStructure:
         )
 
     def ranges(self, points: Floats, size: tuple[int, int]) -> NDArray[np.float32]:
-        """Range (H, W) in each pixel of the camera's image that a confirmed point (N, 3) falls into, else 0."""
+        """Return the range (H, W) in each pixel that a confirmed point (N, 3) falls into, else 0."""
         picture = np.zeros(size, np.float32)
         _, rows, columns, range_m = _confirmed(self._usable(points), size)
         picture[rows, columns] = range_m
@@ -254,7 +279,7 @@ class LidarStructure:
         if problem := azimuth_problem(columns, width):
             return problem
         under = 0.0 if floor is None else float((z < -floor - 0.15 - 0.02 * range_m).mean())
-        if under > _MAX_UNDER_FLOOR:
+        if under > TUNING.max_under_floor:
             return (
                 f"{under:.0%} of the points lie under the floor ({floor:.2f} m under the camera): "
                 "height or tilt of the camera is wrong, or stairs go down"
@@ -266,9 +291,9 @@ class _Building:
     """The structure in a level image, column by column.
 
     Attributes:
-        hit: (H, W) horizontal range of the point in each pixel, 0 without one.
-        flat: (H, W) the point is of the floor or the ceiling.
-        above, below: (H, W) rows of the next points, -1 and H without one; up, down: their indices within the image.
+        hit: horizontal range of the point in each pixel, (H, W); 0 without one.
+        flat: pixels whose point is of the floor or the ceiling, (H, W).
+        above, below: rows of the next points, (H, W), -1 and H without one; up, down: their indices within the image.
     """
 
     def __init__(
@@ -288,7 +313,7 @@ class _Building:
         self.cos, self.sin, self.tan = np.cos(elevation), np.sin(elevation), np.tan(elevation)
         z = range_m * self.sin[rows, 0]
         # A row is half a pixel uncertain, which far away is more than the tolerance.
-        slack = _FLOOR_TOLERANCE_M + range_m * (np.pi / height)
+        slack = TUNING.floor_tolerance_m + range_m * (np.pi / height)
         of_plane = np.zeros(len(z), bool)
         if floor is not None:
             of_plane |= z < -floor + slack
@@ -307,7 +332,7 @@ class _Building:
         self.top_origin = Origin.ASSUMED if ceiling is None else Origin.CEILING
 
     def fill(self) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
-        """Depth, origin and angle to the next point, each (H, W)."""
+        """Return depth, origin and angle to the next point, each (H, W)."""
         height, width = self.size
         column = np.arange(width, dtype=np.int32)
         index = np.arange(height, dtype=np.int32)[:, None]
@@ -340,9 +365,10 @@ class _Building:
         return depth.astype(np.float32), origin, (gap * (np.pi / height)).astype(np.float32)
 
     def _walls(self, index: Indices) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Horizontal range (0: none, NaN: unknown) of the upright surface that each pixel shows, and its origin.
+        """Return the horizontal range (0: none, NaN: unknown) of each pixel's upright surface, and its origin.
 
-        ``index``: the image's rows, (H, 1).
+        Args:
+            index: rows of the image, (H, 1).
         """
         above, below = self.above, self.below
         wall_above = (above >= 0) & ~self.flat[self.up]
@@ -351,7 +377,7 @@ class _Building:
         flat_below = (below < len(index)) & ~wall_below
         r_above, r_below = self.hit[self.up], self.hit[self.down]
         both = wall_above & wall_below
-        same = both & (np.abs(r_above - r_below) < _SAME_SURFACE * np.minimum(r_above, r_below))
+        same = both & (np.abs(r_above - r_below) < TUNING.same_surface * np.minimum(r_above, r_below))
         up, down = self.up[0], self.down[0]
         share = ((index - up) / np.maximum(down - up, 1)).astype(np.float32)
         nearer_above = index - above <= below - index
@@ -372,7 +398,7 @@ class _Building:
         return wall, origin
 
     def _crown(self) -> NDArray[np.float32]:
-        """Horizontal range (W,) at which each column continues above its uppermost point, 0 where unknown.
+        """Return the horizontal range (W,) at which each column continues above its uppermost point, 0 where unknown.
 
         A column is known up to its top where the LiDAR's uppermost ring has a return. Elsewhere that ring passed over
         the surface below it, and the nearest column with a top gives the range behind.
@@ -386,7 +412,7 @@ class _Building:
         return np.where(donor >= 0, across[donor], 0).astype(np.float32)
 
     def _plates(self, depth: Floats, origin: NDArray[np.uint8]) -> None:
-        """Between two points of one height lies a level surface: a table, a bench."""
+        """Put a level surface between two points of one height: a table, a bench."""
         high, low = (self.hit[place] * self.tan[place[0], 0] for place in (self.up, self.down))
         edge = (origin == Origin.EDGE) & (self.above >= 0) & (self.below < self.size[0])
         plate = edge & ~self.flat[self.up] & (high < -0.15) & (np.abs(high - low) < 0.05)
@@ -394,7 +420,7 @@ class _Building:
         np.copyto(origin, np.uint8(Origin.BETWEEN), where=plate)
 
     def _planes(self, depth: Floats, origin: NDArray[np.uint8], wall: Floats) -> None:
-        """Floor and ceiling hide what lies behind them."""
+        """Cut the surfaces by floor and ceiling, which hide what lies behind them."""
         to_floor = np.where(self.sin < 0, -self.ground / self.sin, np.inf)
         np.copyto(origin, np.uint8(self.ground_origin), where=to_floor < depth)
         np.minimum(depth, to_floor, out=depth)
@@ -406,7 +432,7 @@ class _Building:
         np.minimum(depth, to_top, out=depth)
 
     def _bridged(self, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
-        return _bridge(seen, round(_MAX_GAP_DEG / 360 * self.size[1]))
+        return _bridge(seen, round(TUNING.max_gap_deg / 360 * self.size[1]))
 
 
 #: Relative standard deviation at a point and its growth with the angle (1/rad) to it, for each ``Origin``.
@@ -430,19 +456,19 @@ LEAST_SIGMA = 0.005
 
 
 def structure_sigma(origin: NDArray[np.uint8], gap_rad: Floats) -> NDArray[np.float32]:
-    """Relative standard deviation (H, W) of pixels of an ``Origin`` whose next point is ``gap_rad`` away."""
+    """Return the relative standard deviation (H, W) of pixels of an ``Origin`` whose next point is ``gap_rad`` away."""
     base, by_gap = (np.ascontiguousarray(column)[origin] for column in _SIGMA.T)
     sigma = np.hypot(base, by_gap * gap_rad)
     return np.asarray(np.maximum(sigma, LEAST_SIGMA), np.float32)
 
 
 def _highest(z: Floats) -> float:
-    """Height under which nearly all of the heights (N,) lie, at least 0.1 m."""
+    """Return the height under which nearly all of the heights (N,) lie, at least 0.1 m."""
     return max(0.1, float(np.quantile(z, 0.995))) if len(z) else 0.1
 
 
 def _reaches_top(across: Floats, z: Floats, slope: float) -> NDArray[np.bool_]:
-    """Columns (W,) whose uppermost upright point lies where the LiDAR's uppermost ring runs.
+    """Return the columns (W,) whose uppermost upright point lies where the LiDAR's uppermost ring runs.
 
     In range and height the ring is a line of known slope. Its height at range 0, the LiDAR's, is that of the highest
     points: a line fitted to them as well is wrong where far walls are seen by lower rings only.
@@ -461,12 +487,12 @@ def _reaches_top(across: Floats, z: Floats, slope: float) -> NDArray[np.bool_]:
 
 
 def _middle(values: Floats, reach: int = 3) -> Floats:
-    """Median over neighbouring columns (W,), which wrap."""
+    """Return the median over neighbouring columns (W,), which wrap."""
     return np.asarray(np.median([np.roll(values, k) for k in range(-reach, reach + 1)], axis=0))
 
 
 def _bridge(seen: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
-    """For each column the nearest that has points, -1 where none is within a gap of ``most`` columns; they wrap."""
+    """Return for each column the nearest that has points, -1 if none is within a gap of ``most`` columns; they wrap."""
     width = len(seen)
     places = np.flatnonzero(seen)
     if len(places) == 0:

@@ -24,18 +24,32 @@ Floats = NDArray[np.floating]
 Complete = Callable[[NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
 """Channels (6, H, W) (``depth.completion``) -> depth (H, W) in metres and relative sigma (H, W), of one image."""
 SOURCES = ("network", "lidar", "fused", "completed")
-# Of the floor under the robot: a camera's height is known to centimetres.
-_FLOOR_SIGMA = 0.02
-# A point nearer than the local model by this share is of something that has come since.
-_MOVED = 0.15
-# A completion's change counts from this share of the depth on, over an area of so many pixels each way: smaller ones
-# bend what is flat, narrower ones are its blur along edges.
-_LEAST_CHANGE, _LEAST_AREA = 0.1, 7
-# What the LiDAR has measured: upright surfaces with their continuation up and down, and a level ceiling.
+# Surfaces that the LiDAR has measured: upright ones with their continuation up and down, and a level ceiling.
 _MEASURED = (Origin.BEAM, Origin.BETWEEN, Origin.UP, Origin.DOWN, Origin.CEILING)
 _MEASURED_KINDS = (kernels.MEASURED, kernels.BETWEEN, kernels.UP, kernels.DOWN, kernels.CEILING)
-# Relative standard deviation of the network where nothing was measured, fitted on simulated rooms.
-_NETWORK_SIGMA = np.float32(0.58)
+
+
+@dataclass(frozen=True)
+class FusionTuning:
+    """Tuning of the fusion.
+
+    Attributes:
+        floor_sigma: relative standard deviation of the floor's depth under the robot; the camera's height is known to
+            centimetres.
+        network_sigma: the same of the network where nothing was measured, fitted on simulated rooms.
+        moved: a point nearer than the local model by this share belongs to something that has come since.
+        least_change: smallest relative change of a completion that is taken; smaller ones bend flat surfaces.
+        least_area: smallest width and height of such a change, in pixels; narrower ones are blur along edges.
+    """
+
+    floor_sigma: float = 0.02
+    network_sigma: float = 0.58
+    moved: float = 0.15
+    least_change: float = 0.1
+    least_area: int = 7
+
+
+TUNING = FusionTuning()
 
 
 @dataclass(frozen=True)
@@ -194,7 +208,7 @@ class DepthSource:
         known = built.depth_m > 0
         guess = np.maximum(network.depth_m, built.free_m)
         depth = np.where(known, built.depth_m, guess)
-        sigma = np.where(known, built.sigma, np.where(guess > 0, _NETWORK_SIGMA, np.float32(np.inf)))
+        sigma = np.where(known, built.sigma, np.where(guess > 0, np.float32(TUNING.network_sigma), np.float32(np.inf)))
         message = f"{fit.message}; {_surfaces(built)}"
         return replace(
             _of_fit(fit), depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message,
@@ -236,7 +250,7 @@ class DepthSource:
             modelled = local.render(size, ceiling)
             # What this revolution measured plainly nearer has come since.
             hit = (structure.origin == Origin.BEAM) | (structure.origin == Origin.BETWEEN)
-            come = hit & (depth < (1 - _MOVED) * modelled.depth_m)
+            come = hit & (depth < (1 - TUNING.moved) * modelled.depth_m)
             known = (modelled.depth_m > 0) & ~come
             # A surface that the structure assumes in space that beams have passed is none.
             refuted = ~known & ~hit & (depth < modelled.free_m)
@@ -296,12 +310,12 @@ def _contradicts(found_m: Floats, prior_m: Floats) -> NDArray[np.bool_]:
     """Return the pixels at which two depths (H, W) differ plainly, or there is no prior."""
     known = (prior_m > 0) & (found_m > 0)
     change = np.abs(np.log(np.where(known, found_m, 1) / np.where(known, prior_m, 1)))
-    return ~known | (change > _LEAST_CHANGE)
+    return ~known | (change > TUNING.least_change)
 
 
 def _areas(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the parts of a panorama's mask (H, W) that are not narrow."""
-    width = _LEAST_AREA
+    width = TUNING.least_area
     around = np.pad(mask.astype(np.uint8), ((0, 0), (width, width)), mode="wrap")
     return cv2.morphologyEx(around, cv2.MORPH_OPEN, np.ones((width, width), np.uint8))[:, width:-width] > 0
 
@@ -321,7 +335,7 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
         return result
     depth, sigma = result.depth_m.copy(), result.sigma.copy()
     depth[body] = 0 if camera_height_m is None else -camera_height_m / rise[body]
-    sigma[body] = np.inf if camera_height_m is None else _FLOOR_SIGMA
+    sigma[body] = np.inf if camera_height_m is None else TUNING.floor_sigma
     prior = None if result.prior is None else replace(result.prior, robot=body)
     return replace(result, depth_m=depth, sigma=sigma, prior=prior)
 

@@ -1,4 +1,4 @@
-"""Local 3D model: what LiDAR revolutions of the last metres showed, with free space carved, and its depth images.
+"""Local 3D model of the LiDAR revolutions of the last metres, with free space carved, and its depth images.
 
 The model is a window of columns of voxels around the robot. Beams free the voxels that they pass, so people and moved
 things vanish. Each column also keeps the moments of its points, from which surfaces get their place between voxels. A
@@ -22,23 +22,42 @@ from instant_ic.mapping import kernels
 from instant_ic.util.jit import leave_out_blas
 
 Floats = NDArray[np.floating]
-_WINDOW, _CELL_M = 512, 0.05
-_REACH_M = 12.0
-"""Farther points are not kept; the window reaches 12.8 m."""
 STRIDE = 4
-"""Every so many beams of a revolution free space, other ones each time."""
-_LOW_M = -0.2
-_FLOOR_M = 0.1
-"""Points below this height belong to the floor."""
-_BODY_M = (0.1, 2.2)
-"""Heights of the points that place an upright surface; above, a ceiling may be among them."""
-_LEAST_CEILING_M = 1.8
-_CEILING_CLEAR_M = 1.2
-"""Nothing was measured so far below a ceiling."""
-_UNSEEN_M = 0.4
-"""A ray that runs farther through columns nobody has seen ends nowhere."""
-_PLATE_ABOVE_M = 0.3
-"""Things whose top is less than this above the camera may get a plate on top."""
+"""One in this many beams of a revolution frees space, another one each time."""
+
+
+@dataclass(frozen=True)
+class ModelTuning:
+    """Size and tuning of the model; lengths in metres, heights over the floor.
+
+    Attributes:
+        window: columns of the window each way, a power of two.
+        cell_m: side of a voxel.
+        reach_m: farther points are not kept; the window reaches 12.8 m.
+        low_m: height of the lowest voxels.
+        floor_m: points below this height belong to the floor.
+        body_m: heights of the points that place an upright surface; above, a ceiling may be among them.
+        ceiling_m: lowest height of a ceiling.
+        ceiling_clear_m: height below a ceiling in which nothing may have been measured.
+        ceiling_columns: fewest columns that make a ceiling.
+        unseen_m: longest way of a ray through columns that were not seen; a longer one ends nowhere.
+        plate_above_m: things whose top is less than this above the camera may get a plate on top.
+    """
+
+    window: int = 512
+    cell_m: float = 0.05
+    reach_m: float = 12.0
+    low_m: float = -0.2
+    floor_m: float = 0.1
+    body_m: tuple[float, float] = (0.1, 2.2)
+    ceiling_m: float = 1.8
+    ceiling_clear_m: float = 1.2
+    ceiling_columns: int = 60
+    unseen_m: float = 0.4
+    plate_above_m: float = 0.3
+
+
+TUNING = ModelTuning()
 
 
 @dataclass(frozen=True)
@@ -46,9 +65,9 @@ class LocalModelConfig(Checked):
     """Parameters of the local model.
 
     Attributes:
-        keep_m: what was measured farther back on the path than this is forgotten; odometry drifts.
+        keep_m: path of the robot after which measurements are forgotten; odometry drifts.
         height_m: height of the window over the floor.
-        behind_m: how far the top of a low thing goes on behind its face, where nothing was measured.
+        behind_m: length by which the top of a low thing continues behind its face, where nothing was measured.
     """
 
     keep_m: Positive = 10.0
@@ -61,10 +80,10 @@ class LocalDepth:
     """Depth image of the model.
 
     Attributes:
-        depth_m: (H, W) float32 radial metres, 0 where the model does not know.
-        sigma: (H, W) float32 relative standard deviation, inf where unknown.
-        kind: (H, W) uint8, what each pixel shows (constants of ``kernels``).
-        free_m: (H, W) float32, nothing stands nearer than this.
+        depth_m: radial depth in metres, (H, W) float32; 0 is unknown.
+        sigma: relative standard deviation, (H, W) float32; inf where unknown.
+        kind: kind of surface of each pixel (constants of ``kernels``), (H, W) uint8.
+        free_m: distance up to which space is free, (H, W) float32.
     """
 
     depth_m: NDArray[np.float32]
@@ -78,13 +97,13 @@ class LocalModel:
 
     def __init__(self, config: LocalModelConfig | None = None) -> None:
         self.config = config or LocalModelConfig()
-        self._levels = math.ceil((self.config.height_m - _LOW_M) / _CELL_M)
-        self._key = np.empty((_WINDOW, _WINDOW, 2), np.int32)
-        self._odds = np.empty((_WINDOW, _WINDOW, self._levels), np.int8)
-        self._sums = np.empty((_WINDOW, _WINDOW, 6), np.float32)
-        self._last = np.empty((_WINDOW, _WINDOW), np.float32)
-        self._sight = np.empty((_WINDOW, _WINDOW), np.float32)
-        self._index = np.empty((_WINDOW, _WINDOW), np.int32)
+        self._levels = math.ceil((self.config.height_m - TUNING.low_m) / TUNING.cell_m)
+        self._key = np.empty((TUNING.window, TUNING.window, 2), np.int32)
+        self._odds = np.empty((TUNING.window, TUNING.window, self._levels), np.int8)
+        self._sums = np.empty((TUNING.window, TUNING.window, 6), np.float32)
+        self._last = np.empty((TUNING.window, TUNING.window), np.float32)
+        self._sight = np.empty((TUNING.window, TUNING.window), np.float32)
+        self._index = np.empty((TUNING.window, TUNING.window), np.int32)
         self.clear()
 
     def clear(self) -> None:
@@ -97,10 +116,10 @@ class LocalModel:
         """Add a revolution.
 
         Args:
-            points: (N, 3) in the model's frame, metres; points that are not finite are left out.
-            origin: (3,) of the beams.
-            advance_m: how far the robot has come since the last one; ages what is known.
-            stride: every so many beams free space.
+            points: points in the model's frame, (N, 3) metres; those that are not finite are left out.
+            origin: start of the beams, (3,).
+            advance_m: path of the robot since the last revolution.
+            stride: one in this many beams frees space.
 
         Raises:
             ValueError: other shapes, an origin that is not finite, or a negative advance.
@@ -115,73 +134,73 @@ class LocalModel:
         points = points[np.isfinite(points).all(axis=1)]
         self._path_m += advance_m
         kernels.add_revolution(
-            self._key, self._odds, self._sums, self._last, self._sight, points, origin, _CELL_M, _LOW_M, _BODY_M,
-            np.float32(self._path_m), np.float32(self.config.keep_m), self.revolutions % stride, stride, _REACH_M,
+            self._key, self._odds, self._sums, self._last, self._sight, points, origin,
+            TUNING.cell_m, TUNING.low_m, TUNING.body_m,
+            np.float32(self._path_m), np.float32(self.config.keep_m), self.revolutions % stride, stride, TUNING.reach_m,
         )  # fmt: skip
         self.revolutions += 1
 
     def ceiling_m(self, origin: Floats) -> float | None:
-        """Height of the level ceiling around a place (3,) over the floor; None where none was seen."""
-        first = round((_LEAST_CEILING_M - _LOW_M) / _CELL_M)
-        centre = np.floor(np.asarray(origin)[:2] / _CELL_M).astype(np.int64)
+        """Return the height over the floor of the level ceiling around a place (3,); None if none was seen."""
+        first = round((TUNING.ceiling_m - TUNING.low_m) / TUNING.cell_m)
+        centre = np.floor(np.asarray(origin)[:2] / TUNING.cell_m).astype(np.int64)
         found = kernels.ceiling_levels(
             self._key, self._odds, self._last, np.float32(self._path_m), np.float32(self.config.keep_m), centre,
-            round(_REACH_M / _CELL_M), first, round(_CEILING_CLEAR_M / _CELL_M),
+            round(TUNING.reach_m / TUNING.cell_m), first, round(TUNING.ceiling_clear_m / TUNING.cell_m),
         )  # fmt: skip
         # Nothing is seen through a ceiling: the highest level that is as wide as some other counts.
         wide = np.convolve(found, np.ones(3), "same")
-        enough = np.flatnonzero(wide >= max(_LEAST_CEILING_COLUMNS, 0.3 * wide.max()))
+        enough = np.flatnonzero(wide >= max(TUNING.ceiling_columns, 0.3 * wide.max()))
         if len(enough) == 0:
             return None
         best = max(range(max(int(enough[-1]) - 2, 0), int(enough[-1]) + 1), key=lambda level: wide[level])
         near = np.arange(max(best - 1, 0), min(best + 2, len(found)))
-        return float(_LOW_M + (np.average(near, weights=found[near]) + 0.5) * _CELL_M)
+        return float(TUNING.low_m + (np.average(near, weights=found[near]) + 0.5) * TUNING.cell_m)
 
     def render(self, model_from_camera: Matrix, size: tuple[int, int], ceiling_m: float | None = None) -> LocalDepth:
-        """Depth of a panorama.
+        """Render the depth of a panorama.
 
         Args:
-            model_from_camera: (4, 4) pose of the camera.
+            model_from_camera: pose of the camera, (4, 4).
             size: height and width.
             ceiling_m: height over the floor of the ceiling to assume where none was seen; None: unknown.
         """
-        config, cell = self.config, _CELL_M
+        config, cell = self.config, TUNING.cell_m
         origin = np.asarray(model_from_camera[:3, 3], np.float64)
         depth, kind, free = np.zeros(size, np.float32), np.zeros(size, np.uint8), np.zeros(size, np.float32)
         if self.revolutions == 0 or not np.isfinite(model_from_camera).all():
             return LocalDepth(depth, np.full(size, np.inf, np.float32), kind, free)
         measured = self.ceiling_m(origin)
         ceiling = measured if measured is not None else ceiling_m if ceiling_m is not None else math.inf
-        ground = round((_FLOOR_M - _LOW_M) / cell)
-        top = self._levels if ceiling == math.inf else min(int((ceiling - 0.08 - _LOW_M) / cell), self._levels)
+        ground = round((TUNING.floor_m - TUNING.low_m) / cell)
+        top = self._levels if ceiling == math.inf else min(int((ceiling - 0.08 - TUNING.low_m) / cell), self._levels)
         codes, faces = kernels.solid_columns(
             self._key, self._odds, self._sums, self._last, self._sight, np.float32(self._path_m),
-            np.float32(config.keep_m), cell, _LOW_M, ground, top, self._index,
+            np.float32(config.keep_m), cell, TUNING.low_m, ground, top, self._index,
         )  # fmt: skip
         if config.behind_m > 0:
-            highest = int((origin[2] + _PLATE_ABOVE_M - _LOW_M) / cell)
+            highest = int((origin[2] + TUNING.plate_above_m - TUNING.low_m) / cell)
             kernels.put_plates(
                 self._key, self._odds, self._index, codes, faces, origin, cell, ground, config.behind_m, highest
             )
         rays = rays_of(size) @ np.asarray(model_from_camera[:3, :3], np.float32).T
         kernels.cast_rays(
-            self._key, self._index, codes, faces, origin, rays.reshape(-1, 3), cell, _LOW_M, ceiling, measured is None,
-            _REACH_M, _UNSEEN_M, depth.reshape(-1), kind.reshape(-1), free.reshape(-1),
+            self._key, self._index, codes, faces, origin, rays.reshape(-1, 3), cell, TUNING.low_m, ceiling,
+            measured is None,
+            TUNING.reach_m, TUNING.unseen_m, depth.reshape(-1), kind.reshape(-1), free.reshape(-1),
         )  # fmt: skip
         return LocalDepth(depth, _SIGMA[kind], kind, free)
 
     def points(self) -> NDArray[np.float32]:
-        """(N, 3) centres of the solid voxels in the model's frame, on the surface of their column."""
+        """Return the centres of the solid voxels in the model's frame, on the surface of their column, (N, 3)."""
         known = (self._path_m - self._last) <= self.config.keep_m
         a, b, level = np.nonzero((self._odds >= kernels.OCCUPIED) & known[..., None])
         count = self._sums[a, b, 0]
         mean = self._sums[a, b, 1:3] / np.maximum(count, 1)[:, None]
-        across = (self._key[a, b] + 0.5) * _CELL_M + mean
-        z = _LOW_M + (level + 0.5) * _CELL_M
+        across = (self._key[a, b] + 0.5) * TUNING.cell_m + mean
+        z = TUNING.low_m + (level + 0.5) * TUNING.cell_m
         return np.column_stack([across, z]).astype(np.float32)
 
-
-_LEAST_CEILING_COLUMNS = 60
 
 #: Relative standard deviation of depth for each kind of pixel: 68 % of the errors are smaller in seven generated and
 #: scanned worlds (docs/depth.md).

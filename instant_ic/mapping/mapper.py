@@ -14,19 +14,39 @@ from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.lidar.deskew import TimedPoints, points_at
 from instant_ic.mapping.local_model import STRIDE, LocalDepth, LocalModel, LocalModelConfig
 
-_JUMP_M, _JUMP_RAD = 0.2, math.radians(2.0)
-_DRIFT = 0.3
-"""Share of the motion since the last look by which odometry may drift; a larger change of the correction is a jump."""
-_KEEP_S = 60.0
-"""Seconds of motion, such as turns in place, that count as ``keep_m`` of the path."""
-_BACK_NS = 1_000_000_000
-_MOST_POINTS = 200_000
-_ENOUGH_POINTS = 16_000
-_STILL_M, _STILL_RAD = 0.01, math.radians(1.0)
+
+@dataclass(frozen=True)
+class MapperTuning:
+    """Tuning of the mapper.
+
+    Attributes:
+        jump_m: change of the pose's correction beyond drift that is a jump.
+        jump_rad: the same in angle.
+        drift: share of the motion by which odometry may drift.
+        keep_s: seconds of motion, such as turns in place, that count as ``keep_m`` of the path.
+        back_ns: a stamp that goes back by more than this starts the model again.
+        most_points: most points of a revolution; one with more is refused.
+        enough_points: points of a revolution that are used.
+        still_m: motion up to which the robot counts as standing.
+        still_rad: the same in angle.
+    """
+
+    jump_m: float = 0.2
+    jump_rad: float = math.radians(2.0)
+    drift: float = 0.3
+    keep_s: float = 60.0
+    back_ns: int = 1_000_000_000
+    most_points: int = 200_000
+    enough_points: int = 16_000
+    still_m: float = 0.01
+    still_rad: float = math.radians(1.0)
+
+
+TUNING = MapperTuning()
 
 
 class CloudError(ValueError):
-    """A revolution that cannot be added; the text says why."""
+    """A revolution cannot be added; the text says why."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +54,9 @@ class MapperConfig(Checked):
     """Parameters of the local 3D model.
 
     Attributes:
-        model: what is kept, and how finely.
+        model: parameters of the model.
         every_m: metres of motion to the next revolution that is added.
-        every_s: the same in seconds, while the robot stands: for what moves around it.
+        every_s: seconds to the next revolution while the robot stands, for things that move around it.
     """
 
     model: LocalModelConfig = field(default_factory=LocalModelConfig)
@@ -53,7 +73,8 @@ class LocalMapper:
     Args:
         transforms: poses over time.
         config: parameters.
-        map_frame, odom_frame: without a path between them, odometry alone is used.
+        map_frame: frame of the map; odometry alone is used while it is not known.
+        odom_frame: frame of the odometry.
     """
 
     def __init__(
@@ -83,13 +104,13 @@ class LocalMapper:
         """
         held, self._held = self._held, None
         newest = self._taken_ns if held is None else held.stamp_ns
-        if newest is not None and new.stamp_ns < newest - _BACK_NS:
+        if newest is not None and new.stamp_ns < newest - TUNING.back_ns:
             self.clear()
             self._held = new
             raise CloudError(f"time went back by {(newest - new.stamp_ns) / 1e9:.1f} s: the local model starts again")
         count = len(new.time_s)
-        if not 0 < count <= _MOST_POINTS:
-            raise CloudError(f"a revolution of {count} points is left out (1 to {_MOST_POINTS} are possible)")
+        if not 0 < count <= TUNING.most_points:
+            raise CloudError(f"a revolution of {count} points is left out (1 to {TUNING.most_points} are possible)")
         self._held = new
         if held is not None:
             self._add(held)
@@ -109,7 +130,7 @@ class LocalMapper:
         time_s, points = revolution.time_s, revolution.xyz()
         if len(points) != len(time_s):
             raise CloudError(f"a revolution of {len(points)} points with {len(time_s)} times is left out")
-        step = -(-len(points) // _ENOUGH_POINTS)
+        step = -(-len(points) // TUNING.enough_points)
         # Other points each time: of beams that fire in the same order, every second would be of the same rings.
         first = self.model.revolutions % step
         lidar = points_at(
@@ -119,16 +140,16 @@ class LocalMapper:
         if len(lidar) == 0:
             raise CloudError("a revolution without a finite point is left out")
         advance_m = 0.0
-        if self._taken_ns is not None and (moved_m > _STILL_M or turned_rad > _STILL_RAD):
+        if self._taken_ns is not None and (moved_m > TUNING.still_m or turned_rad > TUNING.still_rad):
             since_s = max(stamp_ns - self._taken_ns, 0) / 1e9
-            advance_m = max(moved_m, min(since_s, self.config.every_s) * self.config.model.keep_m / _KEEP_S)
+            advance_m = max(moved_m, min(since_s, self.config.every_s) * self.config.model.keep_m / TUNING.keep_s)
         # At rest revolutions are few, and what has gone shall not stay for long.
         stride = 1 if moved_m < self.config.every_m else STRIDE
         self.model.add(lidar, (model_from_map @ self._map_from(frame, middle_ns))[:3, 3], advance_m, stride)
         self._taken_ns, self._taken_at = stamp_ns, odom_from_lidar
 
     def _map_from(self, frame: str, stamp_ns: int) -> Matrix:
-        """Pose of a sensor in the map at a time; by odometry alone where there is no map."""
+        """Return the pose of a sensor in the map at a time; by odometry alone if there is no map."""
         return self._correction(stamp_ns) @ self.transforms.lookup(self.odom_frame, frame, stamp_ns)
 
     def _correction(self, stamp_ns: int) -> Matrix:
@@ -138,7 +159,7 @@ class LocalMapper:
             return np.eye(4) if self._reference is None else self._reference[1]
 
     def _model_from_map_at(self, frame: str, stamp_ns: int) -> Matrix:
-        """Pose of the map in the model; a jump of the map since the last call moves the model with the robot.
+        """Return the pose of the map in the model; a jump of the map since the last call moves the model too.
 
         Images and revolutions come in any order of their stamps, so correction and motion are compared over the same
         time: a turn on slipping tracks changes the correction by degrees between them and is no jump.
@@ -153,15 +174,15 @@ class LocalMapper:
                 start = odom_from_sensor
             moved_m = float(np.linalg.norm(odom_from_sensor[:3, 3] - start[:3, 3]))
             shift = (map_from_odom - before) @ np.append(odom_from_sensor[:3, 3], 1.0)
-            if float(np.linalg.norm(shift[:3])) > _JUMP_M + _DRIFT * moved_m or (
-                _angle(before, map_from_odom) > _JUMP_RAD + _DRIFT * _angle(start, odom_from_sensor)
+            if float(np.linalg.norm(shift[:3])) > TUNING.jump_m + TUNING.drift * moved_m or (
+                _angle(before, map_from_odom) > TUNING.jump_rad + TUNING.drift * _angle(start, odom_from_sensor)
             ):
                 self._model_from_map = self._model_from_map @ before @ inverse(map_from_odom)
         self._reference = stamp_ns, map_from_odom
         return self._model_from_map
 
     def model_from_camera(self, camera: str, stamp_ns: int) -> Matrix:
-        """Pose of a camera in the model.
+        """Return the pose of a camera in the model.
 
         Raises:
             TransformError: the pose is not known.
@@ -169,7 +190,7 @@ class LocalMapper:
         return self._model_from_map_at(camera, stamp_ns) @ self._map_from(camera, stamp_ns)
 
     def cloud(self) -> NDArray[np.float32]:
-        """(N, 3) points of the model in the map frame; (0, 3) before the first revolution."""
+        """Return the points of the model in the map frame, (N, 3); (0, 3) before the first revolution."""
         if self.model.revolutions == 0:
             return np.empty((0, 3), np.float32)
         map_from_model = inverse(self._model_from_map)
@@ -179,25 +200,25 @@ class LocalMapper:
 
 @dataclass(frozen=True)
 class LocalView:
-    """The model as seen from a camera."""
+    """The model seen from a camera."""
 
     model: LocalModel
     model_from_camera: Matrix
 
     @property
     def ceiling_m(self) -> float | None:
-        """Height of the ceiling over the camera; None where none was seen."""
+        """Height of the ceiling over the camera; None if none was seen."""
         found = self.model.ceiling_m(self.model_from_camera[:3, 3])
         return None if found is None else found - float(self.model_from_camera[2, 3])
 
     def render(self, size: tuple[int, int], ceiling_m: float | None) -> LocalDepth:
-        """Depth image; ``ceiling_m`` over the camera is assumed where no ceiling was seen."""
+        """Render a depth image; ``ceiling_m`` over the camera is assumed where no ceiling was seen."""
         over_floor = None if ceiling_m is None else ceiling_m + float(self.model_from_camera[2, 3])
         return self.model.render(self.model_from_camera, size, over_floor)
 
 
 def correction(transforms: TransformBuffer, map_frame: str, odom_frame: str, stamp_ns: int) -> Matrix:
-    """Pose of odometry in the map at a time, or the newest where that time is not covered.
+    """Return the pose of odometry in the map at a time, or the newest if that time is not covered.
 
     Raises:
         TransformError: there is none.
@@ -209,5 +230,5 @@ def correction(transforms: TransformBuffer, map_frame: str, odom_frame: str, sta
 
 
 def _angle(first: Matrix, second: Matrix) -> float:
-    """Angle between two poses."""
+    """Return the angle between two poses."""
     return math.acos(min(1.0, max(-1.0, float(np.trace(first[:3, :3].T @ second[:3, :3]) - 1) / 2)))

@@ -1,4 +1,13 @@
-"""A keyframe prepared for training: panorama, depth prior with its edges, pose, uncertainty (paper, IV.A-B)."""
+"""A keyframe prepared for training: panorama, depth prior with its edges, pose, uncertainty (paper, IV.A-B).
+
+``prepare`` takes these steps:
+
+1. Check panorama, pose, depth and uncertainty (``_check_panorama``, ``_check_pose``, ``_checked_depth``,
+   ``_checked_sigma``), and mark sky (``sky_region``) and the robot itself (``robot_region``).
+2. ``fill_holes``: fill unknown depth by a pyramid of weighted means (pull-push, Gortler et al., 1996).
+3. ``_cut_tops``: end assumed tops of things where the image does.
+4. ``edge_quads``: mark the quads that cross a depth edge.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +21,6 @@ from instant_ic.vspace.config import GeometryConfig
 
 MOST_SIGMA = 0.5
 """Relative standard deviation above which depth counts as filled in; views of it are less confident."""
-
-
 MOST_COORDINATE_M = 100_000.0
 """Places farther from the map's origin have no centimetres in float32."""
 DEPTH_EDGE_RATIO = 0.10
@@ -23,13 +30,42 @@ ROBOT, SKY, MOVED, ROOM = range(4)
 """Content of a pixel: the robot itself; the sky; something that has moved away; a part of the place. As in
 VspaceLayer.msg.
 """
-_TOP_RAD, _TOP_STEP, _ASSUMED, _CONTRAST, _THING_SHARE = 0.15, 1.3, 0.05, 30.0, 0.15
-"""Of assumed tops, see ``fill_kernels.cut_tops``: their height in the image, the step above them, sigma, grey levels,
-and the share of the thing in a mixed colour."""
-_BAND_SIGMAS, _BAND = 2.0, (0.05, 0.06)  # half width of the band in sigmas of the depth, and its limits
-_DEPTH_M = (0.2, 30.0)  # nearer and farther depths are set to these
-_LEAST_KNOWN = 0.5  # keyframes with a smaller share of known depth are refused
-_SKY_RISE = 0.17  # sine of the elevation that unknown regions must lie above, on the mean, to be the sky
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """Tuning of the preparation of keyframes.
+
+    Attributes:
+        top_rad: height in the image of assumed tops of things (``fill_kernels.cut_tops``).
+        top_step: ratio of the distances above and on such a top.
+        top_sigma: relative standard deviation from which a top counts as assumed.
+        top_contrast: difference in grey levels at which the image ends a thing.
+        thing_share: share of the thing in a mixed colour at its top.
+        band_sigmas: half width of the truncation distance in standard deviations of the depth.
+        band: smallest and largest half width, relative to the depth.
+        depth_m: smallest and largest depth; others are set to these.
+        least_known: keyframes with a smaller share of known depth are refused.
+        sky_rise: smallest mean sine of the elevation of an unknown region that is sky.
+        abrupt: smallest share of a step in the change over five pixels; less is a slope with noise on it.
+        large: a relative difference above this is an edge also where others are near.
+    """
+
+    top_rad: float = 0.15
+    top_step: float = 1.3
+    top_sigma: float = 0.05
+    top_contrast: float = 30.0
+    thing_share: float = 0.15
+    band_sigmas: float = 2.0
+    band: tuple[float, float] = (0.05, 0.06)
+    depth_m: tuple[float, float] = (0.2, 30.0)
+    least_known: float = 0.5
+    sky_rise: float = 0.17
+    abrupt: float = 0.75
+    large: float = 0.3
+
+
+CONFIG = PriorConfig()
 
 
 class KeyframeError(ValueError):
@@ -63,7 +99,7 @@ class PanoramaPrior:
     @property
     def band(self) -> float:
         """Half width, relative to the depth, of the band in which the signed distance is learnt."""
-        return float(np.clip(_BAND_SIGMAS * self.relative_sigma, *_BAND))
+        return float(np.clip(CONFIG.band_sigmas * self.relative_sigma, *CONFIG.band))
 
     @property
     def usable(self) -> NDArray[np.uint8]:
@@ -140,9 +176,9 @@ def prepare(
     sky = content == SKY
     known: NDArray[np.bool_] = depth > 0
     with np.errstate(divide="ignore"):
-        inverse = np.where(known, 1.0 / np.clip(depth, *_DEPTH_M), 0.0)
+        inverse = np.where(known, 1.0 / np.clip(depth, *CONFIG.depth_m), 0.0)
     inverse = np.ascontiguousarray(fill_holes(inverse.astype(np.float32), known & ~sky))
-    inverse[sky] = 1 / _DEPTH_M[1]
+    inverse[sky] = 1 / CONFIG.depth_m[1]
     if np.ndim(relative_sigma):
         _cut_tops(inverse, each, rgb, content == ROOM)
     known |= sky
@@ -166,9 +202,9 @@ def _cut_tops(
 
     height, width = inverse.shape
     colours = area_average(rgb, height, width).astype(np.float32)
-    reach = max(2, round(_TOP_RAD / np.pi * height))
-    step, assumed, contrast, share = (np.float32(value) for value in (_TOP_STEP, _ASSUMED, _CONTRAST, _THING_SHARE))
-    cut_tops(inverse, sigma, colours, room, reach, step, assumed, contrast, share)
+    reach = max(2, round(CONFIG.top_rad / np.pi * height))
+    tuning = (CONFIG.top_step, CONFIG.top_sigma, CONFIG.top_contrast, CONFIG.thing_share)
+    cut_tops(inverse, sigma, colours, room, reach, *(np.float32(value) for value in tuning))
 
 
 def _check_panorama(rgb: NDArray[np.uint8]) -> None:
@@ -196,7 +232,7 @@ def _check_pose(map_from_camera: NDArray[np.floating]) -> None:
 def _checked_depth(
     depth_m: NDArray[np.floating], config: GeometryConfig, robot: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Depth (h, w) and content (h, w)."""
+    """Return the depth (h, w), reduced to 1024 columns, and the content (h, w)."""
     if depth_m.ndim != 2 or depth_m.shape[1] != 2 * depth_m.shape[0] or depth_m.shape[1] < 32:
         raise KeyframeError(f"depth must be (H, 2 H), 32 columns or more (got {depth_m.shape})")
     bad = int(np.count_nonzero(~np.isfinite(depth_m)))
@@ -207,13 +243,13 @@ def _checked_depth(
     # Geometry does not gain from more than 0.35° a pixel, and tears and occupancy cost by the pixel.
     step = max(1, depth_m.shape[1] // 1024)
     rows = depth_m.shape[0] // step
-    depth = np.minimum(depth_m[::step, ::step][:rows, : 2 * rows], _DEPTH_M[1]).astype(np.float32, order="C")
+    depth = np.minimum(depth_m[::step, ::step][:rows, : 2 * rows], CONFIG.depth_m[1]).astype(np.float32, order="C")
     content = np.full(depth.shape, ROOM, np.uint8)
     content[sky_region(depth == 0, config.sky_share)] = SKY
     content[robot_region(depth.shape[0], config.body_below_deg, robot)] = ROBOT
     share = float(np.count_nonzero(depth)) / max(1, int(np.count_nonzero(content != SKY)))
-    if share < _LEAST_KNOWN:
-        raise KeyframeError(f"depth is known in {share:.0%} of the image, {_LEAST_KNOWN:.0%} are needed")
+    if share < CONFIG.least_known:
+        raise KeyframeError(f"depth is known in {share:.0%} of the image, {CONFIG.least_known:.0%} are needed")
     return depth, content
 
 
@@ -235,7 +271,7 @@ def robot_region(height: int, below_deg: float, robot: NDArray[np.bool_] | None)
 
 
 def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.bool_]:
-    """Regions of unknown depth that are the sky, (h, w): as large as ``least_share`` of the sphere, and high up.
+    """Return the regions of unknown depth that are sky, (h, w): as large as ``least_share`` of the sphere, and high up.
 
     Unknown places in a room are small; where they are not, ``least_share`` 1 has them filled from around instead.
     """
@@ -257,7 +293,7 @@ def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.boo
             continue
         part = labels[place] == number
         share = part.sum(axis=1) * area[place[0]]
-        if share.sum() >= least_share and share @ rise[place[0]] > _SKY_RISE * share.sum():
+        if share.sum() >= least_share and share @ rise[place[0]] > CONFIG.sky_rise * share.sum():
             sky[place] |= part
     return sky
 
@@ -270,7 +306,7 @@ def shrunk(rgb: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
 def _checked_sigma(
     relative_sigma: float | NDArray[np.floating], depth_m: NDArray[np.floating], depth: NDArray[np.float32]
 ) -> tuple[float, NDArray[np.float32]]:
-    """One number for the image, and of each pixel of the depth (after ``_checked_depth``), (h, w), inf = unknown."""
+    """Return the uncertainty of the image and of each pixel, (h, w); inf is unknown."""
     sigma = np.asarray(relative_sigma, np.float32)
     if sigma.ndim == 0:
         if not np.isfinite(sigma) or sigma < 0:
@@ -315,10 +351,6 @@ def fill_holes(
     return filled if values.ndim == 3 else filled[..., 0]
 
 
-_ABRUPT = 0.75  # of the change over five pixels: a step that makes up less of it is a slope with noise on it
-_LARGE = 0.3  # a difference larger than this share is an edge also where others are near
-
-
 def edge_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.uint8]:
     """1 for each quad (v, u)-(v + 1, u + 1) that crosses a depth edge; columns wrap, the last row has no quad below.
 
@@ -342,5 +374,5 @@ def _torn_pairs(line: list[NDArray[np.float32]], ratio: float) -> NDArray[np.boo
     jump, nearest = np.abs(a - b), np.minimum(a, b)
     limit = 0.5 * jump
     off = (np.abs(2 * a - before - b) > limit) & (np.abs(2 * b - after - a) > limit)
-    abrupt = (jump > _ABRUPT * np.abs(last - first)) | (jump > _LARGE * nearest)
+    abrupt = (jump > CONFIG.abrupt * np.abs(last - first)) | (jump > CONFIG.large * nearest)
     return (jump > ratio * nearest) & off & abrupt
