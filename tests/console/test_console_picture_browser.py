@@ -85,7 +85,8 @@ def pass_to(page, demo, mode):
 
 
 def test_a_tinted_view_has_the_cameras_colours_at_the_switch_and_the_camera_the_views(open_page, passages):
-    demo = passages(colour_release_s=3600)  # not let go of, however long a busy machine takes for a picture
+    # The colours are not released, however long a busy machine takes for a picture.
+    demo = passages(colour_release_s=3600, dissolve_ms=300, ease_ms=300)
     demo.tint = TINT
     page = open_page(at=demo, bypass_csp=True)
     expect_body(page, "image", "live")
