@@ -148,7 +148,7 @@ async def drive(port: int, seconds: float) -> tuple[list[float], list[float]]:
     trips, stops = [], []
     async with ConsoleClient(f"http://127.0.0.1:{port}/") as driver:
         await driver.acquire()
-        driver._tasks.pop().cancel()  # stop the client's own heartbeat; this function sends it
+        driver.beats.cancel()  # stop the client's own heartbeat; this function sends it
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             sent_s = time.monotonic()

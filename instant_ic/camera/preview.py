@@ -37,6 +37,11 @@ class PreviewParser:
         self._buffer = bytearray()
         self._length: int | None = None
 
+    @property
+    def waiting(self) -> int:
+        """Number of bytes that wait for the rest of a part."""
+        return len(self._buffer)
+
     def feed(self, data: bytes) -> list[bytes]:
         """Take the next chunk and return the JPEGs that it completes, oldest first."""
         self._buffer += data

@@ -27,7 +27,8 @@ class ConsoleClient:
             await console.wait_for(lambda c: c.mode == "virtual", timeout_s=60)
 
     ``state``, ``plan``, ``health``, ``session`` and ``hello`` hold the newest message of that type;
-    ``frames[FrameKind.PANORAMA]`` holds the newest panorama.
+    ``frames[FrameKind.PANORAMA]`` holds the newest panorama. ``socket`` is the WebSocket, ``beats`` the task that sends
+    pings and repeats the command.
     """
 
     def __init__(
@@ -62,8 +63,9 @@ class ConsoleClient:
         self._sequence = 0
         self._command = (0.0, 0.0)
         self._http: aiohttp.ClientSession | None = None
-        self._socket: aiohttp.ClientWebSocketResponse | None = None
-        self._tasks: list[asyncio.Task[None]] = []
+        self.socket: aiohttp.ClientWebSocketResponse | None = None
+        self.beats: asyncio.Task[None] | None = None
+        self._reader: asyncio.Task[None] | None = None
         self._news = asyncio.Condition()
 
     async def __aenter__(self) -> Self:
@@ -83,7 +85,7 @@ class ConsoleClient:
         self._http = aiohttp.ClientSession()
         parts = urlsplit(self.url)
         try:
-            self._socket = await asyncio.wait_for(
+            self.socket = await asyncio.wait_for(
                 self._http.ws_connect(
                     f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}/ws",
                     headers={
@@ -98,18 +100,19 @@ class ConsoleClient:
         except BaseException:
             await self._http.close()
             raise
-        self._tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._beat())]
+        self._reader, self.beats = asyncio.create_task(self._read()), asyncio.create_task(self._beat())
         await self.wait_for(lambda c: c._offset_ms is not None and "hello" in c.messages, timeout_s)
 
     async def close(self) -> None:
         """Stop and disconnect."""
-        for task in self._tasks:
+        tasks = [task for task in (self._reader, self.beats) if task is not None]
+        for task in tasks:
             task.cancel()
-        for task in self._tasks:
+        for task in tasks:
             with contextlib.suppress(asyncio.CancelledError, aiohttp.ClientError, ConnectionError):
                 await task
-        if self._socket is not None:
-            await self._socket.close()
+        if self.socket is not None:
+            await self.socket.close()
         if self._http is not None:
             await self._http.close()
 
@@ -131,7 +134,7 @@ class ConsoleClient:
     @property
     def closed(self) -> bool:
         """True if the socket is closed."""
-        return self._socket is None or self._socket.closed
+        return self.socket is None or self.socket.closed
 
     async def acquire(self, *, take: bool = False, timeout_s: float = 5.0) -> None:
         """Become the driver; raise TimeoutError if another client keeps the lease."""
@@ -171,9 +174,9 @@ class ConsoleClient:
 
     async def send(self, message: dict[str, Any]) -> None:
         """Send a text message."""
-        if self._socket is None:
+        if self.socket is None:
             raise RuntimeError("console client: connect() first")
-        await self._socket.send_json(message)
+        await self.socket.send_json(message)
 
     async def wait_for(self, predicate: Callable[[ConsoleClient], object], timeout_s: float = 10.0) -> None:
         """Wait until ``predicate(self)`` is true; it is checked after each message.
@@ -186,7 +189,7 @@ class ConsoleClient:
             async with asyncio.timeout(timeout_s):
                 async with self._news:
                     while not predicate(self):
-                        if self._socket is None or self._socket.closed:
+                        if self.socket is None or self.socket.closed:
                             raise ConnectionError(f"console client: {self.url} closed the connection")
                         await self._news.wait()
         except TimeoutError:
@@ -195,9 +198,9 @@ class ConsoleClient:
             ) from None
 
     async def _read(self) -> None:
-        assert self._socket is not None
+        assert self.socket is not None
         try:
-            async for message in self._socket:
+            async for message in self.socket:
                 if message.type is aiohttp.WSMsgType.BINARY:
                     await self._on_frame(decode_frame(message.data))
                 elif message.type is aiohttp.WSMsgType.TEXT:
@@ -233,8 +236,8 @@ class ConsoleClient:
             self.errors.append(message["text"])
 
     async def _beat(self) -> None:
-        assert self._socket is not None
-        while not self._socket.closed:
+        assert self.socket is not None
+        while not self.socket.closed:
             # Well below the server's drive.beat_timeout_s.
             await self.send({"type": "ping", "client_ms": time.monotonic() * 1000})
             if self._command != (0.0, 0.0) and self._offset_ms is not None:

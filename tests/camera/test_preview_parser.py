@@ -77,7 +77,7 @@ def test_length_is_read_in_any_case() -> None:
 def test_rubbish_neither_raises_nor_fills_the_memory(rubbish: bytes, sizes: list[int]) -> None:
     found, parser = parse(rubbish, sizes)
     assert found == [] or all(frame[:2] == b"\xff\xd8" for frame in found)
-    assert len(parser._buffer) <= max(4096, len(rubbish))
+    assert parser.waiting <= max(4096, len(rubbish))
 
 
 def test_stream_recovers_after_rubbish() -> None:

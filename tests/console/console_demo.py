@@ -97,7 +97,7 @@ class Demo:
         self.images = True
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
         self._layers_at: Pose | None = None  # keyframe of the layers that were sent
-        self._version = 0
+        self.version = 0
         self.mode = "real"
         self.reason = ""
         self.robot: Pose = np.zeros(3)
@@ -105,11 +105,11 @@ class Demo:
         self.plan: dict[str, Any] = {"trajectory": [], "path": [], "subgoal": None}
         self.costmap: GridImage | None = None
         self._command = (0.0, 0.0)
-        self._placing = threading.Lock()
+        self.placing = threading.Lock()
         self._transitions = 0
         self._slow_due = 0.0
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
-        self._panorama, self._panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
+        self.panorama, self.panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
         self.recorder = DemoRecorder()
         self._desk = RecordingDesk(self.recorder.ask, lambda status: self.server.publish("recording", status), 0.2)
         self._stop = threading.Event()
@@ -196,12 +196,12 @@ class Demo:
         from demo_layers import demo_layers  # takes seconds to import
 
         self._layers_at = keyframe.copy()
-        self._version += 1
-        self.server.send_layers(demo_layers(self._version, _camera(keyframe)))
+        self.version += 1
+        self.server.send_layers(demo_layers(self.version, _camera(keyframe)))
 
     def place(self, x: float, y: float, yaw: float) -> None:
         """Place both robots at this pose (m, rad)."""
-        with self._placing:
+        with self.placing:
             self.robot, self.vbot = np.array([x, y, yaw]), np.array([x, y, yaw])
 
     def reset(self) -> None:
@@ -213,7 +213,7 @@ class Demo:
 
     def step(self, seconds: float) -> None:
         """Advance both robots."""
-        with self._placing:
+        with self.placing:
             self._step(seconds)
 
     def _step(self, seconds: float) -> None:
@@ -303,11 +303,11 @@ class Demo:
     def _send_panorama(self) -> None:
         captured_ms = self.server.now_ms()
         camera = _camera(self.robot)
-        if not np.array_equal(self._panorama_camera, camera):  # a standing robot sees the same image
-            self._panorama = _jpeg(demo_world.shade(_position(camera), _turned(self._directions, camera)))
-            self._panorama_camera = camera
+        if not np.array_equal(self.panorama_camera, camera):  # a standing robot sees the same image
+            self.panorama = _jpeg(demo_world.shade(_position(camera), _turned(self._directions, camera)))
+            self.panorama_camera = camera
         header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist(), "p": camera[:3, 3].tolist()}
-        self.server.send_frame(FrameKind.PANORAMA, header, self._panorama)
+        self.server.send_frame(FrameKind.PANORAMA, header, self.panorama)
 
     def _send_view(self) -> None:
         captured_ms = self.server.now_ms()

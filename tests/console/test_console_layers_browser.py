@@ -110,7 +110,7 @@ def test_a_bad_frame_of_layers_is_refused_and_the_ones_before_stay(open_page, ro
     demo.place(1.9, 0.2, 0.1)
     wait_place(page, 1.9, 0.2, 0.1)
     demo.send_layers(np.array([1.7, 0.2, 0.0]))
-    version = demo._version
+    version = demo.version
     wait_until(
         lambda: any(s.drawn and s.drawn[0] == version for s in demo.server.pages.sessions.values()), page, "the next"
     )
@@ -127,9 +127,9 @@ def test_the_cameras_image_is_shown_from_where_the_robot_is_now_until_a_key_swit
         page = open_layers(open_page, demo, "?quality=full")  # on the CPU it is off at first
         wait_until(lambda: not demo.server.needs_views(), page, "the layers")
         expect_body(page, "image", "live")
-        wait_until(lambda: np.allclose(demo._panorama_camera[:2, 3], KEYFRAME[:2]), page, "an image from there")
+        wait_until(lambda: np.allclose(demo.panorama_camera[:2, 3], KEYFRAME[:2]), page, "an image from there")
         demo.images = False
-        image, camera = demo._panorama, demo._panorama_camera
+        image, camera = demo.panorama, demo.panorama_camera
         room_there = room_seen(there, 0.0, demo.look.pitch)
         demo.place(*there)
         header = {

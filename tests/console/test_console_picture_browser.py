@@ -182,7 +182,7 @@ def test_the_picture_never_jumps_at_a_switch_and_the_rest_of_the_pose_is_eased_o
     assert step < 0.35 * total + 0.5
     assert max(b["blend"] - a["blend"] for a, b in itertools.pairwise(seen)) < 0.25
     # The r-bot stands 2 cm and 1.1° beside the v-bot when the camera comes back.
-    with demo._placing:
+    with demo.placing:
         demo.robot, demo.forced_mode = np.array([0.52, 0.3, 0.22]), "real"
     pass_to(page, demo, "real")
     page.wait_for_function("Math.abs(window.seen.at(-1).yaw - 0.22) < 5e-4", timeout=WAIT_MS)

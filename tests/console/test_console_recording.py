@@ -53,7 +53,7 @@ def desk():
 
     yield made, recorder, wait_for
     made.stop()
-    assert not made._thread.is_alive()
+    assert "recording desk" not in [thread.name for thread in threading.enumerate()]
 
 
 def test_a_recording_is_begun_told_and_ended(desk):

@@ -25,7 +25,6 @@ from instant_ic.console.drive import DriveConfig
 from instant_ic.console.faults import MOST_NAMES, FaultList
 from instant_ic.console.log_rate import LogRate
 from instant_ic.console.pages import WATCHER_SHARE
-from instant_ic.console.session import MAX_REPLIES
 from instant_ic.util.web_access import TokenBucket
 
 __all__ = ["certificate"]  # a fixture
@@ -170,7 +169,7 @@ def test_fault_a_flood_closes_its_own_socket_with_a_reason_and_no_other(serve, f
                 assert pongs <= 200 + 100 * WAIT_S  # 2 s of them at once, then the rate
             writer.close()
             await driver.wait_for(lambda c: c.session["clients"] == 1)
-            assert driver.session["driver"] == "you" and not driver._socket.closed
+            assert driver.session["driver"] == "you" and not driver.closed
 
     run(scenario)
 
@@ -198,7 +197,8 @@ def test_fault_an_emergency_stop_waits_behind_other_clients_messages(serve):
         handled.update([session.number]),
         handle(session, message, now),
     )
-    asked = asyncio.Event()
+    asked, loops = asyncio.Event(), []
+    server.pages.on_watched = lambda _: loops.append(asyncio.get_running_loop())
 
     def stop(stopped):
         at_the_stop.append(handled.copy())
@@ -212,7 +212,7 @@ def test_fault_an_emergency_stop_waits_behind_other_clients_messages(serve):
         await until(lambda: len(server.pages.sessions) == 6)
         number = max(server.pages.sessions)
         # On the server's own thread: its turns stand still until all bytes lie in the sockets.
-        gate = asyncio.run_coroutine_threadsafe(hold(), server._loop)
+        gate = asyncio.run_coroutine_threadsafe(hold(), loops[0])
         await asked.wait()
         for _, writer in flooders:
             writer.write(frame(PING) * 1000)
@@ -284,29 +284,36 @@ def test_fault_a_client_that_does_not_read_grows_the_servers_memory(serve, monke
     for limit in ("BYTES_PER_S", "BURST_BYTES"):  # which would close it before
         monkeypatch.setattr(connections_module, limit, 1e9)
     server = serve(max_messages_per_s=1e6)
-    most = []
 
     async def scenario():
         async with ConsoleClient(server.url) as driver:
             await driver.acquire()
-            reader, writer = await raw_socket(server)  # reads nothing from here on
-            reader._transport.pause_reading()
+            _, writer = await raw_socket(server)  # reads nothing from here on
             await until(lambda: len(server.pages.sessions) == 2)
             session = server.pages.sessions[max(server.pages.sessions)]
             while session.number in server.pages.sessions:
-                most.append(len(session._replies))
-                assert most[-1] <= MAX_REPLIES
                 server.send_frame(FrameKind.PANORAMA, {}, bytes(200_000))
                 writer.write(frame(PING) * 100)
                 with contextlib.suppress(TimeoutError, ConnectionError):
                     await asyncio.wait_for(writer.drain(), 0.01)
-            assert len(session._replies) <= MAX_REPLIES
+            assert session.chokes or session.connection.transport is None  # its replies are bounded
             await until(lambda: session.connection.transport is None)  # cut off although it takes no closing frame
             writer.close()
             await driver.wait_for(lambda c: c.session["clients"] == 1)
 
     run(scenario)
-    assert max(most) <= MAX_REPLIES
+
+
+class Heard(dict):
+    """Messages of a client, whose types are kept in a list."""
+
+    def __init__(self, types, messages):
+        super().__init__(messages)
+        self.types = types
+
+    def __setitem__(self, kind, message):
+        self.types.append(kind)
+        super().__setitem__(kind, message)
 
 
 def test_what_changes_nothing_is_not_sent_to_all(serve):
@@ -318,8 +325,7 @@ def test_what_changes_nothing_is_not_sent_to_all(serve):
             await driver.acquire()
             await watcher.wait_for(lambda c: c.session["driver"] == "other")
             heard = []
-            take = driver._on_text
-            driver._on_text = lambda message: (heard.append(message["type"]), take(message))
+            driver.messages = Heard(heard, driver.messages)
             await watcher.send({"type": "lease", "take": False})
             await watcher.send({"type": "yield"})
             await watcher.send({"type": "estop_release"})
@@ -345,9 +351,8 @@ async def ask_and_leave(server, path, begun):
     writer.close()
 
 
-def test_fault_requests_whose_clients_have_left_wait_for_ever(serve):
+def test_fault_requests_whose_clients_have_left_wait_for_ever(serve, monkeypatch):
     """The limits count connections; a client that opens and closes them could leave any number of waiting requests."""
-    server = serve()
     asked = Counter()
 
     class Full:
@@ -358,7 +363,8 @@ def test_fault_requests_whose_clients_have_left_wait_for_ever(serve):
         def wait_s(self):
             return 0.01
 
-    server._sockets._buckets["127.0.0.1"] = Full()
+    monkeypatch.setattr("instant_ic.console.server.AddressBuckets", lambda *_: SimpleNamespace(of=lambda _: Full()))
+    server = serve()
 
     async def scenario():
         for _ in range(10):
@@ -380,11 +386,11 @@ def test_fault_another_machines_reports_grow_the_consoles_memory():
         status = SimpleNamespace(name=f"{name}: link", level=2, message="lost")
         faults.take_diagnoses(SimpleNamespace(status=[status]), now_s=0.001 * number)
         faults.take_heartbeat(SimpleNamespace(node=name, state=2, cpu_percent=1.0), now_s=0.001 * number)
-    assert len(faults._diagnoses) == len(faults._heartbeats) == len(faults._cpu_percent) == most
+    assert len(faults.nodes(now_s=1.0)) == most
     assert faults.worst(now_s=1.0)[0]["text"] == "lost"
     late = SimpleNamespace(name="arbiter: control", level=2, message="stopped")
     faults.take_diagnoses(SimpleNamespace(status=[late]), now_s=100.0)
-    assert faults._diagnoses.keys() == {"arbiter: control"}  # what nobody has reported for long makes room
+    assert [fault["text"] for fault in faults.worst(now_s=100.0)].count("stopped") == 1  # it finds a place
 
 
 def test_networks_of_addresses():
@@ -415,7 +421,7 @@ def test_fault_idle_connections_starve_the_driver(serve, sent):
             async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(local_addr=ELSEWHERE)) as http:
                 async with http.get(server.url + "health") as response:
                     assert response.status == 200
-            assert not driver._socket.closed
+            assert not driver.closed
         for _, writer in held:
             writer.close()
 
@@ -693,7 +699,7 @@ def test_fault_hostile_json_drives_or_ends_the_server(serve, text):
     async def scenario():
         async with ConsoleClient(server.url) as client:
             await client.acquire()
-            await client._socket.send_str(text.replace("TIME", str(server.now_ms())))
+            await client.socket.send_str(text.replace("TIME", str(server.now_ms())))
             await client.wait_for(lambda c: len(c.errors) == 1)
             await client.send_drive(0.1, 0.0)  # the connection is well
             await until(lambda: (0.1, 0.0) in server.backend.commands)
