@@ -93,6 +93,7 @@ LAUNCH = """launch:
     - {{name: world, value: corridor-free}}
     - {{name: camera.port, value: {camera}}}
     - {{name: lidar.data_port, value: {lidar}}}
+    - {{name: lidar.position_port, value: {position}}}
     required: true
 - include:
     file: {folder}/robot.yaml
@@ -100,6 +101,7 @@ LAUNCH = """launch:
     - {{name: camera_url, value: "http://127.0.0.1:{camera_link}"}}
     - {{name: lidar_host, value: 127.0.0.1}}
     - {{name: lidar_port, value: {lidar_link}}}
+    - {{name: lidar_position_port, value: {position}}}
     - {{name: serial_port, value: $(run-dir)/dev/relay}}
 - include:
     file: {folder}/station.yaml
@@ -457,7 +459,7 @@ def running_rig(factor: float, log: Path | None) -> Iterator[Rig]:
     ports = {"camera": 0, "console": 0, "second_console": 0}
     while len(set(ports.values())) < len(ports):  # a port that was free may be given again
         ports = {name: free_port() for name in ports}
-    ports |= {name: free_port(socket.SOCK_DGRAM) for name in ("lidar", "lidar_link")}
+    ports |= {name: free_port(socket.SOCK_DGRAM) for name in ("lidar", "lidar_link", "position")}
     with contextlib.ExitStack() as ends:
         run_dir = Path(ends.enter_context(tempfile.TemporaryDirectory(prefix="ic-", ignore_cleanup_errors=True)))
         (run_dir / "dev").mkdir(mode=0o700)

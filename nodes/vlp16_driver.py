@@ -15,7 +15,7 @@ from instant_ic.lidar.feed import PacketFeed, Packets
 from instant_ic.lidar.flatscan import check_level, warm_up
 from instant_ic.lidar.packets import DATA_PACKET_BYTES
 from instant_ic.lidar.player import CapturePlayer
-from instant_ic.lidar.receiver import PacketReceiver, ReceiverError, ReceiverThread
+from instant_ic.lidar.receiver import PacketReceiver, ReceiverError, ReceiverThread, SensorDatagram
 from instant_ic.lidar.report import LidarReport
 from instant_ic.lidar.stream import Revolution
 from instant_ic.msg import LaserScan, PointCloud2, VelodyneScan, cloud_message, stamp_ns
@@ -59,7 +59,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
                 self.receiver = PacketReceiver(config, self.feed.sources, self.clock.steady_ns)
             except ReceiverError as error:
                 raise NodeError(str(error)) from error
-            self.thread = ReceiverThread(self.receiver, self.take, self.on_fault)
+            self.thread = ReceiverThread(self.receiver, self.on_datagram, self.on_fault)
             self.thread.start()
 
     def on_fault(self, error: Exception) -> None:
@@ -81,9 +81,9 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     def play(self) -> None:
         if self.player.ended:
             return
-        for stamp, _, payload in self.player.due(self.clock.steady_ns()):
-            if len(payload) == DATA_PACKET_BYTES:  # captures of a sensor hold its position packets too
-                self.take(payload, stamp)
+        for stamp, port, payload in self.player.due(self.clock.steady_ns()):
+            is_data = port != self.config.position_port or len(payload) == DATA_PACKET_BYTES
+            self.on_datagram(SensorDatagram(stamp, payload, is_data))
         if not self.player.ended:
             return
         if (last := self.feed.finish()) is not None:
@@ -94,6 +94,13 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         if self.config.loop:
             self.report.capture_restarts()
             self.open_capture()
+
+    def on_datagram(self, received: SensorDatagram) -> None:
+        """Take a datagram, on whichever thread it arrives."""
+        if received.is_data:
+            self.take(received.payload, received.stamp_ns)
+        else:
+            self.call_soon(self.diagnose_all, self.report.position(received.payload))
 
     def take(self, payload: bytes, stamp: int) -> None:
         """Take one data packet, on whichever thread packets arrive."""

@@ -21,7 +21,7 @@ MIN_MEMORY_GB = 4.0
 MIN_DISK_GB = 2.0
 MIN_SHM_MB = 64.0
 TCP_PORTS = {8080: "operator's page", 8089: "simulated Theta"}
-UDP_PORTS = {2368: "VLP-16 data"}
+UDP_PORTS = {2368: "VLP-16 data", 8308: "VLP-16 position"}
 _LONGEST_SOCKET_NAME = 107
 
 

@@ -41,6 +41,7 @@ def free_ports() -> dict[str, int]:
     return {
         "camera_port": free_port(),
         "lidar_port": free_port(socket.SOCK_DGRAM),
+        "lidar_position_port": free_port(socket.SOCK_DGRAM),
         "console_port": free_port(),
     }
 

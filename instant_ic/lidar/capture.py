@@ -1,6 +1,6 @@
-"""UDP payloads from pcap files of either endianness, with micro- or nanoseconds.
+"""UDP payloads from capture files: pcap (either endianness, micro- and nanoseconds) and pcapng.
 
-Source: the pcap draft of the IETF opsawg (draft-ietf-opsawg-pcap).
+Source: the pcap and pcapng drafts of the IETF opsawg (draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng).
 """
 
 import struct
@@ -17,6 +17,7 @@ _PCAP_MAGIC = {
     b"\x4d\x3c\xb2\xa1": ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
+_PCAPNG_MAGIC = b"\x0a\x0d\x0d\x0a"
 
 
 class CaptureError(ValueError):
@@ -51,7 +52,7 @@ class CaptureReader:
         """Open and read the file.
 
         Raises:
-            CaptureError: the file is not pcap.
+            CaptureError: the file is neither pcap nor pcapng.
             OSError: the file cannot be read.
         """
         self.path = Path(path)
@@ -59,16 +60,17 @@ class CaptureReader:
         self.skipped: Counter[str] = Counter()
         self._data = self.path.read_bytes()
         magic = self._data[:4]
-        if magic not in _PCAP_MAGIC:
+        if magic not in _PCAP_MAGIC and magic != _PCAPNG_MAGIC:
             raise CaptureError(
-                f"{self.path}: not a pcap file: it starts with {magic.hex(' ') or 'nothing'}. "
+                f"{self.path}: neither pcap nor pcapng: it starts with {magic.hex(' ') or 'nothing'}. "
                 "Convert it with 'editcap -F pcap'."
             )
 
     def __iter__(self) -> Iterator[Datagram]:
         """Iterate over all UDP payloads in file order; the counters restart at zero."""
         self.datagrams, self.skipped = 0, Counter()
-        for stamp_ns, link, start, end in self._frames():
+        frames = self._pcapng() if self._data[:4] == _PCAPNG_MAGIC else self._pcap()
+        for stamp_ns, link, start, end in frames:
             found = _udp(self._data, start, end, link)
             if isinstance(found, str):
                 self.skipped[found] += 1
@@ -77,7 +79,7 @@ class CaptureReader:
             port, start, end = found
             yield Datagram(stamp_ns, port, self._data[start:end])
 
-    def _frames(self) -> Iterator[tuple[int, int, int, int]]:
+    def _pcap(self) -> Iterator[tuple[int, int, int, int]]:
         """Yield stamp, link type, start and end of each frame."""
         data = self._data
         order, unit_ns = _PCAP_MAGIC[data[:4]]
@@ -101,6 +103,53 @@ class CaptureReader:
             at += captured
         if at < size:
             self.skipped["cut record"] += 1
+
+    def _pcapng(self) -> Iterator[tuple[int, int, int, int]]:
+        """Yield stamp, link type, start and end of each frame in the enhanced packet blocks."""
+        data, size = self._data, len(self._data)
+        at, order = 0, "<"
+        interfaces: list[tuple[int, float]] = []
+        while at + 12 <= size:
+            if data[at : at + 4] == _PCAPNG_MAGIC:
+                order = "<" if data[at + 8 : at + 12] == b"\x4d\x3c\x2b\x1a" else ">"
+                interfaces = []
+            kind, length = struct.unpack_from(order + "II", data, at)
+            if length < 12 or length % 4 or at + length > size:
+                self.skipped["cut record"] += 1
+                return
+            body, end = at + 8, at + length - 4
+            at += length
+            if kind == 1 and end - body >= 8:
+                link = struct.unpack_from(order + "H", data, body)[0]
+                interfaces.append((link, _tick_ns(data, body + 8, end, order)))
+            elif kind == 6 and end - body >= 20:
+                interface, high, low, captured, original = struct.unpack_from(order + "IIIII", data, body)
+                if interface >= len(interfaces) or body + 20 + captured > end:
+                    self.skipped["broken packet block"] += 1
+                elif captured < original:
+                    self.skipped["cut frame"] += 1
+                else:
+                    link, tick_ns = interfaces[interface]
+                    ticks = high << 32 | low
+                    stamp_ns = ticks * int(tick_ns) if tick_ns >= 1.0 else round(ticks * tick_ns)
+                    yield stamp_ns, link, body + 20, body + 20 + captured
+            elif kind in (2, 3):
+                self.skipped["packet block without a time"] += 1
+        if at < size:
+            self.skipped["cut record"] += 1
+
+
+def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:
+    """Return the nanoseconds per timestamp unit, from the interface options (if_tsresol, code 9)."""
+    while at + 4 <= end:
+        code, length = struct.unpack_from(order + "HH", data, at)
+        if code == 0:
+            break
+        if code == 9 and length >= 1 and at + 4 < end:
+            value = data[at + 4]
+            return 1e9 / 2 ** (value & 0x7F) if value & 0x80 else 10.0 ** (9 - value)
+        at += 4 + (length + 3) // 4 * 4
+    return 1000.0
 
 
 def _udp(data: bytes, start: int, end: int, link: int) -> tuple[int, int, int] | str:

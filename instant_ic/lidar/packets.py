@@ -1,12 +1,15 @@
-"""VLP-16 wire format of data packets (1206 bytes).
+"""VLP-16 wire format of data packets (1206 bytes) and position packets (512 bytes).
 
-Source: Velodyne VLP-16 User Manual (63-9243), chapter 9.
+Source: Velodyne VLP-16 User Manual (63-9243), chapters 9 and 12.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 DATA_PACKET_BYTES = 1206
+POSITION_PACKET_BYTES = 512
 BLOCKS = 12
 FIRINGS = 2
 """Firing sequences in one block."""
@@ -101,6 +104,59 @@ def encode_data_packet(
     packet["return_mode"] = return_mode
     packet["product"] = product
     return packet.tobytes()
+
+
+@dataclass(frozen=True)
+class PositionPacket:
+    """State of the sensor's clock from a position packet.
+
+    Attributes:
+        timestamp_us: microseconds past the hour.
+        pps: 0 absent, 1 synchronising, 2 locked, 3 error.
+        nmea: last sentence of the GPS receiver, without CR LF; empty without a receiver.
+    """
+
+    timestamp_us: int
+    pps: int
+    nmea: str
+
+
+_POSITION_TIME = 0xC6
+_POSITION_PPS = 0xCA
+_POSITION_NMEA = 0xCE
+
+
+def encode_position_packet(timestamp_us: int, pps: int = 0, nmea: str = "") -> bytes:
+    """Return the bytes of one position packet (512); see `PositionPacket` for the fields.
+
+    Raises:
+        PacketError: a value does not fit the format.
+    """
+    if not 0 <= timestamp_us < HOUR_US:
+        raise PacketError(f"timestamp_us must be in 0..{HOUR_US - 1}, microseconds past the hour (got {timestamp_us})")
+    if pps not in (0, 1, 2, 3):
+        raise PacketError(f"pps must be 0, 1, 2 or 3 (got {pps})")
+    sentence = f"{nmea}\r\n".encode("ascii", "strict") if nmea else b""
+    if len(sentence) > POSITION_PACKET_BYTES - _POSITION_NMEA:
+        raise PacketError(f"nmea is too long: {len(sentence)} bytes of {POSITION_PACKET_BYTES - _POSITION_NMEA}")
+    packet = bytearray(POSITION_PACKET_BYTES)
+    packet[_POSITION_TIME : _POSITION_TIME + 4] = timestamp_us.to_bytes(4, "little")
+    packet[_POSITION_PPS] = pps
+    packet[_POSITION_NMEA : _POSITION_NMEA + len(sentence)] = sentence
+    return bytes(packet)
+
+
+def decode_position_packet(payload: bytes) -> PositionPacket:
+    """Decode one position packet.
+
+    Raises:
+        PacketError: not 512 bytes.
+    """
+    if len(payload) != POSITION_PACKET_BYTES:
+        raise PacketError(f"a position packet has {POSITION_PACKET_BYTES} bytes (got {len(payload)})")
+    timestamp_us = int.from_bytes(payload[_POSITION_TIME : _POSITION_TIME + 4], "little") % HOUR_US
+    text = payload[_POSITION_NMEA:].split(b"\0", 1)[0].split(b"\r\n", 1)[0]
+    return PositionPacket(timestamp_us, payload[_POSITION_PPS], text.decode("ascii", "replace"))
 
 
 def check_data_packet(payload: bytes | memoryview) -> str | None:

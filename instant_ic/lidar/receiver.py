@@ -1,17 +1,17 @@
 """Receiver of the sensor's UDP packets."""
 
 import ipaddress
-import select
+import selectors
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from instant_ic.config.ranges import Range, check_ranges
-from instant_ic.lidar.packets import DATA_PACKET_BYTES, check_data_packet
+from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES, check_data_packet
 from instant_ic.lidar.sources import SourceGuard
 from instant_ic.util.closing import Closing
 from instant_ic.util.pace import current
@@ -20,28 +20,30 @@ _SO_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
 """Constant of Linux, which Python 3.11 does not define."""
 _TIMESPEC = struct.Struct("@ll")
 _MOST_AT_ONCE = 512
-"""Datagrams per read, so that a flood does not delay the shutdown."""
+"""Datagrams per read from one port, so that a flood on it delays neither the other port nor the shutdown."""
 _GATHER_S = 0.005
 """The first packet waits this long for the next ones: waking up for each of 754 packets a second costs more than
 decoding them. The kernel stamps each packet at its arrival."""
 
 
 class ReceiverError(OSError):
-    """The port cannot be bound; the text says why."""
+    """A port cannot be bound; the text says which one and why."""
 
 
 @dataclass(frozen=True)
 class ReceiverConfig:
-    """Addresses and port of the receiver.
+    """Addresses and ports of the receiver.
 
     Attributes:
         host: local address; 0.0.0.0 also receives the broadcasts of a sensor with factory settings.
         port: UDP port of data packets; 0: any free port.
+        position_port: UDP port of position packets; -1: not received.
         sensor: the sensor's IPv4 address; empty: the first sender until the driver restarts.
     """
 
     host: str = "0.0.0.0"
     port: Annotated[int, Range(0, 65535)] = 2368
+    position_port: Annotated[int, Range(-1, 65535)] = 8308
     sensor: str = ""
 
     def __post_init__(self) -> None:
@@ -53,19 +55,29 @@ class ReceiverConfig:
                 raise ValueError(f"sensor must be an IPv4 address or empty (got {self.sensor!r})") from error
 
 
+class SensorDatagram(NamedTuple):
+    """A datagram from the sensor."""
+
+    stamp_ns: int
+    """Time of arrival in the kernel, since the epoch."""
+    payload: bytes
+    is_data: bool
+    """True from the data port, False from the position port."""
+
+
 class PacketReceiver(Closing):
-    """Socket for the sensor's packets.
+    """Sockets on both ports of the sensor.
 
     Example:
         >>> with PacketReceiver(ReceiverConfig()) as receiver:      # doctest: +SKIP
-        ...     for payload, stamp_ns in receiver.read(timeout_s=0.1): ...
+        ...     for received in receiver.read(timeout_s=0.1): ...
 
     Attributes:
         sources: check of the senders.
-        port: the bound UDP port.
+        port, position_port: the bound UDP ports; -1 for none.
 
     Raises:
-        ReceiverError: the port is in use or not permitted.
+        ReceiverError: a port is in use or not permitted.
     """
 
     def __init__(
@@ -76,36 +88,53 @@ class PacketReceiver(Closing):
     ) -> None:
         self.sources = sources or SourceGuard(config.sensor)
         self._steady_ns = steady_ns
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._selector = selectors.DefaultSelector()
+        self._sockets: list[socket.socket] = []
         try:
-            self._socket.setblocking(False)
-            # Room for half a second of packets, because the decoder's thread may be delayed.
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
-            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-            self._socket.bind((config.host, config.port))
-        except OSError as error:
+            self.port = self._bind(config.host, config.port, is_data=True)
+            position = config.position_port
+            self.position_port = self._bind(config.host, position, is_data=False) if position >= 0 else -1
+        except ReceiverError:
             self.close()
-            raise ReceiverError(
-                f"UDP {config.host}:{config.port} cannot be bound ({error.strerror}). "
-                "Stop the program that uses the port: 'ss -ulpn' shows it."
-            ) from error
-        self.port = int(self._socket.getsockname()[1])
+            raise
 
     def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
+        for bound in self._sockets:
+            bound.close()
+        self._selector.close()
 
-    def read(self, timeout_s: float) -> Iterator[tuple[bytes, int]]:
-        """Yield payload and kernel's time of arrival of the datagrams; wait at most ``timeout_s`` for the first."""
-        if select.select([self._socket], [], [], timeout_s)[0]:
+    def read(self, timeout_s: float) -> Iterator[SensorDatagram]:
+        """Yield the sensor's datagrams; wait at most ``timeout_s`` for the first one, and yield nothing after that."""
+        if self._selector.select(timeout_s):
             time.sleep(_GATHER_S)
-        for _ in range(_MOST_AT_ONCE):
-            try:
-                payload, ancillary, _, sender = self._socket.recvmsg(DATA_PACKET_BYTES + 512, 64)
-            except BlockingIOError:
-                break
-            if self.sources.admit(sender, check_data_packet(payload) is None, self._steady_ns()):
-                yield payload, _stamp_ns(ancillary)
+        for key, _ in self._selector.select(0.0):
+            bound, is_data = key.fileobj, bool(key.data)
+            assert isinstance(bound, socket.socket)
+            for _ in range(_MOST_AT_ONCE):
+                try:
+                    payload, ancillary, _, sender = bound.recvmsg(DATA_PACKET_BYTES + 512, 64)
+                except BlockingIOError:
+                    break
+                well_formed = check_data_packet(payload) is None if is_data else len(payload) == POSITION_PACKET_BYTES
+                if self.sources.admit(sender, is_data, well_formed, self._steady_ns()):
+                    yield SensorDatagram(_stamp_ns(ancillary), payload, is_data)
+
+    def _bind(self, host: str, port: int, is_data: bool) -> int:
+        bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sockets.append(bound)
+        try:
+            bound.setblocking(False)
+            # Room for half a second of packets, because the decoder's thread may be delayed.
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+            bound.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            bound.bind((host, port))
+        except OSError as error:
+            raise ReceiverError(
+                f"UDP {host}:{port} cannot be bound ({error.strerror}). "
+                "Stop the program that uses the port: 'ss -ulpn' shows it."
+            ) from error
+        self._selector.register(bound, selectors.EVENT_READ, is_data)
+        return int(bound.getsockname()[1])
 
 
 class ReceiverThread(threading.Thread):
@@ -113,27 +142,27 @@ class ReceiverThread(threading.Thread):
 
     Args:
         receiver: closed at the end.
-        on_packet: called on this thread with payload and stamp of each datagram.
+        on_datagram: called on this thread with each datagram.
         on_fault: called on this thread with the exception that ended it.
     """
 
     def __init__(
         self,
         receiver: PacketReceiver,
-        on_packet: Callable[[bytes, int], None],
+        on_datagram: Callable[[SensorDatagram], None],
         on_fault: Callable[[Exception], None],
     ) -> None:
         super().__init__(name="vlp16 receiver", daemon=True)
         self.receiver = receiver
-        self._on_packet = on_packet
+        self._on_datagram = on_datagram
         self._on_fault = on_fault
         self.ending = threading.Event()
 
     def run(self) -> None:
         try:
             while not self.ending.is_set():
-                for payload, stamp_ns in self.receiver.read(timeout_s=0.2):
-                    self._on_packet(payload, stamp_ns)
+                for received in self.receiver.read(timeout_s=0.2):
+                    self._on_datagram(received)
         except Exception as error:  # noqa: BLE001 - nothing else reports what ends a thread
             self._on_fault(error)
 

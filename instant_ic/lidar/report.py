@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from instant_ic.lidar.feed import PacketFeed
 from instant_ic.lidar.flatscan import coverage
-from instant_ic.lidar.packets import LASERS
+from instant_ic.lidar.packets import LASERS, PacketError, decode_position_packet
 from instant_ic.lidar.stream import Revolution
 from instant_ic.util.diagnosis import Diagnosis, Level
 from instant_ic.util.repeats import RepeatWatch
@@ -35,6 +35,7 @@ _TOO_SMALL = (
     "to 359 on its web page. If the rest may stay unseen, set vlp16_driver decoder.fov_start_deg and "
     "decoder.fov_end_deg."
 )
+_PPS = ("absent", "synchronising", "locked", "error")
 
 
 class LidarReport:
@@ -80,6 +81,15 @@ class LidarReport:
         # Without a return nothing would seem to be in the way.
         self.blind = len(revolution.points) < _LEAST_RETURNS * LASERS * len(revolution.firing_azimuth)
         return covered and not self.blind
+
+    def position(self, payload: bytes) -> Diagnosis:
+        """Return a diagnosis of the sensor's clock from a position packet."""
+        try:
+            position = decode_position_packet(payload)
+        except PacketError as error:
+            return Diagnosis("position", Level.WARN, str(error))
+        pps = _PPS[position.pps] if position.pps < len(_PPS) else str(position.pps)
+        return Diagnosis("position", Level.OK, f"pulse per second {pps}", {"nmea": position.nmea})
 
     def source(self, steady_ns: int) -> Diagnosis:
         """Return a diagnosis of the sender: one sender, packets in order, each revolution a new one."""

@@ -30,21 +30,21 @@ class SourceGuard:
         self.foreign = 0
         self._configured = bool(sensor)
         self._address = sensor
-        self._port: int | None = None
-        self._port_ns = 0
-        """Time of the last packet from the port."""
+        self._ports: dict[bool, tuple[int, int]] = {}
+        """Source port of data (True) and position packets, and the time of the last packet from it."""
         self._rival = ""
         self._rival_ns: int | None = None
         self._late_level = 0.0
         self._late_ns: int | None = None
 
-    def admit(self, sender: tuple[str, int], well_formed: bool, now_ns: int) -> bool:
+    def admit(self, sender: tuple[str, int], is_data: bool, well_formed: bool, now_ns: int) -> bool:
         """Return whether a datagram is from the sensor.
 
         Another port of the same address is accepted as a restarted sensor once the old port has been silent.
 
         Args:
             sender: address and port.
+            is_data: True from the data port, False from the position port.
             well_formed: False if the payload cannot be the sensor's; then it neither selects a sender nor is a fault.
             now_ns: steady time.
         """
@@ -56,9 +56,10 @@ class SourceGuard:
         self._address = self._address or address
         if address != self._address:
             return self._reject(sender, now_ns, doubtful=not self._configured)
-        if self._port not in (None, port) and now_ns - self._port_ns < self.QUIET_S * 1e9:
+        before = self._ports.get(is_data)
+        if before is not None and before[0] != port and now_ns - before[1] < self.QUIET_S * 1e9:
             return self._reject(sender, now_ns, doubtful=True)
-        self._port, self._port_ns = port, now_ns
+        self._ports[is_data] = (port, now_ns)
         return True
 
     def count(self, taken: int, out_of_order: int, now_ns: int) -> None:

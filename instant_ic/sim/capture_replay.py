@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from instant_ic.lidar.capture import CaptureReader
-from instant_ic.lidar.packets import DATA_PACKET_BYTES
+from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES
 
 
 def with_noise(packet: bytes, rng: np.random.Generator) -> bytes:
@@ -19,15 +19,15 @@ def with_noise(packet: bytes, rng: np.random.Generator) -> bytes:
 
 
 class CaptureReplay:
-    """Sends the data packets of a VLP-16 capture with recorded timing, at first with unchanged payloads.
+    """Sends the data and position packets of a VLP-16 capture with recorded timing, at first with unchanged payloads.
 
     It starts again after the end, with a pause of one packet. The ranges then have noise: without it, a short capture
     would be a sensor that repeats itself, which the driver withholds.
 
     Args:
-        path: pcap file.
+        path: pcap or pcapng.
         host: destination address.
-        data_port: destination UDP port; the recorded port is ignored.
+        data_port, position_port: destination UDP ports; the recorded ports are ignored.
 
     Attributes:
         sent: datagrams sent.
@@ -38,14 +38,15 @@ class CaptureReplay:
         ValueError: the file has no VLP-16 packets.
     """
 
-    def __init__(self, path: str | Path, host: str, data_port: int) -> None:
-        datagrams = [d for d in CaptureReader(path) if len(d.payload) == DATA_PACKET_BYTES]
+    def __init__(self, path: str | Path, host: str, data_port: int, position_port: int) -> None:
+        ports = {DATA_PACKET_BYTES: data_port, POSITION_PACKET_BYTES: position_port}
+        datagrams = [d for d in CaptureReader(path) if len(d.payload) in ports]
         if not datagrams:
-            raise ValueError(f"pcap {path} has no VLP-16 packets (UDP payloads of 1206 bytes)")
+            raise ValueError(f"pcap {path} has no VLP-16 packets (UDP payloads of 1206 or 512 bytes)")
         first = min(d.stamp_ns for d in datagrams)
         # Sorted by time only: packets with equal stamps keep their order, or the driver would count them as late.
         self._items = sorted(
-            (((d.stamp_ns - first) * 1e-9, (host, data_port), d.payload) for d in datagrams),
+            (((d.stamp_ns - first) * 1e-9, (host, ports[len(d.payload)]), d.payload) for d in datagrams),
             key=lambda item: item[0],
         )
         count = len(self._items)
@@ -62,7 +63,7 @@ class CaptureReplay:
         """Send the packets that are due at ``time_s`` (seconds since the start)."""
         while self._items[self._next][0] + self._began_s <= time_s:
             _, address, payload = self._items[self._next]
-            if self._rng is not None:
+            if self._rng is not None and len(payload) == DATA_PACKET_BYTES:
                 payload = with_noise(payload, self._rng)
             # The kernel reports the refusal of an earlier datagram here; a real sensor ignores it.
             with contextlib.suppress(ConnectionRefusedError):

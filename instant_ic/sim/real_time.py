@@ -75,7 +75,7 @@ class SimulatedDevices:
         simulation, lidar = self._simulation, config.lidar
         if lidar.enabled and config.pcap:
             path = Path(config.pcap).expanduser()
-            self.scanner = CaptureReplay(path, lidar.host, lidar.data_port)
+            self.scanner = CaptureReplay(path, lidar.host, lidar.data_port, lidar.position_port)
         elif lidar.enabled:
             self.scanner = Vlp16Server(simulation.scanner)
         if config.camera.enabled:

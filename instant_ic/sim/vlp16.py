@@ -5,6 +5,9 @@ import math
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
 from typing import Annotated
 
 import numba
@@ -34,7 +37,7 @@ class Vlp16Config(Checked):
     Attributes:
         enabled: whether the scanner is simulated.
         host: destination of the packets.
-        data_port: destination UDP port.
+        data_port, position_port: destination UDP ports.
         range_noise: standard deviation of a range, metres.
         max_range: a surface farther away gives no return, metres.
         burst: packets sent together (1.33 ms each); larger bursts need less CPU.
@@ -43,6 +46,7 @@ class Vlp16Config(Checked):
     enabled: bool = True
     host: str = "127.0.0.1"
     data_port: Annotated[int, Range(1, 65535)] = 2368
+    position_port: Annotated[int, Range(1, 65535)] = 8308
     range_noise: NotNegative = 0.01
     max_range: Annotated[float, Range(above=MIN_RANGE_M, high=131)] = 100.0
     burst: PositiveInt = 8
@@ -227,6 +231,14 @@ class Vlp16:
         length = wire.DATA_PACKET_BYTES
         return [data[i * length : (i + 1) * length] for i in range(count)]
 
+    def position_packet(self, time_s: float) -> bytes:
+        """Position packet of a sensor whose clock is locked to GPS time."""
+        now_ns = self._epoch_ns(time_s)
+        moment = datetime.fromtimestamp(now_ns // 1_000_000_000, UTC)
+        body = f"GPRMC,{moment:%H%M%S},A,0000.0000,N,00000.0000,E,000.0,000.0,{moment:%d%m%y},000.0,E"
+        checksum = reduce(xor, body.encode("ascii"))
+        return wire.encode_position_packet((now_ns // 1000) % wire.HOUR_US, 2, f"${body}*{checksum:02X}")
+
 
 class Vlp16Server:
     """Sends the scanner's packets over UDP as simulated time advances.
@@ -236,6 +248,7 @@ class Vlp16Server:
         skipped: data packets skipped because the machine was too slow.
     """
 
+    POSITION_PERIOD_S = 0.1
     #: Lag above which packets are skipped, seconds.
     MOST_LAG_S = 0.5
 
@@ -244,6 +257,7 @@ class Vlp16Server:
         self._config = scanner.config
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._next_position_s = 0.0
         self.sent = 0
         self.skipped = 0
 
@@ -257,6 +271,9 @@ class Vlp16Server:
             for packet in self._scanner.make(due):
                 self._send(packet, self._config.data_port)
                 self.sent += 1
+        if time_s >= self._next_position_s:
+            self._send(self._scanner.position_packet(time_s), self._config.position_port)
+            self._next_position_s = time_s + self.POSITION_PERIOD_S
 
     def close(self) -> None:
         self._socket.close()

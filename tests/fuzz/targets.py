@@ -87,6 +87,19 @@ def _parse_data_packets() -> Callable[[bytes], object]:
     return parse
 
 
+def _position_packets() -> list[bytes]:
+    from instant_ic.lidar.packets import encode_position_packet
+
+    sentence = "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A"
+    return [encode_position_packet(5), encode_position_packet(3_599_999_999, 2, sentence)]
+
+
+def _parse_position_packet() -> Callable[[bytes], object]:
+    from instant_ic.lidar.packets import decode_position_packet
+
+    return lambda data: decode_position_packet(data)
+
+
 def _captures() -> list[bytes]:
     payload = _data_packets()[0]
     udp = struct.pack(">HHHH", 2368, 2368, 8 + len(payload), 0) + payload
@@ -96,6 +109,16 @@ def _captures() -> list[bytes]:
     for order, magic in (("<", 0xA1B2C3D4), (">", 0xA1B23C4D)):
         head = struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, 1)
         samples.append(head + 2 * (struct.pack(order + "IIII", 5, 6, len(frame), len(frame)) + frame))
+
+    def block(kind: int, body: bytes) -> bytes:
+        body += bytes(-len(body) % 4)
+        return struct.pack("<II", kind, 12 + len(body)) + body + struct.pack("<I", 12 + len(body))
+
+    interface = struct.pack("<HHI", 1, 0, 65535) + struct.pack("<HHB3xHH", 9, 1, 9, 0, 0)
+    packet = struct.pack("<IIIII", 0, 1, 2, len(frame), len(frame)) + frame
+    samples.append(
+        block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)) + block(1, interface) + 2 * block(6, packet)
+    )
     return samples
 
 
@@ -915,6 +938,12 @@ def _parse_zenoh() -> Callable[[bytes], object]:
     return parse
 
 
+def _position_errors() -> tuple[type[BaseException], ...]:
+    from instant_ic.lidar.packets import PacketError
+
+    return (PacketError,)
+
+
 def _lines(samples: tuple[dict[str, Any], ...]) -> list[bytes]:
     return [json.dumps(sample).encode() for sample in samples]
 
@@ -929,7 +958,15 @@ TARGETS = {
             dictionary=(b"\xff\xee", b"\x37\x22", b"\x39\x22"),
             share=600,
         ),
-        Target("pcap", _captures, _parse_capture, _capture_errors(), (b"\x81\x00",), share=1500),
+        Target(
+            "vlp16-position",
+            _position_packets,
+            _parse_position_packet,
+            _position_errors(),
+            (b"$GPRMC,", b",A,", b"\r\n", b",,", b"nan", b"1e9"),
+            share=3000,
+        ),
+        Target("pcap", _captures, _parse_capture, _capture_errors(), (b"\x0a\x0d\x0d\x0a", b"\x81\x00"), share=1500),
         Target(
             "roboclaw-replies", lambda: [_roboclaw_session()[1]], _parse_replies, dictionary=(b"\xff", b"\0"), share=800
         ),

@@ -73,9 +73,10 @@ def test_the_pages_recorder_keeps_the_last_minute_and_writes_where_it_is_told() 
 
 
 def test_simulated_devices_and_drivers_meet() -> None:
-    found = nodes("sim", camera_port="9001", lidar_port="9002", console_port="9004")
+    found = nodes("sim", camera_port="9001", lidar_port="9002", lidar_position_port="9003", console_port="9004")
     assert "camera.port:=9001" in found["simulator"] and "url:=http://127.0.0.1:9001" in found["theta_camera"]
     assert "lidar.data_port:=9002" in found["simulator"] and " port:=9002" in found["vlp16_driver"]
+    assert "lidar.position_port:=9003" in found["simulator"] and "position_port:=9003" in found["vlp16_driver"]
     assert "host:=127.0.0.1" in found["vlp16_driver"]
     assert "roboclaw.port:=/run/here/dev/roboclaw" in found["crawler_base"]
     assert "server.port:=9004" in found["console"]

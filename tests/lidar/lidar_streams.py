@@ -138,3 +138,21 @@ def pcap(frames: list[tuple[int, bytes]], order: str = "<", nano: bool = False, 
         fraction = stamp_ns % SECOND if nano else stamp_ns % SECOND // 1000
         out += struct.pack(order + "IIII", stamp_ns // SECOND, fraction, len(frame), len(frame)) + frame
     return out
+
+
+def pcapng(frames: list[tuple[int, bytes]], order: str = "<", resolution: int | None = None) -> bytes:
+    """A pcapng file of (stamp_ns, frame); resolution is if_tsresol, microseconds without it."""
+
+    def block(kind: int, body: bytes) -> bytes:
+        body += b"\0" * (-len(body) % 4)
+        return struct.pack(order + "II", kind, 12 + len(body)) + body + struct.pack(order + "I", 12 + len(body))
+
+    option = b"" if resolution is None else struct.pack(order + "HHB3xHH", 9, 1, resolution, 0, 0)
+    unit_ns = 1000 if resolution is None else 10 ** (9 - resolution)
+    out = block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1))
+    out += block(1, struct.pack(order + "HHI", 1, 0, 65535) + option)
+    for stamp_ns, frame in frames:
+        ticks = stamp_ns // unit_ns
+        head = struct.pack(order + "IIIII", 0, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
+        out += block(6, head + frame)
+    return out

@@ -1,11 +1,11 @@
-"""Captures: all forms of pcap, and every way in which they can be broken."""
+"""Captures: all forms of pcap, pcapng, and every way in which they can be broken."""
 
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lidar_streams import DATA, SECOND, pcap, udp_frame
+from lidar_streams import DATA, SECOND, pcap, pcapng, udp_frame
 
 from instant_ic.lidar.capture import CaptureError, CaptureReader, Datagram
 
@@ -26,6 +26,15 @@ def test_pcap_in_both_endiannesses_and_both_resolutions(tmp_path: Path, order: s
     datagrams, reader = read(tmp_path, pcap(FRAMES, order, nano))
     assert datagrams == [(stamp, 2368, b"first"), (stamp + SECOND, 8308, b"second")]
     assert reader.datagrams == 2
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(
+    ("resolution", "stamp"), [(None, STAMP // 1000 * 1000), (9, STAMP), (3, STAMP // 10**6 * 10**6)]
+)
+def test_pcapng(tmp_path: Path, order: str, resolution: int | None, stamp: int) -> None:
+    datagrams, _ = read(tmp_path, pcapng(FRAMES, order, resolution))
+    assert datagrams == [(stamp, 2368, b"first"), (stamp + SECOND, 8308, b"second")]
 
 
 def test_vlan_tags_and_other_link_types(tmp_path: Path) -> None:
@@ -67,7 +76,7 @@ def test_what_is_no_datagram_is_counted_by_reason(tmp_path: Path) -> None:
 
 
 def test_file_that_is_no_capture_is_refused_in_words(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match=r"not a pcap file: it starts with 47 49 46 38"):
+    with pytest.raises(CaptureError, match=r"neither pcap nor pcapng: it starts with 47 49 46 38"):
         read(tmp_path, b"GIF89a")
     with pytest.raises(CaptureError, match="nothing"):
         read(tmp_path, b"")
@@ -75,8 +84,9 @@ def test_file_that_is_no_capture_is_refused_in_words(tmp_path: Path) -> None:
 
 @settings(max_examples=150)
 @given(cut=st.integers(0, 400), flips=st.lists(st.tuples(st.integers(0, 399), st.integers(0, 255)), max_size=8))
-def test_damaged_captures_never_raise(tmp_path_factory: pytest.TempPathFactory, cut: int, flips) -> None:  # type: ignore[no-untyped-def]
-    data = bytearray(pcap(FRAMES))
+@pytest.mark.parametrize("make", [pcap, pcapng])
+def test_damaged_captures_never_raise(tmp_path_factory: pytest.TempPathFactory, make, cut: int, flips) -> None:  # type: ignore[no-untyped-def]
+    data = bytearray(make(FRAMES))
     for at, value in flips:
         if 4 <= at < len(data):
             data[at] = value

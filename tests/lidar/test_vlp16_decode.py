@@ -18,7 +18,9 @@ from instant_ic.lidar.packets import (
     RETURN_STRONGEST,
     PacketError,
     check_data_packet,
+    decode_position_packet,
     encode_data_packet,
+    encode_position_packet,
 )
 
 RECORDINGS = ("einride_recording", "mrpt_sample_velodyne_vlp16_gps", "btlad_my")
@@ -185,3 +187,30 @@ def test_what_the_format_cannot_hold_is_refused(change: dict[str, object], key: 
     assert check_data_packet(encode_data_packet(**good)) is None  # type: ignore[arg-type]
     with pytest.raises(PacketError, match=key):
         encode_data_packet(**{**good, **change})  # type: ignore[arg-type]
+
+
+def test_position_packet_round_trip() -> None:
+    sentence = "$GPRMC,225446.25,A,4916.45,N,12311.12,W,000.5,054.7,191194,020.3,E*68"
+    position = decode_position_packet(encode_position_packet(1_234_567_890, 2, sentence))
+    assert (position.timestamp_us, position.pps, position.nmea) == (1_234_567_890, 2, sentence)
+    assert decode_position_packet(encode_position_packet(0)).nmea == ""
+    late = bytearray(encode_position_packet(0))
+    late[0xC6:0xCA] = (HOUR_US + 7).to_bytes(4, "little")
+    assert decode_position_packet(bytes(late)).timestamp_us == 7
+    with pytest.raises(PacketError, match="512"):
+        decode_position_packet(b"\0" * 511)
+
+
+@pytest.mark.real_data
+def test_position_packets_of_a_real_sensor_agree_with_velodyne_decoder() -> None:
+    path = DATA / "mrpt_sample_velodyne_vlp16_gps.pcap"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    payloads = [datagram.payload for datagram in CaptureReader(path) if datagram.port == 8308]
+    assert len(payloads) == 57
+    for payload in payloads:
+        ours, theirs = decode_position_packet(payload), oracle.TelemetryPacket(payload)
+        assert ours.timestamp_us == theirs.usec_since_toh
+        assert ours.pps == theirs.pps_status.value
+        assert ours.nmea == theirs.nmea_sentence.strip()
+        assert ours.nmea.startswith("$GPRMC")

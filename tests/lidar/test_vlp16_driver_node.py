@@ -23,7 +23,7 @@ from instant_ic.config.params import build, load_file
 from instant_ic.config.robot import Mount
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.lidar.config import DecoderConfig, FlatScanConfig
-from instant_ic.lidar.packets import HOUR_US, PACKET_PERIOD_US
+from instant_ic.lidar.packets import HOUR_US, PACKET_PERIOD_US, encode_position_packet
 from instant_ic.lidar.sources import SourceGuard
 from instant_ic.msg import (
     LaserScan,
@@ -46,12 +46,12 @@ START = 1_700_000_000 * SECOND
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """0.4 s inside a round wall of 5 m, recorded long ago, with a packet of 512 bytes and a frame that is no IP."""
+    """0.4 s inside a round wall of 5 m, recorded long ago, with a position packet and a frame that is no IP."""
     frames = [
         (RECORDED + round((index + 1) * PACKET_PERIOD_US * 1000.0), udp_frame(payload))
         for index, payload in enumerate(wall_stream(302, 5.0, azimuth_cdeg=18100))
     ]
-    frames.insert(100, (frames[100][0], udp_frame(bytes(512), port=8308)))
+    frames.insert(100, (frames[100][0], udp_frame(encode_position_packet(5, 2, "$GPRMC,1,A"), port=8308)))
     frames.insert(50, (frames[50][0], b"\xff" * 60))
     path = tmp_path / "wall.pcap"
     path.write_bytes(pcap(frames, nano=True))
@@ -87,6 +87,7 @@ def test_capture_gives_points_packets_scans_and_the_mount(capture: Path) -> None
     bus.advance(0.6)
     text = "receiving packets; 1 incomplete revolutions gave no scan"
     assert node.diagnoses()["packets"][:2] == (OK, text)
+    assert node.diagnoses()["position"][:2] == (OK, "pulse per second locked")
 
 
 def test_capture_at_twice_the_pace_takes_half_the_time_with_the_same_stamps(capture: Path) -> None:
@@ -237,7 +238,7 @@ def test_capture_that_is_missing_or_none_is_told(tmp_path: Path) -> None:
     with pytest.raises(NodeError, match=r"nowhere\.pcap"):
         played(tmp_path / "nowhere.pcap")
     (tmp_path / "text.pcap").write_text("hello")
-    with pytest.raises(NodeError, match="not a pcap file"):
+    with pytest.raises(NodeError, match="neither pcap nor pcapng"):
         played(tmp_path / "text.pcap")
     with pytest.raises(ValueError, match="source"):
         Vlp16DriverConfig(source="serial")
@@ -267,7 +268,7 @@ class Listened:
 
     def __init__(self, run_dir: Path, **changes: Any) -> None:
         clock = SystemClock()
-        config = Vlp16DriverConfig(host="127.0.0.1", port=0, **changes)
+        config = Vlp16DriverConfig(host="127.0.0.1", port=0, position_port=0, **changes)
         self.driver = Vlp16DriverNode(config, LocalTransport(run_dir, "vlp16_driver", clock.now_ns), clock)
         self.probe = Probe(config, LocalTransport(run_dir, "probe", clock.now_ns), clock)
 

@@ -11,8 +11,8 @@ SENSOR, STRANGER = "192.168.1.201", "192.168.1.66"
 QUIET_NS = round(SourceGuard.QUIET_S * SECOND)
 
 
-def admit(guard: SourceGuard, sender: tuple[str, int], now_ns: int) -> bool:
-    return guard.admit(sender, True, now_ns)
+def admit(guard: SourceGuard, sender: tuple[str, int], now_ns: int, is_data: bool = True) -> bool:
+    return guard.admit(sender, is_data, True, now_ns)
 
 
 def test_first_sender_is_kept_and_a_second_one_withholds_until_it_is_quiet() -> None:
@@ -44,6 +44,14 @@ def test_configured_address_drops_the_others_without_stopping_the_robot() -> Non
     assert guard.foreign == 1
 
 
+def test_position_packet_of_another_address_withholds() -> None:
+    guard = SourceGuard()
+    assert admit(guard, (SENSOR, 2368), 0)
+    assert admit(guard, (SENSOR, 8308), 0, is_data=False)
+    assert not admit(guard, (STRANGER, 8308), 1, is_data=False)
+    assert guard.doubt(1) is not None
+
+
 @pytest.mark.parametrize("sensor", ["", SENSOR])
 def test_same_address_with_another_port_is_a_second_sender_while_the_first_is_heard(sensor: str) -> None:
     guard = SourceGuard(sensor)
@@ -64,9 +72,9 @@ def test_sensor_that_was_restarted_is_taken_again() -> None:
 
 def test_datagrams_that_are_no_packets_neither_lock_nor_withhold() -> None:
     guard = SourceGuard()
-    assert guard.admit((STRANGER, 5), False, 0)  # for the stream to count
+    assert guard.admit((STRANGER, 5), True, False, 0)  # for the stream to count
     assert admit(guard, (SENSOR, 2368), 0)
-    assert not guard.admit((STRANGER, 5), False, 1)
+    assert not guard.admit((STRANGER, 5), True, False, 1)
     assert guard.doubt(1) is None
 
 

@@ -127,6 +127,20 @@ def test_noise_and_limits(box_room: World) -> None:
     assert abs((noisy - truth)[seen].mean()) < 0.001
 
 
+def test_position_packets_carry_the_time_of_day(box_room: World) -> None:
+    simulation = Simulation(SimulationConfig(lidar=QUIET), START_NS, box_room)
+    packet = wire.decode_position_packet(simulation.scanner.position_packet(2.5))
+    # 1 700 000 000 s is 22:13:20 UTC; 2.5 s later the sentence says 22:13:22.
+    assert packet.nmea.startswith("$GPRMC,221322,A,")
+    assert packet.pps == 2
+    assert packet.timestamp_us == (13 * 60 + 22.5) * 1e6
+    body, checksum = packet.nmea[1:].split("*")
+    total = 0
+    for byte in body.encode():
+        total ^= byte
+    assert int(checksum, 16) == total
+
+
 def listen() -> tuple[socket.socket, int]:
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
@@ -137,7 +151,8 @@ def listen() -> tuple[socket.socket, int]:
 
 def test_the_server_sends_bursts_and_leaves_out_what_is_too_late(box_room: World) -> None:
     data, port = listen()
-    config = Vlp16Config(range_noise=0.0, data_port=port, burst=8)
+    position, position_port = listen()
+    config = Vlp16Config(range_noise=0.0, data_port=port, position_port=position_port, burst=8)
     simulation = Simulation(SimulationConfig(lidar=config), START_NS, box_room)
     server = Vlp16Server(simulation.scanner)
     try:
@@ -149,6 +164,7 @@ def test_the_server_sends_bursts_and_leaves_out_what_is_too_late(box_room: World
         assert server.sent == 8
         received = [data.recv(2000) for _ in range(8)]
         assert {len(p) for p in received} == {1206}
+        assert len(position.recv(2000)) == 512
         simulation.step(2.0)
         server.pump(simulation.time_s)
         # All but the last 0.1 s of two seconds are left out.
@@ -157,6 +173,7 @@ def test_the_server_sends_bursts_and_leaves_out_what_is_too_late(box_room: World
     finally:
         server.close()
         data.close()
+        position.close()
 
 
 def write_pcap(path: Path, items: list[tuple[float, int, bytes]]) -> None:
@@ -176,25 +193,29 @@ def write_pcap(path: Path, items: list[tuple[float, int, bytes]]) -> None:
 def test_a_capture_is_sent_at_its_own_pace_and_untouched_and_again_with_noise(box_room: World, tmp_path: Path) -> None:
     _, packets = simulate(box_room, 0.0, 0.0, 0.02)
     path = tmp_path / "scan.pcap"
+    position = wire.encode_position_packet(5, 0, "")
     write_pcap(
         path,
         [(100.0 + 0.1 * i, 2368, p) for i, p in enumerate(packets[:5])]
-        + [(100.25, 8308, bytes(512)), (100.3, 53, b"dns")],
+        + [(100.25, 8308, position), (100.3, 53, b"dns")],
     )
     data, port = listen()
-    replay = CaptureReplay(path, "127.0.0.1", port)
+    telemetry, telemetry_port = listen()
+    replay = CaptureReplay(path, "127.0.0.1", port, telemetry_port)
     try:
         assert replay.duration_s == pytest.approx(0.4)
         replay.pump(0.0)
         assert replay.sent == 1
         replay.pump(0.22)
         assert replay.sent == 3
+        replay.pump(0.26)
+        assert replay.sent == 4 and telemetry.recv(2000) == position
         replay.pump(0.41)
-        assert replay.sent == 5
+        assert replay.sent == 6
         assert [data.recv(2000) for _ in range(5)] == packets[:5]
-        replay.pump(0.60)  # second round began at 0.4 * 6 / 5 = 0.48
+        replay.pump(0.60)  # second round began at 0.4 * 7 / 6 = 0.467
         again, first = (np.frombuffer(p, np.uint8).astype(int) for p in (data.recv(2000), packets[0]))
-        assert replay.sent == 7
+        assert replay.sent == 8
         # The driver would take the same data for those of a sensor that repeats itself. A unit of range is 2 mm.
         changed = np.flatnonzero(again - first)
         assert 100 < len(changed) < 284 and np.abs(again - first).max() == 1
@@ -202,13 +223,14 @@ def test_a_capture_is_sent_at_its_own_pace_and_untouched_and_again_with_noise(bo
     finally:
         replay.close()
         data.close()
+        telemetry.close()
 
 
 def test_a_capture_without_packets_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "dns.pcap"
     write_pcap(path, [(1.0, 53, b"dns")])
     with pytest.raises(ValueError, match="has no VLP-16 packets"):
-        CaptureReplay(path, "127.0.0.1", 2368)
+        CaptureReplay(path, "127.0.0.1", 2368, 8308)
 
 
 @pytest.mark.real_data
