@@ -1,4 +1,10 @@
-"""Front end: matches each scan against the local map of recent keyframes."""
+"""Front end: matches each scan against the local map of recent keyframes.
+
+1. ``guess_from_odometry``, ``guess_from_velocity``: the predicted pose, its uncertainty, and the window to search.
+2. ``track``: match the scan in that window; then, if the score is poor, in a wide window; then, in doubt, at all
+   headings (``_search_all_headings``).
+3. ``_add_keyframe``: a scan that has moved far enough becomes a keyframe, and the local map is rebuilt.
+"""
 
 from __future__ import annotations
 
@@ -19,38 +25,77 @@ from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
 MIN_POINTS = 20
 """A scan with fewer points is not matched; odometry decides."""
-SEARCH_M, SEARCH_RAD = 0.3, 0.3
-"""Half width of the search around the predicted pose; it grows with the odometry step."""
-RECOVERY_M, RECOVERY_RAD = 1.2, 1.2
-"""Half width of the wide search."""
-RECOVERY_SCORE, MIN_SCORE = 0.6, 0.35
-"""A score below the first starts the wide search. Below the second the scan counts as lost: its pose is odometry's."""
-RECOVERY_MARGIN = 0.1
-"""Minimum score gain of the wide search over the first search."""
-START_KEYFRAMES = 4
-"""Maximum number of keyframes taken at the start pose before the robot moves."""
-WIDE_GAIN = 0.35
-"""Share of the residual that a pose found over all headings must explain, of the local match's and of the second best
-place's."""
-SCORE_MEMORY, SCORE_DROP = 0.05, 0.15
-"""Weight of a scan in the usual score; a score this much below the usual one is in doubt."""
-DOUBTFUL_TURN_RAD = 0.15
-"""σ of a heading by odometry, that of a turn of 40° in one scan, above which the match is in doubt at any score."""
-WIDE_SIGMAS, WIDE_REACH_M = 3.0, 6.0
-"""Reach of the search over all headings: standard deviations of the guess since the last match, and its limit."""
-WINDOW_PER_M, WINDOW_PER_RAD, TURN_WINDOW_PER_M = 0.4, 0.4, 0.2
-"""Growth of the search window with the odometry step: translation per metre, rotation per radian and per metre; twice
-the σ of the odometry."""
-FLOOR_SIGMA_M, FLOOR_SIGMA_RAD = 0.01, 0.03
-"""σ of an odometry step, also while standing."""
-SIGMA_M_PER_M, SIGMA_RAD_PER_RAD, SIGMA_RAD_PER_M = 0.2, 0.2, 0.1
-"""σ of an odometry step beyond that: tracks slip, and skid steering turns less than the encoders."""
-KEYFRAME_M, KEYFRAME_RAD = 0.25, 0.2
-"""Motion since the last keyframe after which a scan becomes a keyframe."""
-STEP_SIGMA_M, STEP_SIGMA_RAD = 0.005, 0.0015
-"""Scan-matching error between keyframes beyond its own covariance."""
-KNOWN_MAP_STEP_M = 2.0
-"""Distance in metres after which the local map is rebuilt when localising in a known map."""
+
+
+@dataclass(frozen=True)
+class FrontEndConfig:
+    """Tuning of the front end.
+
+    Attributes:
+        search_m: half width of the search around the predicted pose in metres; it grows with the odometry step.
+        search_rad: the same for the heading, in radians.
+        recovery_m: half width of the wide search in metres.
+        recovery_rad: the same for the heading, in radians.
+        recovery_score: score below which the wide search starts.
+        min_score: score below which the scan counts as lost: its pose is odometry's.
+        recovery_margin: least gain of the wide search's score over the first search's.
+        start_keyframes: most keyframes taken at the start pose before the robot moves.
+        wide_gain: share of the residual that a pose found over all headings must explain, of the local match's
+            and of the second best place's.
+        score_memory: weight of a scan in the usual score.
+        score_drop: a score this much below the usual one is in doubt.
+        doubtful_turn_rad: standard deviation of a heading by odometry, that of a turn of 40° in one scan, above
+            which the match is in doubt at any score.
+        wide_sigmas: reach of the search over all headings, in standard deviations of the guess since the last
+            match.
+        wide_reach_m: limit of that reach in metres.
+        window_per_m: growth of the search window per metre of the odometry step; as the next two, twice its
+            standard deviation.
+        window_per_rad: growth of the window's rotation per radian.
+        turn_window_per_m: growth of the window's rotation per metre.
+        floor_sigma_m: standard deviation of an odometry step in metres, also while standing.
+        floor_sigma_rad: the same for the heading, in radians.
+        sigma_m_per_m: growth of the standard deviation per metre: tracks slip.
+        sigma_rad_per_rad: growth of the heading's per radian: skid steering turns less than the encoders.
+        sigma_rad_per_m: growth of the heading's per metre.
+        keyframe_m: motion since the last keyframe after which a scan becomes a keyframe, in metres.
+        keyframe_rad: the same for the heading, in radians.
+        step_sigma_m: scan-matching error between keyframes beyond its own covariance, in metres.
+        step_sigma_rad: the same for the heading, in radians.
+        known_map_step_m: distance after which the local map is rebuilt when localising in a known map, in
+            metres.
+    """
+
+    search_m: float = 0.3
+    search_rad: float = 0.3
+    recovery_m: float = 1.2
+    recovery_rad: float = 1.2
+    recovery_score: float = 0.6
+    min_score: float = 0.35
+    recovery_margin: float = 0.1
+    start_keyframes: int = 4
+    wide_gain: float = 0.35
+    score_memory: float = 0.05
+    score_drop: float = 0.15
+    doubtful_turn_rad: float = 0.15
+    wide_sigmas: float = 3.0
+    wide_reach_m: float = 6.0
+    window_per_m: float = 0.4
+    window_per_rad: float = 0.4
+    turn_window_per_m: float = 0.2
+    floor_sigma_m: float = 0.01
+    floor_sigma_rad: float = 0.03
+    sigma_m_per_m: float = 0.2
+    sigma_rad_per_rad: float = 0.2
+    sigma_rad_per_m: float = 0.1
+    keyframe_m: float = 0.25
+    keyframe_rad: float = 0.2
+    step_sigma_m: float = 0.005
+    step_sigma_rad: float = 0.0015
+    known_map_step_m: float = 2.0
+
+
+TUNING = FrontEndConfig()
 
 
 class SlamStatus(enum.StrEnum):
@@ -133,7 +178,7 @@ class FrontEnd:
     def __init__(self, config: SlamConfig) -> None:
         self.config = config
         self.trajectory: list[ScanKeyframe] = []
-        self._field = LikelihoodField(config.field.resolution_m, config.field.max_range_m + (RECOVERY_M + 0.5))
+        self._field = LikelihoodField(config.field.resolution_m, config.field.max_range_m + (TUNING.recovery_m + 0.5))
         self._lost_sigma_m = 0.0
         self._usual_score = 0.0
         self._covariance = np.zeros((3, 3))
@@ -153,18 +198,18 @@ class FrontEnd:
     def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
         """Return the guess at ``pose`` after an odometry step (3,) in the base's own frame."""
         distance, turn = math.hypot(step[0], step[1]), abs(step[2])
-        translation = FLOOR_SIGMA_M + SIGMA_M_PER_M * distance
-        rotation = FLOOR_SIGMA_RAD + SIGMA_RAD_PER_RAD * turn + SIGMA_RAD_PER_M * distance
-        window_m = SEARCH_M + WINDOW_PER_M * distance
-        window_rad = SEARCH_RAD + WINDOW_PER_RAD * turn + TURN_WINDOW_PER_M * distance
-        return self._guess(pose, translation, rotation, window_m, window_rad, rotation > DOUBTFUL_TURN_RAD)
+        translation = TUNING.floor_sigma_m + TUNING.sigma_m_per_m * distance
+        rotation = TUNING.floor_sigma_rad + TUNING.sigma_rad_per_rad * turn + TUNING.sigma_rad_per_m * distance
+        window_m = TUNING.search_m + TUNING.window_per_m * distance
+        window_rad = TUNING.search_rad + TUNING.window_per_rad * turn + TUNING.turn_window_per_m * distance
+        return self._guess(pose, translation, rotation, window_m, window_rad, rotation > TUNING.doubtful_turn_rad)
 
     def guess_from_velocity(self, pose: FloatArray, elapsed_s: float) -> Guess:
         """Return the guess at ``pose`` without odometry: the window covers any motion possible in the elapsed time."""
         match = self.config.match
         translation = 0.5 * match.free_motion_speed_mps * elapsed_s + 0.05
         rotation = 0.5 * match.free_motion_yaw_rate_radps * elapsed_s + 0.05
-        return self._guess(pose, translation, rotation, SEARCH_M + translation, SEARCH_RAD + rotation)
+        return self._guess(pose, translation, rotation, TUNING.search_m + translation, TUNING.search_rad + rotation)
 
     def constant_velocity(self, pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:
         """Return the pose after ``elapsed_s`` at the velocity of the last ``step`` (3,), which took ``step_s`` seconds.
@@ -182,7 +227,7 @@ class FrontEnd:
     def _guess(
         pose: FloatArray, sigma_m: float, sigma_rad: float, window_m: float, window_rad: float, doubtful: bool = False
     ) -> Guess:
-        window = SearchWindow(min(window_m, RECOVERY_M), min(window_rad, RECOVERY_RAD))
+        window = SearchWindow(min(window_m, TUNING.recovery_m), min(window_rad, TUNING.recovery_rad))
         return Guess(pose, np.array([sigma_m, sigma_m, sigma_rad]), window, doubtful)
 
     def track(
@@ -199,27 +244,29 @@ class FrontEnd:
 
         status = SlamStatus.TRACKED
         match = match_scan(self._field, points, guess.pose, guess.sigma, guess.window)
-        if match.score < RECOVERY_SCORE or match.at_border:
-            recovered = match_scan(self._field, points, guess.pose, guess.sigma, SearchWindow(RECOVERY_M, RECOVERY_RAD))
+        if match.score < TUNING.recovery_score or match.at_border:
+            recovered = match_scan(
+                self._field, points, guess.pose, guess.sigma, SearchWindow(TUNING.recovery_m, TUNING.recovery_rad)
+            )
             # Unless the first window was too small, the wide search must be clearly better: a window this large always
             # contains a slightly better pose.
-            margin = 0.0 if match.at_border else RECOVERY_MARGIN
-            if recovered.score >= MIN_SCORE and recovered.score > match.score + margin:
+            margin = 0.0 if match.at_border else TUNING.recovery_margin
+            if recovered.score >= TUNING.min_score and recovered.score > match.score + margin:
                 match, status = recovered, SlamStatus.RECOVERED
         if self._doubtful(match, guess):
             wide = self._search_all_headings(points, guess, match.score)
             if wide is not None:
                 match, status = wide, SlamStatus.RECOVERED
-        if match.score < MIN_SCORE:
+        if match.score < TUNING.min_score:
             return Track(guess.pose, self._grown_covariance(guess), match.score, SlamStatus.LOST, None)
 
         accepted = accept(match.pose, match.score, status is SlamStatus.RECOVERED)
         self._lost_sigma_m = 0.0
-        self._usual_score += SCORE_MEMORY * (match.score - self._usual_score)
+        self._usual_score += TUNING.score_memory * (match.score - self._usual_score)
         self._covariance = match.covariance
         added: ScanKeyframe | None = None
         if self.in_known_map:
-            if math.hypot(*(match.pose[:2] - self._built_at)) > KNOWN_MAP_STEP_M:
+            if math.hypot(*(match.pose[:2] - self._built_at)) > TUNING.known_map_step_m:
                 self._build_known(match.pose)
         elif accepted and (self._moved(match.pose) or self._first_was_poor(match, status)):
             added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns)
@@ -244,23 +291,23 @@ class FrontEnd:
 
     def _doubtful(self, match: Match, guess: Guess) -> bool:
         """Return whether the scan may fit better at a heading that the local search does not reach."""
-        usual = max(RECOVERY_SCORE, self._usual_score - SCORE_DROP)
+        usual = max(TUNING.recovery_score, self._usual_score - TUNING.score_drop)
         return match.at_border or match.score < usual or guess.doubtful
 
     def _search_all_headings(self, points: FloatArray, guess: Guess, score: float) -> Match | None:
         """Return the best pose over all headings near the guess; None unless unique and better than ``score``."""
         found = find_place(self._field, points, guess.pose, self.reach_m(guess), math.pi)
-        if found is None or found.score < RECOVERY_SCORE:
+        if found is None or found.score < TUNING.recovery_score:
             return None
         other = max(score, found.runner_up)
-        if found.score - other < WIDE_GAIN * (1.0 - other):
+        if found.score - other < TUNING.wide_gain * (1.0 - other):
             return None
         return Match(found.pose, found.covariance, found.score, False, found.covariance)
 
     def reach_m(self, guess: Guess) -> float:
         """Return the distance from the guess within which the robot is, by odometry since the last match."""
         sigma_m = float(guess.sigma[0]) + self._lost_sigma_m
-        return min(RECOVERY_M + WIDE_SIGMAS * sigma_m, WIDE_REACH_M)
+        return min(TUNING.recovery_m + TUNING.wide_sigmas * sigma_m, TUNING.wide_reach_m)
 
     def _grown_covariance(self, guess: Guess) -> FloatArray:
         # Odometry errs by its scale: the errors of the steps without a match add up.
@@ -274,13 +321,13 @@ class FrontEnd:
         This happens when the first scan covered half a revolution, before odometry arrived. Without a further keyframe,
         each scan would start a wide search until the robot moves.
         """
-        few = len(self.trajectory) < START_KEYFRAMES
-        return few and status is SlamStatus.TRACKED and match.score < RECOVERY_SCORE
+        few = len(self.trajectory) < TUNING.start_keyframes
+        return few and status is SlamStatus.TRACKED and match.score < TUNING.recovery_score
 
     def _moved(self, pose: FloatArray) -> bool:
         last = self.trajectory[-1].map_from_base
         step = relative2(last, pose)
-        return math.hypot(step[0], step[1]) >= KEYFRAME_M or abs(step[2]) >= KEYFRAME_RAD
+        return math.hypot(step[0], step[1]) >= TUNING.keyframe_m or abs(step[2]) >= TUNING.keyframe_rad
 
     def _add_keyframe(self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int) -> ScanKeyframe:
         step, step_covariance, drift = np.zeros(3), np.zeros((3, 3)), covariance.copy()
@@ -289,7 +336,7 @@ class FrontEnd:
             yaw = float(last.map_from_base[2])
             step = relative2(last.map_from_base, pose)
             step_covariance = turned(covariance, -yaw)
-            step_covariance += np.diag(np.square([STEP_SIGMA_M, STEP_SIGMA_M, STEP_SIGMA_RAD]))
+            step_covariance += np.diag(np.square([TUNING.step_sigma_m, TUNING.step_sigma_m, TUNING.step_sigma_rad]))
             drift = grown_drift(last.drift, pose[:2] - last.map_from_base[:2], yaw, step_covariance)
         keyframe = ScanKeyframe(stamp_ns, pose.copy(), scan, step, step_covariance, drift)
         self.trajectory.append(keyframe)

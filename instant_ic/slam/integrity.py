@@ -5,13 +5,20 @@ the map, or end in space that the map shows as free. Neither happens where the r
 contradiction counts together with a drop of the match score, both against the scans before: a map that has drifted
 contradicts new scans too, but gradually, and at a good score.
 
-`IntegrityMonitor` is a Bayes filter on one bit, lost or not. The log-likelihood ratio of a scan was chosen on the Intel
-log and a generated office, with robots put down elsewhere; docs/benchmarks.md has the figures on other logs. While the
-monitor doubts, the map must not grow: otherwise the scan agrees with its own copy.
+`IntegrityMonitor` is a Bayes filter on one bit, lost or not, in log-odds:
 
-A robot that is put down in a place that looks the same fits at a good score, and each scan contradicts little. After a
-weak sign (`IntegrityMonitor.sign`) scans are therefore provisional for some metres, and the map before them is kept. If
-the next ones contradict it and agree with the map that has the provisional ones, metre after metre, the robot is lost.
+1. ``contradiction``: the share of a scan's rays that contradict the map.
+2. ``matched``: the scan's log-likelihood ratio, from the rise of that share and the drop of the score; it counts in
+   proportion to the time since the scan before (``_weigh``). Time without a match raises the log-odds (``_unseen``).
+3. ``doubts``: from a first threshold on, scans stay out of the map; otherwise the scan would agree with its own copy.
+4. ``compared``: a robot that is put down in a place that looks the same fits at a good score, and each scan contradicts
+   little. After a weak ``sign``, scans are therefore provisional for some metres, and the map before them is kept. If
+   the next ones contradict it and agree with the map that has the provisional ones, metre after metre, it is lost.
+5. ``lost``: from a second threshold on, the pose is no longer used, and only recognition of the place ends this.
+6. ``integrity``: bounds of the error, by the mixture of the match's covariance and that of a lost robot.
+
+The ratios were chosen on the Intel log and a generated office, with robots put down elsewhere; docs/benchmarks.md has
+the figures on other logs.
 """
 
 from __future__ import annotations
@@ -26,52 +33,82 @@ from numpy.typing import NDArray
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
 POINTS = 120
-"""Number of rays compared with the map, evenly chosen."""
-RECOVERED = 1.6
-"""Evidence of a scan that only the wide search matches, at least: it stays out of the map."""
+"""Number of rays that are compared with the map, evenly chosen."""
 RANGE_M, SLACK_M = 12.0, 0.25
 """Farther hits are not compared; a wall and a hit this close together agree."""
 OCCUPIED_LOG_ODDS = 1.0
 """A cell above is a wall: two hits more than rays through it."""
 LEAST_KNOWN = 20
-"""Fewer comparable rays count as so many: five of five are little evidence."""
-FULL_CONTRADICTION, FULL_DROP = 0.25, 0.2
-"""Share of contradicted rays, and drop of the score, above their levels, which are full evidence together."""
-LONG_DROP, LONG_DROP_SHARE = 0.4, 0.6
-"""A drop of the score this large is neutral to weak evidence without a contradiction: the place may be new."""
-EVIDENCE = 2.0
-"""Limit of a scan's log-likelihood ratio: no single scan decides."""
-EVIDENCE_S = 0.1
-"""Scans closer in time see the same scene: their evidence counts in proportion to the time between them."""
-PER_M, AGREES = 100.0, 0.1
-"""Evidence of a metre in which all rays contradict the map before the sign and none the map since, and the difference
-of the two shares that is no evidence. 0.3 m at a difference of 0.3 make a sign a loss."""
-LONGEST_STEP_M = 0.25
-"""Way between two scans that counts at most."""
-LEVEL_SHARE = 0.1
-"""Weight of a new scan in the levels."""
-FLOOR = -6.0
-"""Least log-odds of being lost. Higher makes false alarms, lower delays detection."""
-DOUBT, SUSPICIOUS = -5.5, 0.5
-"""Log-odds, or evidence of the last scan, above which scans are kept out of the map: a quarter of a scan's evidence is
-enough, also at a high rate."""
-LOST = 0.0
-"""Log-odds from which the robot is lost. Scans of one place agree or disagree with the map together, so later ones that
-fit do not restore the trust; only recognition does."""
-UNSEEN_S, UNSEEN_PERIODS, UNSEEN_PER_S, UNSEEN_MOST = 1.0, 2.0, 0.6, -1.0
-"""After a second without a matched scan, and this many times the usual period of the scans, the log-odds grow by this
-much a second, up to a limit."""
-NEW_VIEW_M = 0.5
-"""From this motion since the last scan without a doubt on a lower score is less evidence, from twice of it on none: the
-view is new, and doubtful scans are not in the map."""
-LONGEST_DOUBT = 30
-"""Scans after which a doubt that is less likely than not is dropped: the robot has driven on, and its map must grow."""
-UNTRUSTED = 0.5
-"""Probability of being lost from which a pose must not be used."""
+"""Least number of comparable rays in the share: five of five are little evidence."""
 BOUND_SIGMAS, BOUND_YAW_SIGMAS = 3.717, 3.291
-"""99.9 % of a Gaussian in the plane, and on a line, lie within so many σ."""
-LOST_SIGMA_M, LOST_SIGMA_RAD = 10.0, math.pi / math.sqrt(3.0)
-"""σ of the pose of a lost robot: a building, and any heading."""
+"""Standard deviations within which 99.9 % of a Gaussian lie: in the plane, and on a line."""
+LOST_SIGMA_RAD = math.pi / math.sqrt(3.0)
+"""Standard deviation of a lost robot's heading: any heading."""
+
+
+@dataclass(frozen=True)
+class IntegrityConfig:
+    """Tuning of the filter; log-odds and log-likelihood ratios are natural logarithms.
+
+    Attributes:
+        recovered: least evidence of a scan that only the wide search matches: it stays out of the map.
+        full_contradiction: rise of the share of contradicted rays that is full evidence, together with
+            ``full_drop``.
+        full_drop: drop of the match score that is full evidence, together with ``full_contradiction``.
+        long_drop: drop of the score that is evidence without a contradiction; weak, since the place may be new.
+        long_drop_share: share of the full evidence that such a drop is.
+        evidence_s: scans closer in time than this see the same scene: their evidence counts in proportion to
+            the time in seconds.
+        evidence: limit of a scan's log-likelihood ratio: no single scan decides.
+        per_m: evidence of a metre in which all rays contradict the map before the sign and none the map since;
+            0.3 m at a difference of 0.3 make a sign a loss.
+        agrees: difference of the two shares that is no evidence.
+        longest_step_m: way between two scans that counts at most, in metres.
+        level_share: weight of a new scan in the usual score and contradiction.
+        floor: least log-odds of being lost; higher makes false alarms, lower delays detection.
+        doubt: log-odds above which scans are kept out of the map.
+        suspicious: evidence of the last scan above which it is kept out: a quarter of a scan's, at any rate of
+            scans.
+        lost: log-odds from which the robot is lost. Scans of one place agree or disagree with the map together,
+            so later ones that fit do not restore the trust; only recognition does.
+        unseen_s: time without a matched scan after which the log-odds grow, in seconds.
+        unseen_periods: the same in usual periods of the scans; the longer time counts.
+        unseen_per_s: growth of the log-odds per second from then on.
+        unseen_most: log-odds up to which they grow.
+        new_view_m: a low score counts less as evidence after the robot has moved this far since the last
+            trusted scan, and not at all after twice the distance, in metres.
+        longest_doubt: scans after which a doubt that is less likely than not is dropped: the robot has driven
+            on, and its map must grow.
+        untrusted: probability of being lost from which a pose must not be used.
+        lost_sigma_m: standard deviation of a lost robot's position in metres: a building.
+    """
+
+    recovered: float = 1.6
+    full_contradiction: float = 0.25
+    full_drop: float = 0.2
+    long_drop: float = 0.4
+    long_drop_share: float = 0.6
+    evidence_s: float = 0.1
+    evidence: float = 2.0
+    per_m: float = 100.0
+    agrees: float = 0.1
+    longest_step_m: float = 0.25
+    level_share: float = 0.1
+    floor: float = -6.0
+    doubt: float = -5.5
+    suspicious: float = 0.5
+    lost: float = 0.0
+    unseen_s: float = 1.0
+    unseen_periods: float = 2.0
+    unseen_per_s: float = 0.6
+    unseen_most: float = -1.0
+    new_view_m: float = 0.5
+    longest_doubt: int = 30
+    untrusted: float = 0.5
+    lost_sigma_m: float = 10.0
+
+
+TUNING = IntegrityConfig()
 
 
 @njit(cache=True)
@@ -161,7 +198,7 @@ class Integrity:
     @property
     def trusted(self) -> bool:
         """True if the pose may be used."""
-        return self.lost_probability < UNTRUSTED
+        return self.lost_probability < TUNING.untrusted
 
 
 class IntegrityMonitor:
@@ -176,7 +213,7 @@ class IntegrityMonitor:
     def __init__(self) -> None:
         self.contradiction = 0.0
         self.after_gap = self.sign = False
-        self._log_odds = self._provisional_log_odds = FLOOR
+        self._log_odds = self._provisional_log_odds = TUNING.floor
         self._suspicious = False  # the last scan, whatever the time since the one before
         self._unseen_s = 0.0
         self._moved_m = 0.0
@@ -191,12 +228,12 @@ class IntegrityMonitor:
     @property
     def doubts(self) -> bool:
         """True if scans must stay out of the map."""
-        return self._suspicious or self._log_odds > DOUBT
+        return self._suspicious or self._log_odds > TUNING.doubt
 
     @property
     def lost(self) -> bool:
         """True if the pose must no longer be used, and the map be left as it is."""
-        return max(self._log_odds, self._provisional_log_odds) >= LOST
+        return max(self._log_odds, self._provisional_log_odds) >= TUNING.lost
 
     @property
     def lost_probability(self) -> float:
@@ -217,26 +254,26 @@ class IntegrityMonitor:
         """
         self.contradiction = contradicted
         usual = score if self._score_level is None else self._usual_score
-        excess = min(max(contradicted - self._usual_contradiction, 0.0) / FULL_CONTRADICTION, 1.0)
-        drop = min(max(usual - score, 0.0) / FULL_DROP, 1.0)
+        excess = min(max(contradicted - self._usual_contradiction, 0.0) / TUNING.full_contradiction, 1.0)
+        drop = min(max(usual - score, 0.0) / TUNING.full_drop, 1.0)
         self._note_gap(elapsed_s)
         self._unseen(elapsed_s)
         self._unseen_s = 0.0
-        long_drop = min(max(usual - score, 0.0) / LONG_DROP, 1.0)
+        long_drop = min(max(usual - score, 0.0) / TUNING.long_drop, 1.0)
         self._moved_m += moved_m
-        long_drop *= min(max(2.0 - self._moved_m / NEW_VIEW_M, 0.0), 1.0)
-        share = max(math.sqrt(excess * drop), LONG_DROP_SHARE * long_drop)
-        evidence = EVIDENCE * (2.0 * share - 1.0)
+        long_drop *= min(max(2.0 - self._moved_m / TUNING.new_view_m, 0.0), 1.0)
+        share = max(math.sqrt(excess * drop), TUNING.long_drop_share * long_drop)
+        evidence = TUNING.evidence * (2.0 * share - 1.0)
         if recovered:
-            self._weigh(max(evidence, RECOVERED), EVIDENCE_S)
+            self._weigh(max(evidence, TUNING.recovered), TUNING.evidence_s)
         else:
             self._weigh(evidence, elapsed_s)
         if self._score_level is None or not self.doubts:
             self.after_gap, self._moved_m = False, 0.0
             level = score if self._score_level is None else self._score_level
-            self._score_level = level + LEVEL_SHARE * (score - level)
+            self._score_level = level + TUNING.level_share * (score - level)
             self._usual_score = min(self._score_level, score)
-            self._contradiction_level += LEVEL_SHARE * (contradicted - self._contradiction_level)
+            self._contradiction_level += TUNING.level_share * (contradicted - self._contradiction_level)
             self._usual_contradiction = max(self._contradiction_level, contradicted)
 
     def compared(self, excess: float, moved_m: float) -> None:
@@ -248,18 +285,20 @@ class IntegrityMonitor:
             excess: share of its rays that contradict the map before, less the share that contradicts the map since.
             moved_m: since the scan before; a radian counts as half a metre.
         """
-        evidence = PER_M * (excess - AGREES) * min(moved_m, LONGEST_STEP_M)
-        self._provisional_log_odds = min(max(self._provisional_log_odds + evidence, FLOOR), LOST + EVIDENCE)
+        evidence = TUNING.per_m * (excess - TUNING.agrees) * min(moved_m, TUNING.longest_step_m)
+        self._provisional_log_odds = min(
+            max(self._provisional_log_odds + evidence, TUNING.floor), TUNING.lost + TUNING.evidence
+        )
 
     def settled(self) -> None:
         """Forget the comparison: the provisional scans have become part of the map."""
-        self._provisional_log_odds = FLOOR
+        self._provisional_log_odds = TUNING.floor
 
     def unmatched(self, fits_nowhere: bool, elapsed_s: float) -> None:
         """Take in a scan without a match: one that fits nowhere near, or one without points."""
         self._note_gap(elapsed_s)
         if fits_nowhere:
-            self._weigh(EVIDENCE, elapsed_s)
+            self._weigh(TUNING.evidence, elapsed_s)
         self._unseen(elapsed_s)
 
     def _note_gap(self, elapsed_s: float) -> None:
@@ -268,18 +307,18 @@ class IntegrityMonitor:
 
     def _usual_s(self, elapsed_s: float) -> float:
         """Return the time between matched scans that raises no doubt."""
-        return max(UNSEEN_S, UNSEEN_PERIODS * (elapsed_s if self._period_s is None else self._period_s))
+        return max(TUNING.unseen_s, TUNING.unseen_periods * (elapsed_s if self._period_s is None else self._period_s))
 
     def _unseen(self, elapsed_s: float) -> None:
         """Let the doubt grow with the time without a matched scan."""
         usual_s = self._usual_s(elapsed_s)
         before = max(self._unseen_s - usual_s, 0.0)
         self._unseen_s += elapsed_s
-        grown = UNSEEN_PER_S * (max(self._unseen_s - usual_s, 0.0) - before)
-        if self._log_odds < UNSEEN_MOST:
-            self._log_odds = min(self._log_odds + grown, UNSEEN_MOST)
+        grown = TUNING.unseen_per_s * (max(self._unseen_s - usual_s, 0.0) - before)
+        if self._log_odds < TUNING.unseen_most:
+            self._log_odds = min(self._log_odds + grown, TUNING.unseen_most)
         period_s = elapsed_s if self._period_s is None else self._period_s
-        self._period_s = period_s + LEVEL_SHARE * (min(elapsed_s, usual_s) - period_s)
+        self._period_s = period_s + TUNING.level_share * (min(elapsed_s, usual_s) - period_s)
 
     def integrity(self, covariance: FloatArray, localized: bool) -> Integrity:
         """Return the trust in a pose of ``covariance`` (3, 3); a robot without a place in its saved map is lost."""
@@ -290,18 +329,22 @@ class IntegrityMonitor:
         return Integrity(lost, BOUND_SIGMAS * sigma_m, min(heading, math.pi))
 
     def _weigh(self, evidence: float, elapsed_s: float) -> None:
-        self._suspicious, self.sign = evidence >= SUSPICIOUS, evidence > 0.0
-        self._log_odds += evidence * min(1.0, max(elapsed_s, 0.0) / EVIDENCE_S)
-        self._log_odds = min(max(self._log_odds, FLOOR), LOST + EVIDENCE)
+        self._suspicious, self.sign = evidence >= TUNING.suspicious, evidence > 0.0
+        self._log_odds += evidence * min(1.0, max(elapsed_s, 0.0) / TUNING.evidence_s)
+        self._log_odds = _bounded(self._log_odds)
         self._doubtful_scans = self._doubtful_scans + 1 if self.doubts else 0
-        if self._doubtful_scans > LONGEST_DOUBT and not self.lost:
-            self._log_odds, self._doubtful_scans, self._suspicious = FLOOR, 0, False
+        if self._doubtful_scans > TUNING.longest_doubt and not self.lost:
+            self._log_odds, self._doubtful_scans, self._suspicious = TUNING.floor, 0, False
+
+
+def _bounded(log_odds: float) -> float:
+    return min(max(log_odds, TUNING.floor), TUNING.lost + TUNING.evidence)
 
 
 def mixture(covariance: FloatArray, lost_probability: float) -> FloatArray:
     """Return the covariance (3, 3) of a pose that is wrong with a probability; its own below the monitor's floor."""
-    floor = 1.0 / (1.0 + math.exp(-FLOOR))
+    floor = 1.0 / (1.0 + math.exp(-TUNING.floor))
     p = min(max((lost_probability - floor) / (1.0 - floor), 0.0), 1.0)
-    lost = np.diag(np.square([LOST_SIGMA_M, LOST_SIGMA_M, LOST_SIGMA_RAD]))
+    lost = np.diag(np.square([TUNING.lost_sigma_m, TUNING.lost_sigma_m, LOST_SIGMA_RAD]))
     mixed: FloatArray = (1.0 - p) * covariance + p * lost
     return mixed

@@ -1,7 +1,16 @@
 """Loop closure: finds loops over the keyframes and optimises their poses, in parallel to the scan thread.
 
-It keeps its own copy of the poses. Only new keyframes go in, and only an `LoopOutcome` comes out. The result does not
-depend on timing: the same keyframes give the same result.
+It keeps its own copy of the poses. Only new keyframes go in, and only a `LoopOutcome` comes out. The result does not
+depend on timing: the same keyframes give the same result. `LoopClosure.update`, for each new keyframe:
+
+1. ``_add``: tie it to the keyframe before by the measured step, and grow the drift.
+2. ``_chains``: every `SPACING_M`, find runs of older keyframes within the drift of its pose.
+3. ``find_place``: match the recent keyframes (``_query``) against each run, by correlative search. The place must have
+   a shape and be clearly better than the next one (``_good``).
+4. ``_confirm``: a large correction needs several loops that agree with each other.
+5. ``_optimise``: optimise the pose graph (``pose_graph``); a loop that the rest contradicts is rejected.
+6. ``_thin_out``: in a place with enough keyframes, remove the new one and chain its edges.
+7. ``_rebuild_map``: if poses have changed, build the occupancy map again.
 """
 
 from __future__ import annotations

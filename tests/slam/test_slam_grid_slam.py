@@ -10,7 +10,7 @@ from slam_planar_world import PlanarWorld, box_room, corridor, l_corridor
 
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, Scan, SlamResult, SlamStatus
-from instant_ic.slam.front_end import RECOVERY_SCORE
+from instant_ic.slam.front_end import TUNING
 
 STEP_NS = 100_000_000
 
@@ -124,7 +124,7 @@ def test_a_poor_first_scan_is_made_up_for_where_the_robot_stands() -> None:
     half = np.where(np.arange(len(whole.ranges)) < 400, whole.ranges, np.inf)
     drive.slam.process(Scan(half, whole.angle_min, whole.angle_increment, 0.3, 30.0, drive.stamp_ns), np.zeros(3))
     drive.go(0.0, 0.0, 20)
-    assert drive.results[0].score < RECOVERY_SCORE
+    assert drive.results[0].score < TUNING.recovery_score
     assert [result.keyframe_added for result in drive.results] == [True] + [False] * 19
     assert min(result.score for result in drive.results[1:]) > 0.85
     assert max(error for error, _ in drive.errors) < 0.02
