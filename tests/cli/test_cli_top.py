@@ -16,7 +16,6 @@ import pytest
 from cli_helpers import talking, wait_until
 from rich.console import Console
 
-from instant_ic.bus.control import NodeControl
 from instant_ic.bus.heartbeat import Flow, Heartbeat
 from instant_ic.bus.registry import NodeInfo
 from instant_ic.cli.top import SORT_KEYS, Processes, as_json, make_rows, table
@@ -97,23 +96,6 @@ def test_once_and_json(ic, run_dir, monkeypatch):
     wait_until(lambda: re.search(row_with_rate, ic("top", "--once")[1]), "a heartbeat with rates")
     row = json.loads(ic("top", "--json")[1])[0]
     assert row["node"] == "talker" and row["rss_mb"] > 10 and row["cpu_percent"] is not None
-
-
-def test_node_in_a_long_callback_and_one_that_hangs(ic, tmp_path_factory, monkeypatch):
-    """A node that sends no heartbeat is shown with what it is doing; a stopped process as silent."""
-    run_dir = tmp_path_factory.mktemp("r")
-    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
-    with talking(run_dir, "-p", "sleep_s:=600.0") as process:
-        assert ic("topic", "pub", "--once", "/sleep", "Bool", "{data: true}")[0] == 0
-        wait_until(lambda: NodeControl(run_dir, "talker").status()["busy_s"] > 0.5, "the long callback")
-        row = json.loads(ic("top", "--json")[1])[0]
-        assert row["state"] == "busy" and re.match(r"in callback of /sleep for \d+ s", row["message"])
-        process.send_signal(signal.SIGSTOP)
-        try:
-            row = json.loads(ic("top", "--json")[1])[0]
-        finally:
-            process.kill()  # its callback would hold up the end
-        assert row["state"] == "silent" and row["rss_mb"] > 10
 
 
 def test_nobody_runs(ic, tmp_path, monkeypatch):

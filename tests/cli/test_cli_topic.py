@@ -88,21 +88,20 @@ def test_echo(ic):
     assert status == 1 and "/scam has no publisher (did you mean '/scan'?); waiting for it" in error
     status, _, error = ic("topic", "echo", "/heard", "--timeout", "0.3")
     assert status == 1 and "/heard has a publisher that sends nothing" in error
-    status, out, error = ic("topic", "echo", "/flag", "-n", "2", "--timeout", "2")
-    assert status == 1 and out.count("---") == 1 and error == "ic: only 1 message received in 2 s\n"
+    status, out, error = ic("topic", "echo", "/flag", "-n", "2", "--timeout", "0.8")
+    assert status == 1 and out.count("---") == 1 and error == "ic: only 1 message received in 1 s\n"
 
 
 def test_hz_bw_and_delay(ic):
-    status, out, _ = ic("topic", "hz", "/scan", "/heartbeat", "--duration", "2.5")
+    status, out, _ = ic("topic", "hz", "/scan", "/heartbeat", "--duration", "1.6")
     found = re.findall(r"/scan +average rate: ([\d.]+)  min: .*s max: .*s std dev: .*s window: (\d+)  lost: 0", out)
     assert status == 0 and 0 < float(found[-1][0]) < 60 and int(found[-1][1]) > 2
     assert re.search(r"/heartbeat +average rate: [\d.]+", out)
-    wait_until(lambda: "window: 5  lost: 0" in ic("topic", "hz", "/scan", "-w", "5", "--duration", "1.2")[1], "5 gaps")
     # CDR by hand: 4 + stamp 8 + frame_id 4 + 6, padded to 20, 7 floats 28, ranges 4 + 160, intensities 4, and 4 before.
-    status, out, _ = ic("topic", "bw", "/scan", "--duration", "1.2")
+    status, out, _ = ic("topic", "bw", "/scan", "--duration", "0.6")
     sizes = "size mean: 220 B min: 220 B max: 220 B"
     assert status == 0 and re.search(rf"[\d.]+ kB/s from \d+ messages  {sizes}", out), out
-    status, out, _ = ic("topic", "delay", "/scan", "--duration", "1.2")
+    status, out, _ = ic("topic", "delay", "/scan", "--duration", "0.6")
     found = re.findall(r"average delay: ([\d.]+)  min", out)
     assert status == 0 and 0.24 < float(found[-1]) < 30
     status, _, error = ic("topic", "delay", "/flag", "--duration", "30")
@@ -125,7 +124,7 @@ def test_delay_by_simulated_time(ic, talker):
     thread = threading.Thread(target=tick)
     thread.start()
     try:
-        out = ic("topic", "delay", "/scan", "--use-sim-time", "--duration", "2.2")[1]
+        out = ic("topic", "delay", "/scan", "--use-sim-time", "--duration", "1.2")[1]
         pub = ("--use-sim-time", "-1", "--qos", "latched", "-w", "0", "/stamp", "Header", "{stamp: now}")
         status, printed, error = ic("topic", "pub", *pub)
     finally:

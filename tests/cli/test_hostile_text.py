@@ -55,8 +55,11 @@ def test_fault_escapes_of_a_bag_or_a_name_control_the_terminal(bag, words, capsy
     assert RAW.findall(out + err) == []
 
 
-def test_passwords_of_addresses_that_a_command_prints_are_masked(capsys):
-    status = main(["launch", "robot", "--check", "camera_url:=rtsp://me:secret@10.0.0.7/live"])
+def test_passwords_of_addresses_that_a_command_prints_are_masked(capsys, tmp_path):
+    file = tmp_path / "camera.yaml"
+    url = "{name: url, value: 'rtsp://me:secret@10.0.0.7/live'}"
+    file.write_text(f"launch:\n- node: {{exec: theta_camera, param: [{url}]}}\n")
+    status = main(["launch", str(file), "--check"])
     out, err = capsys.readouterr()
     assert status != 0 and "set password_file" in out + err
     assert "secret" not in out + err

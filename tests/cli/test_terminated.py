@@ -3,13 +3,8 @@
 import signal
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
-
-from instant_ic.experiments import recordings
-from instant_ic.experiments.stack import StackError
 
 WAITS = """
 import sys, time
@@ -64,43 +59,3 @@ def test_a_hangup_that_nohup_ignores_stays_ignored() -> None:
     process.send_signal(signal.SIGHUP)
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 130  # 143, had the hangup counted
-
-
-class Status:
-    def __init__(self, name: str, message: str) -> None:
-        self.name, self.message = name, message
-
-
-class Silent:
-    """A stack whose driver gets points and makes no scan of them."""
-
-    pace, observer = 1.0, None
-
-    def __init__(self) -> None:
-        self.observer = self
-
-    def collect(self, topic: str, *_: Any) -> list[Any]:
-        array = type(
-            "Array", (), {"status": [Status("vlp16_driver: packets", "9 incomplete revolutions gave no scan")]}
-        )
-        return [array] if topic == "/diagnostics" else []
-
-    def subscribe(self, topic: str, kind: Any, callback: Any, qos: Any) -> None:
-        assert topic == "/lidar/points"
-        for _ in range(3):
-            callback(None)
-
-    def publisher(self, *_: Any) -> None:
-        pass
-
-    def wait_for(self, condition: Any, timeout_s: float, what: str) -> Any:
-        raise StackError(f"no {what} within {timeout_s} s; the stack's output ends with: a long log")
-
-    def check_alive(self, what: str) -> None:
-        pass
-
-
-def test_a_capture_without_scans_is_reported_with_the_drivers_reason(tmp_path: Path) -> None:
-    with pytest.raises(StackError) as caught:
-        recordings._watch(Silent(), tmp_path, 40.0, lambda text: None)  # type: ignore[arg-type]
-    assert str(caught.value) == "the capture gives 3 point clouds and 0 scans (9 incomplete revolutions gave no scan)"

@@ -1,6 +1,6 @@
 import io
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -134,98 +134,86 @@ def test_table_of_nodes(out: io.StringIO) -> None:
 def beat(node: str, state: int = 1, pid: int = 1, rate_hz: float = 10.0, age_s: float = 0.1) -> Any:
     empty, none = np.zeros(0, np.float32), np.zeros(0, np.uint64)
     return NodeStatus(
-        header=header("", 5),
-        node=node,
-        pid=pid,
-        state=state,
-        message="all well",
-        cpu_percent=3.0,
-        rss_mb=4.0,
-        inputs=[],
-        input_rates_hz=empty,
-        input_ages_s=empty,
-        input_lost=none,
-        lost_topics=[],
-        lost_publishers=[],
-        lost_counts=none,
-        outputs=["/pose"],
-        output_rates_hz=np.array([rate_hz], np.float32),
+        header=header("", 5), node=node, pid=pid, state=state, message="all well", cpu_percent=3.0, rss_mb=4.0,
+        inputs=[], input_rates_hz=empty, input_ages_s=empty, input_lost=none,
+        lost_topics=[], lost_publishers=[], lost_counts=none,
+        outputs=["/pose"], output_rates_hz=np.array([rate_hz], np.float32),
         output_ages_s=np.array([age_s], np.float32),
-    )
+    )  # fmt: skip
+
+
+@contextmanager
+def listening(nodes: list[NodeSpec], run_dir: Path, *senders: tuple[Path, str]) -> Iterator[tuple[HealthMonitor, list]]:
+    """A monitor, and a publisher of heartbeats for each folder and node."""
+    transports = [LocalTransport(folder, name, lambda: 1) for folder, name in senders]
+    monitor = HealthMonitor(nodes, run_dir)
+    try:
+        yield monitor, [t.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE) for t in transports]
+    finally:
+        for each in (monitor, *transports):
+            each.close()
+
+
+def hear(monitor: HealthMonitor, condition: Callable[[], object], send: Callable[[], object] = lambda: None) -> None:
+    """Send until the subscription is connected and the monitor has heard it."""
+    for _ in range(2000):
+        send()
+        monitor.poll()
+        if condition():
+            return
+        time.sleep(0.01)
+    raise AssertionError("nothing was heard")
 
 
 def test_heartbeats_become_health(tmp_path: Path) -> None:
     nodes = [NodeSpec("my_slam", "grid_slam", ()), NodeSpec("other", "navigator", ())]
-    transport = LocalTransport(tmp_path, "my_slam", lambda: 1)
-    monitor = HealthMonitor(nodes, tmp_path)
-    try:
+    wrong = beat("my_slam", pid=77)
+    wrong.outputs = [*wrong.outputs, "/more"]
+    with listening(nodes, tmp_path, (tmp_path, "my_slam")) as (monitor, [publisher]):
         assert monitor.nodes_missing() == ["my_slam", "other"] and monitor.waiting_for() == ["map"]
-        publisher = transport.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE)
-        for _ in range(2000):  # until the subscription is connected
-            publisher.send(serialize(beat("my_slam", pid=77)))
-            monitor.poll()
-            if "my_slam" in monitor.nodes:
-                break
-            time.sleep(0.01)
+
+        def send() -> None:
+            publisher.send(b"no CDR")  # wrong ones do not end the launcher
+            publisher.send(serialize(wrong))
+
+        hear(monitor, lambda: "my_slam" in monitor.nodes, send)
         health = monitor.nodes["my_slam"]
         assert (health.state, health.message, health.outputs["/pose"].rate_hz) == ("running", "all well", 10.0)
+        assert "/more" not in health.outputs and not health.silent
         assert monitor.nodes_missing() == ["other"] and monitor.waiting_for() == []
-        assert not health.silent
         assert monitor.beat_s(nodes[0], 77) == health.seen_s
         assert monitor.beat_s(nodes[0], 78) is None  # of the process before
         assert monitor.beat_s(nodes[1], 77) is None
-    finally:
-        monitor.close()
-        transport.close()
-
-
-def test_a_wrong_heartbeat_does_not_end_the_launcher(tmp_path: Path) -> None:
-    transport = LocalTransport(tmp_path, "my_slam", lambda: 1)
-    monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
-    wrong = beat("my_slam")
-    wrong.outputs = [*wrong.outputs, "/more"]
-    try:
-        publisher = transport.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE)
-        for _ in range(2000):  # until the subscription is connected
-            publisher.send(b"no CDR")
-            publisher.send(serialize(wrong))
-            monitor.poll()
-            if "my_slam" in monitor.nodes:
-                break
-            time.sleep(0.01)
-        assert monitor.nodes["my_slam"].state == "running" and "/more" not in monitor.nodes["my_slam"].outputs
-    finally:
-        monitor.close()
-        transport.close()
 
 
 def test_fault_a_bridged_heartbeat_hides_that_a_node_hangs(tmp_path: Path) -> None:
     """A station's heartbeats come by the bridge: under a robot's name, and under ever new ones."""
-    bridge, own = LocalTransport(tmp_path, "host_bridge", lambda: 1), LocalTransport(tmp_path, "my_slam", lambda: 1)
     spec = NodeSpec("my_slam", "grid_slam", ())
-    monitor = HealthMonitor([spec], tmp_path)
-    try:
-        publishers = [t.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE) for t in (bridge, own)]
-        for count in range(2000):  # until the subscriptions are connected
-            for name in ("my_slam", "host_bridge", f"stranger{count}"):
-                publishers[0].send(serialize(beat(name, pid=5)))
-            publishers[1].send(serialize(beat("my_slam", pid=77)))
-            monitor.poll()
-            if {"my_slam", "host_bridge"} <= monitor.nodes.keys():
-                break
-            time.sleep(0.01)
-        publishers[0].send(serialize(beat("my_slam", pid=5)))
-        publishers[0].send(serialize(beat("host_bridge", pid=6)))
-        for _ in range(2000):
-            monitor.poll()
-            if monitor.nodes["host_bridge"].pid == 6:
-                break
-            time.sleep(0.01)
+    with listening([spec], tmp_path, (tmp_path, "host_bridge"), (tmp_path, "my_slam")) as (monitor, [bridge, own]):
+
+        def send() -> None:
+            for name in ("my_slam", "host_bridge", f"stranger{time.monotonic_ns()}"):
+                bridge.send(serialize(beat(name, pid=5)))
+            own.send(serialize(beat("my_slam", pid=77)))
+
+        hear(monitor, lambda: {"my_slam", "host_bridge"} <= monitor.nodes.keys(), send)
+        bridge.send(serialize(beat("my_slam", pid=5)))
+        bridge.send(serialize(beat("host_bridge", pid=6)))
+        hear(monitor, lambda: monitor.nodes["host_bridge"].pid == 6)
         assert monitor.beat_s(spec, 77) is not None
         assert monitor.nodes.keys() == {"my_slam", "host_bridge"}
-    finally:
-        for each in (monitor, bridge, own):
-            each.close()
+
+
+def test_each_group_is_heard_in_its_own_run_directory(tmp_path: Path) -> None:
+    left = tmp_path / "left"
+    nodes = [NodeSpec("slam", "grid_slam", ()), NodeSpec("slam", "grid_slam", (), run_dir=left, group="left")]
+    for folder in (tmp_path, left):
+        prepare(folder)
+    with listening(nodes, tmp_path, (left, "slam")) as (monitor, [publisher]):
+        assert monitor.waiting_for() == ["map", "left/map"]
+        hear(monitor, lambda: monitor.nodes, lambda: publisher.send(serialize(beat("slam"))))
+        assert list(monitor.nodes) == ["left/slam"]
+        assert monitor.nodes_missing() == ["slam"] and monitor.waiting_for() == ["map"]
 
 
 def test_one_message_reaches_a_milestone(tmp_path: Path) -> None:
@@ -267,29 +255,6 @@ def test_a_topic_that_flowed_and_slows_down_or_stops_is_a_fault_after_a_while(
         assert faults_after(1, 9.5, 0.1) == []
     finally:
         monitor.close()
-
-
-def test_each_group_is_heard_in_its_own_run_directory(tmp_path: Path) -> None:
-    left = tmp_path / "left"
-    nodes = [NodeSpec("slam", "grid_slam", ()), NodeSpec("slam", "grid_slam", (), run_dir=left, group="left")]
-    for folder in (tmp_path, left):
-        prepare(folder)
-    transport = LocalTransport(left, "slam", lambda: 1)
-    monitor = HealthMonitor(nodes, tmp_path)
-    try:
-        assert monitor.waiting_for() == ["map", "left/map"]
-        publisher = transport.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE)
-        for _ in range(2000):
-            publisher.send(serialize(beat("slam")))
-            monitor.poll()
-            if monitor.nodes:
-                break
-            time.sleep(0.01)
-        assert list(monitor.nodes) == ["left/slam"]
-        assert monitor.nodes_missing() == ["slam"] and monitor.waiting_for() == ["map"]
-    finally:
-        monitor.close()
-        transport.close()
 
 
 @pytest.mark.parametrize(
