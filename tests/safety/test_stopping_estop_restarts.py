@@ -258,11 +258,27 @@ def test_a_stop_whose_state_cannot_be_written_holds_and_is_an_error(robot: Robot
     assert not robot.bus.last("/ic/state").estop
 
 
+TOUCHER = """
+from pathlib import Path
+from instant_ic.bus import Node
+from instant_ic.control.freshness import TimeoutConfig
+
+class Toucher(Node[TimeoutConfig]):
+    name = "toucher"
+
+if __name__ == "__main__":
+    Path("{started}").touch()
+"""
+"""A node that only notes that it was started, and ends."""
+
+
 def test_a_stack_whose_state_cannot_be_written_is_not_started(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     launch, started = tmp_path / "stack.yaml", tmp_path / "started"
-    launch.write_text(f"launch:\n- executable: {{cmd: touch {started}, name: toucher}}\n")
+    node = tmp_path / "toucher.py"
+    node.write_text(TOUCHER.format(started=started))
+    launch.write_text(f"launch:\n- node: {{exec: {node}, name: toucher}}\n")
     with tempfile.TemporaryDirectory() as run_dir:  # short enough for the names of sockets
         words = ["launch", str(launch), "--run-dir", run_dir, "--plain"]
         assert main(words) == 0 and started.exists()
