@@ -16,7 +16,7 @@ from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import ROOM, prepare
 
 
-def demo_layers(version: int, map_from_camera: Matrix, width: int = 1024, depth_width: int = 512) -> PageLayers:
+def demo_layers(version: int, map_from_camera: Matrix, width: int = 768, depth_width: int = 384) -> PageLayers:
     """Return what a keyframe at this pose shows: the camera's surfaces, and the guess behind them.
 
     Args:
