@@ -75,7 +75,7 @@ def layer_mesh(
     alone = torn[:-1] | right[:-1] | torn[1:] | right[1:]  # pixels that are squares of their own
     corners = corner_values(inverse, torn)
     tile = int(np.gcd(height, width) & -np.gcd(height, width))  # the largest power of two that divides both
-    errors = lattice_errors(corners, _directions(height, width), alone, tile)
+    errors = lattice_errors(corners, corner_directions(height, width), alone, tile)
     limit = np.float32(tolerance)
     vertices, triangles = count_triangles(errors, alone, shown, tile, limit)
     places = np.empty((vertices, 2), np.uint16)
@@ -86,7 +86,7 @@ def layer_mesh(
 
 
 @functools.lru_cache(maxsize=4)
-def _directions(height: int, width: int) -> NDArray[np.float32]:
+def corner_directions(height: int, width: int) -> NDArray[np.float32]:
     """Return the unit vectors at the pixels' corners, (height + 1, width, 3)."""
     azimuth = np.pi - np.arange(width) * (2 * np.pi / width)
     directions = directions_at(azimuth, np.pi / 2 - np.arange(height + 1) * (np.pi / height))

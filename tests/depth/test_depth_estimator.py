@@ -65,14 +65,6 @@ def test_tells_what_its_numbers_are(config: DepthEstimatorConfig) -> None:
     np.testing.assert_allclose(image_array(depth), 128 / 255, rtol=0.02)
 
 
-def test_png_is_taken_as_well(config: DepthEstimatorConfig) -> None:
-    with LockstepBus(START) as bus:
-        bus.add(DepthEstimatorNode, config)
-        bus.publish(TOPIC, compressed_image_message(picture(".png"), "camera", START), stamp_ns=START)
-        (depth,) = bus.messages("/depth/raw")
-    np.testing.assert_allclose(image_array(depth), 128 / 255, rtol=1e-5)
-
-
 def test_what_is_no_panorama_is_told(config: DepthEstimatorConfig) -> None:
     square = cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes()
     with LockstepBus(START) as bus:

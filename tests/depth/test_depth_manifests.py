@@ -187,12 +187,3 @@ def test_onnxruntime_gets_the_providers_from_the_asked_one_on(tmp_path, monkeypa
     tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"d": (1, 1, 64, 128)}, channel("image", 0, "d"), CHANNELS)
     assert DepthModel.load(manifest_of(path), provider=asked).provider == "cpu"
     assert got == [PROVIDERS[name] for name in listed]
-
-
-def test_unknown_provider_and_threads(tmp_path: Path) -> None:
-    path = tmp_path / "m.onnx"
-    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"d": (1, 1, 64, 128)}, channel("image", 0, "d"), CHANNELS)
-    with pytest.raises(ValueError, match="provider must be one of auto, tensorrt, cuda, cpu"):
-        DepthModel.load(manifest_of(path), provider="gpu")
-    with pytest.raises(ValueError, match="threads must be 1 or more"):
-        DepthModel.load(manifest_of(path), threads=0)

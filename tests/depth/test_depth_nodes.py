@@ -258,19 +258,21 @@ def test_lidar_alone_needs_no_network() -> None:
     assert keyframes[0].fit and keyframes[0].source == "lidar" and keyframes[0].scale == 1.0
 
 
-def completed_config(tmp_path: Path) -> DepthScalerConfig:
+@pytest.fixture(scope="module")
+def completed(tmp_path_factory: pytest.TempPathFactory) -> DepthScalerConfig:
     """With a completion that puts everything at least an eighth farther, and is sure of it."""
     torch.manual_seed(0)
     model = CompletionNet(CompletionConfig(64, (8, 8, 8), 2))
     torch.nn.init.constant_(model.head.bias[:16], 2.4)  # times a sigma of 0.05 or more
     torch.nn.init.constant_(model.head.bias[16:], -1.0)
-    export_model(model.eval(), tmp_path / "c.onnx", "c", "Apache-2.0", 40.0)
-    return DepthScalerConfig(source="completed", completion=str(tmp_path / "c.onnx"), provider="cpu")
+    path = tmp_path_factory.mktemp("completion") / "c.onnx"
+    export_model(model.eval(), path, "c", "Apache-2.0", 40.0)
+    return DepthScalerConfig(source="completed", completion=str(path), provider="cpu")
 
 
-def test_completion_corrects_the_fused_depth(tmp_path: Path) -> None:
+def test_completion_corrects_the_fused_depth(completed: DepthScalerConfig) -> None:
     depths, sigmas = [], []
-    for config in (DepthScalerConfig(source="fused"), completed_config(tmp_path)):
+    for config in (DepthScalerConfig(source="fused"), completed):
         with LockstepBus(START) as bus:
             node = bus.add(DepthScalerNode, config)
             drive(bus, 2.5)
@@ -287,10 +289,10 @@ def test_completion_corrects_the_fused_depth(tmp_path: Path) -> None:
     np.testing.assert_array_equal(sigmas[1][~changed], sigmas[0][~changed])
 
 
-def test_a_completion_that_fails_or_takes_too_long_leaves_the_fused_depth(tmp_path: Path) -> None:
+def test_a_completion_that_fails_or_takes_too_long_leaves_the_fused_depth(completed: DepthScalerConfig) -> None:
     cancelled = threading.Event()
     with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode, completed_config(tmp_path))
+        node = bus.add(DepthScalerNode, completed)
         node.completion.timeout_s = 0.05
         node.completion.model.complete = lambda rgb, prior: cancelled.wait(60)
         node.completion.model.cancel = cancelled.set
@@ -302,25 +304,13 @@ def test_a_completion_that_fails_or_takes_too_long_leaves_the_fused_depth(tmp_pa
         assert len(bus.messages("/depth/scaled")) == 1 and not node.stopping
 
 
-def test_the_node_hears_messages_while_a_completion_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What runs in the worker is given back to the node's thread later: nothing is published before."""
-    given = []
-    monkeypatch.setattr("instant_ic.bus.node.Worker.submit", lambda self, item: given.append((self, item)))
-    with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode, completed_config(tmp_path))
-        drive(bus, 0.5)
-        assert len(given) == 1 and not bus.messages("/depth/scaled")
-        worker, job = given[0]
-        worker._do(job)
-        drive(bus, 0.02, START + S)
-        assert len(bus.messages("/depth/scaled")) == 1 and level(node, "scale")[1].endswith("; completed")
-
-
-def test_no_depth_is_requested_while_a_completion_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_depth_is_requested_while_a_completion_runs(
+    completed: DepthScalerConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Until its keyframe is taken every image would be due, and each request costs an inference."""
     monkeypatch.setattr("instant_ic.bus.node.Worker.submit", lambda self, item: setattr(self, "busy", True))
     with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode, completed_config(tmp_path))
+        node = bus.add(DepthScalerNode, completed)
         drive(bus, 0.5)  # an image, its revolution and its depth
         assert node.worker.busy
         before = len(bus.messages("/depth/request"))
@@ -412,17 +402,6 @@ def test_only_a_recent_state_in_which_the_virtual_space_is_shown_brings_keyframe
         assert not taken(1.6, 11)  # the state is 3 s old
 
 
-def test_what_moves_around_a_standing_robot_is_seen_after_a_while(model_file: Path) -> None:
-    config = DepthScalerConfig(keyframes=KeyframeSelectionConfig(refresh_s=2.0), scaler=ScalerConfig("as_estimated"))
-    with LockstepBus(START) as bus:
-        bus.add(DepthEstimatorNode, DepthEstimatorConfig(model=str(model_file)))
-        bus.add(DepthScalerNode, config)
-        publish_mounts(bus)
-        images(bus, [0.0] * 25, START)
-        assert [(stamp_ns(k) - START) / S for k in bus.messages("/keyframe")] == [0.0, 2.0, 4.0]
-        assert len(bus.messages("/depth/raw")) == 3
-
-
 def test_a_request_is_repeated_until_depth_arrives() -> None:
     with LockstepBus(START) as bus:
         bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated")))
@@ -456,14 +435,6 @@ def test_time_that_goes_back_makes_a_new_keyframe() -> None:
             (stamp,) = images(bus, [0.0], begin)
             bus.publish("/depth/raw", image_message(depth, "32FC1", "camera", stamp), stamp_ns=stamp)
         assert [stamp_ns(k) - START for k in bus.messages("/keyframe")] == [20 * S, 10 * S]
-
-
-def test_lidar_alone_tells_a_silent_lidar() -> None:
-    with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode, DepthScalerConfig(source="lidar"))
-        drive(bus, 1.5, network=False, lidar=False)
-        assert bus.messages("/depth/scaled") == []
-        assert level(node, "scale") == (1, "no LiDAR revolution within 0.3 s")
 
 
 def test_a_silent_network_is_told() -> None:
@@ -531,10 +502,11 @@ def test_two_runs_are_the_same_bits(model_file: Path) -> None:
     assert first == run()
 
 
-def test_no_lidar_is_told_and_no_keyframe_at_once() -> None:
+@pytest.mark.parametrize("source", ["completed", "lidar"])
+def test_no_lidar_is_told_and_no_keyframe_at_once(source: str) -> None:
     with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode)
-        drive(bus, 1.0, lidar=False)
+        node = bus.add(DepthScalerNode, DepthScalerConfig(source=source))
+        drive(bus, 1.0, network=source != "lidar", lidar=False)
         assert bus.messages("/depth/scaled") == [] and bus.messages("/keyframe") == []
         assert level(node, "scale") == (1, "no LiDAR revolution within 0.3 s")
 
@@ -646,11 +618,6 @@ def test_estimator_tells_broken_pictures_and_old_depth(model_file: Path) -> None
         message = compressed_image_message(jpeg(0), "camera", START + S)
         bus.publish("/camera/image/compressed", message, stamp_ns=START + 3 * S)
         assert level(node, "depth") == (1, "depth is 2.00 s old when it is published")
-
-
-def test_estimator_without_model_ends_in_plain_words(tmp_path: Path) -> None:
-    with pytest.raises(NodeError, match="no manifest"), LockstepBus(START) as bus:
-        bus.add(DepthEstimatorNode, DepthEstimatorConfig(model=str(tmp_path / "absent.onnx")))
 
 
 def test_selector_by_hand() -> None:

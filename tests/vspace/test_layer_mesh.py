@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from instant_ic.vspace.layer_mesh import _directions, layer_mesh
+from instant_ic.vspace.layer_mesh import corner_directions, layer_mesh
 
 H, W = 64, 128
 
@@ -34,7 +34,7 @@ def everywhere(inverse):
 
 def solid_angles(mesh):
     """Signed solid angle of each triangle as the camera sees it (Van Oosterom and Strackee, 1983), (T,)."""
-    directions = _directions(*mesh.size).astype(float)
+    directions = corner_directions(*mesh.size).astype(float)
     vertices = directions[mesh.corners[:, 1], mesh.corners[:, 0] % mesh.size[1]]
     a, b, c = (vertices[mesh.triangles[:, k]] for k in range(3))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c))
@@ -68,7 +68,7 @@ def test_a_plane_needs_few_triangles_and_a_room_is_right():
     assert len(few.triangles) < 0.25 * 2 * H * W
     inverse = room()
     mesh = layer_mesh(inverse, none(inverse), everywhere(inverse), 0.004)
-    directions = _directions(H, W).astype(float)
+    directions = corner_directions(H, W).astype(float)
     corners = directions[mesh.corners[:, 1], mesh.corners[:, 0] % W]
     places = corners / mesh.inverse_depth[:, None]
     middles = places[mesh.triangles].mean(axis=1)

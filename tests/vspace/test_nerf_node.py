@@ -121,18 +121,6 @@ def test_the_first_view_comes_before_any_training(bus):
     assert "shown: the warped panorama" in status.message
 
 
-def test_the_warp_as_the_source_is_ready_with_the_keyframe():
-    with LockstepBus(start_ns=10 * S) as bus:
-        bus.add(NerfNode, NerfConfig(space=dataclasses.replace(SPACE, source="warp")))
-        bus.publish("/keyframe", keyframe_message(number=4), latched=True)
-        bus.advance(1.0)
-        status = bus.last("/vspace/status")
-        assert (status.state, status.keyframe_id, status.iterations) == (READY, 4, 0)
-        assert "source: warp" in status.message
-        bus.publish("/view/request", request_message(1))
-        assert bus.last("/vspace/view").confidence > 0.9
-
-
 def test_auto_trains_nothing_on_a_cpu():
     with LockstepBus(start_ns=10 * S) as bus:
         node = bus.add(NerfNode, NerfConfig(space=dataclasses.replace(SPACE, source="auto")))
@@ -188,13 +176,9 @@ def test_the_same_input_gives_the_same_bytes():
     [
         (keyframe_message(2, fit=False), "no LiDAR"),
         (keyframe_message(2, depth=np.zeros((128, 256), np.float32)), "known in 0%"),
-        (keyframe_message(2, depth=np.full((128, 256), np.nan, np.float32)), "not finite"),
-        (keyframe_message(2, depth=np.ones((100, 256), np.float32)), "depth must be"),
         (keyframe_message(2, panorama=b"\xff\xd8 this is no picture"), "cannot be decoded"),
-        (keyframe_message(2, panorama=b""), "0 bytes"),
-        (keyframe_message(2, sigma=float("nan")), "relative_sigma"),
     ],
-    ids=["unfit", "empty-depth", "nan-depth", "depth-shape", "bad-jpeg", "no-jpeg", "nan-sigma"],
+    ids=["unfit", "empty-depth", "bad-jpeg"],
 )
 def test_a_bad_keyframe_is_refused_and_the_old_space_stays(bus, message, words):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
@@ -289,21 +273,6 @@ def test_a_pose_far_off_is_drawn_without_confidence_and_told(bus):
     assert diagnosis(bus, "view")[0] == 0
 
 
-def test_a_keyframe_of_another_size_takes_over(bus):
-    bus.publish("/keyframe", keyframe_message(1), latched=True)
-    bus.advance(2.0)
-    picture = box_room.panorama(CAMERA, 96)
-    other = dataclasses.replace(
-        keyframe_message(2, depth=picture.depth_m[::2, ::2]),
-        panorama=compressed_image_message(cv2.imencode(".jpg", picture.rgb[..., ::-1])[1].tobytes(), "camera", 7 * S),
-    )
-    bus.publish("/keyframe", other, latched=True)
-    bus.advance(2.0)
-    assert bus.last("/vspace/status").keyframe_id == 2
-    bus.publish("/view/request", request_message(3))
-    assert bus.last("/vspace/view").confidence > 0.9
-
-
 def test_the_robots_mask(tmp_path):
     mask = np.zeros((32, 64), np.uint8)
     mask[20:, 10:20] = 255
@@ -336,16 +305,3 @@ def test_a_request_that_cannot_be_drawn_is_told(bus, request_):
     assert diagnosis(bus, "view")[0] == 1
     bus.publish("/view/request", request_message(4))
     assert bus.last("/vspace/view").request_id == 4
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"render_fps": 0},
-        {"train_ms_per_frame": -1},
-        {"jpeg_quality": 101},
-    ],
-)
-def test_parameters_are_checked(values):
-    with pytest.raises(ValueError, match=next(iter(values))):
-        NerfConfig(**values)

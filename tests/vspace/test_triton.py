@@ -225,32 +225,15 @@ def test_rendering_agrees_with_the_reference(scene, share, depth_share):
     device = TritonDevice(FIELD, TRAIN, DEVICE)
     device.load(torch_device.parameters())
     device.set_scene(scene)
-    rays = perspective_rays(pose_matrix(0.6, -0.5, 0, yaw=0.2), 11, 9, 1.5)  # no whole tiles
+    rays = perspective_rays(pose_matrix(0.6, -0.5, 0, yaw=0.2), 9, 6, 1.5)  # no whole tiles
     colour, depth, confidence = device.draw(rays, share, depth_share)
     expected_colour, expected_depth, expected_confidence = torch_device.draw(rays, share, depth_share)
-    assert colour.shape == (11 * 9, 3)
+    assert colour.shape == (9 * 6, 3)
     assert np.mean(expected_depth > 0) > 0.8
     same = np.isclose(depth, expected_depth, rtol=0.01)
     assert same.mean() > 0.96  # a rounding decides at cell borders and edges
     assert np.mean(confidence[same] != expected_confidence[same]) < 0.02
     assert np.quantile(np.abs(colour[same] - expected_colour[same]), 0.98) < 0.02
-
-
-def test_training_changes_pictures_and_can_be_taken_up_again():
-    scene = room_scene()
-    device = TritonDevice(FIELD, TRAIN, DEVICE)
-    device.set_scene(scene)
-    rays = perspective_rays(pose_matrix(0.3, -0.1, 0, yaw=0.2), 8, 8, 1.0)
-    uniform = np.random.default_rng(0).random((TRAIN.ray_columns * TRAIN.ray_rows, 3), F)
-    before = device.draw(rays, 0.0, 1.0)
-    for _ in range(2):
-        device.step(uniform, 0.04, 0.01)
-    assert not np.array_equal(device.draw(rays, 0.0, 1.0)[0], before[0])
-    # And what was trained can be taken up again.
-    other = TritonDevice(FIELD, TRAIN, DEVICE)
-    other.load(device.parameters())
-    other.set_scene(scene)
-    assert np.allclose(other.draw(rays, 0.0, 1.0)[0], device.draw(rays, 0.0, 1.0)[0], atol=1e-6)
 
 
 def test_other_geometries_are_refused():

@@ -11,7 +11,6 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.vspace import (
     FieldConfig,
-    KeyframeError,
     SpaceState,
     TrainConfig,
     VirtualSpace,
@@ -139,18 +138,6 @@ def test_unknown_depth_is_filled_and_said(room):
     view = warp_of(picture.rgb, depth, camera).render(camera, 96, 54, FOV)
     assert np.all(view.confidence[:, 46:50] == 0.5)
     assert np.all(view.confidence[:, :30] == 1)
-
-
-def test_what_is_no_keyframe_or_view_is_refused(room, warp):
-    camera, picture = room
-    with pytest.raises(KeyframeError, match="not finite"):
-        warp_of(picture.rgb, np.full((64, 128), np.nan), camera)
-    with pytest.raises(KeyframeError, match="one colour"):
-        warp_of(np.zeros_like(picture.rgb), picture.depth_m, camera)
-    with pytest.raises(ValueError, match="pixels a side"):
-        warp.render(camera, 8, 8, FOV)
-    with pytest.raises(ValueError, match="finite"):
-        warp.render(np.full((4, 4), np.nan), 64, 36, FOV)
 
 
 SMALL = VirtualSpaceConfig(
