@@ -286,9 +286,7 @@ class IntegrityMonitor:
             moved_m: since the scan before; a radian counts as half a metre.
         """
         evidence = TUNING.per_m * (excess - TUNING.agrees) * min(moved_m, TUNING.longest_step_m)
-        self._provisional_log_odds = min(
-            max(self._provisional_log_odds + evidence, TUNING.floor), TUNING.lost + TUNING.evidence
-        )
+        self._provisional_log_odds = _bounded(self._provisional_log_odds + evidence)
 
     def settled(self) -> None:
         """Forget the comparison: the provisional scans have become part of the map."""

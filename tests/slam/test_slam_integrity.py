@@ -14,8 +14,7 @@ from instant_ic.sim.worlds import make_world
 from instant_ic.slam import GridSlam
 from instant_ic.slam.integrity import (
     BOUND_SIGMAS,
-    LOST_SIGMA_M,
-    UNTRUSTED,
+    TUNING,
     IntegrityMonitor,
     contradiction,
     mixture,
@@ -81,7 +80,7 @@ def test_three_contradicted_scans_take_the_trust() -> None:
         assert monitor.doubts
         lost.append(monitor.lost)
     assert lost == [False, False, True]
-    assert monitor.lost_probability == pytest.approx(UNTRUSTED)
+    assert monitor.lost_probability == pytest.approx(TUNING.untrusted)
 
 
 def test_evidence_counts_by_time() -> None:
@@ -202,12 +201,14 @@ def test_a_scan_after_a_gap_that_fits_nowhere_is_after_a_gap() -> None:
 def test_covariance_and_bounds_follow_the_probability() -> None:
     own = np.diag([0.01, 0.0004, 0.0001])
     np.testing.assert_allclose(mixture(own, 0.0), own)
-    np.testing.assert_allclose(mixture(own, 1.0), np.diag([LOST_SIGMA_M**2, LOST_SIGMA_M**2, math.pi**2 / 3]))
+    np.testing.assert_allclose(
+        mixture(own, 1.0), np.diag([TUNING.lost_sigma_m**2, TUNING.lost_sigma_m**2, math.pi**2 / 3])
+    )
     trusted = steady().integrity(own, localized=True)
     assert trusted.trusted and trusted.position_bound_m == pytest.approx(BOUND_SIGMAS * 0.1)
     lost = steady().integrity(own, localized=False)
     assert not lost.trusted and lost.lost_probability == 1.0
-    assert lost.position_bound_m == pytest.approx(BOUND_SIGMAS * LOST_SIGMA_M)
+    assert lost.position_bound_m == pytest.approx(BOUND_SIGMAS * TUNING.lost_sigma_m)
     assert lost.heading_bound_rad == math.pi
 
 
