@@ -115,7 +115,7 @@ def test_launch_commands_of_a_page_pass_the_check_in_the_order_given(page, tmp_p
             assert main(words) == 0, f"{page}: {command}: {capsys.readouterr().err}"
 
 
-QUICK = ("info", "diff", "convert", "recover")
+QUICK = ("info", "diff", "recover")
 """Verbs of ``ic bag`` that need no stack."""
 
 

@@ -22,6 +22,3 @@ class TopicChoice:
         if any(fnmatch.fnmatchcase(topic, pattern) for pattern in self.exclude):
             return False
         return not self.topics or any(fnmatch.fnmatchcase(topic, pattern) for pattern in self.topics)
-
-
-EVERYTHING = TopicChoice()

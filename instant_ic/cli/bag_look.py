@@ -1,4 +1,4 @@
-"""``ic bag info``, ``diff``, ``convert`` and ``recover``: the commands that work on files alone."""
+"""``ic bag info``, ``diff``, and ``recover``: the commands that work on files alone."""
 
 from __future__ import annotations
 
@@ -12,14 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bag import BagError, BagReader
-from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.compare import Tolerance, TopicDifference, compare
-from instant_ic.bag.convert import ConvertOptions
-from instant_ic.bag.convert import convert as convert_bags
 from instant_ic.bag.recover import recover as recover_bag
 from instant_ic.cli.commands.bag import pairs, topic_names
 from instant_ic.cli.errors import UserError
-from instant_ic.cli.progress import progress
 from instant_ic.msg import deserialize
 
 BOOKMARKS, _STRING = "/operator/bookmark", "std_msgs/msg/String"
@@ -176,17 +172,6 @@ def _plain(topic: TopicDifference) -> dict[str, Any]:
     for entry in plain["fields"].values():
         entry["largest"] = entry["largest"] if math.isfinite(entry["largest"]) else None  # JSON has no NaN
     return plain
-
-
-def convert(args: argparse.Namespace) -> int:
-    choice = TopicChoice(tuple(topic_names(args.topics)), tuple(topic_names(args.exclude)))
-    options = ConvertOptions(choice, args.start, args.end, args.compression)
-    with progress(f"converting {', '.join(args.bags)}") as step:
-        counts = convert_bags([Path(bag) for bag in args.bags], Path(args.output), options, step)
-    print(f"{args.output}: {counts.total()} messages")
-    for topic, count in sorted(counts.items()):
-        print(f"  {topic}: {count}")
-    return 0
 
 
 def recover(args: argparse.Namespace) -> int:

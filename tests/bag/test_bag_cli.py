@@ -110,20 +110,17 @@ def test_wrong_tolerances_are_told(
     assert status == 2 and message in error
 
 
-def test_convert_and_recover(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_recover(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     bag = make(tmp_path / "bag")
-    words = ("-t", "scan", "--start", "2", "--end", "7", "--compression")
-    status, out, _ = ic(capsys, "bag", "convert", bag, "-o", tmp_path / "new", *words)
-    assert status == 0 and "5 messages" in out and "/scan: 5" in out
-    (tmp_path / "new" / "metadata.yaml").unlink()
-    status, _, error = ic(capsys, "bag", "info", tmp_path / "new")
+    (bag / "metadata.yaml").unlink()
+    status, _, error = ic(capsys, "bag", "info", bag)
     assert status == 1 and "ic bag recover" in error
-    file = tmp_path / "new" / "new.mcap"
+    file = bag / "bag.mcap"
     file.write_bytes(file.read_bytes()[:-100])
-    status, out, _ = ic(capsys, "bag", "recover", tmp_path / "new", "-o", tmp_path / "saved")
-    assert status == 0 and "5 messages" in out and "new.mcap" in out
-    with BagReader(tmp_path / "saved") as reader:
-        assert [m.stamp_ns // S for m in reader.messages()] == [3, 4, 5, 6, 7]
+    status, out, _ = ic(capsys, "bag", "recover", bag, "-o", tmp_path / "saved")
+    assert status == 0 and "messages" in out and "bag.mcap" in out
+    with BagReader(tmp_path / "saved") as reader, BagReader(make(tmp_path / "whole")) as whole:
+        assert [m.stamp_ns for m in reader.messages()] == [m.stamp_ns for m in whole.messages()]
 
 
 def test_control_without_a_node(

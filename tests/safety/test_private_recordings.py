@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic.bag.choice import EVERYTHING
-from instant_ic.bag.convert import convert
+from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.on_demand import OnDemand
 from instant_ic.bag.recorder import BagRecorderConfig, Recorder
 from instant_ic.bag.recover import recover
@@ -45,7 +44,7 @@ def write(path: Path, **options: int) -> Path:
 
 
 def recorder(path: Path, options: BagRecorderConfig | None = None) -> Recorder:
-    return Recorder(path, EVERYTHING, lambda topic, take: pytest.fail("nothing to subscribe to"), None, options)
+    return Recorder(path, TopicChoice(), lambda topic, take: pytest.fail("nothing to subscribe to"), None, options)
 
 
 def test_a_bag_and_the_folders_made_for_it_are_private(tmp_path):
@@ -78,11 +77,10 @@ def test_snapshots_are_private(tmp_path):
     assert_private(tmp_path / "snapshots")
 
 
-def test_converted_and_recovered_bags_are_private(tmp_path):
+def test_recovered_bags_are_private(tmp_path):
     source = write(tmp_path / "drive")
-    convert([source], tmp_path / "converted")
     recover(source, tmp_path / "recovered")
-    for bag in (source, tmp_path / "converted", tmp_path / "recovered"):
+    for bag in (source, tmp_path / "recovered"):
         assert_private(bag)
 
 

@@ -1,4 +1,4 @@
-"""``ic bag``: record, play, inspect, compare, convert and recover bags."""
+"""``ic bag``: record, play, inspect, compare and recover bags."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _VALUES = {"step": "count", "rate": "rate", "seek": "offset_s"}
 
 def add_parser(subparsers: Any) -> None:
     verbs = group(
-        subparsers, "bag", "record, play, inspect, compare, convert and recover bags",
+        subparsers, "bag", "record, play, inspect, compare and recover bags",
         "Work with bags: rosbag2 folders (MCAP) that ROS 2, Foxglove and rosbags can open.", "ic bag record -o drive",
     )  # fmt: skip
     _add_record(verbs)
     _add_play(verbs)
     _add_inspection(verbs)
-    _add_conversion(verbs)
+    _add_recovery(verbs)
     _add_control(verbs)
 
 
@@ -85,20 +85,8 @@ def _add_inspection(verbs: Any) -> None:
     comparing.add_argument("--json", action="store_true", help="print JSON")
 
 
-def _add_conversion(verbs: Any) -> None:
-    """Add ``ic bag convert`` and ``recover``."""
-    text = "convert SQLite bags and bare files to a bag; filter, cut, merge, compress"
-    converting = verb(verbs, "convert", text, "bag_look.convert", "ic bag convert old.bag -o drive")
-    add = converting.add_argument
-    add("bags", nargs="+", metavar="BAG", help="several bags are merged by stamp")
-    add("-o", "--output", required=True, metavar="DIR")
-    text = "name or pattern; repeatable; default: everything"
-    add("-t", "--topic", dest="topics", **_MANY, metavar="TOPIC", help=text)
-    add("-x", "--exclude", **_MANY, metavar="TOPIC", help="topics to leave out")
-    add("--start", **_SPAN, default=0.0, help="start at this offset")
-    add("--end", **_SPAN, default=0.0, help="end at this offset")
-    add("--compression", action="store_true", help="compress with zstd")
-
+def _add_recovery(verbs: Any) -> None:
+    """Add ``ic bag recover``."""
     text, example = "recover a readable bag from one that was cut short or damaged", "ic bag recover broken -o saved"
     rescuing = verb(verbs, "recover", text, "bag_look.recover", example)
     rescuing.add_argument("bag", metavar="BAG", completer=completion.bags)
