@@ -1,9 +1,7 @@
 """Web API of the Ricoh Theta Z1 (OSC 2) over HTTP: state, options and live preview."""
 
-import hashlib
 import json
 import logging
-import secrets
 import threading
 import time
 from collections.abc import Callable
@@ -45,7 +43,6 @@ class SimThetaConfig:
         width, height: preview format until a driver sets another.
         rate: largest frame rate, even if the format promises more.
         latency_s: time from the exposure of an image to its delivery.
-        user, password: credentials of HTTP digest (client mode); an empty user disables it.
     """
 
     enabled: bool = True
@@ -55,8 +52,6 @@ class SimThetaConfig:
     height: PositiveInt = 512
     rate: Annotated[float, Range(above=0, high=30)] = 5.0
     latency_s: Annotated[float, Range(0, below=2)] = 0.20
-    user: str = ""
-    password: str = ""
 
     def __post_init__(self) -> None:
         if (self.width, self.height) not in {f[:2] for f in PREVIEW_FORMATS}:
@@ -127,7 +122,6 @@ class ThetaServer:
         self._options.set({"sleepDelay": NEVER, "offDelay": NEVER})
         self._options_set_s = -1e9
         self._began_s = time.monotonic()
-        self._nonce = secrets.token_hex(16)
         self._frame: bytes | None = None
         self._number = 0
         self._viewers = 0
@@ -246,36 +240,6 @@ class ThetaServer:
 
     # --- Web API ------------------------------------------------------------------------------------
 
-    def authorised(self, header: str | None, method: str, path: str) -> bool:
-        """Return whether an Authorization header answers the digest challenge correctly (RFC 7616, MD5)."""
-        if not self.config.user:
-            return True
-        if not header or not header.lower().startswith("digest "):
-            return False
-        fields: dict[str, str] = {}
-        for part in header[7:].split(","):
-            key, _, value = part.strip().partition("=")
-            fields[key] = value.strip('"')
-
-        def md5(text: str) -> str:
-            return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
-
-        secret = md5(f"{self.config.user}:{fields.get('realm', '')}:{self.config.password}")
-        request = md5(f"{method}:{fields.get('uri', path)}")
-        if fields.get("qop"):
-            middle = f"{fields.get('nc')}:{fields.get('cnonce')}:{fields['qop']}"
-            expected = md5(f"{secret}:{fields.get('nonce')}:{middle}:{request}")
-        else:
-            expected = md5(f"{secret}:{fields.get('nonce')}:{request}")
-        right_nonce = fields.get("nonce") == self._nonce and fields.get("username") == self.config.user
-        return (
-            right_nonce and fields.get("uri") == path and secrets.compare_digest(expected, fields.get("response", ""))
-        )
-
-    @property
-    def challenge(self) -> str:
-        return f'Digest realm="RICOH THETA Z1", qop="auth", nonce="{self._nonce}", algorithm=MD5'
-
     def info(self) -> dict[str, Any]:
         """Reply to GET /osc/info."""
         return {
@@ -367,8 +331,6 @@ class _Handler(BaseHTTPRequestHandler):
         log.debug("theta: " + format, *args)
 
     def do_GET(self) -> None:
-        if not self._authorised():
-            return
         if self.path == "/osc/info":
             self._reply(200, self.camera.info())
         else:
@@ -378,8 +340,6 @@ class _Handler(BaseHTTPRequestHandler):
         """Reply to POST requests: state and commands."""
         length = int(self.headers.get("Content-Length") or 0)
         body = self.rfile.read(length) if 0 <= length < 1_000_000 else b""
-        if not self._authorised():
-            return
         try:
             request = json.loads(body) if body.strip() else {}
         except ValueError:
@@ -403,15 +363,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(_ApiError(400, error.code, str(error)), request.get("name", ""))
         except _ApiError as error:
             self._refuse(error, request.get("name", "") if isinstance(request, dict) else "")
-
-    def _authorised(self) -> bool:
-        if self.camera.authorised(self.headers.get("Authorization"), self.command, self.path):
-            return True
-        self.send_response(401)
-        self.send_header("WWW-Authenticate", self.camera.challenge)
-        self.send_header("Content-Length", "0")
-        self.end_headers()
-        return False
 
     def _refuse(self, error: _ApiError, name: str = "") -> None:
         self._reply(

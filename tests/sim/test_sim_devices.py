@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import requests
 import serial
-from requests.auth import HTTPDigestAuth
 
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.roboclaw import Roboclaw
@@ -213,18 +212,6 @@ def test_mistakes_get_the_cameras_error_codes(camera: ThetaServer, request_body:
     reply = requests.post(url(camera) + "/osc/commands/execute", json=request_body, timeout=TIMEOUT_S)
     assert reply.status_code == 400
     assert reply.json()["state"] == "error" and reply.json()["error"]["code"] == code
-
-
-def test_digest_is_asked_for_and_checked() -> None:
-    server = ThetaServer(SimThetaConfig(port=0, width=640, height=320, user="THETAYN1", password="1234"), grey_ramp)
-    try:
-        address = url(server) + "/osc/info"
-        refused = requests.get(address, timeout=TIMEOUT_S)
-        assert refused.status_code == 401 and "Digest" in refused.headers["WWW-Authenticate"]
-        assert requests.get(address, auth=HTTPDigestAuth("THETAYN1", "9"), timeout=TIMEOUT_S).status_code == 401
-        assert requests.get(address, auth=HTTPDigestAuth("THETAYN1", "1234"), timeout=TIMEOUT_S).json()["model"]
-    finally:
-        server.close()
 
 
 def test_a_taken_port_is_told(camera: ThetaServer) -> None:
