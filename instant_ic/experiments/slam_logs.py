@@ -1,7 +1,7 @@
 """Readers of 2D laser logs: CARMEN (`FLASER`, `ROBOTLASER1`), the mines recordings of BreezySLAM, and bags.
 
 A log is an iterable of `LogEntry`. A line that cannot be read is an error with file and line: the reader raises it as
-`LogError`, or counts it in a `BadLines` and leaves the line out.
+`LogError`, or adds it to a list and leaves the line out.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import io
 import math
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import IO, Any
@@ -34,23 +34,6 @@ class LogError(ValueError):
     """A log cannot be read: ``path:line: what is wrong``."""
 
 
-@dataclass
-class BadLines:
-    """Lines that a reader left out of a log: their number, and the errors of the first few."""
-
-    count: int = 0
-    errors: list[str] = field(default_factory=list)
-
-    def add(self, error: LogError) -> None:
-        """Count one line."""
-        self.count += 1
-        if len(self.errors) < _NAMED_ERRORS:
-            self.errors.append(str(error))
-
-
-_NAMED_ERRORS = 5
-
-
 @dataclass(frozen=True)
 class LogEntry:
     """A scan with the odometry at its stamp.
@@ -71,7 +54,7 @@ class LogEntry:
 class _Lines(io.TextIOWrapper):
     """Lines of a text file, limited in length: a few kilobytes of gzip can hold one line of gigabytes."""
 
-    def __init__(self, raw: Any, path: Path, bad: BadLines | None) -> None:
+    def __init__(self, raw: Any, path: Path, bad: list[str] | None) -> None:
         super().__init__(raw, encoding="ascii", errors="replace")
         self._path, self._left, self._bad = path, _MOST_LOG, bad
 
@@ -89,18 +72,14 @@ class _Lines(io.TextIOWrapper):
         return line
 
 
-def refuse(error: LogError, bad: BadLines | None) -> None:
-    """Count a bad line, or raise its error if nobody counts.
-
-    Raises:
-        LogError: ``bad`` is None.
-    """
+def refuse(error: LogError, bad: list[str] | None) -> None:
+    """Add the error of a line that is left out to ``bad``, or raise it if that is None."""
     if bad is None:
         raise error
-    bad.add(error)
+    bad.append(str(error))
 
 
-def open_log(path: str | Path, bad: BadLines | None = None) -> IO[str]:
+def open_log(path: str | Path, bad: list[str] | None = None) -> IO[str]:
     """Open a text log; gzip is detected from the first two bytes. A cut gzip file gives the lines that it holds."""
     path = Path(path)
     with path.open("rb") as raw:
@@ -108,18 +87,18 @@ def open_log(path: str | Path, bad: BadLines | None = None) -> IO[str]:
     return _Lines(gzip.open(path, "rb") if packed else path.open("rb"), path, bad)
 
 
-def read_log(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
+def read_log(path: str | Path, bad: list[str] | None = None) -> Iterator[LogEntry]:
     """Read the scans of a text log; a line of 24 or more bare numbers is the mines format.
 
     Args:
         path: log file, gzip or plain.
-        bad: counter of the lines that cannot be read and are left out; None: the first one raises.
+        bad: receives the errors of lines that cannot be read, which are left out; None: the first one raises.
 
     Raises:
         LogError: a line cannot be read, or the log has no scan.
         OSError: the file does not exist.
     """
-    with open_log(path, BadLines()) as lines:  # what is damaged is reported when it is read
+    with open_log(path, []) as lines:  # what is damaged is reported when it is read
         first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     fields = first.split()
     mines = len(fields) > _MINES_FIRST_RANGE and fields[0].lstrip("-").isdigit()
@@ -146,7 +125,7 @@ _SICK_RANGE_MAX_M = 80.0
 _SURVEYED_SCANS = 400
 
 
-def read_carmen(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
+def read_carmen(path: str | Path, bad: list[str] | None = None) -> Iterator[LogEntry]:
     """Read the scans of a CARMEN log.
 
     ``FLASER n r0..rn-1 x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``, right to left, with
@@ -175,9 +154,9 @@ def read_carmen(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEn
         raise _nothing(LogError(f"{path}: no FLASER or ROBOTLASER1 line: is this a CARMEN log?"), bad)
 
 
-def _nothing(error: LogError, bad: BadLines | None) -> LogError:
+def _nothing(error: LogError, bad: list[str] | None) -> LogError:
     """Return the error of a log without a scan: that of its first bad line, if it has any."""
-    return LogError(f"{bad.errors[0]} (and no line can be read)") if bad and bad.errors else error
+    return LogError(f"{bad[0]} (and no line can be read)") if bad else error
 
 
 def _survey(path: str | Path) -> _Survey:
@@ -185,7 +164,7 @@ def _survey(path: str | Path) -> _Survey:
     range_max: float | None = None
     poses: list[FloatArray] = []
     readings: list[FloatArray] = []
-    with open_log(path, BadLines()) as lines:
+    with open_log(path, []) as lines:
         for line in lines:
             kind, *fields = line.split() or [""]
             try:
@@ -337,7 +316,7 @@ _MINES_RANGE_MIN_M = 0.06
 _MINES_RANGE_MAX_M = 4.0
 
 
-def read_mines(path: str | Path, bad: BadLines | None = None) -> Iterator[LogEntry]:
+def read_mines(path: str | Path, bad: list[str] | None = None) -> Iterator[LogEntry]:
     """Read the scans of a BreezySLAM `exp*.dat` recording (MinesRover: wheel ticks and a Hokuyo URG-04LX).
 
     Columns: 0 is the time in µs, 2 and 3 the left and right ticks, from 24 on 682 ranges in mm over 240°, right to

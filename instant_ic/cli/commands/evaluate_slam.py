@@ -68,7 +68,7 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     from instant_ic.experiments.plots import save_map
     from instant_ic.experiments.slam import evaluate_log
     from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
-    from instant_ic.experiments.slam_logs import BadLines, is_bag, read_bag, read_log
+    from instant_ic.experiments.slam_logs import is_bag, read_bag, read_log
 
     if args.stamps and not args.relations:
         raise UserError("--stamps selects relations: give --relations too", 2)
@@ -77,7 +77,7 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     stem = args.log.resolve().name.removesuffix(".gz").rsplit(".", 1)[0]
     folder = args.output or Path(f"runs/slam_{stem}_{time.strftime('%Y%m%d_%H%M%S')}")
     check_files(args.json)
-    bad = BadLines()
+    bad: list[str] = []
     with errors_for_the_user(), progress(args.log.name) as advance:
         relations = _relations(args)
         entries = list(read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log, bad))
@@ -95,13 +95,13 @@ def evaluate_slam(args: argparse.Namespace) -> int:
             entries, relations, config, use_wheel_odom=not args.no_odometry,
             on_scan=lambda done: advance(done / len(entries)),
         )  # fmt: skip
-    for line in bad.errors:
+    for line in bad[:5]:
         print(f"left out: {line}", file=sys.stderr)
     import numpy as np
 
     np.savetxt(folder / "trajectory.txt", run.trajectory, fmt=("%.6f", "%.5f", "%.5f", "%.6f"))
     save_map(folder / "map.png", run.slam.grid(), paths={"trajectory": run.trajectory[:, 1:]})
-    report = {"log": args.log.name, **report, "bad_lines": bad.count, "output": str(folder)}
+    report = {"log": args.log.name, **report, "bad_lines": len(bad), "output": str(folder)}
     print_figures(report, folder / "figures.json", args.json)
     return 0
 
