@@ -23,27 +23,17 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
 def newest_python() -> str:
-    """Return the newest interpreter on PATH or in pyenv.
+    """Return the newest interpreter on PATH.
 
     Raises:
         SystemExit: there is none.
     """
     for version in VERSIONS:
-        for python in (shutil.which(f"python{version}"), *_of_pyenv(version)):
-            # A shim of pyenv is on PATH whether or not its version is selected.
-            if python and subprocess.run([python, "-c", ""], capture_output=True).returncode == 0:
-                return python
+        python = shutil.which(f"python{version}")
+        # A shim of pyenv is on PATH whether or not its version is selected.
+        if python and subprocess.run([python, "-c", ""], capture_output=True).returncode == 0:
+            return python
     sys.exit(f"none of Python {', '.join(VERSIONS)} is here: make newest PYTHON=PATH")
-
-
-def _of_pyenv(version: str) -> list[str]:
-    if shutil.which("pyenv") is None:
-        return []
-    root = subprocess.run(["pyenv", "root"], capture_output=True, text=True, check=True).stdout.strip()
-    pythons = Path(root, "versions").glob(f"{version}.*/bin/python")
-    return sorted(
-        map(str, pythons), key=lambda python: [int(part) for part in re.findall(r"\d+", python)], reverse=True
-    )
 
 
 def requirements() -> list[str]:

@@ -125,18 +125,6 @@ def test_folded_file_has_no_norms_and_fewer_enlargements(converted: Path) -> Non
     assert operators.count("Resize") == 4  # those of the contractions; the decoder's six are folded
 
 
-def test_convert_without_output_writes_beside(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[object, ...]] = []
-
-    def export_model(model: SliceNet, path: Path, *rest: object) -> None:
-        asked.append((path, *rest[:-1]))
-        path.write_bytes(b"model")
-
-    monkeypatch.setattr(export, "export_model", export_model)
-    assert main(["depth", "convert", str(checkpoint), "--brightness", "120"]) == 0
-    assert asked == [(checkpoint.with_suffix(".onnx"), "tiny", "Apache-2.0", 16.0, {"steps": 3}, False, 120.0)]
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [

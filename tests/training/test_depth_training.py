@@ -13,7 +13,6 @@ import torch
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_completion
 from instant_ic.training.dataset import Sample
 from instant_ic.training.feeds import FileFeed
-from instant_ic.training.log import TrainingLog
 from instant_ic.training.slicenet import CheckpointError
 from instant_ic.training.trainer import (
     Trainer,
@@ -189,32 +188,3 @@ def test_devices_that_are_not_there() -> None:
         assert select_device("auto").type == "cpu"
         with pytest.raises(ValueError, match="finds no CUDA GPU"):
             select_device("cuda")
-
-
-def test_tensorboard_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-
-    written = []
-
-    class SummaryWriter:
-        def __init__(self, folder: str, purge_step: int | None) -> None:
-            written.append((Path(folder).name, purge_step))
-
-        def add_scalar(self, name: str, value: float, step: int) -> None:
-            written.append((name, value, step))
-
-        def flush(self) -> None:
-            pass
-
-        close = flush
-
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=SummaryWriter))
-    log = TrainingLog(tmp_path / "a.pt", 0, lambda line: None)
-    for step in (50, 100):
-        log.row({"step": step, "loss": step / 100}, "line")
-    log.close()
-    assert written == [("a.tensorboard", None), ("loss", 0.5, 50), ("loss", 1.0, 100)]
-    again = TrainingLog(tmp_path / "a.pt", 60, lambda line: None)  # cut off after step 60's checkpoint
-    again.close()
-    assert written[-1] == ("a.tensorboard", 60)
-    assert [line.split(",")[0] for line in (tmp_path / "a.csv").read_text().split()] == ["step", "50"]
