@@ -1,6 +1,6 @@
 # make run    set everything up in .venv/ and start the simulated stack
 # make test   format, lint, types and all tests
-# make check  format, lint, types and the word list (scripts/check_words.py); the page too, where Node.js is installed
+# make check  format, lint and types; the page too, where Node.js is installed
 # make lock   write requirements*.lock anew after a change of constraints.txt or pyproject.toml (needs network)
 # make newest the unit tests with the newest version of everything, in .venv-newest/ (PYTHON=; default the newest here)
 # make fuzz   a million mutated inputs for each parser of outside bytes: hours (ARGS="--jobs 4 --target glb --count 1000")
@@ -38,7 +38,6 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/python scripts/check_words.py
 	scripts/check_js.sh
 
 fuzz: $(STAMP)

@@ -41,6 +41,10 @@ def test_algorithms_and_devices_know_no_bus(folder):
     assert not wrong(PACKAGE / folder, "bus", "msg", "launch", "bag", "cli")
 
 
+def test_the_local_model_knows_no_depth_network():
+    assert not wrong(PACKAGE / "mapping", "depth")
+
+
 def test_nobody_imports_a_node():
     assert not wrong(PACKAGE)
     assert not wrong(ROOT / "nodes")
