@@ -45,9 +45,9 @@ class _JudgedStack(FilmedStack):
         rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
         chosen = (rows[:, None] * width + columns).reshape(-1)
         depth, confidence = (image.reshape(-1)[chosen] for image in (view.depth_m, view.confidence))
-        priors = self.space.keyframes
-        texture = readiness.Texture.of(priors[0].rgb)
-        self.terms = readiness.error_terms(priors, texture, rays.some(chosen), depth, confidence)
+        prior = self.space.keyframes[0]
+        texture = readiness.Texture.of(prior.rgb)
+        self.terms = readiness.error_terms(prior, texture, rays.some(chosen), depth, confidence)
 
 
 def samples(world: str, seed: int, episodes: int) -> list[dict[str, Any]]:
