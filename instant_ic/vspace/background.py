@@ -69,20 +69,20 @@ class Background:
     """Hidden surfaces of a keyframe, as a mesh over a panorama of (h, w) pixels.
 
     Attributes:
-        inverse: inverse depth, 1/m along each pixel's ray, (h, w) float32.
+        inverse_depth: 1/m along each pixel's ray, (h, w) float32.
         rgb: colours, (h, w, 3) uint8.
-        sure: opacity of the estimate when rendered, 0 to 255, (h, w) uint8; the renderer fills the rest from
+        opacity: weight of the estimate when rendered, 0 to 255, (h, w) uint8; the renderer fills the rest from
             neighbouring pixels of the view.
-        guessed: upper left pixel (row, column) of each quad of estimated surface, (N, 2) int32.
-        sky: the same for sky, (M, 2) int32.
+        quads: upper left pixel (row, column) of each quad of estimated surface, (N, 2) int32.
+        sky_quads: the same for sky, (M, 2) int32.
         map_from_camera: pose of the keyframe's camera, (4, 4) float64.
     """
 
-    inverse: Floats
+    inverse_depth: Floats
     rgb: NDArray[np.uint8]
-    sure: NDArray[np.uint8]
-    guessed: NDArray[np.int32]
-    sky: NDArray[np.int32]
+    opacity: NDArray[np.uint8]
+    quads: NDArray[np.int32]
+    sky_quads: NDArray[np.int32]
     map_from_camera: NDArray[np.float64]
 
     @classmethod
@@ -108,20 +108,20 @@ class Background:
         planes = np.stack([np.where(removed, 0, walls.found * flat), *levels])
         rgb = prior.rgb
         rgb = area_average(rgb, *inverse.shape) if rgb.shape[:2] != inverse.shape else rgb.copy()
-        colours, sure = continued_colours(rgb, planes, kind, grown(edges > 0), rise / flat, walls)
+        colours, opacity = continued_colours(rgb, planes, kind, grown(edges > 0), rise / flat, walls)
         filled = planes.max(axis=0)
         lost = removed & (filled <= 0)
         if lost.any():  # on no plane: filled from the surroundings
             filled[lost] = fill_holes(np.where(hole, 0, inverse).astype(np.float32), ~hole)[lost]
             colours[lost] = np.rint(fill_holes(np.where(hole[..., None], 0, rgb).astype(np.float32), ~hole)[lost])
-            sure[lost] = 255
+            opacity[lost] = 255
         behind = hole & (filled > 0) & ((filled < inverse / CONFIG.behind) | removed)
         inverse = np.where(hole, filled, inverse).astype(np.float32)
         whole = edge_quads(inverse, CONFIG.edge_ratio)[:-1] == 0
-        guessed = _any_corner(behind) & whole
+        estimated = _any_corner(behind) & whole
         return cls(
-            np.maximum(inverse, 1 / CONFIG.sky_m), colours, np.where(sky, np.uint8(255), sure), _places(guessed),
-            _places(_any_corner(sky) & ~guessed & whole), prior.map_from_camera,
+            np.maximum(inverse, 1 / CONFIG.sky_m), colours, np.where(sky, np.uint8(255), opacity), _places(estimated),
+            _places(_any_corner(sky) & ~estimated & whole), prior.map_from_camera,
         )  # fmt: skip
 
     def seen_by(self, others: Sequence[tuple[PanoramaPrior, Floats]]) -> Background:
@@ -132,26 +132,26 @@ class Background:
         Args:
             others: keyframes, and the factors (3,) that bring their colours to this one's exposure.
         """
-        if not others or not len(self.guessed):
+        if not others or not len(self.quads):
             return self
-        height, width = self.inverse.shape
+        height, width = self.inverse_depth.shape
         mask = np.zeros((height, width), bool)
         for down in (0, 1):
             for right in (0, 1):
-                mask[np.minimum(self.guessed[:, 0] + down, height - 1), (self.guessed[:, 1] + right) % width] = True
+                mask[np.minimum(self.quads[:, 0] + down, height - 1), (self.quads[:, 1] + right) % width] = True
         pose = self.map_from_camera.astype(np.float32)
-        ways = rays_of(self.inverse.shape)[mask] / self.inverse[mask][:, None]
+        ways = rays_of(self.inverse_depth.shape)[mask] / self.inverse_depth[mask][:, None]
         points = np.einsum("ij,kj->ik", ways, pose[:3, :3]) + pose[:3, 3]
-        rgb, sure = self.rgb.copy(), self.sure.copy()
-        colours, sures, nearest = rgb[mask], sure[mask], np.full(len(points), np.inf, np.float32)
+        rgb, opacity = self.rgb.copy(), self.opacity.copy()
+        colours, opacities, nearest = rgb[mask], opacity[mask], np.full(len(points), np.inf, np.float32)
         for prior, gain in others:
             local = prior.in_camera(points)
             distance = np.sqrt(np.einsum("ij,ij->i", local, local))
             better = prior.sees(local, distance, CONFIG.same_surface) & (distance < nearest)
             colours[better] = np.rint(np.clip(prior.colours(local[better]) * gain, 0, 255))
-            nearest[better], sures[better] = distance[better], 255
-        rgb[mask], sure[mask] = colours, sures
-        return replace(self, rgb=rgb, sure=sure)
+            nearest[better], opacities[better] = distance[better], 255
+        rgb[mask], opacity[mask] = colours, opacities
+        return replace(self, rgb=rgb, opacity=opacity)
 
     def draw(self, rays: Rays, wanted: NDArray[np.bool_], view: tuple[Floats, Floats, Floats]) -> Floats:
         """Render the background into a perspective view.
@@ -169,15 +169,15 @@ class Background:
         map_from_view, half = pinhole(rays)
         view_from_camera = (np.linalg.inv(map_from_view) @ self.map_from_camera).astype(np.float32)
         nearness, marks = np.zeros(rays.shape, np.float32), np.zeros(rays.shape, np.uint8)
-        directions = rays_of(self.inverse.shape)
-        for mark, quads in ((1, self.guessed), (2, self.sky)):
-            draw_quads(quads, mark, self.inverse, directions, view_from_camera, half, nearness, marks)
+        directions = rays_of(self.inverse_depth.shape)
+        for mark, quads in ((1, self.quads), (2, self.sky_quads)):
+            draw_quads(quads, mark, self.inverse_depth, directions, view_from_camera, half, nearness, marks)
         drawn = wanted & (nearness.reshape(-1) > 0)
         colour, depth, confidence = view
         depth[drawn] = 1 / (rays.axial[drawn] * nearness.reshape(-1)[drawn])
         camera_from_map = np.linalg.inv(self.map_from_camera).astype(np.float32)
         share = np.zeros(len(depth), np.float32)
-        paint(self.rgb, self.sure, camera_from_map, rays.origin, rays.directions, drawn, depth, colour, share)
+        paint(self.rgb, self.opacity, camera_from_map, rays.origin, rays.directions, drawn, depth, colour, share)
         confidence[drawn & (marks.reshape(-1) == 2)] = 1
         return share
 

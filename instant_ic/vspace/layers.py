@@ -84,10 +84,10 @@ def encode(keyframe: Keyframe, number: int, image: bytes | None, version: int) -
     prior, background = keyframe.prior, keyframe.background
     seen = _encoded_geometry(prior.inverse_depth, _marks(keyframe))
     parts = [(Kind.SEEN, image or _jpeg(prior.rgb), seen)]
-    marks = np.rint(background.sure * np.float32(_SURE / 255)).astype(np.uint8) << 3
-    for quads, content in ((background.guessed, Content.SURFACE), (background.sky, Content.SKY)):
+    marks = np.rint(background.opacity * np.float32(_SURE / 255)).astype(np.uint8) << 3
+    for quads, content in ((background.quads, Content.SURFACE), (background.sky_quads, Content.SKY)):
         marks[tuple(quads.T)] |= np.uint8(content)
-    parts.append((Kind.BEHIND, _jpeg(background.rgb), _encoded_geometry(background.inverse, marks)))
+    parts.append((Kind.BEHIND, _jpeg(background.rgb), _encoded_geometry(background.inverse_depth, marks)))
     layers = [
         Layer(
             kind,

@@ -31,10 +31,10 @@ def demo_layers(version: int, map_from_camera: Matrix, width: int = 768, depth_w
     depth = demo_world.distances((x, y, z), equirect_directions(depth_width, depth_width // 2) @ rotation.T)
     prior = prepare(np.ascontiguousarray(rgb), depth, map_from_camera, 0.0, GeometryConfig(), 4096)
     behind = Background.of(prior)
-    guessed = np.zeros(behind.inverse.shape, np.bool_)
-    for quads in (behind.guessed, behind.sky):
+    guessed = np.zeros(behind.inverse_depth.shape, np.bool_)
+    for quads in (behind.quads, behind.sky_quads):
         guessed[quads[:, 0], quads[:, 1]] = True
-    guess = page_layer(_jpeg(behind.rgb), behind.inverse, guessed, behind.sure / 255, map_from_camera)
+    guess = page_layer(_jpeg(behind.rgb), behind.inverse_depth, guessed, behind.opacity / 255, map_from_camera)
     seen = page_layer(_jpeg(rgb), prior.inverse_depth, prior.content == ROOM, None, map_from_camera)
     return PageLayers(version, (0.0, 0.0, z), (seen, guess))
 

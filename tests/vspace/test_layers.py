@@ -65,8 +65,8 @@ def test_depth_content_and_edges_survive():
     warp = space.shown.newest.warp
     assert np.array_equal(seen.edge, warp.depth_edge[1:-1] > 0)
     background = space.shown.newest.background
-    assert np.array_equal(np.argwhere(behind.content == Content.SURFACE), background.guessed)
-    assert len(background.guessed) > 100
+    assert np.array_equal(np.argwhere(behind.content == Content.SURFACE), background.quads)
+    assert len(background.quads) > 100
     assert psnr_db(behind.rgb, background.rgb) > 30
 
 

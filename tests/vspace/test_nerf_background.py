@@ -63,10 +63,10 @@ def test_the_near_side_of_an_edge_by_hand():
 def test_behind_a_thing_its_background_goes_on():
     background = Background.of(keyframe())
     # The thing is gone from it, in depth and in colour.
-    assert 1 / background.inverse[THING] == pytest.approx(np.full((12, 16), 4.0), rel=1e-3)
+    assert 1 / background.inverse_depth[THING] == pytest.approx(np.full((12, 16), 4.0), rel=1e-3)
     assert background.rgb[THING][..., 0].max() < 60
     assert np.array_equal(background.rgb[:20], keyframe().rgb[:20])
-    assert len(background.sky) == 0
+    assert len(background.sky_quads) == 0
 
 
 def test_floor_and_ceiling_are_found_and_go_on_behind_a_thing():
@@ -87,7 +87,7 @@ def test_floor_and_ceiling_are_found_and_go_on_behind_a_thing():
     seen = inverse.copy()
     seen[thing] = np.maximum(np.repeat(flat / 2, W, 1)[thing], inverse[thing])
     background = Background.of(prepare(rgb, 1 / seen, np.eye(4), 0.02, GeometryConfig(), 2048))
-    assert background.inverse[thing] == pytest.approx(inverse[thing], rel=0.07)  # a plane, not a cylinder
+    assert background.inverse_depth[thing] == pytest.approx(inverse[thing], rel=0.07)  # a plane, not a cylinder
     assert background.rgb[40, 60:68, 1].min() > 140  # floor, green
     assert background.rgb[28, 60:68, 2].min() > 140  # wall, blue
 
@@ -150,14 +150,14 @@ def test_floor_and_wall_go_on_behind_a_box():
     background = Background.of(prepare(COLOURS[shown], depth, np.eye(4), 0.02, GeometryConfig(), 2048))
     inside = binary_erosion(shown == 3, iterations=2)
     assert inside.sum() > 200
-    assert background.inverse[inside] * truth[inside] == pytest.approx(np.ones(inside.sum()), abs=0.02)
+    assert background.inverse_depth[inside] * truth[inside] == pytest.approx(np.ones(inside.sum()), abs=0.02)
     for number in (0, 1):
         away = binary_erosion(kind == number, iterations=2) & inside  # a pixel on the line has a share of both
         assert away.any()
         assert np.abs(background.rgb[away].astype(int) - COLOURS[number]).max() <= 2
-        assert (background.sure[away] == 255).all()
+        assert (background.opacity[away] == 255).all()
     quads = np.zeros(depth.shape, bool)
-    quads[tuple(background.guessed.T)] = True
+    quads[tuple(background.quads.T)] = True
     assert quads[inside].mean() > 0.95
 
 
@@ -170,13 +170,13 @@ def test_a_doorway_stays_open():
     assert beside.sum() > 100
     assert background.rgb[beside][:, 0].max() < 60  # nothing red
     wall = beside & (z > -0.15)
-    assert 1 / background.inverse[wall] == pytest.approx(4 / x[wall], rel=0.1)
+    assert 1 / background.inverse_depth[wall] == pytest.approx(4 / x[wall], rel=0.1)
     floor = beside & (z < -0.3)
     assert floor.any()
-    assert 1 / background.inverse[floor] == pytest.approx(1.2 / -z[floor], rel=0.02)
+    assert 1 / background.inverse_depth[floor] == pytest.approx(1.2 / -z[floor], rel=0.02)
     assert np.abs(background.rgb[floor].astype(int) - COLOURS[1]).max() <= 2
     # A wall that leads on out of sight is a guess: part of it is continued from around in the image.
-    assert background.sure[wall].max() < 0.7 * 255 <= background.sure[floor].min()
+    assert background.opacity[wall].max() < 0.7 * 255 <= background.opacity[floor].min()
     space = VirtualSpace(VirtualSpaceConfig(device="cpu", source="warp"))
     space.set_keyframe(COLOURS[shown], depth, np.eye(4), 0.02)
     view = space.render(pose_matrix(x=1.8, pitch=0.4), 160, 90, math.pi / 2)  # in the doorway
