@@ -164,7 +164,7 @@ class Roboclaw:
         self.config = config
         self.counters = LinkCounters()
         self.restarted = False
-        """Whether the controller had lost the watchdog setting of an earlier connection at the last `connect`."""
+        """True if the controller had lost the watchdog setting of an earlier connection at the last `connect`."""
         self._was_set = False
         self._stop_frame = write_frame(config.address, Command.DUTY_ACCELERATION_BOTH, MOTORS_OFF)
         self._has_limits = True  # until the firmware does not answer

@@ -41,7 +41,8 @@ class CalibrationRecording:
         frames: pairs of image and revolution, from as many places as the recording has.
         camera_from_lidar: (4, 4) from the transforms in the bag; None if they are missing.
         base_from_lidar: (4, 4) from the transforms in the bag; None if they are missing.
-        pictures, places: number of images in the bag, and number of places in the recording.
+        pictures: number of images in the bag.
+        places: number of places in the recording.
         moves: whether odometry was available to compensate the motion.
     """
 

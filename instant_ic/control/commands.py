@@ -49,7 +49,7 @@ class CommandRules:
         sent = self._virtual(s) if s.mode == Mode.VIRTUAL else self._real(s)
         ahead, behind = s.inputs.blind
         if (ahead and sent.twist[0] > 0.0) or (behind and sent.twist[0] < 0.0):
-            text = f"the LiDAR sees nothing any more {'ahead' if ahead else 'behind'}: uncover it, or drive another way"
+            text = f"the LiDAR is covered {'ahead' if ahead else 'behind'}: uncover it, or drive another way"
             return DriveCommand(NO_MOTION, Notice(Reason.BLIND, text), blocked=True, hard=True)
         return sent
 

@@ -22,7 +22,7 @@ from instant_ic.geometry.motion import along_arc
 from instant_ic.geometry.poses import relative2, wrap_angle
 
 LOOKAHEAD_TIME_S = 1.0
-"""The carrot is so far ahead at the present speed."""
+"""Distance of the carrot in seconds at the present speed."""
 SCALING_MIN_RADIUS_M, SCALING_MIN_SPEED_M_S = 0.60, 0.05
 """The robot is slower in curves tighter than the radius, but not slower than the speed."""
 ROTATE_MIN_RAD, ROTATE_STOP_RAD = 0.8, 0.15

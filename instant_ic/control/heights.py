@@ -32,12 +32,12 @@ ROW_RAD, ROWS = math.radians(2.0), 90
 CLEAR_MARGIN_M = 0.15
 """A beam must end this far behind a mark to clear it."""
 INSIDE_WEIGHT, MOST_EVIDENCE = 4, 200
-"""A beam that ends in a mark counts as much as so many that end just behind it; bound of the sum."""
+"""Weight of a beam that ends in a mark against one that ends just behind it; bound of the sum."""
 FAST = {"contract", "arcp", "afn"}
 """Fast-math flags that keep nan and inf."""
 UNSEEN_EDGE_M, FAR_BEHIND_M = 0.1, 0.4
-"""A thing that only the lowest ring meets, from above, may begin so far before that point; the next ring then ends at
-least so far behind it."""
+"""Distances before and behind the point where only the lowest ring meets a thing, from above: the thing may begin that
+far before it, and the next ring ends at least that far behind it."""
 SCATTER_M = 0.01
 """Metres by which the heights of points on one surface differ: noise of the ranges, pitch of the robot."""
 INSTANTS = 65
@@ -46,7 +46,7 @@ INSTANTS = 65
 
 @dataclass(frozen=True)
 class HeightConfig:
-    """Which points are obstacles, and how long they are kept; nav2's names where nav2 has the parameter.
+    """Limits of obstacles from 3D points, with nav2's names where nav2 has the parameter.
 
     Attributes:
         enabled: false: the flat scan alone.

@@ -98,7 +98,7 @@ class OperatorCommands:
         return -1.0 if self._let_go_ns is None else (now_ns - self._let_go_ns) / 1e9
 
     def forget_zeros(self) -> None:
-        """Count the zeros from the next step on: nobody has looked meanwhile."""
+        """Count the zeros from the next step on: the steps before were not watched."""
         self._let_go_ns = None
 
     def hand_back(self, now_ns: int) -> None:

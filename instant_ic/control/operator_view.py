@@ -1,4 +1,4 @@
-"""What the operator sees: age and rate of the images at the robot and at the page, and where they were taken."""
+"""Age and rate of the images that the operator sees, at the robot and at the page, and where they were taken."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PageReport:
     """Seconds since its arrival, when the report was sent."""
     view_id: int
     view_age_s: float
-    """As ``image_age_s``, of the newest rendered view."""
+    """Age of the newest rendered view in seconds, as ``image_age_s``."""
     view_delay_s: float
     """Seconds from the request of a view to its arrival."""
     view_position: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Whether a switch to the v-bot makes sense: is there space behind the obstacle, and a way round for the r-bot?"""
+"""Check of a switch to the v-bot: space behind the obstacle, and a way round it for the r-bot."""
 
 from __future__ import annotations
 

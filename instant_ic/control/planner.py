@@ -87,7 +87,7 @@ TUNING = PlannerTuning()
 
 @dataclass(frozen=True)
 class PlannerConfig(Checked):
-    """What the planner may cross; names of nav2's Smac planner.
+    """Limits of the planner, with the names of nav2's Smac planner.
 
     Attributes:
         allow_unknown: plan through unseen cells; the driven path still ends before them.

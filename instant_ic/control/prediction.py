@@ -20,7 +20,7 @@ _along_arc = njit(cache=True)(along_arc)
 _step_towards = njit(cache=True)(step_towards)
 
 _YAW_MARGIN_RAD = 0.4
-"""As ``margin_m``, when turning on the spot."""
+"""Margin in metres when turning on the spot, in place of ``margin_m``."""
 _MAX_HORIZON_S = 8.0
 """Longest prediction, however slow the robot."""
 _STEP_S = 0.05
@@ -148,8 +148,8 @@ def _roll_out(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the poses (N, 3) under a command, and how far the farthest corner has travelled at each, (N,).
 
-    As ``kinematics.accelerate`` and ``move``, step by step: the command takes effect after ``late_steps``, and changes
-    the velocity by at most ``steepest`` (2,) per step.
+    The steps are those of ``kinematics.accelerate`` and ``move``. The command takes effect after ``late_steps``, and
+    changes the velocity by at most ``steepest`` (2,) per step.
     """
     most_steps = math.ceil(_MAX_HORIZON_S / _STEP_S)
     poses, travelled = np.empty((most_steps + 1, 3)), np.zeros(most_steps + 1)

@@ -1,4 +1,4 @@
-"""Whether the robot still gets nearer to its goal, or goes round in circles between ways that turn out to be closed."""
+"""Progress towards a goal, against driving in circles between ways that turn out to be closed."""
 
 from __future__ import annotations
 

@@ -112,7 +112,7 @@ class MonitoredCommand:
     action: str
     """``free``, ``slowdown``, ``approach`` (slowed in proportion to the time to collision) or ``stop``."""
     time_to_collision_s: float
-    """Of the requested command; inf without contact within ``time_before_collision``."""
+    """Time to collision of the requested command; inf without contact within ``time_before_collision``."""
     polygon: str = ""
     """Name of the deciding polygon; ``source_timeout`` when the points are too old."""
 

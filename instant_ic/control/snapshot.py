@@ -35,7 +35,7 @@ class Vspace:
     ready_radius_m: float = 0.0
     message: str = ""
     expected_psnr_db: float = 0.0
-    """Of the view requested last; 0 or NaN: unknown."""
+    """Expected quality of the view requested last, in dB; 0 or NaN: unknown."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class ArbiterInputs:
     scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) hits of the newest scan and 3D points in ``base_link``, at the robot's present pose."""
     blind: tuple[bool, bool] = (False, False)
-    """Whether the LiDAR sees nothing any more ahead and behind, where it did before: it is covered."""
+    """LiDAR covered ahead, and behind: it measures nothing where it did before."""
     moving: MovingPoints = NOTHING_MOVES
     """People and other moving things, in ``base_link`` at the robot's present pose."""
     costmap: Costmap | None = None
@@ -147,7 +147,7 @@ class Snapshot:
     agree_s: float
     """Seconds for which the two robots have agreed; -1 while they do not."""
     prediction: Prediction | None
-    """Of the driven robot."""
+    """Predicted trajectory of the driven robot."""
     since_return_s: float
     """Seconds since the last return or abandoned entry; inf: none."""
     awaits_operator: bool
@@ -169,7 +169,7 @@ class Snapshot:
     contradicted: bool = False
     """Wheels and LiDAR contradict each other, and the robot has not been stopped for it yet."""
     vbot_jumped: bool = False
-    """As ``pose_jumped``: the r-bot would follow the v-bot to a place where nobody drove it."""
+    """The v-bot's pose has jumped: the r-bot would follow it to a place where nobody drove it."""
     no_view_fits: bool = False
     """An entry was abandoned, and neither has a view fitted since nor has the operator let go."""
     leading_back: bool = False

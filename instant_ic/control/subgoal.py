@@ -1,4 +1,4 @@
-"""Where the r-bot is sent while the operator drives the v-bot (paper, III.A)."""
+"""Subgoal of the r-bot while the operator drives the v-bot (paper, III.A)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SEARCH_RADIUS_M = 1.5
 
 @dataclass(frozen=True)
 class SubgoalConfig(Checked):
-    """Where to look for a free place.
+    """Search for a free place.
 
     Attributes:
         extend_m: m; length searched straight on for a free place behind the obstacle.

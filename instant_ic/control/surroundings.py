@@ -85,7 +85,7 @@ class Surroundings:
         self.costmap: Costmap | None = None
         self.points_seen = False
         self.blind = (False, False)
-        """Whether a sector that was measured before is not any more, ahead and behind: the LiDAR is covered."""
+        """LiDAR covered ahead, and behind: it measures nothing in a sector where it did before."""
         self.findings: dict[str, Diagnosis] = {}
         """By input: scan, points, costmap, pose."""
         if not config.points.enabled:

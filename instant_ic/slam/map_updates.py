@@ -1,4 +1,4 @@
-"""What to publish of a growing map: the part that changed, and the whole map at a lower rate."""
+"""Updates of a growing map: the part that changed, and the whole map at a lower rate."""
 
 from __future__ import annotations
 

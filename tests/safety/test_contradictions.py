@@ -162,7 +162,7 @@ def test_a_lidar_that_is_covered_ahead_stops_the_robot_and_lets_it_turn_and_back
     assert stack.drive(FORWARD, 2.0, until=lambda: stack.state.reason_code == Reason.BLIND) <= 0.45
     stack.drive(FORWARD, 0.6)
     assert stack.tracks_stand
-    ahead = "the LiDAR sees nothing any more ahead: uncover it, or drive another way"
+    ahead = "the LiDAR is covered ahead: uncover it, or drive another way"
     assert stack.page.state["reason"] == ahead
     level, text, _ = stack.nodes["vlp16_driver"].diagnoses()["cover"]
     assert level == ERROR and "from 330° on (clockwise from ahead): uncover the sensor" in text
