@@ -78,9 +78,9 @@ def _table(args: argparse.Namespace) -> int:
     plan = load(args.folder)
     participants = {code: Participant.load(args.folder, plan, code) for code in plan.orders()}
     found = rows(list(participants.values()))
-    table = Table(*found[0])
-    for row in found:
-        table.add_row(*("–" if value is None else f"{value}" for value in row.values()))
+    table = Table("", *(row["condition"] for row in found))
+    for measure in list(found[0])[1:]:
+        table.add_row(measure, *("–" if row[measure] is None else f"{row[measure]}" for row in found))
     Console().print(table)
     for code, one in participants.items():
         if one.answers.get("text"):
