@@ -11,6 +11,7 @@ import os
 import signal
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -112,6 +113,7 @@ class _Workers:
         prepare: Callable[[], None],
         call_timeout_s: float,
     ) -> None:
+        warnings.filterwarnings("ignore", message="A worker stopped while")  # loky renews a process that has grown
         self._function, self._tasks, self._prepare, self._call_timeout_s = function, tasks, prepare, call_timeout_s
         self._waiting = deque(range(len(tasks)))
         self._all: list[ProcessPoolExecutor] = []
