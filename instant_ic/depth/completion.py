@@ -24,7 +24,7 @@ def prior_channels(
         sigma: (H, W) its relative standard deviation.
         ranges_m: (H, W) range of the confirmed point in each pixel, 0 without one.
         up: (3,) gravity's up in the camera's frame.
-        camera_height_m: of the camera over the floor; None where it is not known.
+        camera_height_m: height of the camera over the floor; None if it is unknown.
         network_m: (H, W) depth of the network that sees the image alone, scaled and corrected by points, 0 = unknown.
 
     Returns:

@@ -44,7 +44,7 @@ def load_depth(path: str | Path, png_unit_m: float = 1e-3) -> NDArray[np.float32
     """Depth (H, W) float32 in metres, 0 = unknown: also what is not finite, not above 0, or 10 km and farther.
 
     Args:
-        path: of the file.
+        path: the file.
         png_unit_m: metres per unit of a PNG (Stanford 2D-3D-S: 1/512, Matterport3D: 1/4000). Its largest value, 65535,
             is unknown.
 

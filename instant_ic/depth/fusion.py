@@ -22,7 +22,7 @@ def ceiling_height(depth_m: Floats, rise: Floats, least_m: float = 0.3) -> float
     Args:
         depth_m: (H, W) radial metres, 0 = unknown.
         rise: (H, W) sine of each pixel's elevation over the horizon.
-        least_m: what is lower is no ceiling.
+        least_m: lowest height of a ceiling.
 
     Returns:
         None where no level surface stands out.

@@ -35,8 +35,8 @@ class KeyframeSelector:
     """Decide of which images a keyframe could be taken, and for each scaled depth image whether it becomes one.
 
     Attributes:
-        count: of keyframes.
-        virtual: whether the operator sees the virtual space.
+        count: number of keyframes.
+        virtual: the operator sees the virtual space.
     """
 
     def __init__(self, config: KeyframeSelectionConfig | None = None) -> None:
@@ -52,7 +52,7 @@ class KeyframeSelector:
 
         Args:
             map_from_camera: (4, 4) pose of the image.
-            fit: whether its depth could be scaled.
+            fit: its depth could be scaled.
             stamp_ns: its time; waiting is measured by it.
         """
         if not self.due(map_from_camera, stamp_ns, fit):

@@ -324,7 +324,7 @@ class _Building:
         self.flat = np.zeros(size, bool)
         self.flat[rows, columns] = of_plane
         self.some = self.hit > 0
-        # Where nobody knows the floor, it lies as low as the lowest points, or lower.
+        # An unknown floor lies as low as the lowest points, or lower.
         self.ground = floor if floor is not None else _highest(-z)
         self.ground_origin = Origin.FLOOR if floor is not None else Origin.ASSUMED
         usual = config.ceiling_height_m - self.ground if ceiling_guess is None else ceiling_guess
@@ -390,7 +390,7 @@ class _Building:
             (wall_below & flat_above & (self.sin > 0), r_below, Origin.UP),
             # Something low with floor seen over it: its top is somewhere between.
             (wall_below & flat_above & (self.sin <= 0) & ~nearer_above, r_below, Origin.EDGE),
-            # Without a crown nobody knows where it ends (a window, the sky): floor does not begin at its highest point.
+            # Without a crown its end is unknown (a window, the sky): floor does not begin at its highest point.
             (wall_below & (above < 0), np.where(crown > 0, crown, np.nan), Origin.UP),
         ):
             np.copyto(wall, value, where=where)
@@ -476,7 +476,7 @@ def _reaches_top(across: Floats, z: Floats, slope: float) -> NDArray[np.bool_]:
     Args:
         across: horizontal range of that point, 0 where there is none.
         z: its height.
-        slope: of the ring.
+        slope: slope of the ring.
     """
     there = across > 0
     if not there.any():

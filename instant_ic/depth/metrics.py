@@ -53,7 +53,7 @@ def depth_metrics(
         predicted: predicted depth, usually (H, W).
         truth: true depth, of the same shape.
         valid: same shape; False leaves a pixel out.
-        weights: how much each pixel counts, of a shape that broadcasts to theirs; by default all the same. For an
+        weights: weight of each pixel, of a shape that broadcasts to theirs; by default all the same. For an
             equirect image by solid angle: ``solid_angle_weights(height)[:, None]``.
 
     Raises:

@@ -21,7 +21,7 @@ class Consensus:
 
     Attributes:
         scale: metres per unit of depth.
-        share: of the pairs that agree with it, 0..1.
+        share: share of the pairs that agree with it, 0..1.
         rival_scale, rival_share: the next best scale that shares no pair with it; share 0 where there is none.
     """
 
@@ -37,7 +37,7 @@ def max_ratio_scale(depth: Floats, range_m: Floats, confidence: float = 0.995) -
     Args:
         depth: estimated depth, any shape and unit; values that are not positive and finite are left out.
         range_m: LiDAR ranges in metres, any shape; likewise.
-        confidence: quantile that stands for the maximum, which keeps outliers out.
+        confidence: quantile used as the maximum, which keeps outliers out.
 
     Returns:
         Metres per unit of depth.
@@ -117,9 +117,9 @@ def ransac_line(
     Args:
         x: abscissas of the pairs, (N,).
         y: ordinates of the pairs, (N,).
-        tolerance: how far each y may lie from the line, (N,); residuals are weighted by its inverse.
+        tolerance: largest distance of each y from the line, (N,); residuals are weighted by its inverse.
         trials: pairs of points that are tried.
-        seed: of the choice of pairs, so that the same input gives the same line.
+        seed: seed of the choice of pairs, so that the same input gives the same line.
 
     Returns:
         Slope, offset, and which pairs agree, (N,).
@@ -168,7 +168,7 @@ def sector_factors(
     with a Gaussian of half a sector's width: where there are few points or none, the global scale stays.
 
     Args:
-        azimuth_rad: of the pairs, (N,).
+        azimuth_rad: azimuth of the pairs, (N,).
         log_ratio: log of range over scaled depth of the pairs, (N,).
         sector_deg: width of a sector, 360 is a multiple of it.
         trust_points: number of points at which a sector's own median counts half.

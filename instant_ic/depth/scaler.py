@@ -41,7 +41,7 @@ class ScalerConfig:
     Attributes:
         method: sector, ransac, median_ratio, max_ratio (the paper's), as_estimated (not for driving).
         maxima: max_ratio's largest depth: over the LiDAR's directions (lidar) or the whole image (image).
-        output_kind: of the model, as in its manifest: metric, scale_invariant, relative, disparity.
+        output_kind: kind of the model's output, as in its manifest: metric, scale_invariant, relative, disparity.
         min_range_m: metres from the camera; nearer points (the robot itself) are left out.
         max_range_m: metres; farther points are left out, farther depth is cut.
         min_points: points on known depth; fewer give no scale.

@@ -59,8 +59,8 @@ class SourceConfig:
     Attributes:
         source: ``fused``: LiDAR and network; ``lidar``: no network; ``network``: scaled by the LiDAR; ``completed``:
             ``fused``, corrected by a completion.
-        scaler: how the network's depth is scaled.
-        lidar: how depth is made from points alone.
+        scaler: parameters of the scaling of the network's depth.
+        lidar: parameters of depth from points alone.
     """
 
     source: str = "fused"
@@ -100,7 +100,7 @@ class DepthResult(ScaleFit):
 
     Attributes:
         sigma: (H, W) float32 relative standard deviation, inf where unknown.
-        source: what ``depth_m`` was made from.
+        source: source of ``depth_m``.
         prior: for :func:`complete`; None unless the source is ``completed`` and the result ok.
     """
 
@@ -326,7 +326,7 @@ def without_body(result: DepthResult, up: Floats, camera_height_m: float | None,
     Args:
         result: depth (H, W).
         up: (3,) gravity's up in the camera's frame.
-        camera_height_m: of the camera over the floor; None: what is masked is unknown.
+        camera_height_m: height of the camera over the floor; None leaves masked pixels unknown.
         elevation_deg: below it the image shows the robot; -90 masks nothing.
     """
     rise = rays_of(result.depth_m.shape) @ np.asarray(up, np.float32)

@@ -225,7 +225,7 @@ def _measured_voxels(odds, code, tops, ground, top):  # type: ignore[no-untyped-
     """Write the solid voxels of a column as far as they follow from its own measurements.
 
     Arrays and parameters:
-        odds: of the column, (L,); code: out, (L,); ground, top: as in ``solid_columns``.
+        odds: log odds of the column, (L,); code: out, (L,); ground, top: as in ``solid_columns``.
         tops: out, (3,): one past the highest measured level, first free level above, and one past the highest level
             that beams met again and again.
     """
@@ -492,7 +492,7 @@ def _meet_column(code, face, origin, dx, dy, dz, flat, t, leave, cell, low, pend
     """Return where and on what a ray meets a column between ``t`` and ``leave``; ``pending`` if nothing is nearer.
 
     Arrays and parameters:
-        code, face: of the column, (L,) and (6,); origin: of the ray, (3,).
+        code, face: codes and surface of the column, (L,) and (6,); origin: start of the ray, (3,).
         dx, dy, dz, flat: direction of the ray, and the length of its horizontal part.
         pending: length and kind of the surface met before.
     """

@@ -52,10 +52,11 @@ def outvoted(directions, inverse, sure, map_from_camera, camera_from_map, room, 
     """Pixels of keyframe ``own`` through which most of the keyframes with an opinion have looked.
 
     Arrays and parameters:
-        directions: of the panorama's pixels, (h, w, 3), camera frame.
-        inverse, sure: of all keyframes, newest first, (K, h, w); map_from_camera, camera_from_map: (K, 4, 4).
+        directions: unit vectors of the panorama's pixels in the camera's frame, (h, w, 3).
+        inverse, sure: inverse depth and known pixels of all keyframes, newest first, (K, h, w).
+        map_from_camera, camera_from_map: poses and their inverses, (K, 4, 4).
         room: (K,) of each against ``own``.
-        step: every so many pixels are asked.
+        step: distance in pixels between those that are voted on.
         out: (h, w) uint8; blocks of ``step`` × ``step`` are set to 1.
     """
     count, height, width = inverse.shape

@@ -23,7 +23,7 @@ def in_front(inverse, depth_edge, level, reach, steps):  # type: ignore[no-untyp
     two sides of that edge.
 
     Arrays and parameters:
-        inverse, depth_edge: of the ``PanoramaPrior``, (h, w).
+        inverse, depth_edge: arrays of the ``PanoramaPrior``, (h, w).
         level: (h, w) over 0 on the floor and the ceiling, which hide nothing.
         reach: pixels at most.
         steps: out, (h, w) int32: pixels from the edge, from 1; 0 where no edge is near, or on the far side.

@@ -87,7 +87,7 @@ class Choice:
 
     Attributes:
         field: the field is shown.
-        gain_db: as last measured; NaN: not measured.
+        gain_db: last measurement; NaN before the first.
         hopeless: at the rate of its last gain, the field would still lose at the end of its training.
     """
 

@@ -47,7 +47,7 @@ class TrainConfig:
         ray_columns: rays of a batch in azimuth; even in solid angle.
         ray_rows: rays of a batch in height; ray_columns x ray_rows in all, both multiples of 8.
         iterations: length of a training run; idle after it.
-        seed: of the first weights and of the rays.
+        seed: seed of the first weights and of the rays.
     """
 
     ray_columns: Annotated[int, Range(8, 1024)] = 128
@@ -117,7 +117,7 @@ class VirtualSpaceConfig:
         source: field: the panorama warped by its depth until the field is measured to be better; warp: that alone, no
             training; auto: field on a GPU, else warp, because no field trained on a CPU becomes better in time; mesh.
         mesh: file of a place scanned beforehand (GLB, glTF, PLY, OBJ), with source: mesh.
-        mesh_pose: where the mesh lies in the map: x, y, z (m), yaw (degrees, counter-clockwise).
+        mesh_pose: pose of the mesh in the map: x, y, z (m), yaw (degrees, counter-clockwise).
         mesh_max_triangles: larger meshes are refused.
         mesh_fit_colours: a factor a colour, so that the mesh looks like the newest keyframe.
         device: auto: triton where it works, else cpu (numba); cuda: triton where it works, else torch-cuda;

@@ -40,8 +40,9 @@ def walls_behind(  # type: ignore[no-untyped-def]
     walls at its left and right go on; two of them meet in a corner.
 
     Arrays and parameters:
-        upright, wall: of ``farthest_walls``; hole: (h, w) near surfaces.
-        far: of ``farthest_walls``; look: rows above a near surface, span: columns beside it, that a wall is fitted to.
+        upright, wall: as in ``farthest_walls``; hole: near surfaces, (h, w).
+        far: result of ``farthest_walls``.
+        look, span: rows above a near surface, and columns beside it, that a wall is fitted to.
         same: neighbours whose distances differ by less than this factor are one surface.
         behind: a wall is farther than what hides it by this factor.
         slope_prior: pseudo-observations for a wall at right angles to the ray; farthest: in metres.

@@ -90,7 +90,7 @@ def cut_tops(inverse, sigma, rgb, room, reach, step, assumed, contrast, share): 
         rgb: (h, w, 3) float32; room: (h, w) where pixels show surfaces.
         reach: rows of a top, at most; step: a thing is nearer than what is above it by this factor.
         assumed: sigma of an assumed depth, at least, and at least twice that of the thing.
-        contrast: of the colours of both, at least; share of the thing's colour in a pixel that belongs to it.
+        contrast: least difference of the colours of both; share: share of the thing's colour in a pixel of it.
     """
     height, width = inverse.shape
     above, thing = np.zeros(3, np.float32), np.zeros(3, np.float32)

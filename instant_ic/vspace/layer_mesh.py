@@ -27,7 +27,7 @@ class LayerMesh:
     Attributes:
         corners: column and row of each vertex on the lattice of pixel corners, (N, 2) uint16: column 0 is the left edge
             of the panorama, row 0 its upper edge.
-        inverse_depth: of each vertex, in 1/m along the ray, (N,) float32.
+        inverse_depth: inverse depth of each vertex, 1/m along the ray, (N,) float32.
         triangles: indices of vertices, (T, 3) uint32, counter-clockwise as the panorama's camera sees them.
         size: height and width of the panorama's depth, which the lattice belongs to.
     """
@@ -48,7 +48,7 @@ def layer_mesh(
 
     Args:
         inverse_depth: in 1/m along the ray, > 0, (h, w), w = 2 h.
-        depth_edge: of ``prior.edge_quads``, (h, w).
+        depth_edge: quads that cross a depth edge (``prior.edge_quads``), (h, w).
         shown: (h, w) false where the layer has no surface.
         tolerance: largest error of the inverse depth, in 1/m.
 

@@ -20,7 +20,7 @@ from instant_ic.vspace.nerf.field import Floats
 
 _CODES = 65535
 _QUALITY = 90
-"""JPEG quality of what has no camera image."""
+"""JPEG quality of panoramas without a camera image."""
 
 
 class Kind(enum.IntEnum):
@@ -113,7 +113,7 @@ def _marks(keyframe: Keyframe) -> NDArray[np.uint8]:
 
 
 def _encoded_geometry(inverse_depth: Floats, marks: NDArray[np.uint8]) -> tuple[float, bytes]:
-    """Depth in metres that the highest code stands for, and the PNG."""
+    """Return the depth in metres of the highest code, and the PNG."""
     most = float(inverse_depth.max())
     code = np.maximum(np.rint(inverse_depth * np.float32(_CODES / most)), 1).astype(np.uint16)
     image = np.dstack([marks, (code & 255).astype(np.uint8), (code >> 8).astype(np.uint8)])  # OpenCV writes BGR
@@ -134,7 +134,7 @@ class DecodedLayer:
         inverse_depth: 1/m along the ray, (h, 2 h) float32.
         content: ``Content``, (h, 2 h) uint8: of each pixel, or of the quad right of and below it (``BEHIND``).
         confidence: 0..1, (h, 2 h) float32: below 1 the depth is filled from around; of a guess its share of an image.
-        edge: whether the quad right of and below a pixel crosses a depth edge, (h, 2 h).
+        edge: pixels whose quad, right of and below them, crosses a depth edge, (h, 2 h).
     """
 
     rgb: NDArray[np.uint8]

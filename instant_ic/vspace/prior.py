@@ -83,7 +83,7 @@ class PanoramaPrior:
         depth_edge: 1 where the quad between pixel (v, u) and (v + 1, u + 1) crosses a depth edge, (h, w) uint8.
         map_from_camera: pose, (4, 4).
         relative_sigma: standard deviation of the depth, relative to it: median over the image.
-        sigma: as ``relative_sigma``, of each pixel, (h, w) float32; ``MOST_SIGMA`` where the depth was filled in.
+        sigma: relative standard deviation of each pixel's depth, (h, w) float32; ``MOST_SIGMA`` where it was filled.
         content: ``ROOM``, ``ROBOT``, ``SKY`` or ``MOVED``, (h, w) uint8; only ``ROOM`` has surfaces.
     """
 

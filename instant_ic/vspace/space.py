@@ -228,7 +228,7 @@ class VirtualSpace(RayRenderer):
         Args: as ``prior.prepare``.
 
         Raises:
-            KeyframeError: the keyframe is no good; the old space stays as it was.
+            KeyframeError: the keyframe cannot be used; the old space stays as it was.
         """
         prepared = self.prepare(rgb, depth_m, map_from_camera, relative_sigma)
         if self.config.source == "field":
@@ -247,7 +247,7 @@ class VirtualSpace(RayRenderer):
         Args: as ``prior.prepare``.
 
         Raises:
-            KeyframeError: the keyframe is no good; the old space stays as it was.
+            KeyframeError: the keyframe cannot be used; the old space stays as it was.
         """
         self.show(self.prepare(rgb, depth_m, map_from_camera, relative_sigma), dissolve=True)
 
@@ -267,7 +267,7 @@ class VirtualSpace(RayRenderer):
         Args: as ``prior.prepare``.
 
         Raises:
-            KeyframeError: the keyframe is no good.
+            KeyframeError: the keyframe cannot be used.
         """
         config = self.config
         prior = prepare(
@@ -485,8 +485,8 @@ class VirtualSpace(RayRenderer):
         """Load the space of a file or folder; on the CPU its views are bit-identical to those before saving.
 
         Args:
-            path: what ``save`` was given.
-            device: as in ``VirtualSpaceConfig``; the file's own where None.
+            path: the file or its folder.
+            device: value of ``VirtualSpaceConfig.device``; None for the file's own.
 
         Raises:
             SpaceFileError: missing, damaged, foreign, or of a newer version.

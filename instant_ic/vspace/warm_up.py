@@ -31,7 +31,7 @@ def warm_up(config: VirtualSpaceConfig | None = None) -> None:
     rgb[::2] = 255
     below = np.sin((np.arange(32) - 15.5) * (math.pi / 32))[:, None]
     depth = np.repeat(np.minimum(4.0, 1.2 / np.maximum(below, 0.1)), 64, 1).astype(np.float32)  # walls and a floor
-    depth[12:20, 28:36] = 2.0  # something behind which nobody has seen
+    depth[12:20, 28:36] = 2.0  # a thing that hides what lies behind it
     aside = np.eye(4)
     aside[1, 3] = 1.0
     for pose in (aside, np.eye(4))[-config.keyframes :]:

@@ -83,7 +83,7 @@ class PanoramaWarp:
     """A panorama with depth that can be seen from elsewhere.
 
     Attributes:
-        inverse, depth_edge, known: of its mesh, as ``warp_kernels.draw_mesh`` takes them, (h + 2, w).
+        inverse, depth_edge, known: arrays of its mesh, as ``warp_kernels.draw_mesh`` takes them, (h + 2, w).
 
     Example:
         >>> warp = PanoramaWarp(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), 4096))  # doctest: +SKIP

@@ -102,8 +102,8 @@ class TrainingScene:
 
     Attributes:
         priors: the keyframes, newest first; all of one size.
-        lattice: of the field.
-        occupancy: round the surfaces of all keyframes.
+        lattice: lattice of the field.
+        occupancy: cells around the surfaces of all keyframes.
         gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3) float32; 1 where None.
     """
 
@@ -146,9 +146,9 @@ def ray_sources(keyframes: int, tiles: int, step: int) -> NDArray[np.int32]:
     for long.
 
     Args:
-        keyframes: of the scene.
-        tiles: of 8 × 8 rays in a batch.
-        step: of this run, from 1.
+        keyframes: number of keyframes of the scene.
+        tiles: number of tiles of 8 × 8 rays in a batch.
+        step: step of this run, from 1.
     """
     if keyframes == 1:
         return np.zeros(tiles, np.int32)
@@ -210,9 +210,15 @@ def depth_trust(prior: PanoramaPrior) -> Floats:
 
 @dataclass(frozen=True)
 class Rays:
-    """A view's rays: ``origin`` (3,) float32 map frame; ``directions`` (P, 3) float32 unit vectors, map frame;
-    ``axial`` (P,): the depth times it has an inverse that is linear over a plane in the image (depth along the view's
-    axis per metre along the ray); ``shape`` (height, width); ``stride``: between so many pixels it may be interpolated.
+    """Rays of a view, in the map's frame.
+
+    Attributes:
+        origin: position of the camera, (3,) float32.
+        directions: unit vectors, (P, 3) float32.
+        axial: depth along the view's axis per metre along the ray, (P,); the inverse of an axial depth is linear over a
+            plane in the image.
+        shape: height and width of the view.
+        stride: distance in pixels over which depth may be interpolated.
     """
 
     origin: Floats
@@ -230,8 +236,8 @@ class Device(Protocol):
     """A backend that trains and renders: ``numba_device``, ``torch_device`` or ``triton_device``.
 
     Attributes:
-        name: of the hardware and the backend, for the status.
-        on_gpu: whether it computes on a GPU.
+        name: name of the hardware and the backend, for the status.
+        on_gpu: it computes on a GPU.
     """
 
     name: str
@@ -254,10 +260,10 @@ class Device(Protocol):
         """Colours (P, 3) in 0..1, depth along the ray (P,) with 0 where nothing is met, confidence (P,).
 
         Args:
-            rays: of the view.
-            panorama_share: of the keyframe's panorama in the colour of surfaces that it has seen; the rest is the
-                field's. With 1 the colour of surfaces without confidence is not worked out.
-            depth_share: of the keyframe's depth in the signed distance; the rest is the field's.
+            rays: P rays of the view.
+            panorama_share: weight of the keyframe's panorama in the colour of surfaces that it has seen; the rest is
+                the field's. With 1 the colour of surfaces without confidence is not worked out.
+            depth_share: weight of the keyframe's depth in the signed distance; the rest is the field's.
         """
 
     def parameters(self) -> FieldParameters:

@@ -15,7 +15,7 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS, BLOCK, encode_block, layer_
 FIRST_STEP = 0.7
 """Smallest step through empty cells, in cells."""
 NOT_SEEN = np.float32(1e9)
-"""Stands for "no distance known before"."""
+"""Value of an unknown earlier distance."""
 LOOKED_THROUGH = 3.0
 """A keyframe whose surface lies this many truncation distances behind a point has looked through it: it is free."""
 
@@ -71,7 +71,7 @@ def sample_rays(  # type: ignore[no-untyped-def]
     Arrays and parameters:
         uniform: (N, 3) in [0, 1): place in the stratum (azimuth, height) and in the band; N = columns · rows.
         sources: (N / 64,): the keyframe that each tile of 8 × 8 strata looks from.
-        rgb, inverse, depth_edge, usable, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
+        rgb, inverse, depth_edge, usable, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         trust: (K, h, w): weight of the depth by its uncertainty, 0..1.
         map_from_camera: (K, 4, 4) float32; gains: (K, 3).
         points: out, (2 N, 3). Rays go by tiles: 64 points on the surface, then 64 in the band.
@@ -331,8 +331,8 @@ def trace(  # type: ignore[no-untyped-def]
     The distance is the field's and the prior's own, mixed: a young field's surfaces are rough.
 
     Arrays and parameters:
-        grid, low, cell: of the ``Occupancy``.
-        inverse, depth_edge, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
+        grid, low, cell: grid, lowest corner and cell size of the ``Occupancy``.
+        inverse, depth_edge, known, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4) float32.
         share: weight of the prior in the distance, 0..1; with 1 the field is not asked at all.
         origin: (3,); directions: (P, 3) unit vectors of all pixels, map frame.
@@ -401,10 +401,10 @@ def mix_panorama(  # type: ignore[no-untyped-def]
     """Mix the panorama's colour into that of surfaces which a keyframe has seen: of the newest that has.
 
     Arrays and parameters:
-        rgb, inverse, depth_edge, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
+        rgb, inverse, depth_edge, known, band: arrays of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4); gains: (K, 3).
         depth, confidence: (P,), of ``trace``; nothing happens where either is 0.
-        share: of the panorama, 0..1.
+        share: weight of the panorama, 0..1.
         colour: in and out, (P, 3) in 0..1.
     """
     count, height, width = rgb.shape[:3]

@@ -15,7 +15,7 @@ def forget_stale(folder: Path) -> list[Path]:
     after a change there, with array shapes that the new code no longer has.
 
     Args:
-        folder: of the sources; numba's files lie in its ``__pycache__``.
+        folder: folder of the sources; numba's files lie in its ``__pycache__``.
 
     Returns:
         What was deleted.

@@ -27,7 +27,7 @@ from instant_ic.vspace.nerf.field import (
 )
 
 FIRST_STRIDE = 4
-"""Every so many pixels the rays are traced, or ``Rays.stride`` where that is less, the rest only where those between
+"""Distance in pixels of the rays traced first, at most ``Rays.stride``; the rest are traced only where those between
 differ; a power of two, 1 traces all."""
 DEPTH_TOLERANCE = 0.08
 """Neighbours further apart than this share are traced, not interpolated."""

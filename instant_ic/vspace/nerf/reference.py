@@ -107,11 +107,11 @@ def train_step(
     Args:
         field: parameters and lattice.
         priors: the keyframes, newest first.
-        state: of the optimiser.
+        state: state of the optimiser.
         config: size of the batch and weights.
         uniform: (N, 3) in [0, 1), one row a ray.
         rates: learning rates of table and network.
-        weights: of the batch's samples in the loss, colour's and distance's, each (2 N,) (``field.sample_weights``).
+        weights: weights of the samples' colours and distances in the loss, (2 N,) each (``field.sample_weights``).
 
     Returns:
         Mean squared colour error (0..1 units) and mean squared distance error (units of the band).

@@ -122,7 +122,7 @@ def volume_gradient(  # type: ignore[no-untyped-def]
     Σᵢⱼ wᵢ wⱼ |oᵢ − oⱼ| + ⅓ Σ wᵢ² · step`` (Barron et al., 2022), o in bands behind the surface.
 
     Arrays and parameters:
-        points, target, weight: of ``march.sample_rays``: of each tile's 128 rows the first 64 are used.
+        points, target, weight: results of ``march.sample_rays``; the first 64 of each tile's 128 rows are used.
         jitter: (N,) place of each ray's samples in their strata, 0..1.
         sources: (N / 64,) each tile's keyframe; cameras: (K, 3); band: (K,).
         losses: weights of depth, opacity and distortion, (3,).
@@ -215,8 +215,8 @@ def composite(  # type: ignore[no-untyped-def]
     """Render rays by compositing around their guiding depth: hash grid, network and sums in one pass.
 
     Arrays and parameters:
-        band: of the newest keyframe, whose camera is ``focus[0, :3]``.
-        depth_share: of the guiding depth in the depth that comes out; the rest is the mean over the samples.
+        band: truncation distance of the newest keyframe, whose camera is ``focus[0, :3]``.
+        depth_share: weight of the guiding depth in the resulting depth; the rest is the mean over the samples.
         origin: (3,); directions: (P, 3).
         depth: in and out, (P,): metres along the ray, 0 where it meets nothing.
         colour: out, (P, 3) in 0..1, before a mid-grey ground as in training; not written where nothing is met.
