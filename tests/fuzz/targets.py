@@ -463,7 +463,7 @@ def _parse_bus() -> Callable[[bytes], object]:
     logging.getLogger("instant_ic.bus").setLevel(logging.CRITICAL)
     out = host.context.socket(zmq.PUB)
     out.bind("inproc://fuzz")
-    subscription._socket.connect("inproc://fuzz")
+    subscription.socket.connect("inproc://fuzz")
     subscription.read()
 
     def parse(data: bytes) -> None:
@@ -476,7 +476,7 @@ def _parse_bus() -> Callable[[bytes], object]:
         subscription.read()
         subscription.take()
         assert claim.json_path.exists()  # the registry's entry stays alive
-        for source in subscription._sources.values():
+        for source in subscription.sources.values():
             source.expected = 0
 
     return parse
@@ -562,7 +562,7 @@ def _bridge_frames() -> list[bytes]:
         wire.Bye("closing", "over").encode(),
         wire.Announce(1, "/cmd", "node", "std_msgs/msg/String", digest, "sensor").encode(),
         wire.Refuse(1, "no").encode(),
-        wire.Notice("clock", "off").encode(),
+        wire.HostNotice("clock", "off").encode(),
         wire.Ping(1, 5, 6).encode(),
         wire.Pong(1, 5, 6, 7, 8).encode(),
         wire.Ack(5, (1, 2, 3)).encode(),
