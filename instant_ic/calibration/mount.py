@@ -160,7 +160,7 @@ def calibrate(
     level = _EdgeLevel(edges, frames, blur_px[0])
     if full_circle:
         start, rival = _around(level, camera_from_lidar, yaw_step_deg)
-        report(f"yaw {_correction(camera_from_lidar, start)[5] / math.radians(1):+.1f} deg around the full circle")
+        report(f"yaw {correction(camera_from_lidar, start)[5] / math.radians(1):+.1f} deg around the full circle")
     found = start
     for number, blur in enumerate(blur_px):
         level = level if number == 0 else _EdgeLevel(edges, frames, blur)
@@ -168,7 +168,7 @@ def calibrate(
         report(f"blur {blur:g} px: score {level.score(found):.3f}")
     found, rivals = _among_rivals(level, start, found)
     for other in rivals:
-        shift = _correction(found, other)
+        shift = correction(found, other)
         centimetres = ", ".join(f"{value:+.1f}" for value in shift[:3] * 100)
         report(f"a pose {centimetres} cm away fits as well")
     before, after = _above_chance(level, camera_from_lidar, found)
@@ -176,9 +176,9 @@ def calibrate(
     if len({frame.place for frame in frames}) < _PLACES_FOR_HEIGHT:
         covariance[2, 2] += _UNCHECKED_HEIGHT**2
     for other in rivals:  # either may be true: the selected pose is off by nothing or by the whole difference
-        shift = _correction(found, other) / _UNIT
+        shift = correction(found, other) / _UNIT
         covariance += 0.5 * np.outer(shift, shift)
-    units = _correction(start, found) / _UNIT
+    units = correction(start, found) / _UNIT
     values, vectors = np.linalg.eigh(covariance)
     limit = np.array([_MOST_SIGMA_M] * 3 + [math.radians(_MOST_SIGMA_DEG)] * 3)
     loose = vectors[:, np.sqrt(values) > (limit / _UNIT).max()]
@@ -264,7 +264,7 @@ def _moved(camera_from_lidar: Matrix, units: Floats) -> Matrix:
     return np.asarray(change @ camera_from_lidar)
 
 
-def _correction(before: Matrix, after: Matrix) -> NDArray[np.float64]:
+def correction(before: Matrix, after: Matrix) -> NDArray[np.float64]:
     """Return the motion (6,) from one pose to another in the camera's frame, metres and radians."""
     change = after @ np.linalg.inv(before)
     return np.concatenate([change[:3, 3], Rotation.from_matrix(change[:3, :3]).as_rotvec()])
@@ -297,7 +297,7 @@ def _climb(level: _EdgeLevel, start: Matrix, found: Matrix) -> Matrix:
         steps = np.eye(6) / 3
         return np.array([(cost(units + step) - cost(units - step)) * 1.5 for step in steps])
 
-    first = _correction(start, found) / _UNIT
+    first = correction(start, found) / _UNIT
     result = minimize(cost, first, jac=slope, method="BFGS", options={"gtol": 2e-4, "maxiter": 25})
     return _moved(start, result.x)
 
@@ -321,11 +321,11 @@ def _among_rivals(level: _EdgeLevel, start: Matrix, found: Matrix) -> tuple[Matr
     up_and_down = [_moved(found, k * np.eye(6)[2]) for k in (-8, 8)]
     for pose in [pose for _, pose in peaks[:2]] + up_and_down:
         other = _climb(level, start, pose)
-        if all(np.abs(_correction(known, other) / _UNIT).max() > 2 for known in maxima):
+        if all(np.abs(correction(known, other) / _UNIT).max() > 2 for known in maxima):
             maxima.append(other)
     best = max(maxima, key=level.score)
     tied = [other for other in maxima if other is best or _difference(level, best, other) < 3.0]
-    tied.sort(key=lambda pose: float(np.linalg.norm(_correction(start, pose) / _UNIT)))
+    tied.sort(key=lambda pose: float(np.linalg.norm(correction(start, pose) / _UNIT)))
     return tied[0], tied[1:]
 
 

@@ -14,7 +14,7 @@ from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bus.node_files import node_class
 from instant_ic.calibration.bag import read_recording
 from instant_ic.calibration.edges import CUES, FloorPlane, find_floor, lidar_edges, picture_edges
-from instant_ic.calibration.mount import AXES, CalibrationError, CalibrationFrame, _correction, calibrate
+from instant_ic.calibration.mount import AXES, CalibrationError, CalibrationFrame, calibrate, correction
 from instant_ic.calibration.overlay import before_and_after, overlay
 from instant_ic.cli.main import main
 from instant_ic.config.params import build, load_file
@@ -125,7 +125,7 @@ def test_camera_is_found_by_the_command(drive, tmp_path, capsys):
     ]
     assert main(words) == 0
     summary = json.loads(numbers.read_text())
-    error = _correction(truth, np.array(summary["camera_from_lidar"]))
+    error = correction(truth, np.array(summary["camera_from_lidar"]))
     assert np.linalg.norm(error[:3]) <= 0.02
     assert np.degrees(np.linalg.norm(error[3:])) <= 0.3
     assert all(summary["constrained"].values())
@@ -142,7 +142,7 @@ def test_yaw_is_found_around_the_full_circle(drive):
     recording = read_recording(drive[0], most_frames=3)
     turned = pose_matrix(yaw=math.radians(130)) @ recording.camera_from_lidar
     result = calibrate(recording.frames, turned, **QUICK)
-    error = _correction(drive[1], result.camera_from_lidar)
+    error = correction(drive[1], result.camera_from_lidar)
     assert abs(math.degrees(error[5])) < 0.5
     assert result.yaw_rival < 0.8
 
@@ -152,7 +152,7 @@ def test_what_standing_still_does_not_constrain_is_kept(drive):
     result = calibrate(recording.frames, recording.camera_from_lidar, **QUICK)
     assert not result.constrained[AXES.index("z")]
     assert result.sigma[2] > 0.03
-    error = _correction(recording.camera_from_lidar, result.camera_from_lidar)
+    error = correction(recording.camera_from_lidar, result.camera_from_lidar)
     assert abs(error[2]) < 0.03
 
 
