@@ -24,6 +24,8 @@ def print_table(rows: Iterable[Sequence[object]], headings: Sequence[str] = (), 
 
     table = Table(box=None, pad_edge=False, show_header=bool(headings), header_style="bold")
     cells = [[Text(visible(masked(str(cell)))) for cell in row] for row in rows]
+    if not (cells or headings):
+        return
     for number in range(len(headings) or max(map(len, cells), default=0)):
         heading = headings[number] if headings else ""
         table.add_column(heading, justify="right" if number in right else "left", overflow="fold")

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.robot_parameters import RELATED, Driving, disagreements
 from instant_ic.util import paths
+from instant_ic.util.files import replacing
 
 if TYPE_CHECKING:
     from instant_ic.config.params import Values
@@ -215,11 +216,10 @@ def _remembered(cache: Path) -> list[str]:
 
 
 def _remember(cache: Path, keys: Sequence[str]) -> None:
-    scratch = cache.with_suffix(f".{os.getpid()}")
     with suppress(OSError):
         cache.parent.mkdir(parents=True, exist_ok=True)
-        scratch.write_text(json.dumps(list(keys)[-_MOST_REMEMBERED:]))
-        scratch.replace(cache)
+        with replacing(cache) as stream:
+            stream.write(json.dumps(list(keys)[-_MOST_REMEMBERED:]).encode())
 
 
 def _check_apart(request: str) -> list[str]:

@@ -66,10 +66,10 @@ def main() -> None:
     """Wait for the launcher's end."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the reaper must outlive the launcher
-    told = b""
+    received = b""
     while piece := os.read(0, 4096):
-        told += piece
-    mark = told.decode().strip()
+        received += piece
+    mark = received.decode().strip()
     killed = kill_marked(mark) if mark else {}
     try:
         for pid, command in killed.items():

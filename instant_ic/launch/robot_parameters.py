@@ -19,7 +19,7 @@ RELATED = (
 )
 """Nodes that have something to agree on."""
 _MISSED = 2
-"""Messages that may be missing before a time-out."""
+"""Number of messages that a time-out must span."""
 
 
 @dataclass(frozen=True)

@@ -187,22 +187,22 @@ class StackScreen:
         return Group(Rule(style="dim"), node_table(view.rows, self._colours), self._footer(view))
 
     def _footer(self, view: StackView) -> Text:
-        words = Text(overflow="ellipsis", no_wrap=True)
+        text = Text(overflow="ellipsis", no_wrap=True)
         if view.ending:
-            return words.append("stopping", style="bold yellow")
+            return text.append("stopping", style="bold yellow")
         waiting = view.missing or view.waiting
         if not view.looked:
-            words.append("starting", style="yellow")
+            text.append("starting", style="yellow")
         elif waiting:
-            words.append(f"waiting for {', '.join(waiting)}", style="yellow")
+            text.append(f"waiting for {', '.join(waiting)}", style="yellow")
         else:
-            words.append("ready", style="bold green")
+            text.append("ready", style="bold green")
         if self._page:
-            words.append(" · ").append(self._page, style="bold underline")
+            text.append(" · ").append(self._page, style="bold underline")
         if view.pace:
-            words.append(f" · {view.pace}", style="yellow")
-        words.append(f" · {_duration(time.monotonic() - self._started_s)} · Ctrl-C stops the stack", style="dim")
-        return words
+            text.append(f" · {view.pace}", style="yellow")
+        text.append(f" · {_duration(time.monotonic() - self._started_s)} · Ctrl-C stops the stack", style="dim")
+        return text
 
 
 def _duration(seconds: float) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from instant_ic.cli import completion
 from instant_ic.cli.arguments import check_files, group, numbers, positive_int, verb
 from instant_ic.cli.errors import UserError
+from instant_ic.cli.tables import print_table
 
 if TYPE_CHECKING:
     from instant_ic.calibration.bag import CalibrationRecording
@@ -137,11 +138,12 @@ def _lidar_mount() -> Matrix:
 def _tell(summary: dict[str, Any]) -> None:
     before = summary["mount_xyz_before"] + summary["mount_rpy_deg_before"]
     after = summary["mount_xyz"] + summary["mount_rpy_deg"]
-    print(f"{'camera on base_link':20} {'before':>9} {'after':>9} {'+-':>8}")
+    rows = []
     for number, (axis, sigma) in enumerate(summary["sigma_m_deg"].items()):
-        unit = "m" if number < 3 else "deg"
-        note = "" if summary["constrained"][axis] else "   not constrained by this recording"
-        print(f"  {axis:5} {unit:12} {before[number]:9.3f} {after[number]:9.3f} {sigma:8.3f}{note}")
+        note = "" if summary["constrained"][axis] else "not constrained by this recording"
+        figures = (f"{before[number]:.3f}", f"{after[number]:.3f}", f"{sigma:.3f}")
+        rows.append((f"{axis} ({'m' if number < 3 else 'deg'})", *figures, note))
+    print_table(rows, ("camera on base_link", "before", "after", "+-", ""), right=(1, 2, 3))
     print(f"overlap of LiDAR edges with image edges: {summary['score_before']:.2f} times chance before, "
           f"{summary['score_after']:.2f} after")  # fmt: skip
     if summary["yaw_rival"] > 0.8:

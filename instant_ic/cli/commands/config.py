@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from instant_ic.cli import completion
 from instant_ic.cli.arguments import group, launch_values, verb
 from instant_ic.cli.errors import UserError
+from instant_ic.cli.tables import print_table
 
 if TYPE_CHECKING:
     from instant_ic.launch.description import NodeSpec
@@ -102,11 +103,8 @@ def show_node(args: argparse.Namespace) -> int:
         if not args.changed or info.value != info.default
     ]
     rows = [(i.name, one_line(i.value), values[i.name].where if i.name in values else "default") for i in infos]
-    key_width = max((len(key) for key, _, _ in rows), default=0)
-    value_width = min(max((len(value) for _, value, _ in rows), default=0), 40)
     print(f"{spec.label} ({spec.file.name}):")
-    for key, value, origin in rows:
-        print(f"  {key:{key_width}}  {value:{value_width}}  {origin}")
+    print_table(rows)
     return 0
 
 
