@@ -101,7 +101,8 @@ def test_warnings_of_a_start_that_does_not_end_are_shown(out: io.StringIO, monke
         screen.node_line("slam", WARNED)
         screen.refresh(StackView(missing=("page",)))
         assert out.getvalue() == ""
-        monkeypatch.setattr(time, "monotonic", lambda: screen._started_s + 31.0)
+        later_s = time.monotonic() + 31.0
+        monkeypatch.setattr(time, "monotonic", lambda: later_s)
         screen.refresh(StackView(missing=("page",)))
     assert out.getvalue().splitlines()[0] == f"  slam │ {WARNED}"
 

@@ -34,10 +34,6 @@ def nodes(name: str, **arguments: str) -> dict[str, str]:
     return {node.name: " ".join(node.command) for node in description.nodes}
 
 
-def test_there_are_the_five() -> None:
-    assert {"sim", "robot", "station", "full", "replay"} <= set(NAMES)
-
-
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("given", [NEEDED, EVERYTHING], ids=["defaults", "everything"])
 def test_every_node_accepts_its_parameters(name: str, given: dict[str, dict[str, str]]) -> None:
