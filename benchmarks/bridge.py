@@ -5,7 +5,7 @@
 
 Commands go 20 times per second from the station to the robot; images (200 kB, 10 per second) and states (20 per second)
 the other way. Two bridges with CURVE and the shipped topic lists run in their own processes; the network is
-``instant_ic.experiments.impaired_link`` in a third.
+``impaired_link.py`` in a third.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def bridges(folder: Path, network: list[str]) -> Iterator[list[psutil.Process]]:
     stores["station"].allow(Peer("robot", "driver", made["robot"].public_key))
     listen, through = free_port(), free_port()
     ends = {"robot": f"listen:=tcp://127.0.0.1:{listen}", "station": f"connect:=tcp://127.0.0.1:{through}"}
-    commands = [["-m", "instant_ic.experiments.impaired_link", str(through), "127.0.0.1", str(listen), *network]]
+    commands = [[str(Path(__file__).with_name("impaired_link.py")), str(through), "127.0.0.1", str(listen), *network]]
     for host, end in ends.items():
         parameters = ["-p", end, "-p", f"keys:={stores[host].folder}"]
         config = str(shipped_file("config", "bridge.yaml"))

@@ -10,6 +10,7 @@ import time
 import pytest
 import zmq
 
+from benchmarks.impaired_link import ImpairedLink, Impairment
 from instant_ic.bridge.commands import COMMANDS
 from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyStore, Peer
@@ -18,7 +19,6 @@ from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_protocol import VERSION, Hello
 from instant_ic.bridge.host_session import Arrived, Ended, LinkTimes, Side, Up
 from instant_ic.bridge.host_topics import TopicRule
-from instant_ic.experiments.impaired_link import ImpairedLink, Impairment
 
 STATE, PICTURE = TopicRule("/ic/state"), TopicRule("/camera", lane="bulk")
 COMMAND = TopicRule("/operator/cmd_vel", lane="command", max_age_s=0.25)

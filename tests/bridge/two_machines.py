@@ -53,7 +53,7 @@ class TwoMachines:
     """Robot and station with separate networks, run directories and keys; a context manager.
 
     The kernel adds delay and loss (``tc netem``) if it can. Otherwise a proxy on the station's side does
-    (:mod:`~instant_ic.experiments.impaired_link`), in which a lost packet is a stall of 0.2 s. ``made_by`` names the
+    (``benchmarks/impaired_link.py``), in which a lost packet is a stall of 0.2 s. ``made_by`` names the
     method.
 
     Args:
@@ -154,9 +154,9 @@ class TwoMachines:
             return
         self.made_by = "proxy"  # the kernel lacks sch_netem
         words = [str(PORT), ROBOT_ADDRESS, str(PORT), f"--delay-ms={self.delay_ms}", f"--jitter-ms={self.jitter_ms}"]
-        module = "instant_ic.experiments.impaired_link"
+        link = Path(__file__).resolve().parents[2] / "benchmarks" / "impaired_link.py"
         self._proxy = subprocess.Popen(
-            [*self.prefix("station"), sys.executable, "-m", module, *words, f"--stall-share={self.loss}"]
+            [*self.prefix("station"), sys.executable, str(link), *words, f"--stall-share={self.loss}"]
         )
         self.station_target = ("127.0.0.1", PORT)
 

@@ -10,11 +10,11 @@ from page_renderer import PageRenderer
 
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayers
-from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.layers import encode
+from tests import box_room
 
 pytestmark = BROWSER_TEST
 WIDTH, HEIGHT, FOV = 480, 270, math.pi / 2

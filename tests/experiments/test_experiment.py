@@ -15,7 +15,6 @@ from instant_ic.bus import LATCHED
 from instant_ic.cli.main import main
 from instant_ic.experiments import (
     ablation,
-    box_room,
     compared,
     environments,
     lab,
@@ -60,6 +59,7 @@ from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.world import Material
 from instant_ic.vspace import VirtualSpaceConfig
 from instant_ic.vspace.mesh_space import MeshSpace
+from tests import box_room
 
 FINE = ScanQuality(0.0, 0.0, 0.0, 0.06, 3.0, 1024, 0.0, 0.0)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room, vspace, vspace_sources
+from instant_ic.experiments import vspace, vspace_sources
 from instant_ic.experiments.colour_only import ColourOnlyField, composite_gradient, density
 from instant_ic.experiments.vspace import compare, converge, scores
 from instant_ic.experiments.vspace_sources import VspaceSettings
@@ -13,6 +13,7 @@ from instant_ic.experiments.worlds import CAMERA_HEIGHT_M, path_poses
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.worlds import corridor_world
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
+from tests import box_room
 
 SMALL = VirtualSpaceConfig(
     device="cpu",

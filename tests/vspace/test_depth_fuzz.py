@@ -8,7 +8,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import (
     FieldConfig,
@@ -23,6 +22,7 @@ from instant_ic.vspace.layers import decode_layer, encode
 from instant_ic.vspace.nerf import occupancy
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.vspace.prior import SKY, prepare
+from tests import box_room
 
 RGB = box_room.panorama(np.eye(4), 16).rgb
 VALUES = (0.0, 1e-30, 0.05, 0.2, 1.0, 3.0, 29.99, 30.0, 1e4, 1e30, 1e300, math.nan, math.inf, -math.inf, -1.0)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from instant_ic.experiments import box_room
 from instant_ic.vspace import FieldConfig, SpaceState, TrainConfig, VirtualSpace, VirtualSpaceConfig, devices
 from instant_ic.vspace.devices import DeviceError, check_device, make_device
 from instant_ic.vspace.nerf.numba_device import NumbaDevice
 from instant_ic.vspace.nerf.torch_device import TorchDevice
+from tests import box_room
 
 CONFIG = VirtualSpaceConfig(
     field=FieldConfig(levels=2, log2_table=10, hidden=8), train=TrainConfig(ray_columns=16, ray_rows=16)

@@ -9,13 +9,13 @@ import pytest
 
 from instant_ic.adapters.vspace import layers_message, layers_of
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import deserialize, serialize
 from instant_ic.vspace import FieldConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.layers import Content, Kind, LayersError, decode_layer, encode
 from nodes.nerf import NerfConfig, NerfNode
+from tests import box_room
 from tests.vspace.test_nerf_node import keyframe_message
 
 WARP = VirtualSpaceConfig(source="warp", device="cpu")

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.mesh_file import MeshError
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
@@ -14,6 +13,7 @@ from instant_ic.vspace import KeyframeError, SpaceState, VirtualSpaceConfig
 from instant_ic.vspace.mesh_space import MeshSpace, make_space
 from instant_ic.vspace.scanned_mesh import load_mesh
 from instant_ic.vspace.space import VirtualSpace
+from tests import box_room
 
 trimesh = pytest.importorskip("trimesh")
 

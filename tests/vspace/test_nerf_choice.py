@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, SpaceState, TrainConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.choice import Choice, WarpTrial, gain_db
 from instant_ic.vspace.config import ReadinessConfig
+from tests import box_room
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import CUBE_FACES
 from instant_ic.vspace import FieldConfig, TrainConfig
@@ -19,6 +18,7 @@ from instant_ic.vspace.nerf.reference import TorchField
 from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
 from instant_ic.vspace.prior import MOVED, prepare
 from instant_ic.vspace.view import perspective_rays
+from tests import box_room
 
 F = np.float32
 FOCUS = np.array(

@@ -7,7 +7,6 @@ import types
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, ReadinessConfig, SpaceState, TrainConfig, VirtualSpace, VirtualSpaceConfig
@@ -15,6 +14,7 @@ from instant_ic.vspace.agreement import exposure_gain, exposure_gains, moved
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.keyframes import Keyframe, recent, spread
 from instant_ic.vspace.prior import MOVED, ROOM, prepare
+from tests import box_room
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",

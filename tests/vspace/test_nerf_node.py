@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import (
@@ -22,6 +21,7 @@ from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpace, VirtualSpa
 from instant_ic.vspace.jobs import IncomingKeyframe, JobKind, JobOutcome, ViewOrder, load_robot_mask
 from instant_ic.vspace.schedule import JobSchedule, Turns
 from nodes.nerf import NerfConfig, NerfNode
+from tests import box_room
 
 EMPTY, TRAINING, READY = 0, 1, 2
 S = 1_000_000_000

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.vspace import KeyframeError
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import edge_quads, prepare
+from tests import box_room
 
 CAMERA = np.eye(4)
 PICTURE = box_room.panorama(CAMERA, 64)

@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.field import Rays
 from instant_ic.vspace.prior import prepare
 from instant_ic.vspace.readiness import Texture, error_terms, expected_psnr_db
+from tests import box_room
 
 WARP = VirtualSpaceConfig(source="warp", device="cpu")
 

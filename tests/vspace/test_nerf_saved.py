@@ -7,7 +7,6 @@ import os
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import (
     FieldConfig,
@@ -16,6 +15,7 @@ from instant_ic.vspace import (
     VirtualSpace,
     VirtualSpaceConfig,
 )
+from tests import box_room
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",

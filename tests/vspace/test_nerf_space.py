@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import (
@@ -26,6 +25,7 @@ from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.vspace.prior import area_average, edge_quads, fill_holes, prepare
 from instant_ic.vspace.view import perspective_rays
 from instant_ic.vspace.warm_up import warm_up
+from tests import box_room
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",

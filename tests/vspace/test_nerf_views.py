@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, NotReadyError, TrainConfig, View, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.view import continue_unseen, equirect_rays
+from tests import box_room
 
 CONFIG = VirtualSpaceConfig(
     device="cpu", field=FieldConfig(log2_table=13), train=TrainConfig(ray_columns=64, ray_rows=32, iterations=80)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
 from instant_ic.vspace.config import GeometryConfig
@@ -19,6 +18,7 @@ from instant_ic.vspace.nerf.reference import TorchField, query, sample_rays
 from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
 from instant_ic.vspace.prior import MOVED, prepare
 from instant_ic.vspace.view import perspective_rays
+from tests import box_room
 
 F = np.float32
 FIELD = FieldConfig(levels=4, log2_table=12, hidden=16, geometry="density")

@@ -17,7 +17,6 @@ triton = pytest.importorskip("triton", reason="triton is not installed: make ins
 
 import triton.language as tl  # noqa: E402
 
-from instant_ic.experiments import box_room  # noqa: E402
 from instant_ic.geometry.poses import pose_matrix  # noqa: E402
 from instant_ic.vspace import FieldConfig, TrainConfig  # noqa: E402
 from instant_ic.vspace.config import GeometryConfig  # noqa: E402
@@ -31,6 +30,7 @@ from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors  # noq
 from instant_ic.vspace.nerf.triton_device import TritonDevice  # noqa: E402
 from instant_ic.vspace.prior import prepare  # noqa: E402
 from instant_ic.vspace.view import perspective_rays  # noqa: E402
+from tests import box_room  # noqa: E402
 
 DEVICE = "cuda" if CUDA else "cpu"
 F = np.float32

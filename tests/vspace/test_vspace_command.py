@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from instant_ic.cli.main import main
-from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
+from tests import box_room
 
 
 def write_rgb(path, rgb):

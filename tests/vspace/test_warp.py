@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.experiments import box_room
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_pixels
@@ -22,6 +21,7 @@ from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.prior import prepare
 from instant_ic.vspace.view import perspective_rays
 from instant_ic.vspace.warp import PanoramaWarp, Pyramid
+from tests import box_room
 
 FOV = math.pi / 2
 

@@ -194,7 +194,7 @@ class ImpairedLink:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a link until it is stopped: ``python -m instant_ic.experiments.impaired_link 7451 10.0.0.1 7450``."""
+    """Run a link until it is stopped: ``python benchmarks/impaired_link.py 7451 10.0.0.1 7450``."""
     import argparse
 
     parser = argparse.ArgumentParser(description="TCP proxy that behaves as a bad network.")
