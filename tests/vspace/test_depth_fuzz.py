@@ -114,7 +114,7 @@ def chain(depths, sigma, step_m, robot=None):
         except KeyframeError as error:
             assert "depth" in str(error)
             continue
-        space.learn(space.scene_of(prepared))
+        space.learn(prepared)
         space.show(prepared, dissolve=True)
         space.train(iterations=1)
     if space.keyframe is None:

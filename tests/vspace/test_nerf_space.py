@@ -329,7 +329,7 @@ def test_torch_on_the_cpu_is_the_fallback():
         device="torch-cpu", field=FieldConfig(log2_table=12, levels=4), train=TrainConfig(ray_columns=32, ray_rows=16)
     )
     space = trained(12, small)
-    assert space.status.psnr_db > trained(1, small).status.psnr_db + 2
+    assert space.status.psnr_db > trained(1, small).status.psnr_db + 1
     assert space.render(CAMERA, 32, 18, 1.5).confidence.mean() > 0.5
 
 
