@@ -81,7 +81,8 @@ def topic_rows(flows: Mapping[str, Flow]) -> list[TopicRow]:
     rows = []
     for topic, flow in flows.items():
         expected = expected_rate(topic)
-        fault = expected.fault(flow.rate_hz, flow.age_s) if expected else ""
+        started = flow.age_s < math.inf  # some topics are published only while somebody subscribes
+        fault = expected.fault(flow.rate_hz, flow.age_s) if expected and started else ""
         if (flow.rate_hz > 0 or fault) and not topic.endswith(EVERY_NODES):
             rows.append(TopicRow(topic, flow.rate_hz, flow.age_s, expected.rate_hz if expected else None, fault))
     return sorted(rows, key=lambda row: (not row.fault, row.nominal_hz is None))
