@@ -45,14 +45,22 @@ def test_page_draws_picture_and_map_without_errors(open_page):
     assert floor[0] > floor[2] + 10
 
 
-def test_without_webgl_the_page_says_what_to_do_and_does_not_connect(browser, demo):
+@pytest.mark.parametrize("press", ["button", "space"])
+def test_without_webgl_the_page_says_what_to_do_and_only_stops_the_robot(browser, demo, press):
     context = browser.new_context(viewport=SIZE)
     page = context.new_page()
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
     page.goto(demo.server.url)
     page.get_by_text("WebGL 2 is missing. Use a current Chrome, Edge, Firefox or Safari").wait_for(timeout=WAIT_MS)
-    assert not page.locator("#estop").count()
-    assert demo.server.drive.gate.driver is None
+    expect_body(page, "link", "up")
+    page.keyboard.down("w")
+    if press == "button":
+        page.locator("#estop").click()
+    else:
+        page.keyboard.press("Space")
+    expect_body(page, "estop", "set")
+    assert demo.estop
+    assert demo.server.drive.gate.driver is None and not demo.commands
     context.close()
 
 

@@ -18,10 +18,11 @@ import { GlViewer } from "./viewer.js";
 
 const canvas = elementOf("view", HTMLCanvasElement), scale = elementOf("scale", HTMLInputElement);
 const helpDialog = elementOf("help", HTMLDialogElement);
-const viewer = makeViewer(); // before the link: a page that shows nothing must not drive
 const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
 const lease = new Lease(link);
 const drive = new Drive(link);
+attachStop(); // first: it works without an image too
+const viewer = makeViewer();
 const look = new Look(canvas);
 const images = new Images(viewer, link);
 const screen = new Screen(viewer, images, look, link, lease);
@@ -29,16 +30,30 @@ const recording = new Recording(link);
 const pads = new Gamepads(drive, look);
 const wake = () => screen.wake();
 
-/** Returns the viewer. Without WebGL 2 the page shows what to do instead of its controls, and throws. */
+/** Returns the viewer. Without WebGL 2 it throws, and the page can only stop the robot. */
 function makeViewer() {
   try {
     return new GlViewer(canvas, new URLSearchParams(location.search).get("quality") === "full");
   } catch (error) {
-    const text = byId("no-view");
-    document.body.replaceChildren(text);
-    text.hidden = false;
+    onlyStop();
     throw error;
   }
+}
+
+/** Shows what to do to see the robot, and the emergency stop: a page that shows nothing must not drive. */
+function onlyStop() {
+  const text = byId("no-view");
+  byId("stick").remove();
+  document.body.replaceChildren(text, byId("right-bottom"), byId("banner"), byId("toast"));
+  text.hidden = false;
+  lease.mayDrive = false;
+  const show = () => hud.showBanner(link, lease, null);
+  for (const name of ["open", "lost"]) link.addEventListener(name, show);
+  lease.addEventListener("change", show);
+  link.addEventListener("signed-out", () => location.reload());
+  onDetail(link, "message", (/** @type {Message} */ message) => {
+    if (message.type === "session") lease.take(message);
+  });
 }
 
 // ---- from the server -----------------------------------------------------------------------------
@@ -115,6 +130,20 @@ function showBanner() {
 
 // ---- from the operator -----------------------------------------------------------------------------
 
+/** The button and the space bar stop the robot. */
+function attachStop() {
+  for (const name of ["pointerdown", "click"]) byId("estop").addEventListener(name, stopNow);
+  for (const name of /** @type {const} */ (["keydown", "keyup"])) {
+    window.addEventListener(name, (event) => {
+      if (event.code !== "Space") return;
+      // No focused button may receive the space bar.
+      event.preventDefault();
+      event.stopPropagation();
+      if (name === "keydown" && !event.repeat) stopNow();
+    }, { capture: true });
+  }
+}
+
 function stopNow() {
   drive.stop();
   link.send({ type: "estop" });
@@ -167,24 +196,12 @@ const SHORTCUTS = {
 };
 
 window.addEventListener("keydown", (event) => {
-  if (event.code === "Space") {
-    // The space bar always stops, so no focused button may receive it.
-    event.preventDefault();
-    event.stopPropagation();
-    if (!event.repeat) stopNow();
-    return;
-  }
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
   SHORTCUTS[event.code]?.();
   if (isDriveKey(event)) askForTheLease();
 }, { capture: true });
-window.addEventListener("keyup", (event) => {
-  if (event.code === "Space") event.preventDefault();
-}, { capture: true });
-
 /** @type {Record<string, () => void>} */
 const CLICKS = {
-  estop: stopNow,
   take: () => lease.takeOver(),
   yield: () => lease.handOver(),
   compass: () => look.centre(),
@@ -197,7 +214,6 @@ const CLICKS = {
   "save-view": SHORTCUTS.KeyP,
 };
 for (const [id, action] of Object.entries(CLICKS)) byId(id).addEventListener("click", action);
-byId("estop").addEventListener("pointerdown", stopNow);
 for (const button of document.querySelectorAll("#more button")) {
   button.addEventListener("click", () => byId("more").hidePopover());
 }
