@@ -22,7 +22,7 @@ STATE, MAP, CAMERA, KEYFRAME = "/ic/state", "/map", "/camera/image/compressed", 
 TYPES = {STATE: ("ControlState",), MAP: ("OccupancyGrid",), CAMERA: ("CompressedImage",), KEYFRAME: ("Keyframe",)}
 SIZE = (320, 180)
 AROUND_S, MOST_S = 2.0, 60.0
-"""The film begins and ends this long before and after the virtual space, and is no longer."""
+"""Images begin and end this long before and after the virtual space, and span no more than the second value."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
         if len(states) < 2:
             raise ValueError(f"{bag}: {len(states)} messages on {STATE}, 2 are needed")
         log = as_log(states, len(keyframes))
-        times = film_times(log, frame_s)
+        times = moment_times(log, frame_s)
         photos: list[tuple[float, bytes]] = []  # the newest image at each time
         for one in reader.messages([CAMERA]):
             time_s = (one.stamp_ns - begin_ns) / 1e9
@@ -121,7 +121,7 @@ def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> DriveLog:
     )
 
 
-def film_times(log: DriveLog, frame_s: float) -> NDArray[np.float64]:
+def moment_times(log: DriveLog, frame_s: float) -> NDArray[np.float64]:
     """Return times around the first passage through the virtual space, or of the first minute without one."""
     times, virtual = np.array(log.time_s), np.array(log.virtual)
     begin, end = times[0], times[-1]

@@ -34,7 +34,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """Plots as SVG text, or the ``data:`` address of an image or film."""
+    """Plots as SVG text, or the ``data:`` address of an image."""
 
     caption: str
     source: str

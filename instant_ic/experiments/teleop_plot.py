@@ -1,26 +1,23 @@
-"""Plot and video of ``experiments.teleop``."""
+"""Plot of ``experiments.teleop``."""
 
 from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.footprint import Footprint
 from instant_ic.control.states import Mode
 from instant_ic.experiments.plots import save_figure
-from instant_ic.experiments.teleop import TeleopSettings, decode, photograph
+from instant_ic.experiments.teleop import TeleopSettings
 from instant_ic.experiments.teleop_figures import TRACK_S, TeleopDrive
-from instant_ic.experiments.teleop_stack import METHODS, SimulatedStack
+from instant_ic.experiments.teleop_stack import METHODS
 from instant_ic.experiments.teleop_worlds import Course, floor_plan
-from instant_ic.sim.contact import OccupancyMask
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -31,8 +28,6 @@ _MODE_COLOURS = {
     Mode.STOPPED: "#D55E00",
 }  # fmt: skip
 _MARGIN_M = 1.4
-_PICTURE, _MAP = (640, 360), 360
-FPS = 10
 
 
 def save_plot(path: Path | io.BytesIO, drives: Sequence[TeleopDrive], settings: TeleopSettings, most: int = 4) -> None:
@@ -141,109 +136,3 @@ def _legend(names: Sequence[str]) -> list[Any]:
         dot("<", "back", mfc="none"),
         *(Patch(color=colour, label=mode.name) for mode, colour in _MODE_COLOURS.items()),
     ]
-
-
-class Video:
-    """Split-screen video of one drive in simulated time: the operator's view, and the map.
-
-    Raises:
-        ValueError: the file cannot be written.
-    """
-
-    def __init__(self, path: Path) -> None:
-        import cv2
-
-        size = (_PICTURE[0] + _MAP, _PICTURE[1])
-        self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, size)
-        if not self._writer.isOpened():
-            raise ValueError(f"{path}: the video cannot be written")
-        self._frames = screen_frames(1.0 / FPS)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Close the file."""
-        self._writer.release()
-
-    def on_step(self, stack: SimulatedStack) -> None:
-        """Add a frame when one is due; pass this method to ``teleop.run_episode``."""
-        frame = self._frames(stack)
-        if frame is not None:
-            self._writer.write(frame)
-
-
-def screen_frames(period_s: float) -> Callable[[SimulatedStack], NDArray[np.uint8] | None]:
-    """Return a function that renders screen and map, (360, 1000, 3) BGR, if a frame is due, else returns None."""
-    plan: PlanImage | None = None
-    next_s = 0.0
-
-    def frame(stack: SimulatedStack) -> NDArray[np.uint8] | None:
-        nonlocal plan, next_s
-        if stack.time_s < next_s or not stack.log.pictures or not stack.log.time_s:
-            return None
-        next_s = stack.time_s + period_s - 1e-6
-        plan = plan or PlanImage(floor_plan(stack.simulation.world, 0.05))
-        return np.hstack([operator_image(stack), plan.draw(stack)])
-
-    return frame
-
-
-def operator_image(stack: SimulatedStack) -> NDArray[np.uint8]:
-    """Render the operator's screen, with mode and reason, (360, 640, 3) BGR."""
-    import cv2
-
-    shown = stack.log.pictures[-1]
-    if shown.virtual:
-        rgb = decode(shown.jpeg)
-    else:
-        rgb = photograph(stack, shown, *_PICTURE, math.pi / 2)
-    frame = np.ascontiguousarray(cv2.resize(rgb, _PICTURE)[..., ::-1])
-    mode = Mode(stack.log.mode[-1]).name
-    for words, top in (
-        (f"{'virtual space' if shown.virtual else 'camera'}  ({mode})", 0),
-        (stack.log.reason[-1], 334),
-    ):
-        frame[top : top + 26] //= 2
-        at = (10, top + 18)
-        cv2.putText(frame, words[:80], at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-    return frame
-
-
-class PlanImage:
-    """The floor plan scaled to a square, with the robots on it (BGR)."""
-
-    def __init__(self, plan: OccupancyMask) -> None:
-        rows, columns = np.nonzero(plan.cells)
-        points = plan.centre(np.column_stack([rows, columns]))
-        low, high = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
-        self.scale = _MAP / float((high - low).max())
-        self.middle = 0.5 * (low + high)
-        self.base = np.full((_MAP, _MAP, 3), 255, np.uint8)
-        at = self.pixels(points)
-        self.base[at[:, 1].clip(0, _MAP - 1), at[:, 0].clip(0, _MAP - 1)] = 140
-
-    def pixels(self, points: FloatArray) -> NDArray[np.int32]:
-        """Return column and row (N, 2) of positions (N, 2)."""
-        offset = (np.asarray(points) - self.middle) * self.scale * [1, -1] + _MAP / 2
-        return np.asarray(np.rint(offset), np.int32)
-
-    def draw(self, stack: SimulatedStack) -> NDArray[np.uint8]:
-        import cv2
-
-        frame = self.base.copy()
-        log = stack.log
-        cv2.polylines(frame, [self.pixels(np.array(log.robot)[:, :2])], False, (60, 60, 200), 1, cv2.LINE_AA)
-        robots = [(log.robot[-1], (60, 60, 200))]
-        if log.virtual[-1]:
-            robots.append((log.vbot[-1], (200, 120, 0)))
-        for pose, colour in robots:
-            c, s = math.cos(pose[2]), math.sin(pose[2])
-            corners = Footprint().corners() @ np.array([[c, s], [-s, c]]) + pose[:2]
-            cv2.polylines(frame, [self.pixels(corners)], True, colour, 2, cv2.LINE_AA)
-            nose = np.stack([pose[:2], pose[:2] + 0.4 * np.array([c, s])])
-            cv2.polylines(frame, [self.pixels(nose)], False, colour, 1, cv2.LINE_AA)
-        cv2.putText(frame, f"{stack.time_s:.1f} s", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
-        return frame

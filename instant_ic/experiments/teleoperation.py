@@ -1,4 +1,4 @@
-"""V.D, Fig. 9: the whole flow with numbered stills, a film, the state over time, and both trajectories on the map."""
+"""V.D, Fig. 9: the whole flow with numbered stills, the state over time, and both trajectories on the map."""
 
 from __future__ import annotations
 
@@ -11,40 +11,39 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
 from instant_ic.experiments import illusion
 from instant_ic.experiments.compared import command_of
 from instant_ic.experiments.illusion_stack import SOURCES, FilmedStack
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.plots import jpeg
-from instant_ic.experiments.recorded_drive import Moment, read_drive
+from instant_ic.experiments.recorded_drive import SIZE, Moment, read_drive
 from instant_ic.experiments.report import Answer, Figure, Part, Section, Table, Text, image_address
-from instant_ic.experiments.teleop import TeleopSettings, run_episode
-from instant_ic.experiments.teleop_plot import save_plot, screen_frames
+from instant_ic.experiments.teleop import TeleopSettings, decode, photograph, run_episode
+from instant_ic.experiments.teleop_plot import save_plot
 
 _FRAME_S = 0.25
-_SIZE = (500, 180)
 _BESIDE_S = 1.0
 """Stills 1 and 5 are this long before and after the virtual space."""
 
 
 class _Recorded(FilmedStack):
-    """A stack that keeps the operator's screen beside the map."""
+    """A stack that keeps the operator's screen."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.frames: list[Moment] = []
-        self._frame = screen_frames(_FRAME_S)
+        self._next_still_s = 0.0
 
     def step(self, operate: Callable[[], tuple[float, float]] | None = None) -> None:
-        """Advance the stack, then keep a frame if one is due."""
+        """Advance the stack, then keep the shown image if one is due."""
         super().step(operate)
-        frame = self._frame(self)
-        if frame is not None:
-            rgb = np.ascontiguousarray(cv2.resize(frame, _SIZE, interpolation=cv2.INTER_AREA)[..., ::-1])
-            self.frames.append(Moment(self.time_s, self.log.pictures[-1].virtual, rgb))
+        if self.time_s < self._next_still_s or not self.log.pictures:
+            return
+        self._next_still_s = self.time_s + _FRAME_S - 1e-6
+        shown = self.log.pictures[-1]
+        rgb = decode(shown.jpeg) if shown.virtual else photograph(self, shown, *SIZE, math.pi / 2)
+        self.frames.append(Moment(self.time_s, shown.virtual, cv2.resize(rgb, SIZE, interpolation=cv2.INTER_AREA)))
 
 
 _COST_S = 60.0
@@ -78,7 +77,7 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
     images = {}
     frames = stacks[0].frames
     if arguments["images"] and frames:
-        images = _shown(frames, _FRAME_S)
+        images = _shown(frames)
         plot = io.BytesIO()
         save_plot(plot, [drive], settings)
         images["Trajectories of r-bot and v-bot, state over time"] = image_address(plot.getvalue(), "image/png")
@@ -89,20 +88,19 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
 
 def _recorded(bag: Path) -> dict[str, Any]:
     found = read_drive(bag, _FRAME_S)
-    images = _shown(found.moments, _FRAME_S) if found.moments else {}
+    images = _shown(found.moments) if found.moments else {}
     images["Trajectories of r-bot and v-bot"] = image_address(found.plot, "image/png")
     images["State over time"] = image_address(found.modes, "image/png")
     row = {key: value for key, value in asdict(found.drive).items() if key != "tracks"}
     return {"drive": row | {"contacts": None}, "views": {}, "images": images}
 
 
-def _shown(frames: Sequence[Moment], frame_s: float) -> dict[str, str]:
-    """Return numbered stills and a film."""
+def _shown(frames: Sequence[Moment]) -> dict[str, str]:
+    """Return numbered stills."""
     images = {}
     for number, frame in enumerate(stills(frames), 1):
         what = "virtual" if frame.virtual else "real"
         images[f"{number}: {frame.time_s:.1f} s, {what}"] = image_address(jpeg(frame.image))
-    images["Film"] = image_address(_webp([frame.image for frame in frames], frame_s), "image/webp")
     return images
 
 
@@ -132,7 +130,7 @@ def section(results: Sequence[Result], options: Options) -> Section:
     parts: list[Part] = [Text(text)]
     for one in results:
         images = one.data.get("images", {})
-        # The command stands under the last still, the film and the plot.
+        # The command stands under the last still and the plot.
         parts += [Figure(name, images[name], "" if name[0] in "1234" else command) for name in images]
     done = [one for one in results if one.data]
     lines: list[list[Any]] = [
@@ -156,12 +154,3 @@ def section(results: Sequence[Result], options: Options) -> Section:
         all(flow) if flow else None, f"{sum(flow)} of {len(flow)} drives, {where}" if flow else "", len(flow)
     )
     return Section("Teleoperation (V.D, Fig. 9)", parts, answers={"flow": answer})
-
-
-def _webp(images: Sequence[NDArray[np.uint8]], frame_s: float) -> bytes:
-    from PIL import Image
-
-    first, *others = [Image.fromarray(image) for image in images]
-    out = io.BytesIO()
-    first.save(out, "WEBP", save_all=True, append_images=others, duration=round(1000 * frame_s), loop=0, quality=50)
-    return out.getvalue()

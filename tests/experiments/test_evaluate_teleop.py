@@ -16,7 +16,7 @@ from instant_ic.control.states import Mode
 from instant_ic.experiments import teleop, teleop_figures, teleop_worlds
 from instant_ic.experiments.teleop_figures import DriveLog, Shown, Switch, TeleopDrive
 from instant_ic.experiments.teleop_operator import ScriptedOperator, Sight
-from instant_ic.experiments.teleop_plot import Video, save_plot
+from instant_ic.experiments.teleop_plot import save_plot
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
 from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.contact import OccupancyMask
@@ -258,7 +258,6 @@ class TestOperator:
         (["--methods", "ic,magic"], "method must be one of"),
         (["--world", "nowhere"], "neither corridor"),
         (["--jobs", "0"], "jobs must be at least 1"),
-        (["--video", "film.avi"], "must end in .mp4"),
         (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),
         (["-p", "arbiter.no_key:=1"], "unknown parameter 'no_key'"),
         (["--json", "/no/such/folder/out.json"], "does not exist"),
@@ -285,18 +284,9 @@ def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp
         stacks.append(SimulatedStack(world, config))
         return stacks[-1]
 
-    if method == "stop":  # its film and its plot, once
-        with Video(tmp_path / "drive.mp4") as video:
-            (drive,) = teleop.run_episode(settings, 0, video.on_step, (method,), make_stack, short_course)
-        read = cv2.VideoCapture(str(tmp_path / "drive.mp4"))
-        frames = int(read.get(cv2.CAP_PROP_FRAME_COUNT))
-        picture, plan = np.hsplit(read.read()[1], [640])
-        assert frames > 10 * (drive.seconds - 0.5) and plan.shape == (360, 360, 3)
-        assert picture.std() > 20 and (plan > 240).mean() > 0.5  # a corridor, and a drawing on white
-        save_plot(tmp_path / "drive.png", [drive], settings)
-        assert cv2.imread(str(tmp_path / "drive.png")).std() > 10
-    else:
-        (drive,) = teleop.run_episode(settings, 0, None, (method,), make_stack, short_course)
+    (drive,) = teleop.run_episode(settings, 0, None, (method,), make_stack, short_course)
+    save_plot(tmp_path / "drive.png", [drive], settings)
+    assert cv2.imread(str(tmp_path / "drive.png")).std() > 10
     assert drive.completed and drive.contacts == 0 and not drive.switches
     assert 1.0 < drive.seconds < 4.0
     # He lets go where the picture, 0.2 s old, is 0.25 m before the goal; then come the command's way and braking.

@@ -367,7 +367,7 @@ def test_a_recorded_drive_is_shown(tmp_path) -> None:
     assert drive["mode_seconds"]["virtual"] == pytest.approx(2.0, abs=0.06)
     stills = [name for name in found["images"] if name[0].isdigit()]
     assert [name.split()[-1] for name in stills] == ["real", "virtual", "virtual", "virtual", "real"]
-    assert {"Film", "Trajectories of r-bot and v-bot", "State over time"} < {*found["images"]}
+    assert {"Trajectories of r-bot and v-bot", "State over time"} < {*found["images"]}
     section = teleoperation.section([Result(unit, found, 1.0, 1.0)], options)
     assert section.answers["flow"].held is True
     with pytest.raises(ValueError, match="does not react"):

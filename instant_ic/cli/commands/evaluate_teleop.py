@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from pathlib import Path
 from typing import Any
 
 from instant_ic.cli.arguments import verb
@@ -40,13 +39,11 @@ def add_kind(kinds: Any) -> None:
     add("--methods", default="ic,stop", metavar="M,M", help="ic, stop (default: %(default)s)")
     text = "depth source of the virtual space (docs/depth.md; default: %(default)s)"
     add("--depth", choices=("completed", "fused", "lidar"), default="completed", help=text)
-    text = "write a split-view video of the first course and method here"
-    add("--video", type=Path, metavar="OUT.mp4", help=text)
 
 
 def run(args: argparse.Namespace) -> int:
     use_one_thread_for_matrices()
-    check_outputs(args, video=".mp4")
+    check_outputs(args)
     with errors_for_the_user():
         return _evaluate(args)
 
@@ -73,11 +70,6 @@ def _evaluate(args: argparse.Namespace) -> int:
         from instant_ic.experiments.teleop_plot import save_plot
 
         save_plot(args.plot, drives, settings)
-    if args.video:
-        from instant_ic.experiments.teleop_plot import Video
-
-        with Video(args.video) as video:
-            teleop.run_episode(settings, 0, video.on_step, methods[:1])
     for row in figures.pop("each"):
         if row["contacts"] or not row["completed"]:
             print(
