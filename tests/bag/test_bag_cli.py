@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from instant_ic.bag import BagReader, BagWriter
+from instant_ic.bag import BagWriter
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.cli.commands.bag import size
 from instant_ic.cli.main import main
@@ -67,17 +67,6 @@ def test_info_lists_bookmarks(capsys: pytest.CaptureFixture[str], tmp_path: Path
     assert told["bookmarks"] == [{"at_s": 1.0, "name": "door stuck"}, {"at_s": 3.5, "name": "person"}]
 
 
-def test_info_names_a_file_that_is_not_in_the_bag(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    bag = make(tmp_path / "bag")
-    (bag / "bag_1.mcap").write_bytes((bag / "bag.mcap").read_bytes()[:-50])
-    status, out, _ = ic(capsys, "bag", "info", bag)
-    assert (
-        status == 0
-        and f"bag_1.mcap is in the folder but not in the index: its recording was cut short. Run ic bag recover {bag}"
-        in out
-    )
-
-
 def test_diff_prints_what_differs(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     a, b = make(tmp_path / "a"), make(tmp_path / "b", gain=1.5)
     status, out, _ = ic(capsys, "bag", "diff", a, b)
@@ -108,34 +97,6 @@ def test_wrong_tolerances_are_told(
     bag = make(tmp_path / "bag")
     status, _, error = ic(capsys, "bag", "diff", bag, bag, *words)
     assert status == 2 and message in error
-
-
-def test_recover(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    bag = make(tmp_path / "bag")
-    (bag / "metadata.yaml").unlink()
-    status, _, error = ic(capsys, "bag", "info", bag)
-    assert status == 1 and "ic bag recover" in error
-    file = bag / "bag.mcap"
-    file.write_bytes(file.read_bytes()[:-100])
-    status, out, _ = ic(capsys, "bag", "recover", bag, "-o", tmp_path / "saved")
-    assert status == 0 and "messages" in out and "bag.mcap" in out
-    with BagReader(tmp_path / "saved") as reader, BagReader(make(tmp_path / "whole")) as whole:
-        assert [m.stamp_ns for m in reader.messages()] == [m.stamp_ns for m in whole.messages()]
-
-
-def test_control_without_a_node(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path / "run"))
-    for words, status, message in (
-        (("snapshot",), 1, "no bag_recorder runs in"),
-        (("control", "pause"), 1, "no bag_recorder or bag_player runs in"),
-        (("control", "rate"), 2, "ic bag control rate needs a value"),
-        (("control", "pause", "3"), 2, "ic bag control pause takes no value"),
-        (("control", "pause", "--node", "x"), 1, "named x runs in"),
-    ):
-        got, _, error = ic(capsys, "bag", *words)
-        assert got == status and message in error, words
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,8 @@
-import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.records import ChunkIndex
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
@@ -102,22 +99,6 @@ def test_type_hash_is_that_of_ros(tmp_path: Path) -> None:
     assert digests[BOOL] == "RIHS01_feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9"
 
 
-def test_bare_mcap_file_opens_too(tmp_path: Path) -> None:
-    bag = make_bag(tmp_path / "bag")
-    with BagReader(bag / "bag.mcap") as reader:
-        assert reader.count == 22
-
-
-def test_big_messages_over_many_chunks_keep_their_order(tmp_path: Path) -> None:
-    payloads = [bytes([i]) * 700_000 for i in range(9)]
-    with BagWriter(tmp_path / "bag") as writer:
-        for index, payload in reversed(list(enumerate(payloads))):
-            writer.write("/scan", SCAN, payload, 10 + index, RELIABLE)
-            writer.flush()
-    with BagReader(tmp_path / "bag") as reader:
-        assert [m.payload for m in reader.messages()] == payloads
-
-
 @pytest.mark.parametrize(
     ("action", "message"),
     [
@@ -130,63 +111,6 @@ def test_big_messages_over_many_chunks_keep_their_order(tmp_path: Path) -> None:
 def test_what_cannot_be_done_is_told(tmp_path: Path, action: object, message: str) -> None:
     with pytest.raises(BagError, match=message):
         action(tmp_path)  # type: ignore[operator]
-
-
-def test_flushed_messages_of_a_killed_recorder_are_recovered(tmp_path: Path) -> None:
-    writer = BagWriter(tmp_path / "bag")
-    for index in range(10):
-        writer.write("/scan", SCAN, scan(index), 100 + index, SENSOR)
-    writer.flush()
-    writer.write("/scan", SCAN, scan(99), 200, SENSOR)  # never flushed: lost with its process
-    # What a kill leaves: no index, no metadata.yaml.
-    with pytest.raises(BagError, match="ic bag recover"):
-        BagReader(tmp_path / "bag")
-    recovered = recover(tmp_path / "bag", tmp_path / "saved")
-    assert recovered.count == 10
-    with BagReader(tmp_path / "saved") as reader:
-        assert [m.payload for m in reader.messages()] == [scan(i) for i in range(10)]
-        assert [t.qos for t in reader.topics] == [SENSOR]
-        assert reader.custom["recovered_from"] == "bag"
-    writer.close()
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-def test_cut_anywhere_all_before_the_cut_is_saved(tmp_path: Path, compressed: bool) -> None:
-    sent = [(100 + i, bytes([i]) * (1000 + 37 * i)) for i in range(30)]
-    with BagWriter(tmp_path / "bag", compressed) as writer:
-        for number, (stamp_ns, payload) in enumerate(sent):
-            writer.write("/scan", SCAN, payload, stamp_ns, SENSOR)
-            if number % 7 == 6:
-                writer.flush()  # chunks of 7 messages
-    data = (tmp_path / "bag" / "bag.mcap").read_bytes()
-    index = get_index(data)
-    cut_file = tmp_path / "cut.mcap"
-    least = 0
-    for at in range(0, len(data), 997 if not compressed else 97):
-        cut_file.write_bytes(data[:at])
-        whole_chunks = sum(chunk.chunk_start_offset + chunk.chunk_length <= at for chunk in index)
-        try:
-            result = recover(cut_file, tmp_path / f"saved{at}")
-        except BagError as error:
-            assert whole_chunks == 0, error
-            continue
-        with BagReader(tmp_path / f"saved{at}") as reader:
-            got = [(m.stamp_ns, m.payload) for m in reader.messages()]
-        assert got == sent[: len(got)] and result.count == len(got) and result.stopped_by
-        assert len(got) >= min(30, 7 * whole_chunks)
-        if not compressed:
-            # Of a cut chunk everything but the message under the cut: each has 31 bytes of head.
-            assert sum(len(payload) + 31 for _, payload in sent[: len(got) + 1]) > at - 15_000 or len(got) == 30
-        assert len(got) >= least  # never less of a longer file
-        least = len(got)
-    assert least == 30
-
-
-def get_index(data: bytes) -> list[ChunkIndex]:
-    """The chunk index as the independent `mcap` package reads it."""
-    summary = make_reader(io.BytesIO(data)).get_summary()
-    assert summary is not None
-    return summary.chunk_indexes
 
 
 class Losses:

@@ -3,7 +3,6 @@
 import contextlib
 import fcntl
 import io
-import itertools
 import json
 import os
 import pty
@@ -177,31 +176,6 @@ def test_snapshots_on_demand_and_at_an_emergency_stop(talker: Talker, tmp_path: 
         assert any(m.stamp_ns > stops[1][0] for m in reader.messages({"/count"}))
 
 
-def test_recorder_is_paused_and_split_from_another_terminal(talker: Talker, tmp_path: Path) -> None:
-    process = talker.start("bag", "record", "-o", tmp_path / "bag", "/count")
-    try:
-        wait_for(lambda: status(talker).get("messages"), "messages")
-        assert talker.ic("bag", "control", "pause").returncode == 0
-        wait_for(lambda: left_out(talker) >= 50, "half a second")
-        assert status(talker)["state"] == "paused"
-        assert talker.ic("bag", "control", "split").returncode == 0
-        assert talker.ic("bag", "control", "resume").returncode == 0
-        wait_for(lambda: status(talker).get("files") == 2, "the second file")
-        refused = talker.ic("bag", "control", "rate", "2")
-        assert refused.returncode == 1 and "no bag_player runs" in refused.stderr
-        refused = talker.ic("bag", "snapshot")
-        assert refused.returncode == 1 and "start it with --snapshot" in refused.stderr
-    finally:
-        text = end(process)
-    assert process.returncode == 0, text
-    with BagReader(tmp_path / "bag") as reader:
-        values = [deserialize(m.payload, m.type_name).data for m in reader.messages()]
-        assert json.loads(reader.custom["instant_ic.paused"])["/count"] >= 50
-        assert [file.name for file in reader.files] == ["bag.mcap", "bag_1.mcap"]
-    gaps = [b - a for a, b in itertools.pairwise(values) if b - a != 1]
-    assert len(gaps) == 1 and gaps[0] >= 50
-
-
 def test_player_is_steered_from_another_terminal(talker: Talker, tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as writer:
         for index in range(100):
@@ -278,16 +252,3 @@ def test_keys_in_a_terminal(talker: Talker, tmp_path: Path) -> None:
         os.close(ours)
         os.close(theirs)
     assert json.loads(BagReader(tmp_path / "bag").custom["instant_ic.paused"])["/count"] >= 1
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A real file system of 20 MB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=20m", "tmpfs", str(folder)]
-    done = subprocess.run(mount, capture_output=True, text=True)
-    if done.returncode:
-        pytest.skip(f"a tmpfs cannot be mounted here: {done.stderr.strip()}")
-    yield folder
-    subprocess.run(["umount", folder], check=True)

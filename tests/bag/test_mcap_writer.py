@@ -23,7 +23,7 @@ def fill(file: McapWriter, sizes: list[int]) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-@pytest.mark.parametrize("sizes", [[0, 1, 5, 300], [CHUNK_BYTES, CHUNK_BYTES - 100, 7], [3_000_000] * 3, [40] * 5000])
+@pytest.mark.parametrize("sizes", [[0, 1, 5, 300], [CHUNK_BYTES, CHUNK_BYTES - 100, 7], [3_000_000] * 3])
 def test_mcap_package_reads_it_with_check_sums(tmp_path: Path, sizes: list[int], compressed: bool) -> None:
     file = McapWriter(tmp_path / "a.mcap", compressed)
     sent = fill(file, sizes)
@@ -65,7 +65,7 @@ def whole_messages(path: Path) -> list[bytes]:
         return [m.data for _, _, m in make_reader(stream, validate_crcs=True).iter_messages()]
 
 
-@pytest.mark.parametrize("limit", [10_000, 100_000, 1_000_000, 2_345_678])
+@pytest.mark.parametrize("limit", [10_000, 1_000_000])
 def test_full_disk_leaves_a_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
     full_disk(monkeypatch, limit)
     file = McapWriter(tmp_path / "a.mcap")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +9,9 @@ import pytest
 
 from instant_ic.bag import BagReader, BagWriter, Schema
 from instant_ic.bag.metadata import own_schema, store_of, with_hash
-from instant_ic.bag.player import BagPlayer, PlayOptions
-from instant_ic.bag.replay import ReplayNode, replay
 from instant_ic.bag.upgrade import upgrade_of
-from instant_ic.bus import LATCHED, SENSOR, Node
-from instant_ic.cli.main import main
-from instant_ic.msg import ControlState, Float32, deserialize, header, pose_message, serialize, twist_message
+from instant_ic.bus import LATCHED
+from instant_ic.msg import ControlState, deserialize, header, pose_message, serialize, twist_message
 
 NAME = "instant_ic_msgs/msg/ControlState"
 S = 1_000_000_000
@@ -51,11 +46,6 @@ def bag(tmp_path: Path) -> Path:
     return tmp_path / "bag"
 
 
-def test_the_test_writes_what_the_old_definition_says() -> None:
-    message = store_of(old_schema()).deserialize_cdr(old_payload(2), NAME)
-    assert (message.mode, message.transitions, message.vbot_limit_m_s) == (2, 3, 0.25)
-
-
 def test_an_older_message_is_read_as_the_present_one_with_an_unknown_code(bag: Path) -> None:
     with BagReader(bag) as reader:
         assert reader.differing_types() == []
@@ -68,40 +58,6 @@ def test_an_older_message_is_read_as_the_present_one_with_an_unknown_code(bag: P
         (first, *_) = reader.messages()
         assert first.payload == old_payload(0)
         assert reader.decoder(reader.topics[0])(first.payload).reason == "stopped: no camera image for 1.6 s"
-
-
-def test_an_older_message_is_played(bag: Path) -> None:
-    player = BagPlayer(bag, PlayOptions(rate=20.0))
-    assert player.left_out == {}
-    sent = []
-    assert player.play(sent.append, threading.Event())
-    player.close()
-    assert [deserialize(m.payload, m.type_name).mode for m in sent] == [0, 1, 2]
-
-
-def test_info_lists_the_bag(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bag", "info", str(bag)]) == 0
-    assert "/ic/state" in capsys.readouterr().out
-
-
-@dataclass(frozen=True)
-class ModeConfig:
-    pass
-
-
-class ModeNode(Node[ModeConfig]):
-    name = "modes"
-
-    def setup(self) -> None:
-        self.out = self.publisher("/mode", Float32, qos=SENSOR)
-        self.subscribe("/ic/state", ControlState, lambda m: self.out.publish(Float32(data=float(m.mode))), qos=LATCHED)
-
-
-def test_an_older_message_is_replayed_through_a_node(bag: Path, tmp_path: Path) -> None:
-    replay(bag, [ReplayNode("modes", ModeNode, ModeConfig())], tmp_path / "new")
-    with BagReader(tmp_path / "new") as reader:
-        found = [deserialize(m.payload, m.type_name).data for m in reader.messages({"/mode"})]
-    assert found == [0.0, 1.0, 2.0]
 
 
 def test_fields_that_a_type_has_lost_at_its_end_are_dropped() -> None:

@@ -163,7 +163,7 @@ def test_reserve_of_the_disk_ends_the_file_and_recording_goes_on_when_there_is_r
     recorder.take("/scan", BOOL, b"2", 2 * S)
     recorder.take("/estop", BOOL, YES, 3 * S)
     free[0] = 1_063_000_000  # a little above the reserve: not yet, or it would come and go
-    time.sleep(1.2)
+    time.sleep(0.4)
     assert recorder.state == DISK_FULL
     free[0] = 2_000_000_000
     wait_for(lambda: recorder.state == RECORDING, "room")
@@ -174,38 +174,6 @@ def test_reserve_of_the_disk_ends_the_file_and_recording_goes_on_when_there_is_r
     assert custom(tmp_path / "bag", "disk_full") == {"/scan": 1, "/estop": 1}
 
 
-def test_full_disk_leaves_a_valid_bag_and_a_recorder_that_lives(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recorder = make(tmp_path / "bag")
-    full = threading.Event()
-    write = os.write
-
-    def refuse(fd: int, data: memoryview) -> int:
-        if full.is_set() and len(data) > 50_000:  # the end still finds room
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return write(fd, data)
-
-    monkeypatch.setattr(os, "write", refuse)
-    recorder.take("/estop", BOOL, NO, 1 * S)
-    recorder.take("/scan", BOOL, b"1" * 100_000, 1 * S)
-    wait_for(lambda: (tmp_path / "bag" / "bag.mcap").stat().st_size > 100_000, "the flush")
-    full.set()
-    recorder.take("/estop", BOOL, YES, 2 * S)
-    recorder.take("/scan", BOOL, b"2" * 2_000_000, 2 * S)
-    wait_for(lambda: recorder.error, "the full disk")
-    assert "No space left on device; run ic bag recover" in recorder.error
-    full.clear()
-    wait_for(lambda: recorder.state == RECORDING, "room")
-    recorder.tick()
-    recorder.take("/scan", BOOL, b"3", 3 * S)
-    recorder.close()
-    got = [(topic, stamp_ns, payload[:1]) for topic, stamp_ns, payload in read(tmp_path / "bag")]
-    # The emergency stop that went down with the full disk stands at the beginning of the next file.
-    assert got == [("/estop", S, NO[:1]), ("/scan", S, b"1"), ("/estop", 3 * S, YES[:1]), ("/scan", 3 * S, b"3")]
-    assert read(tmp_path / "bag")[2][2] == YES
-
-
 def test_folder_taken_away_is_told(tmp_path: Path) -> None:
     recorder = make(tmp_path / "bag", free=lambda path: shutil.disk_usage(path).free)
     recorder.take("/scan", BOOL, b"1", 1 * S)
@@ -214,27 +182,6 @@ def test_folder_taken_away_is_told(tmp_path: Path) -> None:
     assert "its folder was removed" in recorder.error
     with pytest.raises(BagError, match="was removed"):
         recorder.close()
-
-
-def test_message_without_a_type_is_told(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "bag")
-    recorder.take("/scan", "", b"?", 1 * S)
-    recorder.take("/odd", "their_msgs/msg/Odd", b"!", 1 * S)
-    recorder.close()
-    assert recorder.unknown_types() == {"their_msgs/msg/Odd": "/odd"}
-    assert read(tmp_path / "bag") == [("/odd", 1 * S, b"!")]
-    assert custom(tmp_path / "bag", "no_type") == {"/scan": 1}
-
-
-def test_losses_by_publisher_are_in_the_metadata(tmp_path: Path) -> None:
-    losses = Losses()
-    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, take: losses)
-    recorder.discover([topic_info("/scan", SENSOR)])
-    recorder.take("/scan", BOOL, b"x", 1 * S)
-    losses.lost, losses.lost_by = 5, {"left": 2, "right": 3}
-    recorder.close()
-    assert custom(tmp_path / "bag", "lost") == {"/scan": 5}
-    assert custom(tmp_path / "bag", "lost_by") == {"/scan": {"left": 2, "right": 3}}
 
 
 def test_losses_are_a_warning_only_while_they_grow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,14 +204,6 @@ def test_losses_are_a_warning_only_while_they_grow(tmp_path: Path, monkeypatch: 
     recorder.close()
 
 
-def test_clock_set_back_while_recording(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "bag")
-    for stamp_s in (100, 101, 40, 41):
-        recorder.take("/scan", BOOL, bytes([stamp_s]), stamp_s * S)
-    recorder.close()
-    assert [m[2][0] for m in read(tmp_path / "bag")] == [40, 41, 100, 101]
-
-
 def entry(value: int, size: int = 10, latched: bool = False, publisher: str = "") -> BagMessage:
     qos = LATCHED if latched else SENSOR
     return BagMessage("/estop" if latched else "/scan", BOOL, bytes([value]) * size, value * S, qos, publisher)
@@ -283,14 +222,6 @@ def test_snapshot_cache_keeps_the_last_seconds_and_what_was_latched_before() -> 
         ("/estop", 7, 2), ("/estop", 7, 3), ("/scan", 7, 7), ("/scan", 8, 8), ("/scan", 9, 9), ("/scan", 10, 10),
     ]  # fmt: skip
     assert cache.span_s == 3.0
-
-
-def test_snapshot_cache_is_bounded_by_bytes() -> None:
-    cache = SnapshotCache(1000.0, 5_000)
-    for second in range(20):
-        cache.add(entry(second, size=1_000), second)
-        assert cache.bytes <= 5_000
-    assert [e.payload[0] for e in cache.content()] == [15, 16, 17, 18, 19]
 
 
 def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
@@ -338,36 +269,15 @@ def test_snapshot_that_cannot_be_written_is_told_and_the_next_succeeds(tmp_path:
     recorder.close()
 
 
-def test_recorder_that_writes_at_once_keeps_no_snapshots(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "bag")
-    with pytest.raises(ValueError, match="start it with --snapshot"):
-        recorder.snapshot()
-    recorder.close()
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"max_bag_size": -1},
-        {"max_bag_duration": -1.0},
-        {"queue_mb": 0},
-        {"max_cache_mb": 0},
-        {"snapshot_seconds": -1.0},
-    ],
-)
-def test_bad_options_name_the_key(bad: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(bad))} must be"):
-        BagRecorderConfig(**bad)  # type: ignore[arg-type]
-
-
 def on_the_disk(path: Path) -> list[bytes]:
     """Payloads in all files of a bag, complete or not."""
     return [message.payload for file in path.glob("*.mcap") for message in McapScan(file).messages()]
 
 
-@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EIO])
-@pytest.mark.parametrize("size", [100, 300_000])
-@pytest.mark.parametrize("end_fits", [True, False])
+@pytest.mark.parametrize(
+    ("error", "size", "end_fits"),
+    [(errno.ENOSPC, 100, True), (errno.ENOSPC, 300_000, False), (errno.EIO, 100, False)],
+)
 def test_every_message_is_recorded_or_counted_whatever_the_disk_refuses(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: int, size: int, end_fits: bool
 ) -> None:

@@ -8,11 +8,10 @@ import pytest
 import zmq
 
 from instant_ic.bag import BagReader
-from instant_ic.bus import RELIABLE, Node, registry
+from instant_ic.bus import RELIABLE, registry
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_subscription import LocalSubscription
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.msg import Bool
 from nodes.bag_recorder import BagRecorderConfig, BagRecorderNode
 
 
@@ -50,42 +49,3 @@ def test_messages_in_the_sockets_at_the_end_are_in_the_bag(
         sender.close()
     with BagReader(tmp_path / "bag") as reader:
         assert [m.payload for m in reader.messages({"/a"})] == [b"\0\1\0\0\1"]
-
-
-def test_read_all_reads_more_sockets_than_one_wait_does(
-    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run_dir = registry.prepare(tmp_path_factory.mktemp("r"))
-    clock = SystemClock()
-    topics = [f"/t{number}" for number in range(70)]
-    sender = LocalTransport(run_dir, "sender", clock.now_ns)
-    publishers = [sender.advertise(topic, "std_msgs/msg/Bool", RELIABLE) for topic in topics]
-    transport = LocalTransport(run_dir, "reader", clock.now_ns)
-    node = Node(None, transport, clock, "reader")
-    heard: list[Bool] = []
-    try:
-        for topic in topics:
-            node.subscribe(topic, Bool, heard.append, RELIABLE)
-        wait_for(lambda: all(publisher.subscriber_count for publisher in publishers))
-        transport._left_s = time.monotonic() + 1000.0  # the bus thread does not read
-        for name in ("_LOOK_S", "_IDLE_S"):
-            monkeypatch.setattr(f"instant_ic.bus.local_transport.{name}", 1000.0)
-        wait_for(lambda: transport._next_look_s > time.monotonic() + 100)
-
-        sent, pause_s = 0, 0.0
-
-        def one_call_reads_all() -> bool:
-            nonlocal sent, pause_s
-            for publisher in publishers:
-                for _ in range(3):
-                    publisher.send(b"\0\1\0\0\1")
-                    sent += 1
-            pause_s += 0.1
-            time.sleep(pause_s)  # asking the sockets would take the event that read_all needs
-            node.read_all()
-            return len(heard) == sent
-
-        wait_for(one_call_reads_all)
-    finally:
-        node.close()
-        sender.close()

@@ -186,13 +186,6 @@ def test_what_cannot_be_replayed_is_told(bag: Path, tmp_path: Path) -> None:
         replay(tmp_path / "empty", [mean_node()], tmp_path / "out")
 
 
-def test_parameters_of_a_replayed_node(tmp_path: Path) -> None:
-    file = tmp_path / "p.yaml"
-    file.write_text("bag_player:\n  ros__parameters:\n    bag: here\n    rate: 2.0\n")
-    node = make_node("bag_player", [file], ["bag_player.rate:=3.0", "grid_slam.rate:=4.0"])
-    assert (node.config.bag, node.config.rate) == ("here", 3.0)
-
-
 def test_type_of_another_definition_is_refused(tmp_path: Path) -> None:
     theirs = with_hash(Schema("sensor_msgs/msg/LaserScan", "ros2msg", "uint8 number\n", ""))
     with BagWriter(tmp_path / "bag") as writer:

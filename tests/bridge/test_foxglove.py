@@ -13,11 +13,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from instant_ic.bag.metadata import own_schema
 from instant_ic.bridge import foxglove_protocol
-from instant_ic.bus import LATCHED, OK, RELIABLE, SENSOR, NodeError, registry
-from instant_ic.bus.control import NodeControl
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
 from instant_ic.experiments.stack import free_port
 from instant_ic.msg import (
-    Bool,
     Clock,
     ControlState,
     String,
@@ -30,7 +28,6 @@ from instant_ic.msg import (
 )
 from instant_ic.util.paths import sign_in_file
 from instant_ic.util.web_access import is_loopback, refusal
-from nodes import foxglove_bridge
 from nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
 
 DRIVE = "/operator/cmd_vel"
@@ -143,22 +140,6 @@ def test_no_flood_of_old_messages_after_a_stall(world):
     assert numbers == sorted(numbers)
 
 
-def test_a_topic_that_changes_its_type_is_offered_anew(world):
-    world.bridge()
-    talker = world.neighbour()
-    first = talker.publisher("/x", String)
-    client = world.client()
-    assert client.subscribe("/x")["schemaName"] == "std_msgs/msg/String"
-    talker.node.drop(first)
-    out = talker.publisher("/x", Bool)
-    client.until(lambda: client.channels.get("/x", {}).get("schemaName") == "std_msgs/msg/Bool", "the other type")
-    client.subscribe("/x", 2)
-    wait_for(lambda: out.subscriber_count == 1, "the subscription")
-    out.publish(Bool(True))
-    client.until(lambda: client.messages, "the message")
-    assert client.messages[0][2] == cdr(Bool(True))
-
-
 def test_simulated_time_is_sent_also_before_topics_flow(world):
     world.bridge(sim_time=True)
     clock = world.neighbour("player").publisher("/clock", Clock)
@@ -198,20 +179,10 @@ def test_nothing_can_be_changed(shared_world):
     assert shared_world.talker.config.rate_hz == 2.0
 
 
-def test_nodes_that_do_not_run_are_named_and_not_looked_for(shared_world, monkeypatch):
-    client = shared_world.client()
-    monkeypatch.setattr(NodeControl, "get", lambda control: pytest.fail(f"{control.node} was asked"))
-    client.send(op="getParameters", parameterNames=[f"/nobody{number}.x" for number in range(500)], id="all")
-    client.until(lambda: client.text("parameterValues"), "the answer")
-    assert len([t for t in client.texts if "does not run" in t.get("message", "")]) == 500
-
-
 # -- who gets in -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "origin", ["https://evil.example", "http://evil.example:8765", "null", "https://app.foxglove.dev.evil.example"]
-)
+@pytest.mark.parametrize("origin", ["https://evil.example", "null"])
 def test_a_foreign_web_page_does_not_get_in(shared_world, origin):
     with pytest.raises(InvalidStatus) as refused:
         shared_world.client(origin=origin)
@@ -220,15 +191,7 @@ def test_a_foreign_web_page_does_not_get_in(shared_world, origin):
     wait_for(lambda: origin in shared_world.live.told("door"), "the diagnosis")
 
 
-def test_a_refusal_is_a_warning_only_for_a_while(world, monkeypatch):
-    monkeypatch.setattr(foxglove_bridge, "REFUSED_S", 0.0)
-    bridge = world.bridge()
-    with pytest.raises(InvalidStatus):
-        world.client(origin="https://evil.example")
-    wait_for(lambda: bridge.diagnoses().get("door") == (OK, "nobody refused lately", {"requests": 1}), "the diagnosis")
-
-
-@pytest.mark.parametrize("origin", [None, "https://app.foxglove.dev", "file://", "http://localhost:3000"])
+@pytest.mark.parametrize("origin", [None, "https://app.foxglove.dev"])
 def test_foxglove_and_programs_of_this_machine_get_in(shared_world, origin):
     assert shared_world.client(origin=origin).info["name"] == "Instant IC"
 

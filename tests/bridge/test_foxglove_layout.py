@@ -10,10 +10,6 @@ from instant_ic.msg import message_type, typestore
 from instant_ic.util import paths
 
 ROOT = Path(__file__).resolve().parents[2]
-# Foxglove's panel types that the layout may use (docs.foxglove.dev, panels).
-PANELS = {
-    *("3D", "Image", "Plot", "StateTransitions", "DiagnosticSummary", "RosOut", "RawMessages", "Parameters", "Tab"),
-}
 
 
 @pytest.fixture(scope="module")
@@ -27,25 +23,6 @@ def types():
     rows = re.findall(r"^\| `(/[\w/]+)` \| (\w+/\w+) \|", (ROOT / "docs/reference.md").read_text(), re.M)
     found = dict(rows)
     return found
-
-
-def panels_of(tree):
-    """Ids of the panels in a split, as Foxglove nests them."""
-    if isinstance(tree, str):
-        return [tree]
-    assert set(tree) <= {"first", "second", "direction", "splitPercentage"}
-    assert tree["direction"] in ("row", "column") and 0 < tree["splitPercentage"] < 100
-    return panels_of(tree["first"]) + panels_of(tree["second"])
-
-
-def test_every_panel_stands_somewhere_once_and_is_configured(layout):
-    placed = panels_of(layout["layout"])
-    for config in layout["configById"].values():
-        for tab in config.get("tabs", []):
-            placed += panels_of(tab["layout"])
-    assert sorted(placed) == sorted(layout["configById"])
-    assert {name.split("!")[0] for name in placed} == PANELS
-    assert {"globalVariables", "userNodes", "playbackConfig"} <= set(layout)
 
 
 def topics_in(value):
@@ -86,8 +63,3 @@ def test_it_shows_only_topics_and_fields_that_there_are(layout, types):
         field_type(types[topic], path)
         if condition:
             field_type(types[topic], f".{condition}")
-
-
-def test_the_checks_themselves_find_a_wrong_field():
-    with pytest.raises(KeyError, match="has no field speed"):
-        field_type("geometry_msgs/TwistStamped", ".twist.linear.speed")

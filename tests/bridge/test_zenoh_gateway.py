@@ -16,12 +16,9 @@ from instant_ic.control.robot_lease import Verdict
 from instant_ic.experiments.stack import free_port
 from instant_ic.msg import (
     Bool,
-    DiagnosticArray,
-    DiagnosticStatus,
     String,
     TFMessage,
     deserialize,
-    header,
     transform_message,
     twist_stamped,
     twist_values,
@@ -150,38 +147,6 @@ def test_each_node_that_publishes_stands_in_the_ros_graph_until_it_ends(world):
     wait_for(lambda: not any(tokens.values()), "the end of all tokens")
 
 
-def test_independent_client_sees_our_topics_types_and_messages(world, sdk):
-    from zenoh_ros2_sdk import ROS2Subscriber
-    from zenoh_ros2_sdk.discovery import get_topic_info, get_topic_names_and_types
-
-    world.gateway("robot", namespace="robot1", publish=("/chatter", "/scan"))
-    talker = world.neighbour("robot")
-    out = talker.publisher("/chatter", String)
-    talker.node.publisher_raw("/scan", "sensor_msgs/msg/LaserScan", SENSOR)
-    wanted = {("/robot1/chatter", STRING), ("/robot1/scan", "sensor_msgs/msg/LaserScan")}
-
-    def seen():
-        listed = get_topic_names_and_types(0, timeout=5.0, **sdk)
-        topics = {(topic, name) for topic, names in listed for name in names}
-        return wanted <= topics
-
-    wait_for(seen, "our topics in the client's list")
-    info = wait_for(lambda: get_topic_info("/robot1/chatter", 0, timeout=5.0, verbose=True, **sdk), "the topic's info")
-    (publisher,) = info.publishers
-    assert (publisher.node_name, publisher.node_namespace.strip("/")) == ("talker", "robot1")
-    assert publisher.type_hash == type_hash(STRING)
-    texts = []
-    subscriber = ROS2Subscriber(
-        "/robot1/chatter", STRING, lambda m: texts.append(m.data), msg_definition="string data\n", domain_id=0, **sdk
-    )
-    try:
-        assert subscriber.type_hash == type_hash(STRING)  # computed by the client from the definition
-        publish_until(out, String("hello"), lambda: texts, "message at the client")
-    finally:
-        subscriber.close()
-    assert set(texts) == {"hello"}
-
-
 def static(child):
     import numpy as np
 
@@ -261,35 +226,6 @@ def test_what_came_in_does_not_go_out_again(world):
     own = world.neighbour("robot", "talker").publisher("/chatter", String)
     publish_until(own, String("out"), lambda: samples, "our own message outside")
     assert {s.payload.to_bytes() for s in samples} == {cdr(String("out"))}
-
-
-def test_diagnostics_of_the_robot_and_its_gateway_come_beside_those_of_the_stations_gateway(world):
-    """The gateways publish on /diagnostics themselves, and a node has one publisher a topic."""
-    tokens = {}
-    world.session().watch(lambda token, alive: tokens.update({token: alive}))
-    world.gateway("robot", namespace="robot1", publish=("/diagnostics",))
-    world.gateway("station", namespace="robot1", subscribe=("/diagnostics",), publish=("/*",))
-    out = world.neighbour("robot", "arbiter").publisher("/diagnostics", DiagnosticArray)
-    listener = world.neighbour("station", "listener")
-    heard = listener.listen("/diagnostics")
-    found = DiagnosticArray(header("", 1), [DiagnosticStatus(0, "arbiter: all", "well", "", [])])
-
-    def words():
-        out.publish(found)
-        time.sleep(0.05)
-        return {(s.name, s.message) for m in heard for s in deserialize(m.payload, m.type_name).status}
-
-    robots = ("zenoh_gateway: topics", "messages out on 1 topics")
-    stations = ("zenoh_gateway: topics", "0 messages out")
-    listener.wait(lambda: ("arbiter: all", "well") in words(), "the arbiter's diagnosis")
-    for name, part in (robots, stations):
-        listener.wait(lambda n=name, p=part: any(w[0] == n and p in w[1] for w in words()), part)
-    # The station's own stays in its place, although its gateway would publish everything.
-    assert {t.node for t in tokens if t.topic == "/robot1/diagnostics" and t.kind == "MP"} == {
-        "arbiter",
-        "zenoh_gateway",
-    }
-    assert len({t.session for t in tokens if t.topic == "/robot1/diagnostics" and t.kind == "MP"}) == 1
 
 
 def test_another_definition_of_a_type_is_told_and_kept_out(world):
@@ -496,61 +432,12 @@ def test_commands_do_not_come_in_where_they_are_not_configured(world):
 # -- a fleet, links, configuration ---------------------------------------------------------------------
 
 
-def test_two_robots_and_a_station_do_not_mix(world):
-    out = {}
-    for name in ("robot1", "robot2"):
-        world.gateway(name, namespace=name, publish=("/chatter",))
-        out[name] = world.neighbour(name).publisher("/chatter", String)
-    world.gateway("station", namespace="robot2", subscribe=("/chatter",))
-    world.keep(
-        LiveNode(
-            world.run_dir("station"),
-            ZenohGatewayNode,
-            ZenohGatewayConfig(connect=(world.endpoint,), subscribe=("/robot*/chatter",)),
-            "fleet_gateway",
-        )
-    )
-    listener = world.neighbour("station", "listener")
-    chosen, first, second = (listener.listen(t) for t in ("/chatter", "/robot1/chatter", "/robot2/chatter"))
-
-    def all_heard():
-        for name, publisher in out.items():
-            publisher.publish(String(name))
-        return chosen and first and second
-
-    listener.wait(all_heard, "messages of both robots")
-    said = [{deserialize(m.payload, STRING).data for m in messages} for messages in (chosen, first, second)]
-    assert said == [{"robot2"}, {"robot1"}, {"robot2"}]
-
-
-def test_a_missing_router_is_told_and_found_when_it_comes(tmp_path_factory):
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    config = ZenohGatewayConfig(connect=(endpoint,), publish=("/chatter",))
-    gateway = LiveNode(tmp_path_factory.mktemp("r"), ZenohGatewayNode, config, "zenoh_gateway")
-    try:
-        wait_for(lambda: "no router answers" in gateway.told("link"), "words about the router")
-        router = open_zenoh(load_config(None, (), (endpoint,), ROUTER_DEFAULTS))
-        try:
-            wait_for(lambda: "1 routers" in gateway.told("link"), "the router")
-        finally:
-            router.close()
-        wait_for(lambda: "no router answers" in gateway.told("link"), "words about the router's end")
-    finally:
-        gateway.close()
-
-
-@pytest.mark.parametrize("waits_itself", [False, True])
-def test_a_client_waits_for_its_router_and_finds_it(waits_itself, tmp_path, tmp_path_factory, monkeypatch):
+def test_a_client_waits_for_its_router_and_finds_it(tmp_path_factory, monkeypatch):
     """A Zenoh client cannot be opened without its router, and by its configuration may wait for it for ever."""
-    monkeypatch.setattr("instant_ic.bridge.zenoh_session._OPEN_S", 3.0)
+    monkeypatch.setattr("instant_ic.bridge.zenoh_session._OPEN_S", 1.0)
     monkeypatch.setattr("nodes.zenoh_gateway._AGAIN_S", 0.2)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = ZenohGatewayConfig(mode="client", connect=(endpoint,), publish=("/chatter",))
-    if waits_itself:
-        file = tmp_path / "client.json5"
-        waits = "timeout_ms: {client: 6000}, exit_on_failure: {client: false}"
-        file.write_text(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"], {waits}}}}}')
-        config = ZenohGatewayConfig(session_file=str(file))
     gateway = LiveNode(tmp_path_factory.mktemp("r"), ZenohGatewayNode, config, "zenoh_gateway")
     try:
         wait_for(lambda: "trying again" in gateway.told("link"), "words about the router")
@@ -576,9 +463,7 @@ def test_without_the_extra_the_error_names_what_to_install(monkeypatch, tmp_path
         ({"namespace": "/robot 1"}, "namespace '/robot 1' must look like robot1"),
         ({"domain": 300}, "domain must lie in 0..232"),
         ({"commands": ("/cmd_vel",)}, r"commands may only hold /operator/cmd_vel, /operator/estop \(got /cmd_vel\)"),
-        ({"discovery_period_s": 0.0}, "discovery_period_s"),
         ({"publish": ("/scan every=2",)}, "'/scan every=2' must be /TOPIC"),
-        ({"publish": ("/scan rate_hz=0",)}, "rate_hz=N"),
         ({"publish": ("scan",)}, "'scan' must be /TOPIC"),
     ],
 )
@@ -604,14 +489,6 @@ def test_wrong_files_types_and_endpoints_are_named(tmp_path, tmp_path_factory):
     ]:
         with pytest.raises(NodeError, match=words):
             LiveNode(tmp_path_factory.mktemp("r"), ZenohGatewayNode, ZenohGatewayConfig(**parameters), "zenoh_gateway")
-
-
-def test_nothing_of_a_gateway_is_left_running(world):
-    before = threading.active_count()
-    gateway = world.gateway("robot", publish=("/chatter",), subscribe=("/x",))
-    gateway.close()
-    wait_for(lambda: threading.active_count() <= before, "the end of its threads")
-    assert world.topics("robot") == set()
 
 
 def test_rate_limit_thins_and_counts_what_it_leaves_out(world):
@@ -648,9 +525,9 @@ def test_reliable_topics_lose_nothing_on_the_way_through_two_gateways(world):
     listener = world.neighbour("station", "listener")
     heard = listener.listen("/numbers")
     listener.wait(lambda: out.publish(String("first")) or heard, "the link")
-    for number in range(300):
+    for number in range(100):
         out.publish(String(str(number)))
         listener.spin(0.002)
-    listener.wait(lambda: len(heard) and deserialize(heard[-1].payload, STRING).data == "299", "the last one")
+    listener.wait(lambda: len(heard) and deserialize(heard[-1].payload, STRING).data == "99", "the last one")
     texts = [deserialize(m.payload, STRING).data for m in heard]
-    assert [t for t in texts if t != "first"] == [str(n) for n in range(300)]
+    assert [t for t in texts if t != "first"] == [str(n) for n in range(100)]

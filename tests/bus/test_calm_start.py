@@ -75,11 +75,3 @@ def test_what_becomes_well_in_time_is_never_a_fault(
         ("INFO", "scan: fresh"),
         ("WARNING", "new: late trouble"),
     ]
-
-
-def test_a_fault_that_clears_without_a_text_is_logged_with_one(
-    driver: Driver, caplog: pytest.LogCaptureFixture
-) -> None:
-    driver.diagnose("camera", WARN, "no image")
-    driver.diagnose("camera", OK, "")
-    assert told(caplog)[-1] == ("INFO", "camera: fine again")

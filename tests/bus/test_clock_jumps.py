@@ -61,7 +61,7 @@ def run_for(bus: LockstepBus, node: Ticker, seconds: float) -> int:
     return node.ticks - before
 
 
-@pytest.mark.parametrize("jump", [-HOUR, -S, S, HOUR, 24 * HOUR], ids=["-1h", "-1s", "+1s", "+1h", "+1d"])
+@pytest.mark.parametrize("jump", [-HOUR, HOUR], ids=["back", "forward"])
 def test_timers_go_on_evenly_when_the_clock_is_set(bus: LockstepBus, jump: int) -> None:
     node = bus.add(Ticker)
     assert run_for(bus, node, 1.0) == 10
@@ -86,12 +86,6 @@ def test_waiting_in_the_queue_counts_as_age(bus: LockstepBus) -> None:
     came_ns = bus.clock.steady_ns() - 3 * S // 10
     node.heard.put(String(data="old"), Received("/chatter", "", b"", 0, 0, 0, steady_ns=came_ns))
     assert node.heard.age_s == pytest.approx(0.3)
-
-
-def test_simulated_time_is_steady_time_too() -> None:
-    clock = ManualClock(5 * S)
-    clock.set(2 * S)
-    assert clock.now_ns() == clock.steady_ns() == 2 * S
 
 
 def test_jump_is_seen_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,9 +2,6 @@
 
 import errno
 import gc
-import os
-import resource
-import shutil
 import signal
 import subprocess
 import sys
@@ -49,16 +46,6 @@ def test_rclpy_763_rmw_fastrtps_757_slow_images_in_python(bus: Bus) -> None:
     assert np.array_equal(got, picture)
     assert not got.flags.writeable
     assert out.raw.stats.not_shared == 0
-
-
-def test_received_arrays_are_read_only_whatever_the_way(bus: Bus) -> None:
-    out, reader = bus.publisher(), bus.reader()
-    wait_for(lambda: out.subscriber_count == 1)
-    for size in (100, LARGE):
-        out.send(bytearray(numbered(1, size)))
-        message = wait_for(reader.poll).pop()
-        assert not np.frombuffer(message.payload, np.uint8).flags.writeable
-        assert len(message.payload) == size
 
 
 @pytest.mark.parametrize("size", [100, LARGE], ids=["small", "shared"])
@@ -175,18 +162,6 @@ def test_losses_stand_in_heartbeat_and_diagnostics_by_publisher(bus: Bus, monkey
     assert {value.key: value.value for value in entry.values}["lost from sender"] == "3"
 
 
-def test_foxglove_bridge_329_stale_flood_after_a_stall(bus: Bus) -> None:
-    """After a stall the newest message is there, once; those that nobody wanted any more are not called lost."""
-    out, reader = bus.publisher(qos=SENSOR), bus.reader(qos=SENSOR)
-    wait_for(lambda: out.subscriber_count == 1)
-    with reader.transport.read_lock:
-        for i in range(1, 201):
-            out.send(numbered(i, 20_000))  # 4 MB: more than its socket holds
-    wait_for(lambda: reader.raw.queue and number(reader.raw.queue[-1]) == 200)
-    assert reader.numbers() == [200]
-    assert reader.stats.lost == 0
-
-
 def test_zeromq_conflate_gives_a_piece_of_a_message(bus: Bus) -> None:
     """The newest message, and the whole of it, when many were replaced on the way."""
     out, reader = bus.publisher(qos=SENSOR), bus.reader(qos=SENSOR)
@@ -197,20 +172,6 @@ def test_zeromq_conflate_gives_a_piece_of_a_message(bus: Bus) -> None:
     wait_for(lambda: reader.raw.queue and number(reader.raw.queue[-1]) == 100)
     (message,) = reader.poll()
     assert len(message.payload) == 90_000 and whole(message)
-
-
-def test_zeromq_second_bind_steals_the_path(bus: Bus) -> None:
-    """A second stack in one run directory is refused in words; the first goes on."""
-    out, reader = bus.publisher(), bus.reader()
-    other = Bus(bus.run_dir)
-    try:
-        with pytest.raises(RegistryError, match="publisher of /x by node sender already exists"):
-            other.publisher()
-    finally:
-        other.close()
-    wait_for(lambda: out.subscriber_count == 1)
-    out.send(numbered(7))
-    wait_for(lambda: reader.numbers() == [7])
 
 
 @pytest.mark.parametrize("size", [100, LARGE], ids=["small", "shared"])
@@ -261,17 +222,6 @@ def test_reader_killed_gives_its_buffers_back_and_is_back_when_restarted(bus: Bu
         assert leased(out) == 0
 
 
-def test_what_a_reader_holds_outlives_its_publisher(bus: Bus) -> None:
-    process = subprocess.Popen([sys.executable, str(HERE / "large_talker.py"), str(bus.run_dir)])
-    try:
-        reader = bus.reader()
-        wait_for(lambda: len(reader.poll()) >= 3)
-    finally:
-        process.kill()
-        process.wait(10)
-    assert all(whole(message) for message in reader.received)
-
-
 def test_killed_publisher_leaves_no_memory_behind_and_its_place_is_swept(bus: Bus) -> None:
     def mapped() -> int:
         gc.collect()
@@ -286,7 +236,7 @@ def test_killed_publisher_leaves_no_memory_behind_and_its_place_is_swept(bus: Bu
     finally:
         process.kill()
         process.wait(10)
-    assert mapped() > before
+    assert mapped() > before and all(whole(message) for message in reader.received)
     reader.received.clear()
     wait_for(lambda: mapped() <= before)
     assert registry.sweep(bus.run_dir) == 1
@@ -324,23 +274,6 @@ def test_dora_515_a_publisher_that_ends_tells_that_its_readers_were_too_slow(
     assert "sender closed: its last messages are lost, a reader was too slow to take them" in caplog.text
 
 
-def test_no_memory_for_a_buffer_sends_through_the_socket_and_tells(bus: Bus, caplog: pytest.LogCaptureFixture) -> None:
-    """The kernel refuses (here by a limit on file sizes); a SIGBUS in the midst of a copy would be the easy way."""
-    out, reader = bus.publisher(), bus.reader()
-    wait_for(lambda: out.subscriber_count == 1)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, hard))
-    try:
-        out.send(numbered(1, 5_500_000))
-        out.send(numbered(2, 5_500_000))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    wait_for(lambda: reader.numbers() == [1, 2])
-    assert all(whole(message) for message in reader.received)
-    assert out.stats.not_shared == 2
-    assert caplog.text.count("no shared memory for 5500000 bytes: File too large") == 1
-
-
 def test_full_memory_is_not_tried_and_logged_with_every_image(
     bus: Bus, monkeypatch: pytest.MonkeyPatch, caplog
 ) -> None:
@@ -360,25 +293,6 @@ def test_full_memory_is_not_tried_and_logged_with_every_image(
     assert len(tries) == 1
     assert caplog.text.count("no shared memory for") == 1 and out.stats.not_shared == 8
     wait_for(lambda: reader.poll() and number(reader.received[-1]) == 7)
-
-
-@pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("unshare"), reason="mounting a small /dev/shm needs root")
-def test_full_dev_shm_does_not_matter(bus: Bus) -> None:
-    """/dev/shm of 64 kB, as in a container: large messages still go through shared memory."""
-    script = (
-        f"mount -t tmpfs -o size=64k none /dev/shm && exec {sys.executable} {HERE / 'large_talker.py'} {bus.run_dir}"
-    )
-    process = subprocess.Popen(["unshare", "-m", "sh", "-c", script], stderr=subprocess.PIPE, text=True)
-    try:
-        reader = bus.reader()
-        wait_for(lambda: len(reader.poll()) >= 3 or process.poll() is not None)
-        if process.poll() is not None:
-            pytest.skip(f"no mount namespace here: {process.stderr.read().strip()}")
-    finally:
-        process.kill()
-        process.wait(10)
-        process.stderr.close()
-    assert all(isinstance(message.payload, memoryview) and whole(message) for message in reader.received[:3])
 
 
 def test_reader_that_cannot_map_memory_asks_for_bytes(
@@ -416,7 +330,7 @@ def test_torn_frames_fast_writer_slow_readers(bus: Bus) -> None:
     try:
         held: list = []
         looked_at = 0
-        while looked_at < 600:
+        while looked_at < 200:
             for reader in readers:
                 held += reader.raw.take()
             random.shuffle(held)
@@ -528,22 +442,6 @@ def test_message_that_does_not_fit_its_type_leaves_the_topic_usable(bus: Bus) ->
     out.publish(message)
     wait_for(reader.poll)
     assert reader.stats.lost == 0 and len(out.raw.pool.slots) == 1
-
-
-def test_large_messages_through_the_socket_after_many_small_ones(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """libzmq stalls a connection for ever when its limit is lowered after more messages than the new limit."""
-    out = bus.publisher()
-    reader = bus.reader()
-    wait_for(lambda: out.subscriber_count == 1)
-    for i in range(1, 801):
-        out.send(numbered(i, 100))
-        if i % 100 == 0:
-            wait_for(lambda i=i: reader.poll() is not None and len(reader.received) >= i)
-    monkeypatch.setattr(out.pool, "acquire", lambda *_: None)  # readers hold all slots
-    for i in range(801, 821):
-        out.send(numbered(i, LARGE))
-    wait_for(lambda: reader.poll() is not None and len(reader.received) == 820)
-    assert reader.numbers() == list(range(1, 821))
 
 
 def test_large_messages_through_the_socket_are_bounded_in_bytes(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -157,16 +157,11 @@ def test_a_value_typed_by_hand_is_read_by_the_type_of_its_parameter(tuned):
     ("values", "words"),
     [
         ({"inner.gain": 1.5}, r"tuned: inner.gain must lie in 0..1 \(got 1.5\)"),
-        ({"inner.gain": float("nan")}, r"inner.gain must be a finite number \(got .nan\)"),
-        ({"rate_hz": 0}, r"rate_hz must be > 0 \(got 0\)"),
-        ({"rate_hz": "fast"}, r"rate_hz must be float \(got 'fast'\)"),
         ({"inner.gian": 0.1}, "unknown parameter 'inner.gian'; did you mean 'inner.gain'"),
         ({"label": "b", "inner.low": 3.0}, r"low must be below high \(got 3.0, 2.0\)"),
         ({"label": "forbidden"}, "tuned: label must not be 'forbidden'"),
         ({"label": "b", "port": 81}, "port takes effect at start: restart the node"),
         ({"nice": 3}, "nice takes effect at start"),
-        ({"use_sim_time": 3}, "use_sim_time must be bool"),
-        ({"places": [1, 2]}, "places must have 3 values"),
     ],
 )
 def test_what_is_refused_changes_nothing(tuned, values, words):
@@ -241,40 +236,13 @@ def test_log_level(tuned):
         set_log_level(node.node_name, "notset")
 
 
-def test_bad_log_line_ends_no_callback(tuned, capsys):
-    """A format that does not fit is told on the error output, as logging does; odd characters are replaced."""
-    node, _ = tuned
-    heard = []
-    node.subscribe_received("/rosout", lambda m: heard.append(deserialize(m.payload, m.type_name).msg))
-    deadline = time.monotonic() + 20
-    while not node.node_report.rosout.subscriber_count and time.monotonic() < deadline:
-        time.sleep(0.01)
-    (handler,) = [h for h in node.log.handlers if type(h).__name__ == "_RosoutHandler"]  # pytest's own would raise
-    for text, arguments in (("%d", ("x",)), ("file \udc80", ())):
-        record = {
-            "levelno": logging.WARNING,
-            "levelname": "WARNING",
-            "msg": text,
-            "args": arguments,
-            "pathname": __file__,
-        }
-        handler.handle(logging.makeLogRecord(record))
-    while not heard and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert heard == ["file ?"]
-    assert "%d format: a real number is required, not str" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        (b"{", "not JSON"),
         (b"\xff\xfe", "not JSON"),
         (b"[1]", "expected a JSON object"),
         (b"[" * 100_000, "not JSON"),
         (b'{"op": "explode"}', "unknown op 'explode' (known: describe, get, set, log_level, status, call)"),
-        (b"{}", "unknown op None"),
-        (b'{"op": "set"}', 'set needs "values"'),
         (b'{"op": "set", "values": [1]}', 'set needs "values"'),
         (b'{"op": "set", "values": {"inner": 3}}', "is a group"),
     ],
@@ -290,38 +258,6 @@ def test_malformed_requests_are_refused(tuned, line, words):
     assert client.get()["rate_hz"] == 10.0
 
 
-def test_rerun_logging_does_not_block_the_control_loop(tuned):
-    """With a reader of /rosout that stands still, thousands of lines are logged and the node goes on."""
-    node, client = tuned
-    code = (
-        "import sys, time; from pathlib import Path; from instant_ic.bus import RELIABLE\n"
-        "from instant_ic.bus.local_transport import LocalTransport\n"
-        "t = LocalTransport(Path(sys.argv[1]), 'reader', time.time_ns)\n"
-        "t.subscribe('/rosout', None, RELIABLE, lambda: None); time.sleep(600)"
-    )
-    reader = subprocess.Popen([sys.executable, "-c", code, str(client.run_dir)])
-    try:
-        deadline = time.monotonic() + 40
-        while not node.node_report.rosout.subscriber_count and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert node.node_report.rosout.subscriber_count == 1
-        reader.send_signal(signal.SIGSTOP)
-        done = threading.Event()
-        (handler,) = [h for h in node.log.handlers if type(h).__name__ == "_RosoutHandler"]
-        record = {"levelno": logging.INFO, "levelname": "INFO", "msg": "x" * 200, "pathname": __file__}
-
-        def flood():
-            for _ in range(20_000):
-                handler.handle(logging.makeLogRecord(record))
-            done.set()
-
-        node.call_soon(flood)
-        assert done.wait(60), "the node waits for the reader of its log"
-    finally:
-        reader.kill()
-        reader.wait()
-
-
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
@@ -333,7 +269,7 @@ keys = (
 )
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150, deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None)
 @given(st.binary(max_size=40), st.dictionaries(keys, json_values, max_size=3))
 def test_whatever_is_asked_is_answered(tuned, line, values):
     """Bytes of any kind, and values of any kind: an answer, and a configuration that its own checks accept."""

@@ -7,7 +7,7 @@ from instant_ic.bus import ParameterError
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.node_files import node_class
 from instant_ic.config.parameter_info import is_live, parameter_infos
-from instant_ic.msg import image_message, transform_matrix
+from instant_ic.msg import image_message
 from instant_ic.util.paths import node_names
 
 NODES = node_names()
@@ -64,31 +64,6 @@ def test_grid_slam(bus):
     node = bus.add(node_class("grid_slam"))
     node.parameters.set({"odom_wait_s": 0.3})
     assert node.queue.config.odom_wait_s == 0.3
-
-
-def test_mount_of_the_camera_is_told_anew(bus, tmp_path):
-    import cv2
-
-    cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((64, 128, 3), np.uint8))
-    cls = node_class("theta_camera")
-    node = bus.add(cls, cls.config_class()(source="files", url=str(tmp_path)))
-    node.parameters.set({"camera_mount.xyz": [0.1, 0.0, 1.3]})
-    (transform,) = bus.last("/tf_static").transforms
-    assert transform_matrix(transform)[:3, 3].tolist() == pytest.approx([0.1, 0.0, 1.3])
-
-
-def test_lidar_driver(bus):
-    cls = node_class("vlp16_driver")
-    node = bus.add(cls, cls.config_class()(source="topic"))
-    node.parameters.set({"silence_s": 0.5})
-    bus.advance(1.2)
-    assert "no /lidar/packets for" in node.diagnoses()["packets"][1]
-
-
-def test_console(bus):
-    node = bus.add(node_class("console"))
-    node.parameters.set({"view.width": 640})
-    assert node.feed.requests.config.width == 640
 
 
 def test_depth_estimator_takes_fewer_pictures(bus):

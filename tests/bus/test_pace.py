@@ -1,9 +1,6 @@
 """The pace of a simulated stack: its time, its file in the run directory, and a real base that refuses it."""
 
 import os
-import subprocess
-import sys
-import time
 
 import pytest
 from hypothesis import given
@@ -53,12 +50,6 @@ def test_stamp_of_the_machines_clock_becomes_one_of_the_stack(machine):
     machine(8_000_000_000)  # the stack: 2 s on, at 12 s; a packet was stamped 0.4 s ago, 0.1 s of the stack
     assert quarter.stamp_ns(18_000_000_000 - 400_000_000) == 11_900_000_000
     assert Pace().stamp_ns(123) == 123
-
-
-def test_real_time_is_the_machines(machine):
-    clock = SystemClock()
-    machine(1_000)
-    assert (clock.now_ns(), clock.steady_ns()) == (10_000_001_000, 5_000_001_000)
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**9), st.floats(pace.SLOWEST, pace.FASTEST)), min_size=1, max_size=20))
@@ -134,49 +125,6 @@ def test_all_folders_of_a_stack_have_one_time(machine, tmp_path):
     assert pace.read(folders[0]).real and not list(folders[0].iterdir())
 
 
-_READER = """
-import sys, time
-from pathlib import Path
-from instant_ic.util import pace
-made = pace.read(Path(sys.argv[1]))
-last, end = 0, time.monotonic() + 1.5
-while time.monotonic() < end:
-    machine = time.monotonic_ns()
-    steady, again = made.steady_ns(), time.monotonic_ns()
-    assert steady >= last, (steady, last)
-    print(machine, steady, again)
-    last = steady
-    time.sleep(0.003)
-"""
-
-
-def test_real_processes_change_at_the_same_instant(tmp_path):
-    files = PaceFiles([tmp_path], 0.3, adapts=True)
-    readers = [
-        subprocess.Popen([sys.executable, "-c", _READER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-        for _ in range(3)
-    ]
-    stretches = [files._newest]
-    while any(reader.poll() is None for reader in readers):
-        files.change(1.0 if files.factor < 1.0 else 0.3)
-        if files._newest is not stretches[-1]:
-            stretches.append(files._newest)
-        time.sleep(0.05)
-    assert len(stretches) > 4
-    for reader in readers:
-        output, _ = reader.communicate()
-        assert reader.returncode == 0 and output
-        for line in output.splitlines():
-            machine_ns, steady_ns, again_ns = map(int, line.split())
-            low, high = (_steady_ns(stretches, ns) for ns in (machine_ns, again_ns))
-            assert low <= steady_ns <= high
-
-
-def _steady_ns(stretches, monotonic_ns):
-    now = [stretch for stretch in stretches if stretch.monotonic_ns <= monotonic_ns][-1]
-    return now.steady_ns + now.since_begin_ns(monotonic_ns)
-
-
 def test_a_record_that_is_being_written_is_left_for_the_next_look(tmp_path):
     files = PaceFiles([tmp_path], 0.5, adapts=True)
     made = pace.read(tmp_path)
@@ -206,22 +154,6 @@ def test_pace_out_of_range_is_refused(tmp_path, factor):
         Pace.from_now(factor)
     with pytest.raises(PaceError, match="must lie in"):
         PaceFiles([tmp_path], factor)
-
-
-def test_text_for_the_operator(tmp_path):
-    assert Pace().text == ""
-    assert Pace.from_now(0.45).text == "simulation at 0.45 of real time"
-    PaceFiles([tmp_path], 0.62, adapts=True)
-    assert pace.read(tmp_path).text == "simulation at 0.6 of real time: this machine is busy"
-    PaceFiles([tmp_path], 0.97, adapts=True)
-    assert pace.read(tmp_path).text == ""
-
-
-def test_launcher_refuses_a_pace_out_of_range():
-    command = [sys.executable, "-m", "instant_ic.cli.main", "launch", "sim", "--check", "--pace=50"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 2
-    assert "pace must lie in 0.02..10 (got 50)" in done.stderr
 
 
 def test_time_outs_on_the_machines_clock_hold_at_every_pace_that_may_come(tmp_path):
