@@ -34,8 +34,6 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         self._live = LiveTopics(self.run_dir)
         self._choice = TopicChoice(self.config.topics, self.config.exclude)
         self.recorder = self._recorder(self.config.folder(), self.config, ExitStack())
-        if self.config.start_paused:
-            self.recorder.pause()
         what = f"keeping the last {self.config.snapshot_seconds:g} s for" if self.config.snapshot else "recording into"
         self.log.info("%s %s", what, self.recorder.path)
         self._stopped: dict[str, bool] = {}
@@ -48,7 +46,6 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             "pause": self.recorder.pause,
             "resume": self.recorder.resume,
             "toggle": self.recorder.toggle,
-            "split": self.recorder.split,
             "snapshot": self._snapshot,
             "record": self._record,
             "stop": lambda: {"path": str(self._on_request().stop())},

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, NoReturn
 
 import yaml
 
@@ -19,10 +16,6 @@ if TYPE_CHECKING:
 
 MOST_CHUNK_BYTES = 256 << 20
 """Largest decompressed chunk or message. Recorders close chunks at about 1 MB, but a single message may be larger."""
-MOST_FILE_BYTES = 64 << 30
-"""Largest decompressed size of a file that was compressed as a whole."""
-_FREE_BYTES = 2 << 30
-"""Space that must stay free on the disk such a file is unpacked to."""
 _PIECE = 1 << 20
 
 
@@ -59,7 +52,7 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
 
 
 def guard_rosbags() -> None:
-    """Add size limits to `rosbags`, which has none: MCAP chunks, messages, whole files, SQLite values, YAML.
+    """Add size limits to `rosbags`, which has none: MCAP chunks, messages, SQLite values, YAML.
 
     This replaces the decompressor tables and YAML readers of `rosbags`; a test checks that `rosbags` uses the
     replacements.
@@ -77,7 +70,7 @@ def guard_rosbags() -> None:
     storage_mcap.DECOMPRESSORS["lz4"] = lambda data, size: decompress(data, "lz4", size)
     storage_mcap.DECOMPRESSORS["zstd"] = lambda data, size: decompress(data, "zstd", size)
     ros2.zstd = SimpleNamespace(  # type: ignore[assignment]
-        decompress=lambda data: decompress(data, "zstd"), open=_open_zstd
+        decompress=lambda data: decompress(data, "zstd"), open=_refuse_file
     )
     if _limit_schema not in apsw.connection_hooks:
         apsw.connection_hooks.append(_limit_schema)
@@ -115,35 +108,9 @@ def _limit_schema(connection: apsw.Connection) -> None:
     connection.config(apsw.SQLITE_DBCONFIG_ENABLE_VIEW, 0)
 
 
-@contextmanager
-def _open_zstd(stream: BinaryIO, _mode: str) -> Iterator[_FileLimit]:
-    import zstandard
-
-    with zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True, closefd=False) as reader:
-        yield _FileLimit(reader)
-
-
-class _FileLimit:
-    """A stream that raises at the file size limit, or before the disk for temporary files is full."""
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-        self._left = min(MOST_FILE_BYTES, shutil.disk_usage(tempfile.gettempdir()).free - _FREE_BYTES)
-
-    def read(self, size: int = _PIECE) -> bytes:
-        """Return the next piece.
-
-        Raises:
-            BagError: the limit is reached.
-        """
-        piece = self._stream.read(size)
-        self._left -= len(piece)
-        if piece and self._left < 0:
-            raise BagError(
-                f"a compressed file of the bag unpacks to more than {MOST_FILE_BYTES >> 30} GB, or to more than "
-                f"{tempfile.gettempdir()} has room for; set TMPDIR to a larger disk"
-            )
-        return piece
+def _refuse_file(stream: object, _mode: str) -> NoReturn:
+    name = getattr(stream, "name", "a file")
+    raise BagError(f"{name} is compressed as a whole; convert its bag first: rosbags-convert --src BAG --dst NEW")
 
 
 def _zstd(data: bytes) -> Iterator[bytes]:

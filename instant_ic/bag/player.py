@@ -15,7 +15,6 @@ from instant_ic.bag.files import BagReader, TopicSummary
 from instant_ic.bag.latched import LatchedValues
 from instant_ic.bag.message import BagMessage
 from instant_ic.bag.metadata import schema_or_unknown
-from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.heartbeat import EVERY_NODES
 from instant_ic.config.ranges import Checked, NotNegative, Range
@@ -244,8 +243,8 @@ class BagPlayer:
             self._send_latched_before(begin_ns, send)
             with self._lock:
                 self._anchor(begin_ns)
-            with ReadAhead(self._messages(set(self._types), begin_ns, self.end_ns + 1), stop) as messages:
-                finished = self._play_once(messages, send, stop, on_clock)
+            messages = self._messages(set(self._types), begin_ns, self.end_ns + 1)
+            finished = self._play_once(messages, send, stop, on_clock)
             if stop.is_set():
                 return False
             if not finished:
@@ -258,7 +257,7 @@ class BagPlayer:
 
     def _play_once(
         self,
-        messages: ReadAhead,
+        messages: Iterator[BagMessage],
         send: Callable[[BagMessage], None],
         stop: threading.Event,
         on_clock: Callable[[int], None],

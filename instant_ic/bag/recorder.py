@@ -72,7 +72,6 @@ class BagRecorderConfig(Checked):
         exclude: names or patterns of the topics to leave out.
         discovery_period_s: seconds between searches for new topics.
         duration_s: seconds after which recording ends; 0 records until stopped.
-        start_paused: record only after a resume command.
         snapshot_after_s: seconds after the request that a snapshot also holds.
     """
 
@@ -89,7 +88,6 @@ class BagRecorderConfig(Checked):
     exclude: tuple[str, ...] = ()
     discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
     duration_s: NotNegative = 0.0
-    start_paused: bool = False
     snapshot_after_s: NotNegative = 2.0
 
     def folder(self) -> Path:
@@ -104,7 +102,6 @@ class _Dropped:
 
     overflow: Counter[str] = field(default_factory=Counter)
     paused: Counter[str] = field(default_factory=Counter)
-    no_type: Counter[str] = field(default_factory=Counter)
 
 
 class Recorder:
@@ -203,9 +200,7 @@ class Recorder:
     ) -> None:
         """Queue one message; never waits. The payload is copied, since its memory may be overwritten."""
         stamp_ns = self._stamp_ns(publish_ns)
-        if not type_name:
-            self.dropped.no_type[topic] += 1
-        elif stamp_ns <= 0:  # a node on simulated time before the first /clock: the message has no time
+        if stamp_ns <= 0:  # a node on simulated time before the first /clock: the message has no time
             self.early += 1
         else:
             qos = self._qos.get(topic, SENSOR)
@@ -233,16 +228,6 @@ class Recorder:
             self.resume()
         else:
             self.pause()
-
-    def split(self) -> None:
-        """End the current file; the next message starts another.
-
-        Raises:
-            ValueError: snapshot mode has no file to split.
-        """
-        if self._thread.writer is None:
-            raise ValueError("snapshot mode has no file to split")
-        self._thread.queue.put(self._thread.end_part)
 
     def snapshot(self, reason: str = "", after_s: float = 0.0) -> BagSnapshot:
         """Write the messages in memory into a separate bag after ``after_s`` more seconds.
@@ -401,7 +386,6 @@ class Recorder:
             "overflow": self.dropped.overflow,
             "paused": self.dropped.paused,
             "disk_full": self._thread.lost(),
-            "no_type": self.dropped.no_type,
             "parameters": self._parameters,
         }
         found = {key: dict(value) for key, value in found.items() if value or key in ("lost", "parameters")}

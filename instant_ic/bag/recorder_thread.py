@@ -145,12 +145,6 @@ class RecorderThread:
         if self.state == FAILED:
             raise BagError(self.error)
 
-    def end_part(self) -> None:
-        """Complete the current file; runs on the writing thread."""
-        if self.writer is not None and self.state == RECORDING and not self.writer.part_is_empty:
-            self.set_custom(self.writer)
-            self.writer.end_part()
-
     def set_custom(self, writer: BagWriter) -> None:
         """Store losses and parameters with a bag."""
         for key, value in self._custom().items():

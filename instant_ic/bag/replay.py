@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import functools
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,6 @@ from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagReader
 from instant_ic.bag.message import BagMessage
 from instant_ic.bag.player import NEVER_PLAYED
-from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.lockstep import LockstepBus, Record
@@ -162,13 +159,12 @@ def replay(
                     made_frames.update(t.child_frame_id for t in transforms)
                 writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
 
-            with LockstepBus(start_ns=reader.start_ns, keep=False, on_record=record) as bus, ExitStack() as stack:
+            with LockstepBus(start_ns=reader.start_ns, keep=False, on_record=record) as bus:
                 running = [bus.add(node.node_class, node.config, node.name) for node in nodes]
                 _check_types(reader, bus)
                 span_ns = max(1, reader.end_ns - reader.start_ns)
                 result.bag_s, result.setup_s = span_ns / 1e9, time.monotonic() - began_s
-                messages = stack.enter_context(ReadAhead(reader.current_messages(), threading.Event()))
-                for message in messages:
+                for message in reader.current_messages():
                     _feed(message, bus, running, made_frames, result)
                     if on_progress is not None:
                         on_progress((message.stamp_ns - reader.start_ns) / span_ns)

@@ -93,11 +93,6 @@ class BagWriter(Closing):
         """Number of files so far."""
         return len(self._done) + (self._part is not None)
 
-    @property
-    def part_is_empty(self) -> bool:
-        """True while the current file has no messages."""
-        return self._part is None or not self._part.given
-
     def write(
         self,
         topic: str,

@@ -23,7 +23,6 @@ _LEFT_OUT = {
     "overflow": "left out because the disk was too slow",
     "disk_full": "left out while the disk was full",
     "paused": "left out while paused",
-    "no_type": "left out because the publisher's type was unknown",
 }
 
 

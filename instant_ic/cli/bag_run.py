@@ -98,7 +98,6 @@ def record(args: argparse.Namespace) -> int:
         min_free_mb=args.min_free // 1_000_000,
         snapshot=args.snapshot,
         max_cache_mb=_megabytes(args.max_cache_size),
-        start_paused=args.start_paused,
     )
     if args.snapshot:
         words += _parameters(snapshot_seconds=args.snapshot_seconds, snapshot_after_s=args.snapshot_after)
@@ -149,7 +148,7 @@ def snapshot(args: argparse.Namespace) -> int:
 def control(args: argparse.Namespace) -> int:
     arguments = argument_of(args.command, args.value)
     on_request = args.command in ("record", "stop")
-    kinds = ("bag_player",) if arguments else ("bag_recorder",) if on_request or args.command == "split" else _STEERED
+    kinds = ("bag_player",) if arguments else ("bag_recorder",) if on_request else _STEERED
     node = _node(kinds, args.node, keeps_snapshots=on_request)
     result = _call(NodeControl(run_dir(), node.name), args.command, **arguments)
     if args.command == "status":

@@ -41,7 +41,6 @@ def level_memory() -> Iterator[None]:
 @pytest.fixture
 def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bounded, "MOST_CHUNK_BYTES", 2 * MB)
-    monkeypatch.setattr(bounded, "MOST_FILE_BYTES", 2 * MB)
 
 
 def packed(compression: str) -> bytes:
@@ -105,10 +104,9 @@ def ros2_bag(mode: CompressionMode, storage: StoragePlugin) -> Callable[[Path], 
     "write",
     [
         ros2_bag(CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
-        ros2_bag(CompressionMode.FILE, StoragePlugin.SQLITE3),
         ros2_bag(CompressionMode.STORAGE, StoragePlugin.MCAP),
     ],
-    ids=["sqlite-message", "sqlite-file", "mcap"],
+    ids=["sqlite-message", "mcap"],
 )
 def test_every_kind_of_bag_is_limited(
     tmp_path: Path, write: Callable[[Path], Path], small_limits: None, monkeypatch: pytest.MonkeyPatch
@@ -118,7 +116,6 @@ def test_every_kind_of_bag_is_limited(
         list(bag.messages())
     # Above the limit it is not the bag that is at fault.
     monkeypatch.setattr(bounded, "MOST_CHUNK_BYTES", 2 * BOMB)
-    monkeypatch.setattr(bounded, "MOST_FILE_BYTES", 2 * BOMB)
     with BagReader(path) as bag:
         assert bag.count == 1
         assert len(next(iter(bag.messages())).payload) >= BOMB - 8

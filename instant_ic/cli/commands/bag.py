@@ -9,7 +9,7 @@ from instant_ic.cli import completion
 from instant_ic.cli.arguments import group, verb
 from instant_ic.cli.errors import UserError
 
-COMMANDS = ("pause", "resume", "toggle", "step", "rate", "seek", "split", "record", "stop", "status")
+COMMANDS = ("pause", "resume", "toggle", "step", "rate", "seek", "record", "stop", "status")
 _VALUES = {"step": "count", "rate": "rate", "seek": "offset_s"}
 
 
@@ -44,7 +44,6 @@ def _add_record(verbs: Any) -> None:
     add("--snapshot-after", **_SPAN, default=2.0, help="seconds to include after the snapshot (default: 2)")
     text = "memory limit for a snapshot (default: 256MB)"
     add("--max-cache-size", type=size, default=256_000_000, metavar="SIZE", help=text)
-    add("--start-paused", action="store_true", help="wait for resume before recording")
     add("--use-sim-time", action="store_true", help="stamp messages with /clock, for example from a playing bag")
 
 
