@@ -53,8 +53,6 @@ SPARE_M = 0.05
 """A goal is reachable if the footprint with this margin on every side can get there."""
 TURNING_RAD_S = 0.1
 """Below this yaw rate the robot does not count as turning when changes of direction are counted."""
-LET_GO_M = 0.1
-"""A contact with a person ends when they are this far apart again."""
 OPERATOR_M_S = 0.4
 
 
@@ -63,7 +61,6 @@ class Episode:
     """Result of one drive."""
 
     index: int
-    people: int
     reachable: bool
     reached: bool = False
     seconds: float = 0.0
@@ -71,10 +68,6 @@ class Episode:
     driven_m: float = 0.0
     contacts: int = 0
     """Number of contacts of the robot with a wall or an object."""
-    people_contacts: int = 0
-    """Number of times the robot drove into a person."""
-    people_into_robot: int = 0
-    """Number of times a person walked into the robot while it stood or drove away."""
     yaw_rate_changes: int = 0
     """Sign changes of the yaw rate beyond TURNING_RAD_S on both sides."""
     clearance_m: float = math.inf
@@ -85,7 +78,7 @@ class Episode:
     controller_ms: list[float] = field(default_factory=list)
     costmap_ms: list[float] = field(default_factory=list)
     tracks: dict[str, list[list[float]]] = field(default_factory=dict)
-    """Tracks of ``robot``, ``vbot`` and each person, for the plot."""
+    """Tracks of ``robot`` and ``vbot``, for the plot."""
 
     @property
     def ratio(self) -> float:
@@ -112,13 +105,12 @@ class FollowDrive:
 
     def __init__(self, seed: int, index: int) -> None:
         self.rng = np.random.default_rng([seed, index])
-        self.room = worlds.make_room(self.rng, hanging=index % 3 == 0)
+        self.room = worlds.make_room(self.rng, low=index % 3 == 0)
         self.mask = worlds.filled(self.room.shapes, self.room.size, 0.01, worlds.IN_THE_WAY_M)
         coarse = worlds.filled(self.room.shapes, self.room.size, 0.025, worlds.IN_THE_WAY_M)
         goal = np.array([*self.room.goal, 0.0])
         self.optimum = worlds.shortest_way(coarse, self.room.start, goal, SPARE_M)
-        self.people = worlds.add_people(self.room, self.rng, int(self.rng.integers(1, 4))) if index % 5 == 0 else []
-        self.episode = Episode(index, len(self.people), self.optimum is not None)
+        self.episode = Episode(index, self.optimum is not None)
         if self.optimum is not None:
             self.episode.optimum_m = float(np.linalg.norm(np.diff(self.optimum[:, :2], axis=0), axis=1).sum())
         start: tuple[float, float, float] = tuple(float(v) for v in self.room.start)  # type: ignore[assignment]
@@ -129,7 +121,6 @@ class FollowDrive:
         )
         self.velocity = (0.0, 0.0)
         self.pose_error = np.zeros(3)
-        self.touching: set[int] = set()
 
         limits, footprint = MotionLimits(), Footprint()
         self.config = CostmapConfig()
@@ -150,7 +141,9 @@ class FollowDrive:
 
     def _map(self) -> StaticMap:
         """Return the map that SLAM would build of the empty room: walls, free inside, unknown outside."""
-        walls = worlds.filled(self.room.shapes[self.room.kinds == 0], self.room.size, 0.05, worlds.IN_THE_WAY_M)
+        walls = worlds.filled(
+            self.room.shapes[self.room.kinds == worlds.WALL], self.room.size, 0.05, worlds.IN_THE_WAY_M
+        )
         occupancy = np.full(walls.cells.shape, -1, dtype=np.int8)
         centres = [walls.origin[i] + (np.arange(walls.cells.shape[1 - i]) + 0.5) * 0.05 for i in (0, 1)]
         inside = [(c > 0) & (c < s) for c, s in zip(centres, self.room.size, strict=True)]
@@ -183,7 +176,6 @@ class FollowDrive:
         episode.contacts = self.robot.contacts
         episode.reason = "" if episode.reached else self.plan_reason
         episode.planner_ms = self.planner.spent_ms
-        tracks |= {f"person {i}": person.track for i, person in enumerate(self.people)}
         episode.tracks = {name: np.round(np.array(track), 3).tolist() for name, track in tracks.items()}
         return episode
 
@@ -195,11 +187,7 @@ class FollowDrive:
         return float(np.hypot(gap[0], gap[1])) <= REACHED_M and abs(wrap_angle(float(gap[2]))) <= REACHED_RAD
 
     def step(self, k: int) -> None:
-        """Advance by a twentieth of a second: people, sensors, the nodes in their order, and the robot."""
-        for person in self.people:
-            worlds.walk(self.room, person, self.robot.pose, DT_S, self.rng)
-            if k % 4 == 0:
-                person.track.append(person.place.copy())
+        """Advance by a twentieth of a second: sensors, the nodes in their order, and the robot."""
         self.pose_error = 0.95 * self.pose_error + self.rng.normal(0.0, [0.005, 0.005, 0.002])
         estimate = self.robot.pose + self.pose_error
         if k % 2 == 0:
@@ -244,7 +232,7 @@ class FollowDrive:
         return (0.0 if abs(bearing) > 0.6 else OPERATOR_M_S), min(max(1.5 * bearing, -0.8), 0.8)
 
     def _see(self, estimate: FloatArray, time_s: float, publish: bool) -> None:
-        points = worlds.look(self.room, self.people, self.robot.pose, self.rng)
+        points = worlds.look(self.room.shapes, self.robot.pose, self.rng)
         ranges = worlds.flat_ranges(points)
         beam = 2 * math.pi / worlds.BEAMS
         scan = (ranges, -math.pi + beam / 2, beam, worlds.RANGE_MIN_M, worlds.RANGE_MAX_M)
@@ -286,22 +274,10 @@ class FollowDrive:
             hard = LimitsConfig().hard_decel_m_s2
             turning = 2.0 * hard / SkidSteerConfig().effective_width
             limits = replace(limits, max_linear_accel_m_s2=hard, max_angular_accel_rad_s2=turning)
-        steering, before = self.robot.kinematics, self.robot.pose.copy()
+        steering = self.robot.kinematics
         for _ in range(3):
             self.velocity = accelerate(self.velocity, asked.command, limits, DT_S / 3)
             self.robot.step(steering.motors_from_tracks(steering.tracks_from_twist(*self.velocity)), DT_S / 3)
-        for i, person in enumerate(self.people):
-            gap, _ = worlds.gap_to_robot(person.place, self.robot.pose)
-            if gap > LET_GO_M:
-                self.touching.discard(i)
-            elif gap <= 0.0 and i not in self.touching:
-                self.touching.add(i)
-                # Who caused the contact: would they be as close if the robot had not moved?
-                closer = worlds.gap_to_robot(person.place, before)[0] - gap
-                if closer > 0.05 * DT_S:
-                    self.episode.people_contacts += 1
-                else:
-                    self.episode.people_into_robot += 1
 
     def _clearance(self, pose: FloatArray) -> float:
         """Return the distance in metres from the footprint's outline to the nearest static object."""
@@ -350,18 +326,14 @@ def summary(episodes: list[Episode]) -> dict[str, Any]:
     slowness = np.array([e.seconds * OPERATOR_M_S / e.optimum_m for e in reached])
     metres = sum(e.driven_m for e in episodes)
     changes = sum(e.yaw_rate_changes for e in episodes)
-    contacts = sum(e.contacts + e.people_contacts for e in episodes)
+    contacts = sum(e.contacts for e in episodes)
     share = len(reached) / len(reachable) if reachable else math.nan
     figures: dict[str, Any] = {
         "episodes": len(episodes),
-        "episodes_with_people": sum(e.people > 0 for e in episodes),
         "reachable": len(reachable),
         "reached": len(reached),
         "reached_share": share,
         "contacts": contacts,
-        "contacts_with_things": sum(e.contacts for e in episodes),
-        "contacts_with_people": sum(e.people_contacts for e in episodes),
-        "people_walked_into_robot": sum(e.people_into_robot for e in episodes),
         "clearance_min_m": min(e.clearance_m for e in episodes),
         "path_ratio_mean": _reduced(np.mean, ratios),
         "path_ratio_max": _reduced(np.max, ratios),
@@ -406,7 +378,7 @@ def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None
 
     def badness(e: Episode) -> tuple[float, ...]:
         missed = e.reachable and not e.reached
-        return (e.contacts + e.people_contacts, float(missed), e.ratio if e.reachable else 0.0)
+        return (e.contacts, float(missed), e.ratio if e.reachable else 0.0)
 
     shown = sorted(episodes, key=badness, reverse=True)[:most]
     columns = min(4, len(shown))
@@ -416,9 +388,7 @@ def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None
         _plot_episode(axes, episode, FollowDrive(seed, episode.index))
     for axes in grid.flat[len(shown) :]:
         axes.set_axis_off()
-    figure.suptitle(
-        "red: robot, blue: v-bot, dashed: shortest way; olive: low things, purple: hanging, green: people", fontsize=9
-    )
+    figure.suptitle("red: robot, blue: v-bot, dashed: shortest way; olive: low things", fontsize=9)
     save_figure(figure, path)
 
 
@@ -428,18 +398,18 @@ def _plot_episode(axes: Any, episode: Episode, drive: FollowDrive) -> None:
     for shape, kind in zip(drive.room.shapes, drive.room.kinds, strict=True):
         cx, cy, half_x, half_y, yaw = shape[:5]
         corner, size = (cx - half_x, cy - half_y), (2 * half_x, 2 * half_y)
-        colour = ("0.25", "0.55", "tab:olive", "tab:purple")[int(kind)]
+        colour = ("0.25", "0.55", "tab:olive")[int(kind)]
         axes.add_patch(Rectangle(corner, *size, angle=math.degrees(yaw), rotation_point="center", lw=0, color=colour))
     if drive.optimum is not None:
         axes.plot(*drive.optimum[:, :2].T, "k--", lw=0.8)
     for name, track in episode.tracks.items():
-        colour, width = {"robot": ("tab:red", 1.6), "vbot": ("tab:blue", 1.0)}.get(name, ("tab:green", 0.6))
+        colour, width = {"robot": ("tab:red", 1.6), "vbot": ("tab:blue", 1.0)}[name]
         axes.plot(*np.array(track).reshape(len(track), -1)[:, :2].T, color=colour, lw=width)
     axes.plot(*drive.room.start[:2], "o", color="tab:orange", ms=6)
     axes.plot(*drive.room.goal, "k*", ms=8)
     verdict = "reached" if episode.reached else ("not reached" if episode.reachable else "unreachable")
     ratio = f", {episode.ratio:.2f} × optimum" if episode.reachable and episode.reached else ""
-    touched = f", {episode.contacts + episode.people_contacts} contacts"
+    touched = f", {episode.contacts} contacts"
     axes.set_title(f"{episode.index}: {verdict}{ratio}{touched}, {episode.seconds:.0f} s", fontsize=8)
     width, height = drive.room.size
     axes.set(aspect="equal", xlim=(-0.3, width + 0.3), ylim=(-0.3, height + 0.3))

@@ -1,7 +1,7 @@
-"""Rooms for ``ic evaluate follow``: walls with doors, boxes, low and hanging objects, people; and a simulated LiDAR.
+"""Rooms for ``ic evaluate follow``: walls with doors, boxes and low objects; and a simulated LiDAR.
 
-Everything is computed from the shapes themselves and shares no code with the code under evaluation: the LiDAR, contacts
-with people, and the shortest path of the true footprint.
+LiDAR and shortest path of the true footprint are computed from the shapes themselves and share no code with the code
+under evaluation.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -30,11 +30,10 @@ IN_THE_WAY_M = (0.05, 1.25)
 """Height range in which an object blocks the robot: the crawler with its mast."""
 LENGTH_M, WIDTH_M = 0.60, 0.50
 WALL_M = 0.10
-PERSON_M = 0.22
-"""Radius of a person."""
-KINDS = ("wall", "box", "low", "hanging")
-STEEPEST = math.tan(math.radians(15.0))
-"""Slope of the lowest and the highest ring."""
+BLIND_M = LIDAR_HEIGHT_M / math.tan(math.radians(15.0))
+"""Distance within which a standing VLP-16 may miss a low object: its lowest ring looks 15° down."""
+WALL, BOX, LOW = range(3)
+"""Kinds of shapes."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class Room:
     Attributes:
         size: (2,) metres; the room extends from (0, 0) to this corner.
         shapes: (N, 7) centre x, y, half length, half width, yaw, lowest and highest z.
-        kinds: (N,) index into KINDS.
+        kinds: (N,) ``WALL``, ``BOX`` or ``LOW``.
         start: (3,) pose of the r-bot.
         goal: (2,) goal of the v-bot.
         route: (M, 2) the v-bot's path to the goal: around walls, through everything else.
@@ -56,25 +55,6 @@ class Room:
     start: FloatArray
     goal: FloatArray
     route: FloatArray
-
-
-@dataclass
-class Person:
-    """A person who walks from place to place.
-
-    Attributes:
-        place: (2,) metres.
-        target: (2,) current destination.
-        speed: m/s.
-        looks: True: stops before a robot in the way; False: walks into it.
-    """
-
-    place: FloatArray
-    target: FloatArray
-    speed: float
-    looks: bool
-    waited_s: float = 0.0
-    track: list[FloatArray] = field(default_factory=list)
 
 
 def filled(shapes: FloatArray, size: FloatArray, cell_m: float, band: tuple[float, float]) -> OccupancyMask:
@@ -99,7 +79,7 @@ def filled(shapes: FloatArray, size: FloatArray, cell_m: float, band: tuple[floa
     return OccupancyMask(cells, np.array([-margin, -margin]), cell_m)
 
 
-def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> Room:
+def make_room(rng: np.random.Generator, low: bool, attempts: int = 200) -> Room:
     """Generate a random room whose goal is at least 5 m from the start, by a path around the walls.
 
     Raises:
@@ -111,18 +91,18 @@ def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> R
         walls = np.array(shapes)
         plan = filled(walls, size, 0.05, IN_THE_WAY_M)
         for _ in range(int(rng.integers(6, 14))):
-            kind = int(rng.choice([1, 1, 1, 2, 3])) if hanging else 1
+            kind = int(rng.choice([BOX, BOX, BOX, LOW])) if low else BOX
             shapes.append(_thing(rng, size, kind))
             kinds.append(kind)
         every = np.array(shapes)
         # Remove objects at the start and the goal.
         start = np.array([*rng.uniform([0.8, 0.8], size - 0.8), rng.uniform(-math.pi, math.pi)])
         goal = rng.uniform([0.8, 0.8], size - 0.8)
-        # A robot that drove to its start has seen the low and hanging objects around it. A robot placed there has not:
-        # no beam reaches them, so no planner could avoid them.
+        # A robot that drove to its start has seen the low objects around it. A robot placed there has not: no beam
+        # reaches them, so no planner could avoid them.
         clear = np.array(
             [
-                k == 0 or (_away(s, start[:2]) > max(0.6, blind_distance_m(s, KINDS[k])) and _away(s, goal) > 0.6)
+                k == WALL or (_away(s, start[:2]) > (BLIND_M if k == LOW else 0.6) and _away(s, goal) > 0.6)
                 for s, k in zip(every, kinds, strict=True)
             ]
         )
@@ -154,7 +134,7 @@ def _walls(rng: np.random.Generator, size: FloatArray) -> tuple[list[Sequence[fl
             shapes.append(
                 (at, centre, half, reach, 0.0, 0.0, 2.5) if across else (centre, at, reach, half, 0.0, 0.0, 2.5)
             )
-    return shapes, [0] * len(shapes)
+    return shapes, [WALL] * len(shapes)
 
 
 def _thing(rng: np.random.Generator, size: FloatArray, kind: int) -> Sequence[float]:
@@ -162,19 +142,10 @@ def _thing(rng: np.random.Generator, size: FloatArray, kind: int) -> Sequence[fl
     half_x, half_y = rng.uniform(0.1, 0.45), rng.uniform(0.1, 0.45)
     if rng.random() < 0.2:
         half_x = half_y = rng.uniform(0.03, 0.06)  # a post or a table leg
-    low, high = {1: (0.0, rng.uniform(0.4, 1.8)), 2: (0.0, rng.uniform(0.08, 0.25)), 3: (rng.uniform(0.75, 1.1), 2.0)}[
-        kind
-    ]
-    if kind == 2:
+    high = rng.uniform(0.08, 0.25) if kind == LOW else rng.uniform(0.4, 1.8)
+    if kind == LOW:
         half_x, half_y = max(half_x, 0.1), max(half_y, 0.1)
-    return (x, y, half_x, half_y, rng.uniform(-math.pi, math.pi), low, high)
-
-
-def blind_distance_m(shape: Sequence[float] | FloatArray, kind: str) -> float:
-    """Return the distance in metres within which a standing VLP-16 may miss a low or hanging object; else 0."""
-    if kind == "hanging":
-        return (float(shape[5]) - LIDAR_HEIGHT_M) / STEEPEST
-    return LIDAR_HEIGHT_M / STEEPEST if kind == "low" else 0.0
+    return (x, y, half_x, half_y, rng.uniform(-math.pi, math.pi), 0.0, high)
 
 
 def _away(shape: Sequence[float] | FloatArray, point: FloatArray) -> float:
@@ -192,15 +163,14 @@ def _length(path: FloatArray) -> float:
 # -- the LiDAR
 
 
-def look(room: Room, people: Sequence[Person], pose: FloatArray, rng: np.random.Generator) -> FloatArray:
+def look(shapes: FloatArray, pose: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return the points (N, 3) of one revolution in the LiDAR's frame, with 1.5 cm of noise.
 
     z points up and x along the robot's heading.
     """
-    circles = np.array([[*p.place, PERSON_M] for p in people]).reshape(-1, 3)
     angles = -math.pi + 2 * math.pi * (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS
     slopes = np.tan(np.radians(RINGS_DEG))
-    flat = _cast(room.shapes, circles, float(pose[0]), float(pose[1]), float(pose[2]), angles, slopes)
+    flat = _cast(shapes, float(pose[0]), float(pose[1]), float(pose[2]), angles, slopes)
     slant = np.hypot(1.0, slopes)[None]
     ranges = flat * slant
     seen = (ranges > RANGE_MIN_M) & (ranges < RANGE_MAX_M)
@@ -221,7 +191,7 @@ def flat_ranges(points: FloatArray) -> FloatArray:
 
 
 @njit(cache=True)
-def _cast(shapes, circles, x, y, yaw, angles, slopes):  # type: ignore[no-untyped-def]
+def _cast(shapes, x, y, yaw, angles, slopes):  # type: ignore[no-untyped-def]
     """Return the horizontal distance (A, R) to the first object along each azimuth and ring; inf for none."""
     out = np.full((angles.shape[0], slopes.shape[0]), np.inf)
     for a in range(angles.shape[0]):
@@ -229,30 +199,20 @@ def _cast(shapes, circles, x, y, yaw, angles, slopes):  # type: ignore[no-untype
         for k in range(slopes.shape[0]):
             if slopes[k] < 0.0:
                 out[a, k] = -LIDAR_HEIGHT_M / slopes[k]
-        for i in range(shapes.shape[0] + circles.shape[0]):
-            if i < shapes.shape[0]:
-                cos, sin = math.cos(shapes[i, 4]), math.sin(shapes[i, 4])
-                px, py = x - shapes[i, 0], y - shapes[i, 1]
-                ox, oy = cos * px + sin * py, cos * py - sin * px
-                ex, ey = cos * dx + sin * dy, cos * dy - sin * dx
-                near, far = -np.inf, np.inf
-                for o, e, half in ((ox, ex, shapes[i, 2]), (oy, ey, shapes[i, 3])):
-                    if abs(e) < 1e-12:
-                        if abs(o) > half:
-                            near = np.inf
-                    else:
-                        t0, t1 = (-half - o) / e, (half - o) / e
-                        near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
-                low, high = shapes[i, 5], shapes[i, 6]
-            else:
-                j = i - shapes.shape[0]
-                px, py = x - circles[j, 0], y - circles[j, 1]
-                b, c = px * dx + py * dy, px * px + py * py - circles[j, 2] ** 2
-                root = b * b - c
-                near, far = np.inf, -np.inf
-                if root > 0.0:
-                    near, far = -b - math.sqrt(root), -b + math.sqrt(root)
-                low, high = 0.0, 1.7
+        for i in range(shapes.shape[0]):
+            cos, sin = math.cos(shapes[i, 4]), math.sin(shapes[i, 4])
+            px, py = x - shapes[i, 0], y - shapes[i, 1]
+            ox, oy = cos * px + sin * py, cos * py - sin * px
+            ex, ey = cos * dx + sin * dy, cos * dy - sin * dx
+            near, far = -np.inf, np.inf
+            for o, e, half in ((ox, ex, shapes[i, 2]), (oy, ey, shapes[i, 3])):
+                if abs(e) < 1e-12:
+                    if abs(o) > half:
+                        near = np.inf
+                else:
+                    t0, t1 = (-half - o) / e, (half - o) / e
+                    near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
+            low, high = shapes[i, 5], shapes[i, 6]
             if near > far or far < 0.0:
                 continue
             near = max(near, 0.0)
@@ -268,64 +228,6 @@ def _cast(shapes, circles, x, y, yaw, angles, slopes):  # type: ignore[no-untype
                 if hit <= far and hit < out[a, k]:
                     out[a, k] = hit
     return out
-
-
-# -- people
-
-
-def add_people(room: Room, rng: np.random.Generator, count: int) -> list[Person]:
-    """Add people at least 2 m from the robot; one in three does not look where they walk."""
-    people = []
-    for _ in range(count):
-        place = free_place(room, rng)
-        while float(np.linalg.norm(place - room.start[:2])) < 2.0:
-            place = free_place(room, rng)
-        people.append(Person(place, free_place(room, rng), rng.uniform(0.4, 1.0), bool(rng.random() > 1 / 3)))
-    return people
-
-
-def free_place(room: Room, rng: np.random.Generator) -> FloatArray:
-    """Return a random position (2,) at least 0.4 m from every shape."""
-    while True:
-        place = rng.uniform([0.5, 0.5], room.size - 0.5)
-        if min(_away(s, place) for s in room.shapes) > 0.4:
-            return place
-
-
-def walk(room: Room, person: Person, robot: FloatArray, dt_s: float, rng: np.random.Generator) -> None:
-    """Move a person by ``dt_s``. A person who looks stops 0.5 m before the robot, and turns around after 3 s."""
-    way = person.target - person.place
-    distance = float(np.linalg.norm(way))
-    if distance < 0.2 or person.waited_s > 3.0:
-        person.target, person.waited_s = free_place(room, rng), 0.0
-        return
-    heading = way / distance
-    step = heading * person.speed * dt_s
-    ahead = person.place + heading * (PERSON_M + 0.1)
-    if min(_away(s, ahead) for s in room.shapes) < PERSON_M:
-        person.target = free_place(room, rng)  # blocked by a wall: choose another destination
-        return
-    gap, direction = gap_to_robot(person.place, robot)
-    in_the_way = float(direction @ heading) > 0.0
-    if in_the_way and (gap < 0.5 if person.looks else gap <= 0.0):
-        person.waited_s += dt_s  # a person who does not look stops after walking into the robot
-        return
-    person.place = person.place + step
-    person.waited_s = 0.0
-
-
-def gap_to_robot(place: FloatArray, robot: FloatArray) -> tuple[float, FloatArray]:
-    """Return metres from a person to the robot's outline (overlap: negative), and the unit vector (2,) towards it."""
-    c, s = math.cos(robot[2]), math.sin(robot[2])
-    dx, dy = place[0] - robot[0], place[1] - robot[1]
-    local = np.array([c * dx + s * dy, c * dy - s * dx])
-    nearest = np.clip(local, [-LENGTH_M / 2, -WIDTH_M / 2], [LENGTH_M / 2, WIDTH_M / 2])
-    away = nearest - local
-    distance = float(np.hypot(*away))
-    if distance < 1e-9:
-        return -PERSON_M, np.array([c, s])
-    towards = np.array([c * away[0] - s * away[1], s * away[0] + c * away[1]]) / distance
-    return distance - PERSON_M, towards
 
 
 # -- the shortest way

@@ -1,4 +1,4 @@
-"""``ic evaluate follow``: its own world by hand (LiDAR, people, shortest way), and one drive from end to end."""
+"""``ic evaluate follow``: its own world by hand (LiDAR, shortest way), and one drive from end to end."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from instant_ic.cli.main import main
-from instant_ic.control.safety import MonitoredCommand
 from instant_ic.experiments import follow
 from instant_ic.experiments import follow_worlds as worlds
-from instant_ic.experiments.follow_worlds import Person, Room
+from instant_ic.experiments.follow_worlds import Room
 
 
 def room(*shapes: tuple[float, ...]) -> Room:
@@ -43,8 +42,7 @@ class TestLidar:
         # A box 0.5 m high whose front is 3 m ahead; a wall behind it at 6 m, 2.5 m high.
         seen = ahead(
             worlds.look(
-                room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.5), (8.05, 4.0, 0.05, 3.0, 0.0, 0.0, 2.5)),
-                [],
+                room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.5), (8.05, 4.0, 0.05, 3.0, 0.0, 0.0, 2.5)).shapes,
                 np.array([2.0, 4.0, 0.0]),
                 Quiet(),
             )
@@ -56,42 +54,8 @@ class TestLidar:
         assert reach[-3] == pytest.approx(3.0, abs=1e-3)  # 0.44 m high
         assert reach[-1] == pytest.approx(6.0, abs=1e-3)  # over it
         assert reach[15] == pytest.approx(6.0, abs=1e-3)  # 2.2 m: the wall still
-        top = ahead(worlds.look(room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.4)), [], np.array([2.0, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
+        top = ahead(worlds.look(room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.4)).shapes, np.array([2.0, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
         assert np.isclose(top[:, 0], 0.2 / math.tan(math.radians(3)), atol=1e-3).any()  # its top, 3.8 m off
-
-
-class TestPeople:
-    robot = np.array([2.0, 4.0, 0.0])
-
-    @pytest.mark.parametrize(("looks", "nearest"), [(True, 0.5), (False, 0.0)])
-    def test_who_looks_stops_before_the_robot_who_does_not_walks_into_it(self, looks: bool, nearest: float) -> None:
-        person, rng = Person(np.array([6.0, 4.0]), np.array([0.6, 4.0]), 1.0, looks), np.random.default_rng(0)
-        gaps = []
-        for _ in range(100):
-            worlds.walk(room((9.9, 4.0, 0.05, 4.0, 0.0, 0.0, 2.5)), person, self.robot, 0.05, rng)
-            gaps.append(worlds.gap_to_robot(person.place, self.robot)[0])
-            if person.waited_s > 0:
-                break
-        assert gaps[-1] == pytest.approx(nearest, abs=0.051)
-
-    def test_a_contact_is_of_who_made_it(self) -> None:
-        def sent(speed: float) -> MonitoredCommand:
-            return MonitoredCommand((speed, 0.0), "free", math.inf)
-
-        drive = follow.FollowDrive(0, 0)
-        drive.late.clear()
-        drive.late.append(sent(0.0))
-        x, y, yaw = drive.robot.pose
-        inside = np.array([x + 0.45 * math.cos(yaw), y + 0.45 * math.sin(yaw)])  # 0.15 m before the nose
-        drive.people = [Person(inside, inside, 0.0, True)]
-        drive.move(sent(0.0))
-        drive.move(sent(0.0))
-        assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 0)
-        drive.touching.clear()
-        drive.velocity, drive.robot.tracks[:] = (0.4, 0.0), 0.4
-        drive.late[0] = sent(0.4)
-        drive.move(sent(0.4))
-        assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 1)
 
 
 class TestShortestWay:
@@ -144,7 +108,7 @@ def test_a_drive_reaches_its_goal_without_contact_and_is_told_in_full(drive: tup
     assert figures["path_ratio_mean"] < 1.3
     assert figures["yaw_rate_changes_per_m"] < 4
     (each,) = figures["each"]
-    assert each["reached"] and each["people"] > 0
+    assert each["reached"]
     assert each["driven_m"] > 0.9 * each["optimum_m"] > 4.0
     for name in ("planner", "controller", "costmap"):
         assert 0 < figures[f"{name}_ms_p50"] <= figures[f"{name}_ms_p99"]
@@ -153,13 +117,12 @@ def test_a_drive_reaches_its_goal_without_contact_and_is_told_in_full(drive: tup
 
 
 def test_figures_of_episodes_by_hand() -> None:
-    good = follow.Episode(0, 0, True, True, 20.0, 8.0, 8.8, yaw_rate_changes=4, clearance_m=0.2, planner_ms=[2.0, 4.0])
-    long = follow.Episode(1, 2, True, True, 30.0, 5.0, 6.0, people_into_robot=1, yaw_rate_changes=2, clearance_m=0.1)
-    lost = follow.Episode(2, 0, True, False, 60.0, 5.0, 3.2, contacts=1, clearance_m=0.0, reason="no way")
-    none = follow.Episode(3, 0, False, False, 40.0, math.inf, 2.0, clearance_m=0.3)
+    good = follow.Episode(0, True, True, 20.0, 8.0, 8.8, yaw_rate_changes=4, clearance_m=0.2, planner_ms=[2.0, 4.0])
+    long = follow.Episode(1, True, True, 30.0, 5.0, 6.0, yaw_rate_changes=2, clearance_m=0.1)
+    lost = follow.Episode(2, True, False, 60.0, 5.0, 3.2, contacts=1, clearance_m=0.0, reason="no way")
+    none = follow.Episode(3, False, False, 40.0, math.inf, 2.0, clearance_m=0.3)
     figures = follow.summary([good, long, lost, none])
     assert (figures["reachable"], figures["reached"], figures["contacts"]) == (3, 2, 1)
-    assert figures["people_walked_into_robot"] == 1
     assert figures["path_ratio_mean"] == pytest.approx((1.1 + 1.2) / 2)
     assert figures["time_ratio_max"] == pytest.approx(30.0 * 0.4 / 5.0)
     assert figures["yaw_rate_changes_per_m"] == pytest.approx(6 / 20.0)

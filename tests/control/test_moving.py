@@ -12,7 +12,6 @@ from instant_ic.control.moving import MovingThings
 from instant_ic.control.planner import Plan, no_plan
 from instant_ic.control.progress import Progress
 from instant_ic.experiments import follow_worlds as worlds
-from instant_ic.experiments.follow_worlds import Person, Room
 from instant_ic.geometry.poses import matrix_from_pose2
 
 ROOM = np.array(
@@ -29,9 +28,8 @@ ROOM = np.array(
 
 def seen(pose: np.ndarray, person: np.ndarray | None, rng: np.random.Generator) -> SortedPoints:
     """A sweep in the room, with a box and a pole, placed in the room's frame."""
-    room = Room(np.array([10.0, 8.0]), ROOM, np.ones(len(ROOM), np.int64), pose, pose[:2], np.zeros((0, 2)))
-    people = [] if person is None else [Person(person, person, 0.0, True)]
-    points = worlds.look(room, people, pose, rng).astype(np.float32)
+    people = [] if person is None else [(*person, 0.2, 0.2, 0.0, 0.0, 1.7)]
+    points = worlds.look(np.array([*ROOM, *people]), pose, rng).astype(np.float32)
     level = matrix_from_pose2(pose)
     level[2, 3] = worlds.LIDAR_HEIGHT_M
     return sort_points(points, np.zeros(len(points), np.float32), level[None], 0.0, HeightConfig())

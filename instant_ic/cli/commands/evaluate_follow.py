@@ -15,8 +15,8 @@ def add_kind(kinds: Any) -> None:
     parser = verb(
         kinds, "follow", "simulate the r-bot following a v-bot through random rooms", run,
         "ic evaluate follow --episodes 50 --seed 0 --json follow.json --plot follow.png",
-        "Drive a v-bot to a goal through random rooms with walls, boxes, low and hanging obstacles, and people in "
-        "a fifth of them. The r-bot follows with the robot's own costmap, planner, follower and collision monitor, "
+        "Drive a v-bot to a goal through random rooms with walls, boxes and low obstacles. "
+        "The r-bot follows with the robot's own costmap, planner, follower and collision monitor, "
         "under slip, command delay, sensor noise and pose drift. Reports contacts, goals reached, path length "
         "relative to the shortest path, and CPU time of each part. The same seed gives the same drives.",
     )  # fmt: skip
@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
         def show_progress(episode: follow.Episode) -> None:
             nonlocal contacts
-            contacts += episode.contacts + episode.people_contacts
+            contacts += episode.contacts
             how = "reached" if episode.reached else episode.reason
             advance(f"driving, {contacts} contacts", f"episode {episode.index}: {how}")
 
@@ -46,9 +46,7 @@ def run(args: argparse.Namespace) -> int:
     each = figures.pop("each")
     print_figures(figures)
     for row in each:
-        if row["contacts"] or row["people_contacts"] or (row["reachable"] and not row["reached"]):
+        if row["contacts"] or (row["reachable"] and not row["reached"]):
             how = "reached" if row["reached"] else f"not reached: {row['reason']}"
-            print(
-                f"episode {row['index']}: {row['contacts'] + row['people_contacts']} contacts, {how}", file=sys.stderr
-            )
+            print(f"episode {row['index']}: {row['contacts']} contacts, {how}", file=sys.stderr)
     return 0
