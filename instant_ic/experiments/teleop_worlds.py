@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import math
 from dataclasses import dataclass
@@ -28,16 +27,9 @@ SPARE_M = 0.10
 FIRST_M, APART_M, LAST_M = 3.2, 3.8, 2.4
 """Minimum distance in metres from the start to the first obstacle, between two, and from the last to the goal."""
 _TALLER_THAN_THINGS_M = (1.9, 2.2)
-_TALL_M = (1.5, 1.9)
-"""In furnished worlds, objects in this height range are not hidden from the operator; a door's lintel is above it."""
-_DRIVE_M = (3.5, 10.0)
-"""Shortest and longest drive across a furnished world."""
+_LONGEST_DRIVE_M = 10.0
 _BEFORE_WALL_M = 1.2
-"""Distance from the wall at which a drive straight ahead ends, at most ``_DRIVE_M[1]`` from its start."""
-_ROOM_M = 0.45
-"""Distance from everything at the start and the goal of such a drive."""
-_LONGEST_THING_M = 1.5
-"""Along the operator's line; v-bots pass no more than 3 m (config/control.yaml: max_pass_m)."""
+"""Distance from the wall at which a drive straight ahead ends."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +59,7 @@ class Course:
 
 
 def make_course(name: str, seed: int, index: int) -> Course:
-    """Create a course: a random corridor, a drive along the simulator's corridor, or one across another world.
+    """Create a course: a random corridor, or a drive straight ahead in another world.
 
     Args:
         name: ``corridors``, or any name of ``sim.worlds.make_world``.
@@ -79,9 +71,7 @@ def make_course(name: str, seed: int, index: int) -> Course:
     """
     if name == RANDOM_CORRIDORS:
         return random_corridor(np.random.default_rng([47, seed, index]), f"corridors {seed}/{index}")
-    if name.partition(":")[0] in ("corridor", "corridor-free"):
-        return straight_ahead(_world(name))
-    return across(_world(name), np.random.default_rng([59, seed, index]))
+    return straight_ahead(_world(name))
 
 
 @functools.lru_cache(maxsize=1)
@@ -186,7 +176,7 @@ def straight_ahead(world: World) -> Course:
     """
     x, y, yaw = world.spawn
     heading = np.array([math.cos(yaw), math.sin(yaw)])
-    steps = np.arange(0.0, _DRIVE_M[1] + _BEFORE_WALL_M, 0.05)
+    steps = np.arange(0.0, _LONGEST_DRIVE_M + _BEFORE_WALL_M, 0.05)
     line = np.array([x, y]) + steps[:, None] * heading
     wall = np.flatnonzero(world.occupied(*_TALLER_THAN_THINGS_M, 0.05).at(line))
     reach = float(steps[wall[0]] if wall.size else steps[-1]) - _BEFORE_WALL_M
@@ -222,50 +212,3 @@ def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> 
     return tuple(
         Obstacle(float(at[0]), float(at[1]), size, 0.5, yaw, BODY_M[1]) for at, size in zip(places, sizes, strict=True)
     )
-
-
-def across(world: World, rng: np.random.Generator, attempts: int = 3000) -> Course:
-    """Make a straight drive between two free positions of a furnished world, preferably through objects.
-
-    No wall and nothing taller than ``_TALL_M`` stands between. The goal can be reached around everything with a margin
-    of ``SPARE_M``. Objects on the line leave the robot as much room before and behind them as in a corridor.
-
-    Raises:
-        ValueError: no such drive found within ``attempts``.
-    """
-    plan, tall = floor_plan(world), world.occupied(*_TALL_M, 0.05)
-    away = plan.distance_m()
-    cells = plan.reachable(world.spawn[:2], 0.35)
-    cells = cells[away[cells[:, 0], cells[:, 1]] >= _ROOM_M] if len(cells) else cells
-    places = plan.centre(cells)
-    longest: Course | None = None
-    for start, goal in places[rng.integers(0, len(places), (attempts, 2))] if len(places) else ():
-        length = float(np.linalg.norm(goal - start))
-        if not _DRIVE_M[0] <= length <= _DRIVE_M[1] or things_between(tall, start, goal):
-            continue
-        things = things_between(plan, start, goal)
-        if any(not _passable(thing, start, goal) for thing in things):
-            continue
-        there = copy.copy(world)
-        there.spawn = (float(start[0]), float(start[1]), math.atan2(goal[1] - start[1], goal[0] - start[0]))
-        course = Course(there, goal[None], things)
-        if not things and longest is not None and longest.way_m >= course.way_m:
-            continue
-        if route(plan, np.array(there.spawn), course.goals, SPARE_M) is None:
-            continue
-        if things:
-            return course
-        longest = course
-    if longest is None:
-        raise ValueError(
-            f"world {world.name!r}: no straight drive of {_DRIVE_M[0]} m between two free places in {attempts} "
-            f"tries ({len(places) * plan.cell_m**2:.1f} m² are {_ROOM_M} m away from everything and can be reached)"
-        )
-    return longest
-
-
-def _passable(thing: Obstacle, start: FloatArray, goal: FloatArray) -> bool:
-    """Return whether there is room before and behind an object, and a v-bot can pass its length."""
-    at, half = np.array([thing.x, thing.y]), 0.5 * thing.length
-    before, behind = (float(np.linalg.norm(end - at)) - half for end in (start, goal))
-    return thing.length <= _LONGEST_THING_M and before >= FIRST_M - 1.0 and behind >= LAST_M - 1.0

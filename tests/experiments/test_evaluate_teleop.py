@@ -18,7 +18,6 @@ from instant_ic.experiments.teleop_figures import DriveLog, Shown, Switch, Teleo
 from instant_ic.experiments.teleop_operator import ScriptedOperator, Sight
 from instant_ic.experiments.teleop_plot import save_plot
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
-from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.contact import OccupancyMask
 
 
@@ -160,15 +159,6 @@ def test_without_obstacles_nothing_is_divided_by_them() -> None:
     assert met["one switch each way an obstacle"] is None and met["contacts == 0"] is True
 
 
-def furnished(thing: tuple[float, float] | None) -> teleop_worlds.World:
-    """A room of 6 x 2.4 m, in it a box of 0.4 x 0.5 x 0.5 m."""
-    building = Building()
-    building.add(Zone(-1.0, -1.2, 5.0, 1.2, 2.6))
-    if thing is not None:
-        building.builder.box(thing, (0.4, 0.5, 0.5))
-    return building.world("room", (0.0, 0.0, 0.0), light_cell_m=1.0, rays=1)
-
-
 class TestWorlds:
     def test_corridors_are_passable_and_their_obstacles_in_the_way(self) -> None:
         for index in range(3):
@@ -193,27 +183,6 @@ class TestWorlds:
         assert course.goals[0] == pytest.approx([9.9, 0.0], abs=0.2)
         (box,) = course.obstacles
         assert (box.x, box.y) == pytest.approx((4.25, 0.0), abs=0.06)
-
-    def test_across_a_furnished_room_he_drives_over_what_stands_there(self) -> None:
-        for seed in range(3):
-            course = teleop_worlds.across(furnished((2.0, 0.1)), np.random.default_rng(seed))
-            (box,) = course.obstacles
-            assert (box.x, box.y) == pytest.approx((2.0, 0.1), abs=0.45)
-            start, goal = np.array(course.world.spawn[:2]), course.goals[0]
-            assert 3.5 <= course.way_m <= 10.0
-            assert course.world.spawn[2] == pytest.approx(math.atan2(*(goal - start)[::-1]))
-            plan = teleop_worlds.floor_plan(course.world)
-            assert teleop_worlds.route(plan, np.array(course.world.spawn), course.goals, 0.05) is not None
-        again = teleop_worlds.across(furnished((2.0, 0.1)), np.random.default_rng(2))
-        assert again.world.spawn == course.world.spawn and np.array_equal(again.goals, course.goals)
-
-    def test_an_empty_room_has_no_obstacles_and_a_closet_no_drive(self) -> None:
-        assert teleop_worlds.across(furnished(None), np.random.default_rng(0), attempts=60).obstacles == ()
-        closet = Building()
-        closet.add(Zone(-1.0, -1.2, 2.0, 1.2, 2.6))
-        world = closet.world("closet", (0.0, 0.0, 0.0), light_cell_m=1.0, rays=1)
-        with pytest.raises(ValueError, match=r"'closet': no straight drive of 3.5 m .* can be reached"):
-            teleop_worlds.across(world, np.random.default_rng(0), attempts=100)
 
 
 def sight(time_s: float, pose: tuple[float, float, float], speed: float = 0.4, **given: bool) -> Sight:

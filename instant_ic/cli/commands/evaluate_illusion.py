@@ -30,7 +30,7 @@ def add_kind(kinds: Any) -> None:
         "as fog, and the error of the expected PSNR. The same seed gives the same figures.",
     )  # fmt: skip
     add_options(parser, 20, 1, 7200.0, "PSNR by distance")
-    worlds = "as ic evaluate teleop: corridors (random), corridor, random:SEED, or a mesh file"
+    worlds = "as ic evaluate teleop: corridors (random), or one where the operator drives straight on"
     add_stack_options(parser, worlds, "nerf.space.keyframes:=1")
     parser.add_argument("--strip", type=Path, metavar="OUT.png", help="write rows of frames by distance here")
 

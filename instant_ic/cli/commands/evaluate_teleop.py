@@ -30,10 +30,7 @@ def add_kind(kinds: Any) -> None:
         "switches, and lost time. The same seed gives the same drives.",
     )  # fmt: skip
     add_options(parser, 50, os.cpu_count() or 1, 7200.0, "the paths of the worst courses")
-    worlds = (
-        "corridors (random), or a world of the simulator: corridor, where the operator drives straight on, "
-        "random:SEED or a mesh file, where the operator drives to random visible places"
-    )
+    worlds = "corridors (random), or a world of the simulator or a mesh file, where the operator drives straight on"
     add_stack_options(parser, worlds, "virtual_robot.vbot.ease_m_s:=0.05")
     add = parser.add_argument
     add("--methods", default="ic,stop", metavar="M,M", help="ic, stop (default: %(default)s)")
