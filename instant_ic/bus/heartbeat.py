@@ -11,7 +11,7 @@ TYPE = "instant_ic_msgs/msg/NodeStatus"
 STATES = ("starting", "running", "degraded", "failed", "stopping")
 SILENT_AFTER_S = 3.0
 """A node without a heartbeat for longer than this is stale (state ``silent``)."""
-EVERY_NODES = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events")
+EVERY_NODES = ("/heartbeat", "/diagnostics", "/rosout")
 """Last parts of the topics that every node publishes. A node that stops them is silent, not slow."""
 
 

@@ -264,7 +264,6 @@ class Node(Generic[ConfigT]):
         """Run ``setup``; called once by whatever drives the node."""
         if not self.lockstep:
             self.node_report = NodeReport(self)
-            self.parameters.on_change = self.node_report.publish_parameters
         if self.use_sim_time:
             self._simulated_time = SimulatedTime(self, self.timers, self.transforms)
         self.callbacks.run_setup(self.setup)

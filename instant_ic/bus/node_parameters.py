@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from instant_ic.bus.callbacks import NodeError
@@ -13,15 +13,10 @@ from instant_ic.config.parameter_info import ParameterInfo, is_live, parameter_i
 
 
 class NodeParameters:
-    """The parameters of one node.
-
-    Attributes:
-        on_change: called with changed values by name.
-    """
+    """The parameters of one node."""
 
     def __init__(self, node: NodeInterface) -> None:
         self._node = node
-        self.on_change: Callable[[Mapping[str, Any]], None] = lambda changed: None
 
     def infos(self) -> list[ParameterInfo]:
         """Return all parameters with their present values; may be called from any thread."""
@@ -57,7 +52,6 @@ class NodeParameters:
             raise params.ParameterError(f"{node.node_name}: {error}") from error
         different = {key: plain(value) for key, value in different.items()}
         node.log.info("parameters changed: %s", ", ".join(f"{key} = {value}" for key, value in different.items()))
-        self.on_change(different)
         node.on_registry_change()
         return different
 

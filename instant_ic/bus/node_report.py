@@ -1,4 +1,4 @@
-"""Reports of every node: log, heartbeat, diagnostics and changes of parameters."""
+"""Reports of every node: log, heartbeat and diagnostics."""
 
 from __future__ import annotations
 
@@ -6,17 +6,14 @@ import logging
 import mmap
 import os
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from instant_ic.bus.diagnostics import ERROR, WARN
 from instant_ic.bus.flow_report import FlowReport
 from instant_ic.bus.node_interface import NodeInterface
-from instant_ic.bus.parameter_event import TOPIC as PARAMETER_EVENTS
-from instant_ic.bus.parameter_event import parameter_event
 from instant_ic.bus.qos import RELIABLE
 from instant_ic.bus.topics import Publisher
 from instant_ic.msg import header, message_type, to_time
@@ -28,7 +25,7 @@ class NodeReport:
     """Publishes what one node reports about itself.
 
     Attributes:
-        rosout, parameter_events, heartbeat, diagnostics: its publishers.
+        rosout, heartbeat, diagnostics: its publishers.
     """
 
     def __init__(self, node: NodeInterface) -> None:
@@ -39,7 +36,6 @@ class NodeReport:
         self._handler = _RosoutHandler(node.node_name, self.rosout)
         for logger in _loggers(node.node_name):
             logger.addHandler(self._handler)
-        self.parameter_events = node.publisher(PARAMETER_EVENTS, message_type("ParameterEvent"), RELIABLE)
         self.heartbeat = node.publisher("/heartbeat", message_type("NodeStatus"), RELIABLE)
         self.diagnostics = node.publisher("/diagnostics", message_type("DiagnosticArray"), RELIABLE)
         self.beat()
@@ -48,11 +44,6 @@ class NodeReport:
         """Publish the log no longer."""
         for logger in _loggers(self._node.node_name):
             logger.removeHandler(self._handler)
-
-    def publish_parameters(self, changed: Mapping[str, Any]) -> None:
-        """Report changed parameters."""
-        event = parameter_event(self._node.node_name, changed, self._node.clock.now_ns())
-        self.parameter_events.publish(event)
 
     def beat(self) -> None:
         """Publish the heartbeat: state, load, topics and their losses."""

@@ -118,23 +118,15 @@ def test_describe_and_get(tuned):
 def test_set_is_taken_on_the_nodes_thread_and_told(tuned):
     node, client = tuned
     heard = []
-    node.subscribe_received("/parameter_events", heard.append)
     node.on_registry_change = lambda: heard.append(node.describe()["params"]["inner"]["gain"])
     deadline = time.monotonic() + 20
-    while not node.node_report.parameter_events.subscriber_count and time.monotonic() < deadline:
-        time.sleep(0.01)
     changed = client.set({"inner.gain": 1, "places": [4, 5, 6], "label": "a"})
     assert changed == {"inner.gain": 1.0, "places": [4.0, 5.0, 6.0]}  # label is as before
     assert node.config == TunedConfig(places=(4.0, 5.0, 6.0), inner=Inner(gain=1.0))
     assert node.reconfigured_on is node.thread
-    while len(heard) < 2 and time.monotonic() < deadline:
+    while not heard and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert heard[0] == 1.0  # ic param, the bag's metadata and others read the registry
-    event = deserialize(heard[1].payload, heard[1].type_name)
-    assert event.node == "/tuned"
-    assert [(p.name, p.value.type) for p in event.changed_parameters] == [("places", 8), ("inner.gain", 3)]
-    assert event.changed_parameters[0].value.double_array_value.tolist() == [4.0, 5.0, 6.0]
-    assert event.changed_parameters[1].value.double_value == 1.0
+    assert heard == [1.0]  # ic param, the bag's metadata and others read the registry
 
 
 def test_fault_a_text_is_set_with_its_password_masked(tuned):

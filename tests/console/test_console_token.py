@@ -22,7 +22,7 @@ launch:
 - node: {{exec: console, param: [{{name: server.host, value: {host}}}, {{name: server.port, value: {port}}}]}}
 - node: {{exec: bag_recorder, param: [{{name: path, value: {bags}}}]}}
 """
-TOPICS = ("/rosout", "/diagnostics", "/heartbeat", "/parameter_events")
+TOPICS = ("/rosout", "/diagnostics", "/heartbeat")
 
 
 def free_port():
