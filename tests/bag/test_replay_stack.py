@@ -28,7 +28,7 @@ DRIVES_AFTER_S = 3.5  # the arbiter first waits for the camera's rate, then for 
 
 
 def with_operator(folder: Path) -> Path:
-    """The bag with commands at 20 Hz and requests for views at 5 Hz."""
+    """The bag with commands at 20 Hz and requests for views at 2 Hz."""
     with BagReader(BAG) as reader, BagWriter(folder) as writer:
         step_ns, number = 50_000_000, 0
 
@@ -39,9 +39,9 @@ def with_operator(folder: Path) -> Path:
             while (at_ns := reader.start_ns + number * step_ns) <= message.stamp_ns:
                 speed = 0.3 if number * 0.05 > DRIVES_AFTER_S else 0.0
                 write("/operator/cmd_vel", twist_stamped(speed, 0.0, at_ns), at_ns)
-                if number % 4 == 0:
+                if number % 10 == 0:
                     pose = pose_message(pose_matrix(0.3, 0.1, 1.1))
-                    write("/view/request", ViewRequest(header("map", at_ns), number, pose, 1.5, 160, 90), at_ns)
+                    write("/view/request", ViewRequest(header("map", at_ns), number, pose, 1.5, 64, 36), at_ns)
                 number += 1
             writer.write(message.topic, message.type_name, message.payload, message.stamp_ns, message.qos)
     return folder
@@ -56,7 +56,7 @@ def test_the_whole_stack_replays_bit_for_bit(tmp_path: Path) -> None:
     result = run(bag, first)
     least = {"/scan": 40, "/pose": 40, "/map": 2, "/depth/scaled": 2, "/keyframe": 2, "/vspace/status": 5}
     least |= {
-        "/vspace/view": 10,
+        "/vspace/view": 4,
         "/costmap": 10,
         "/ic/state": 50,
         "/ic/trajectory": 20,
@@ -69,4 +69,3 @@ def test_the_whole_stack_replays_bit_for_bit(tmp_path: Path) -> None:
     assert states[-1].mode == ControlState.REAL and twist_values(states[-1].applied_command)[0] > 0.1
     run(bag, tmp_path / "second")
     assert [topic.topic for topic in compare(first, tmp_path / "second") if not topic.same] == []
-    assert all(topic.same for topic in compare(first, tmp_path / "second"))

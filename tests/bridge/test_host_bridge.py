@@ -301,7 +301,7 @@ class Importer(Node[NoConfig]):
         self.incoming = ImportedTopics(self, rules, trouble, lambda: self.holder)
 
 
-@pytest.mark.parametrize("release_ms", [100, 999, 1000, 1999])
+@pytest.mark.parametrize("release_ms", [100, 999, 1000])
 @pytest.mark.parametrize("stop_first", [True, False])
 def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_first, release_ms):
     """A restarted bridge hears the latched values of all stations in any order; the stop is of 1000 ms."""
@@ -564,16 +564,6 @@ def test_fault_a_robots_diagnostics_and_log_do_not_reach_the_station(hosts):
     far.wait(arrived, "the robot's words")
 
 
-def test_driver_is_handed_over_by_a_live_parameter(hosts):
-    a, _ = pair(hosts)
-    wait_for(lambda: a.node.link.driver == "station", "driver")
-    a.node.call_soon(a.node.parameters.set, {"driver": "tablet"})
-    wait_for(lambda: a.node.link.driver == "", "nobody drives until the tablet comes")
-    hosts.host("tablet")
-    hosts.bridge("tablet")
-    wait_for(lambda: a.node.link.driver == "tablet", "hand-over")
-
-
 @pytest.mark.parametrize(
     ("values", "words"),
     [
@@ -601,11 +591,6 @@ def test_missing_keys_end_the_start_with_words(hosts):
     hosts.stores["lonely"].create("lonely")
     with pytest.raises(NodeError, match="ic keys allow NAME KEY"):
         hosts.bridge("lonely", connect="tcp://127.0.0.1:1")
-
-
-def test_lockstep_is_refused():
-    with LockstepBus() as bus, pytest.raises(NodeError, match="needs the real bus"):
-        bus.add(HostBridgeNode, HostBridgeConfig(listen="tcp://127.0.0.1:0", to_robot=TO_ROBOT))
 
 
 def test_shipped_lists_are_whole():
