@@ -12,7 +12,7 @@ trap 'rm -rf "$folder"' EXIT
 # pip is locked too, because it installs the other packages.
 compile=("$folder/venv/bin/uv" pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate
   --custom-compile-command 'make lock' --constraint constraints.txt)
-echo pip | "${compile[@]}" --extra dev --extra train --no-emit-package torch --output-file "$folder/requirements.lock" \
+echo pip | "${compile[@]}" --extra dev --no-emit-package torch --output-file "$folder/requirements.lock" \
   pyproject.toml -
 echo triton | "${compile[@]}" --output-file "$folder/requirements-test.lock" -
 mv "$folder"/requirements*.lock .

@@ -42,7 +42,6 @@ def requirements() -> list[str]:
     asked = [
         *PROJECT["project"]["dependencies"],
         *extras["dev"],
-        *extras["train"],
         *PROJECT["build-system"]["requires"],
     ]
     (torch,) = PROJECT["tool"]["uv"]["dependency-metadata"]

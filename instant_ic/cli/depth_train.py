@@ -19,7 +19,6 @@ from instant_ic.util.closing import on_end_signal
 
 if TYPE_CHECKING:
     from instant_ic.training.completion import CompletionConfig, CompletionNet
-    from instant_ic.training.feeds import Feed, Samples
     from instant_ic.training.trainer import Trainer
 
 LICENCE = "Apache-2.0"
@@ -34,29 +33,26 @@ PRESETS: dict[str, dict[str, Any]] = {
 _EPILOG = """examples:
   ic depth textures robosuite-1.5.2-py3-none-any.whl -o runs/textures
   ic depth render --textures runs/textures -o runs/panoramas
-  ic depth train --data rendered:runs/panoramas --export models/mine.onnx
-  ic depth train --data rendered:runs/panoramas --resume --minutes 240 --export models/mine.onnx
-  ic depth train --data rendered:runs/panoramas --data plain:mine --preset gpu
+  ic depth train --data runs/panoramas --export models/mine.onnx
+  ic depth train --data runs/panoramas --resume --minutes 240 --export models/mine.onnx
+  ic depth train --data runs/panoramas --preset gpu
 """
 
 
 def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "train",
-        help="train depth completion on folders of panoramas with depth",
-        description="Train the completion network on rendered panoramas (ic depth render) and your own, and\n"
-        "export it. Ctrl-C ends the training early: the last weights are evaluated, saved and exported. A CSV of the\n"
-        "progress, whose first evaluation is that of the fused depth, and, where the package is installed, a\n"
-        "TensorBoard folder are written beside the checkpoint.",
+        help="train depth completion on rendered panoramas",
+        description="Train the completion network on rendered panoramas (ic depth render) and export it. Ctrl-C ends\n"
+        "the training early: the last weights are evaluated, saved and exported. A CSV of the progress, whose first\n"
+        "evaluation is that of the fused depth, is written beside the checkpoint.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--preset", choices=tuple(PRESETS), default="completion",
                         help="defaults of the options below (%(default)s)")  # fmt: skip
     data = parser.add_argument_group("data")
-    data.add_argument("--data", action="append", required=True, metavar="LAYOUT:FOLDER",
-                      help="panoramas with depth, rendered or plain (docs/depth.md); repeatable: each gets the same "
-                      "share of a batch")  # fmt: skip
+    data.add_argument("--data", type=Path, required=True, metavar="FOLDER", help="panoramas of ic depth render")
     data.add_argument("--workers", type=positive_int, default=1, metavar="N", help="threads that read (%(default)s)")
     training = parser.add_argument_group("training")
     training.add_argument("--height", type=positive_int, default=256, metavar="ROWS",
@@ -157,6 +153,8 @@ def _start(args: argparse.Namespace, network: CompletionConfig) -> tuple[Complet
 
 def _trainer(args: argparse.Namespace) -> Trainer:
     from instant_ic.training.completion import CompletionConfig
+    from instant_ic.training.dataset import open_rendered
+    from instant_ic.training.feeds import Feed
     from instant_ic.training.trainer import Trainer, TrainingConfig, describe_device, select_device
 
     def report(line: str) -> None:
@@ -169,33 +167,14 @@ def _trainer(args: argparse.Namespace) -> Trainer:
     )  # fmt: skip
     model, origin = _start(args, network)
     report(f"training on {describe_device(device)}, {config.batch_size} panoramas per step")
-    feed, held_out = _data(args, network, report)
+    training, held_out = open_rendered(args.data, (network.height, network.width))
+    data = {"folder": args.data.name, "worlds": training.worlds + held_out.worlds}
+    feed = Feed(training, config.batch_size, config.seed, args.workers)
     command = shlex.join(["ic", *sys.argv[1:]])
-    trainer = Trainer(feed, held_out, model, config, args.checkpoint, device, origin, command, report)
+    trainer = Trainer(feed, held_out, model, config, args.checkpoint, data, device, origin, command, report)
     if args.resume:
         trainer.resume(args.checkpoint)
     return trainer
-
-
-def _data(args: argparse.Namespace, network: CompletionConfig, report: Any) -> tuple[Feed, Samples]:
-    """Return training batches and evaluation panoramas of the folders on the command line."""
-    from torch.utils.data import ConcatDataset, Dataset, Subset
-
-    from instant_ic.training.feeds import FileFeed, MixedFeed
-    from instant_ic.training.folders import open_folder
-
-    folders = [open_folder(name, (network.height, network.width)) for name in args.data]
-    if args.batch_size < len(folders):
-        raise ValueError(f"a batch of {args.batch_size} is too small for {len(folders)} folders: increase --batch-size")
-    feeds: list[FileFeed] = []
-    held_out: list[Dataset[Any]] = []
-    for number, folder in enumerate(folders):
-        part = (args.batch_size + number) // len(folders)
-        training, kept = folder.split()
-        report(f"{folder.folder}: {len(training)} panoramas for training, {len(kept)} for evaluation")
-        feeds.append(FileFeed(folder, training, part, args.seed, folder.info, args.workers))
-        held_out.append(Subset(folder, kept.tolist()))  # type: ignore[arg-type]
-    return feeds[0] if len(feeds) == 1 else MixedFeed(feeds), ConcatDataset(held_out)
 
 
 def add_render_parser(commands: Any) -> None:
@@ -203,7 +182,7 @@ def add_render_parser(commands: Any) -> None:
         "render",
         help="render panoramas of generated worlds for ic depth train",
         description="Render panoramas of generated interiors with true depth and fused depth of simulated LiDARs into\n"
-        "a folder, which ic depth train reads as rendered:FOLDER. Run it again to continue; run it several times with\n"
+        "a folder, which ic depth train reads. Run it again to continue; run it several times with\n"
         "another --first at once to use more cores. Ctrl-C loses one panorama.",
     )
     parser.add_argument("-o", "--output", type=Path, default=Path("runs/panoramas"), help="folder (%(default)s)")

@@ -1,1 +1,1 @@
-"""Training of the depth network: data, augmentation, losses, SliceNet in torch, export to ONNX (extra ``train``)."""
+"""Training of the depth network: data, augmentation, losses, SliceNet in torch, export to ONNX."""

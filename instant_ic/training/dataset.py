@@ -1,4 +1,4 @@
-"""Panoramas with depth, the samples of a training."""
+"""Rendered panoramas with depth, the samples of a training."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +28,13 @@ class Sample:
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) radial metres, 0 = unknown.
         world: its seed.
-        prior: (6, H, W) fused depth (``depth.completion.prior_channels``); None: the feed simulates it.
+        prior: (6, H, W) fused depth (``depth.completion.prior_channels``).
     """
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.floating]
     world: int
-    prior: NDArray[np.floating] | None = None
+    prior: NDArray[np.floating]
 
 
 def save_sample(path: Path, rgb: NDArray[np.uint8], depth_m: Floats, priors: Sequence[Floats]) -> None:
@@ -44,49 +43,56 @@ def save_sample(path: Path, rgb: NDArray[np.uint8], depth_m: Floats, priors: Seq
         np.savez_compressed(file, rgb=rgb, depth_m=depth_m.astype(np.float16), priors=np.array(priors, np.float16))
 
 
-class RenderedDataset:
-    """Panoramas of ``ic depth render``; each of their priors is a sample. One world in twelve is held out.
+class RenderedDataset(Sequence[Sample]):
+    """Panoramas of ``ic depth render``; each of their priors is a sample."""
 
-    Raises:
-        DatasetError: there is no panorama in the folder, or none of the needed size.
-    """
-
-    def __init__(self, folder: Path, size: tuple[int, int]) -> None:
-        self.folder, self.size = folder, size
-        self.samples: list[tuple[Path, int]] = []
-        for path in sorted(folder.glob("*-*.npz")):
-            shape = _shape(path)
-            if shape[0] and shape[2:] != size:  # no prior fitted to a few panoramas
-                raise DatasetError(f"{path}: {shape[2]} x {shape[3]}, the network takes {size[0]} x {size[1]}: render "
-                                   "the worlds again into another folder with its --height")  # fmt: skip
-            self.samples += [(path, number) for number in range(shape[0])]
-        if not self.samples:
-            raise DatasetError(f"{folder}: no rendered panoramas: run ic depth render -o {folder}")
+    def __init__(self, files: Sequence[tuple[Path, int]]) -> None:
+        self.files = list(files)
 
     @property
-    def info(self) -> dict[str, Any]:
-        """Recipe for the training record, without the local path."""
-        worlds = {_world(path) for path, _ in self.samples}
-        return {"kind": "rendered", "folder": self.folder.name, "count": len(self.samples), "scenes": len(worlds)}
+    def worlds(self) -> int:
+        """Number of worlds that the panoramas show."""
+        return len({_world(path) for path, _ in self.files})
 
     def __len__(self) -> int:
-        return len(self.samples)
+        return len(self.files)
 
-    def __getitem__(self, index: int) -> Sample:
-        path, number = self.samples[index]
+    def __getitem__(self, index: int) -> Sample:  # type: ignore[override]
+        path, number = self.files[index]
         try:
             with np.load(path) as file:
                 return Sample(file["rgb"], file["depth_m"], _world(path), file["priors"][number])
         except Exception as error:  # a damaged archive raises anything
             raise DatasetError(f"{path}: damaged ({error}): delete it and run ic depth render again") from error
 
-    def split(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the indices for training and for evaluation; a world keeps its part when more are rendered."""
-        held = np.array([_world(path) % _HELD_OUT_WORLDS == 0 for path, _ in self.samples])
-        if held.all() or not held.any():
-            raise DatasetError(f"{self.folder}: worlds for training or for evaluation are missing: render "
-                               f"{_HELD_OUT_WORLDS} or more")  # fmt: skip
-        return np.flatnonzero(~held), np.flatnonzero(held)
+
+def open_rendered(folder: Path, size: tuple[int, int]) -> tuple[RenderedDataset, RenderedDataset]:
+    """Return the panoramas of a folder for training and for evaluation.
+
+    One world in twelve is held out for evaluation; a world keeps its part when more are rendered.
+
+    Args:
+        folder: folder that ``ic depth render`` wrote.
+        size: height and width that the panoramas must have.
+
+    Raises:
+        DatasetError: there is no panorama of this size in the folder, or none for training or for evaluation.
+    """
+    files: list[tuple[Path, int]] = []
+    for path in sorted(folder.glob("*-*.npz")):
+        shape = _shape(path)
+        if shape[0] and shape[2:] != size:  # no prior fitted to a few panoramas
+            raise DatasetError(f"{path}: {shape[2]} x {shape[3]}, the network takes {size[0]} x {size[1]}: render "
+                               "the worlds again into another folder with its --height")  # fmt: skip
+        files += [(path, number) for number in range(shape[0])]
+    if not files:
+        raise DatasetError(f"{folder}: no rendered panoramas: run ic depth render -o {folder}")
+    training = RenderedDataset([file for file in files if _world(file[0]) % _HELD_OUT_WORLDS])
+    held_out = RenderedDataset([file for file in files if _world(file[0]) % _HELD_OUT_WORLDS == 0])
+    if not training or not held_out:
+        raise DatasetError(f"{folder}: worlds for training or for evaluation are missing: render "
+                           f"{_HELD_OUT_WORLDS} or more")  # fmt: skip
+    return training, held_out
 
 
 def _world(path: Path) -> int:

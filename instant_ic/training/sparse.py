@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.sources import DepthSource, SourceConfig
-from instant_ic.experiments.depth_lidar import RangeErrors, measure, measure_world
+from instant_ic.experiments.depth_lidar import RangeErrors, measure_world
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.mapping.local_model import LocalModel
 from instant_ic.mapping.mapper import LocalView
@@ -54,13 +54,6 @@ def sample_prior(
         local = LocalView(drive(renderer, map_from_camera, lidar_m, rng), np.asarray(map_from_camera, np.float64))
     up, mount = map_from_camera[:3, :3].T @ _UP, np.array([0.0, 0.0, lidar_m - camera_m])
     return _prior(rgb, depth_m, points, mount, faulty, up, camera_m + rng.normal(0, 0.01), local, rng)
-
-
-def prior_of_image(rgb: NDArray[np.uint8], depth_m: Floats, rng: np.random.Generator) -> NDArray[np.float32] | None:
-    """Simulate the prior of a level panorama with true depth (H, W) from one revolution; None without a fit."""
-    mount, faulty = np.array([0.0, 0.0, -rng.uniform(0.1, 0.7)]), rng.random() < FAULTY_SHARE
-    points = measure(depth_m, 0.0, -mount[2], _errors(rng, 0.0))
-    return _prior(rgb, depth_m, points, mount, faulty, _UP, None, None, rng)
 
 
 def _errors(rng: np.random.Generator, outliers: float) -> RangeErrors:

@@ -11,7 +11,7 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, 
 from instant_ic.training.augment import photograph, to_brightness, turn_and_mirror, without_lidar
 from instant_ic.training.completion import CompletionNet
 from instant_ic.training.dataset import Sample
-from instant_ic.training.feeds import Ahead, Batch, Feed, Samples, stack
+from instant_ic.training.feeds import Batch, Feed, stack
 from instant_ic.training.log import TrainingLog
 from instant_ic.training.losses import depth_loss, edge_loss, sigma_loss
 from instant_ic.training.slicenet import CheckpointError, read_checkpoint
@@ -149,24 +149,24 @@ def to_tensors(batch: Batch, max_range_m: float, device: torch.device) -> tuple[
 
 @torch.inference_mode()
 def predict(
-    model: CompletionNet, sample: Sample, max_range_m: float, brightness: float = 0.0, seed: int = 0
+    model: CompletionNet, sample: Sample, max_range_m: float, brightness: float = 0.0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the depth of a panorama as in inference, and its ground truth; (H, W) metres each, 0 is unknown.
 
-    There is no augmentation; it runs in float32 on the model's device. ``seed`` is that of a simulated prior.
+    There is no augmentation; it runs in float32 on the model's device.
     """
     model.eval()
-    rgb, truth, prior = to_tensors(
-        stack([sample], np.random.default_rng(seed)), max_range_m, next(model.parameters()).device
-    )
+    rgb, truth, prior = to_tensors(stack([sample]), max_range_m, next(model.parameters()).device)
     depth = model(to_brightness(rgb, brightness), prior)[0][0].clamp(0.1, max_range_m)
     return depth.cpu().numpy(), truth[0].cpu().numpy()
 
 
-def evaluate(model: CompletionNet, samples: Samples, max_range_m: float, brightness: float = 0.0) -> DepthMetrics:
+def evaluate(
+    model: CompletionNet, samples: Sequence[Sample], max_range_m: float, brightness: float = 0.0
+) -> DepthMetrics:
     """Return the mean metrics of :func:`predict` over panoramas, weighted by solid angle."""
     weights = solid_angle_weights(model.config.height)[:, None]
-    each = (predict(model, samples[index], max_range_m, brightness, index) for index in range(len(samples)))
+    each = (predict(model, sample, max_range_m, brightness) for sample in samples)
     return mean_metrics([depth_metrics(depth, truth, weights=weights) for depth, truth in each])
 
 
@@ -176,9 +176,10 @@ class Trainer:
 
     Attributes:
         feed: training batches, of ``config.batch_size``.
-        held_out: panoramas for evaluation, from worlds or scenes that are not in the feed.
+        held_out: panoramas for evaluation, from worlds that are not in the feed.
         model: network to train; it keeps the weights it has.
         output: checkpoint file.
+        data: source of the panoramas, for the record.
         origin: source of the first weights, for the record.
         command: the user's command line, for the record.
         bar: receives the progress 0..1 after each step.
@@ -186,10 +187,11 @@ class Trainer:
     """
 
     feed: Feed
-    held_out: Samples
+    held_out: Sequence[Sample]
     model: CompletionNet
     config: TrainingConfig
     output: Path
+    data: dict[str, Any] = field(default_factory=dict)
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     origin: dict[str, Any] = field(default_factory=dict)
     command: str = ""
@@ -203,7 +205,6 @@ class Trainer:
     def __post_init__(self) -> None:
         torch.set_num_threads(self.config.threads)
         torch.manual_seed(self.config.seed)
-        self._ahead = Ahead(self.feed)
         self.network = self.model.config
         rows = np.maximum(solid_angle_weights(self.network.height), POLE_WEIGHT)
         self.row_weights = torch.from_numpy(rows).to(self.device)
@@ -251,7 +252,7 @@ class Trainer:
         factor = schedule(self.progress, self.config.warmup)
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate * factor * group["rate"]
-        batch = to_tensors(self._ahead.batch(self.step), self.config.max_range_m, self.device)
+        batch = to_tensors(self.feed.batch(self.step), self.config.max_range_m, self.device)
         rgb, truth, prior = self._augmented(*batch)
         self.model.train()
         with torch.autocast(self.device.type, self._half, enabled=self.config.mixed_precision):
@@ -300,8 +301,8 @@ class Trainer:
             log.close()
 
     def close(self) -> None:
-        """Close the feed and its processes."""
-        self._ahead.close()
+        """Close the feed."""
+        self.feed.close()
 
     def _row(self, log: TrainingLog, losses: list[float], since: float, since_step: int) -> tuple[float, int]:
         """Write loss and speed since a time and step; return the current ones."""
@@ -322,7 +323,7 @@ class Trainer:
         step = max(1, len(self.held_out) // self.config.evaluation_panoramas)
         return [self.held_out[i] for i in range(0, len(self.held_out), step)]
 
-    def _evaluate(self, samples: Samples) -> DepthMetrics:
+    def _evaluate(self, samples: Sequence[Sample]) -> DepthMetrics:
         return evaluate(self.average, samples, self.config.max_range_m, self.config.brightness)
 
     def _checkpoint(self, log: TrainingLog, metrics: DepthMetrics, losses: list[float]) -> None:
@@ -353,7 +354,7 @@ class Trainer:
             "network": self.network.as_dict(),
             "parameters": sum(p.numel() for p in self.model.parameters()),
             "training": asdict(self.config),
-            "data": self.feed.info,
+            "data": {**self.data, "panoramas": len(self.feed.samples)},
             "held_out": len(self.held_out),
             "device": describe_device(self.device),
             "steps": self.step,

@@ -7,14 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from instant_ic.cli import depth_train
 from instant_ic.cli.errors import UserError
-from instant_ic.training import feeds
 from instant_ic.training.dataset import DatasetError, save_sample
 from instant_ic.training.rooms import RoomsConfig
 from instant_ic.training.slicenet import CheckpointError
@@ -30,27 +28,6 @@ def ic(*words: str) -> int:
     return int(args.func(args))
 
 
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Priors of panoramas at once: 2 m everywhere."""
-
-    def prior(rgb: np.ndarray, depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        channels = np.zeros((6, *depth_m.shape), np.float32)
-        channels[0], channels[1] = 2.0, 0.3
-        return channels
-
-    monkeypatch.setattr(feeds, "prior_of_image", prior)
-
-
-def plain_folder(root: Path) -> str:
-    for index in range(6):
-        for name in ("rgb", "depth"):
-            (root / name).mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(root / "rgb" / f"{index}.jpg"), np.full((64, 128, 3), 40 * index, np.uint8))
-        np.save(root / "depth" / f"{index}.npy", np.full((64, 128), 1.0 + index, np.float32))
-    return f"plain:{root}"
-
-
 def record(checkpoint: Path) -> dict:
     return torch.load(checkpoint, weights_only=True)["record"]
 
@@ -64,7 +41,7 @@ def rendered_folder(root: Path) -> str:
         channels[0], channels[1] = 1.1 * depth, 0.1
         rgb = np.repeat((depth * 50).astype(np.uint8)[..., None], 3, axis=-1)
         save_sample(root / f"{seed}-0.npz", rgb, depth, [channels, channels])
-    return f"rendered:{root}"
+    return str(root)
 
 
 def test_rendered_panoramas_and_taken_up_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -73,7 +50,7 @@ def test_rendered_panoramas_and_taken_up_again(tmp_path: Path, capsys: pytest.Ca
     assert ic(*words, "--epochs", "1") == 0
     assert record(weights)["steps"] == 4  # 8 worlds x 2 priors / 4
     assert record(weights)["history"][0]["mre"] == pytest.approx(0.1, abs=0.001)  # of the prior
-    assert record(weights)["data"] == {"kind": "rendered", "folder": "p", "count": 18, "scenes": 9, "panoramas": 16}
+    assert record(weights)["data"] == {"folder": "p", "worlds": 9, "panoramas": 16}
     said = capsys.readouterr().out
     assert "training on CPU" in said and json.loads(said.splitlines()[-1])["mre"] > 0
     assert weights.with_suffix(".csv").read_text().splitlines()[-1].startswith("4,")
@@ -81,20 +58,15 @@ def test_rendered_panoramas_and_taken_up_again(tmp_path: Path, capsys: pytest.Ca
     assert record(weights)["steps"] == 8 and len(record(weights)["history"]) == 3
 
 
-def test_folders_mixed_and_started_from_weights(tmp_path: Path) -> None:
-    data = plain_folder(tmp_path / "mine")
+def test_started_from_weights_with_a_preset(tmp_path: Path) -> None:
     first, second = tmp_path / "a.pt", tmp_path / "b.pt"
-    words = ("train", "--data", data, "--batch-size", "3", "--epochs", "1")
+    words = ("train", "--data", rendered_folder(tmp_path / "p"), "--batch-size", "4", "--epochs", "1")
     assert ic(*words, "--checkpoint", str(first)) == 0
-    made = record(first)
-    assert made["data"] == {"kind": "plain", "folder": "mine", "count": 6, "scenes": 6, "panoramas": 5}
-    assert made["held_out"] == 1
-    more = ("--data", rendered_folder(tmp_path / "p"), "--init", str(first), "--checkpoint", str(second))
-    assert ic(*words, *more) == 0
+    assert ic(*words, "--preset", "gpu", "--init", str(first), "--checkpoint", str(second)) == 0
     made = record(second)
-    assert [part["batch_size"] for part in made["data"]["mixed"]] == [1, 2]
-    assert made["held_out"] == 1 + 2
     assert made["start"]["file"] == "a.pt" and made["start"]["record"]["steps"] == record(first)["steps"]
+    training = made["training"]
+    assert (training["batch_size"], training["minutes"], training["learning_rate"]) == (4, 20.0, 2e-3)
 
 
 def test_render_writes_what_train_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,20 +103,12 @@ def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
         (("--height", "100"), UserError, "multiple of 32"),
         (("--encoder", "/absent.pth"), CheckpointError, "no such file"),
         (("--device", "tpu9"), UserError, "device 'tpu9'"),
-        (("--data", "plain:/absent"), DatasetError, "no such folder"),
+        (("--data", "/absent"), DatasetError, "no rendered panoramas"),
         (("--init", "/absent.pt"), CheckpointError, "no such file"),
         (("--checkpoint", "/tmp"), UserError, "is a folder"),
     ],
 )
 def test_mistakes_are_told(words: tuple[str, ...], error: type[Exception], message: str, tmp_path: Path) -> None:
     with pytest.raises(error, match=message):
-        given = () if "--data" in words else ("--data", plain_folder(tmp_path / "mine"))
+        given = () if "--data" in words else ("--data", rendered_folder(tmp_path / "p"))
         ic("train", "--checkpoint", str(tmp_path / "w.pt"), *given, *words)
-
-
-def test_preset_sets_what_is_not_given(tmp_path: Path) -> None:
-    data = plain_folder(tmp_path / "mine")
-    words = ("--data", data, "--epochs", "1", "--checkpoint", str(tmp_path / "w.pt"))
-    assert ic("train", "--preset", "gpu", "--batch-size", "2", *words) == 0
-    made = record(tmp_path / "w.pt")["training"]
-    assert (made["batch_size"], made["minutes"], made["learning_rate"]) == (2, 20.0, 2e-3)

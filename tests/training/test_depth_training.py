@@ -12,7 +12,7 @@ import torch
 
 from instant_ic.training.completion import CompletionConfig, CompletionNet, load_completion
 from instant_ic.training.dataset import Sample
-from instant_ic.training.feeds import FileFeed
+from instant_ic.training.feeds import Feed
 from instant_ic.training.slicenet import CheckpointError
 from instant_ic.training.trainer import (
     Trainer,
@@ -44,17 +44,11 @@ def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, **op
         minutes=60, epochs=epochs, batch_size=3, threads=1, mixed_precision=False, average=0.8, learning_rate=1e-2,
         photograph=False, brightness=0.0,
     )  # fmt: skip
-    feed = FileFeed(samples, np.arange(9), 3, info={"kind": "stripes"})
     torch.manual_seed(0)
     return Trainer(
-        feed,
-        samples[9:],
-        CompletionNet(TINY),
-        config,
-        output,
-        report=lambda line: None,
-        **options,
-    )
+        Feed(samples[:9], 3), samples[9:], CompletionNet(TINY), config, output, {"folder": "stripes"},
+        report=lambda line: None, **options,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +72,7 @@ def test_training_learns(trained: SimpleNamespace) -> None:
 
 def test_record_tells_what_made_the_weights(trained: SimpleNamespace) -> None:
     record = torch.load(trained.path, weights_only=True)["record"]
-    assert record["data"] == {"kind": "stripes", "panoramas": 9} and record["held_out"] == 3
+    assert record["data"] == {"folder": "stripes", "panoramas": 9} and record["held_out"] == 3
     assert (record["steps"], record["epochs"], record["command"]) == (36, 12.0, "ic depth train")
     assert record["device"].startswith("CPU") and record["start"] == {}
     assert record["history"][-1]["mre"] == round(trained.metrics.mre, 5)

@@ -14,7 +14,7 @@ from instant_ic.sim.worlds import random_world
 from instant_ic.training import sparse
 from instant_ic.training.dataset import DatasetError
 from instant_ic.training.photographs import unpack, with_photographs
-from instant_ic.training.sparse import bend, misplaced, prior_of_image, sample_prior, spoiled
+from instant_ic.training.sparse import bend, misplaced, sample_prior, spoiled
 
 SIZE = (64, 128)
 
@@ -84,16 +84,6 @@ def test_wrong_mount_is_within_its_bounds() -> None:
         # The vertical axis moves by tilt alone: 1 degree about x and y and 2 cm along each axis.
         assert np.linalg.norm(moved[1] - points[1]) < 5 * np.radians(1.0) * np.sqrt(2) + 0.02 * np.sqrt(3)
         assert np.linalg.norm(moved[0] - points[0]) < 0.35
-
-
-def test_prior_of_a_panorama_without_a_world(room: tuple) -> None:
-    rgb, true = room[2:]
-    priors = [prior_of_image(rgb, true, np.random.default_rng(seed)) for seed in range(3)]
-    found = [prior for prior in priors if prior is not None]
-    assert found
-    for prior in found:
-        error = np.abs(prior[0] - true)[prior[2] > 0] / true[prior[2] > 0]
-        assert np.median(error) < 0.06
 
 
 def test_photographs_change_the_surfaces_and_nothing_else(world: World, tmp_path: Path) -> None:
