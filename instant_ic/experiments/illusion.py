@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,19 +22,22 @@ from instant_ic.experiments.illusion_stack import (
     HEIGHT,
     LIVE,
     SOURCES,
+    TRUE_DEPTH,
     WIDTH,
     FilmedStack,
     IllusionFrame,
     StackConfig,
 )
+from instant_ic.experiments.plots import image_strip, new_figure, save_figure
 from instant_ic.experiments.processes import run_all
 from instant_ic.experiments.results import finite
 from instant_ic.experiments.teleop import TeleopSettings, run_episode
 
 STEP_M = 0.5
 """Width of a row of ``by_distance``."""
-WITHIN_DB = 2.0
-"""Error allowed in the expected PSNR."""
+_TILE_PX = 400
+_COLUMNS = {LIVE: "shown", "truth": "true", TRUE_DEPTH: "with true depth"}
+_COLOURS = {LIVE: "tab:red", TRUE_DEPTH: "tab:blue"}
 Still = dict[str, NDArray[np.uint8]]
 """Images of one frame: ``truth`` and each source."""
 
@@ -94,7 +99,7 @@ def evaluate(
 
 
 def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
-    """Return the figures of all frames by source, readiness, and each frame; ready for JSON.
+    """Return the figures of all frames by source, and each frame; ready for JSON.
 
     Raises:
         ValueError: the virtual space was never shown.
@@ -114,26 +119,22 @@ def report(films: Sequence[Film], settings: TeleopSettings) -> dict[str, Any]:
         "by_distance": by_distance(frames, LIVE),
         "frames_without_obstacle": sum(frame.distance_m is None for frame in frames),
     }
-    for source in SOURCES[1:]:
-        result[source] = {**figures(frames, source), "by_distance": by_distance(frames, source)}
-    result["readiness"] = readiness(frames)
+    result[TRUE_DEPTH] = {**figures(frames, TRUE_DEPTH), "by_distance": by_distance(frames, TRUE_DEPTH)}
     result["each"] = [asdict(frame) for frame in frames]
     rounded: dict[str, Any] = finite(result, 4)
     return rounded
 
 
 def figures(frames: Sequence[IllusionFrame], source: str) -> dict[str, Any]:
-    """Return the mean figures of frames for a source; NaN where there is nothing to average."""
+    """Return the mean figures of frames for a source."""
     scores = [frame.scores[source] for frame in frames]
     psnr = np.array([one.psnr_db for one in scores])
-    floor = sum(one.floor for one in scores)
     return {
         "frames": len(frames),
         "psnr_mean_db": float(psnr.mean()),
         "psnr_p05_db": float(np.percentile(psnr, 5)),
         "ssim_mean": float(np.mean([one.ssim for one in scores])),
         "unseen_share_mean": float(np.mean([frame.unseen_share[source] for frame in frames])),
-        "floor_fog_share": sum(one.fog for one in scores) / floor if floor else math.nan,
     }
 
 
@@ -146,18 +147,41 @@ def by_distance(frames: Sequence[IllusionFrame], source: str) -> list[dict[str, 
     return [{"distance_m": row, **figures(rows[row], source)} for row in sorted(rows)]
 
 
-def readiness(frames: Sequence[IllusionFrame]) -> dict[str, Any]:
-    """Return the error in dB of the expected PSNR over the live frames that show the view alone."""
-    error = np.array([frame.expected_psnr_db - frame.scores[LIVE].psnr_db for frame in frames if frame.blend == 1])
-    if not error.size:
-        return {}
-    return {
-        "mean_error_db": float(error.mean()),
-        "rms_error_db": float(np.sqrt(np.mean(error**2))),
-        "p95_abs_error_db": float(np.percentile(np.abs(error), 95)),
-        "share_within_2_db": float(np.mean(np.abs(error) <= WITHIN_DB)),
-    }
-
-
 def _row(distance_m: float) -> float:
     return STEP_M * round(distance_m / STEP_M) + 0.0  # no −0
+
+
+def save_strip(path: Path, films: Sequence[Film]) -> None:
+    """Save rows of frames by distance behind the obstacle's near face, of the episode that has most of them.
+
+    Raises:
+        ValueError: no frame has a distance: no obstacle was passed.
+    """
+    film = max(films, key=lambda film: len(film.stills))
+    if not film.stills:
+        raise ValueError(f"{path}: there is no strip because no obstacle was passed")
+    rows = [(f"{at:+.1f} m", [film.stills[at][name] for name in _COLUMNS]) for at in sorted(film.stills)]
+    strip = image_strip(list(_COLUMNS.values()), rows, _TILE_PX)
+    if not cv2.imwrite(str(path), strip[..., ::-1]):
+        raise ValueError(f"{path}: the strip cannot be written")
+
+
+def save_plot(path: Path, report: dict[str, Any]) -> None:
+    """Save PSNR against distance for all sources: each frame, and the means."""
+    figure, axes = new_figure(1, 1, (7.0, 4.6))
+    axis = axes[0, 0]
+    known = [frame for frame in report["each"] if frame["distance_m"] is not None]
+    for source in SOURCES:
+        colour = _COLOURS[source]
+        psnr_db = [frame["scores"][source]["psnr_db"] for frame in known]
+        axis.plot([frame["distance_m"] for frame in known], psnr_db, ".", color=colour, alpha=0.25, markersize=4)
+        rows = (report if source == LIVE else report[source])["by_distance"]
+        means_db = [row["psnr_mean_db"] for row in rows]
+        axis.plot([row["distance_m"] for row in rows], means_db, color=colour, label=_COLUMNS[source])
+    axis.axvline(0.0, color="0.6", linewidth=0.8)
+    axis.set(xlabel="metres behind the obstacle's near face", ylabel="PSNR, dB")
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
+    name = Path(str(report["world"])).name
+    figure.suptitle(f"{name}, {report['episodes']} episode(s), {report['frames']} frames", fontsize=10)
+    save_figure(figure, path)

@@ -7,7 +7,8 @@ modelled: the paler colours of estimated surfaces, colour matching at a switch, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -16,11 +17,11 @@ from numpy.typing import NDArray
 
 from instant_ic.adapters.nerf import decode_keyframe
 from instant_ic.bus.lockstep import Record
-from instant_ic.experiments.illusion_truth import Passage, Score, score
 from instant_ic.experiments.teleop import photograph
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
 from instant_ic.experiments.teleop_worlds import Course
 from instant_ic.experiments.worlds import Obstacle, without
+from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose2_from_matrix, pose_matrix
 from instant_ic.msg import deserialize
 from instant_ic.sim.render import EquirectRenderer
@@ -33,14 +34,60 @@ if TYPE_CHECKING:
 FloatArray: TypeAlias = NDArray[np.float64]
 Image: TypeAlias = NDArray[np.uint8]
 
-LIVE, TRUE_DEPTH, TRUE_FILL = "live", "with_true_depth", "with_true_depth_and_fill"
-SOURCES = (LIVE, TRUE_DEPTH, TRUE_FILL)
+LIVE, TRUE_DEPTH = SOURCES = ("live", "with_true_depth")
 FRAME_S = 0.3
 """Simulated seconds between two compared frames. The page shows up to 60 frames a second."""
 WIDTH, HEIGHT, FOV_RAD = 640, 360, np.pi / 2
 """The page's window, pixels, and its horizontal field of view."""
 TRUE_SIGMA = 0.01
 """Relative sigma of the true depth: it is sampled once per pixel."""
+ASIDE_M = 0.8
+"""Largest distance of an obstacle's centre from the v-bot's line at which it blocks the v-bot's way."""
+
+
+@dataclass(frozen=True)
+class Passage:
+    """The v-bot's way through obstacles: the line from its position (2,) when it takes over along a unit vector (2,).
+
+    ``obstacles`` are those in the way, nearest first, each with the position of its near face along the line, metres.
+    """
+
+    start: FloatArray
+    heading: FloatArray
+    obstacles: tuple[tuple[float, Obstacle], ...]
+
+    @classmethod
+    def of(cls, pose: FloatArray, obstacles: Sequence[Obstacle]) -> Passage:
+        """Return the passage that begins at pose (3,)."""
+        start, heading = np.asarray(pose[:2], np.float64), np.array([math.cos(pose[2]), math.sin(pose[2])])
+        left = np.array([-heading[1], heading[0]])
+        ahead = []
+        for one in obstacles:
+            outline = one.corners() - start
+            near, far = float((outline @ heading).min()), float((outline @ heading).max())
+            if far > 0 and abs(float((outline @ left).mean())) < ASIDE_M:
+                ahead.append((near, one))
+        return cls(start, heading, tuple(sorted(ahead, key=lambda each: each[0])))
+
+    def obstacle_at(self, place: FloatArray) -> tuple[float, Obstacle] | None:
+        """Return how far a position (2,) lies behind the near face of the passed obstacle, and that obstacle.
+
+        The obstacle is the last one whose near face lies behind the position, else the first one; None without any.
+        """
+        if not self.obstacles:
+            return None
+        along = float((np.asarray(place) - self.start) @ self.heading)
+        passed = [each for each in self.obstacles if each[0] <= along]
+        near, obstacle = passed[-1] if passed else self.obstacles[0]
+        return along - near, obstacle
+
+
+@dataclass(frozen=True)
+class Score:
+    """PSNR in dB and SSIM of a shown image against the true one."""
+
+    psnr_db: float
+    ssim: float
 
 
 @dataclass(frozen=True)
@@ -153,13 +200,7 @@ class FilmedStack(SimulatedStack):
             space.render(map_from_shown, *self.size, FOV_RAD) for space in (self.space, self._truth_space)
         )
         self.on_view(live, map_from_shown)
-        unseen = true_depth.confidence == 0
-        filled = replace(
-            true_depth,
-            rgb=np.where(unseen[..., None], truth.rgb, true_depth.rgb),
-            confidence=np.where(unseen, np.float32(1), true_depth.confidence),
-        )
-        views = {LIVE: live, TRUE_DEPTH: true_depth, TRUE_FILL: filled}
+        views = {LIVE: live, TRUE_DEPTH: true_depth}
         images = {name: view.rgb for name, view in views.items()}
         if self._blend < 1:
             camera = self._camera_image(world_from_shown)
@@ -171,7 +212,7 @@ class FilmedStack(SimulatedStack):
             self._blend,
             distance_m,
             with_obstacle,
-            {name: score(image, truth, world_from_shown, FOV_RAD) for name, image in images.items()},
+            {name: Score(psnr_db(image, truth.rgb), ssim(image, truth.rgb)) for name, image in images.items()},
             {name: view.unseen_share for name, view in views.items()},
             live.expected_psnr_db,
         )

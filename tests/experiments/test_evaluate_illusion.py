@@ -14,9 +14,8 @@ import pytest
 
 from instant_ic.cli.main import main
 from instant_ic.experiments import illusion, teleop, teleop_worlds
-from instant_ic.experiments.illusion_plot import save_plot, save_strip
-from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, FilmedStack, IllusionFrame
-from instant_ic.experiments.illusion_truth import Passage, Score, fog_pixels, score, surfaces
+from instant_ic.experiments.illusion import save_plot, save_strip
+from instant_ic.experiments.illusion_stack import LIVE, SOURCES, TRUE_DEPTH, FilmedStack, IllusionFrame, Passage, Score
 from instant_ic.experiments.results import save_json
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
 from instant_ic.experiments.worlds import Obstacle, without
@@ -82,48 +81,21 @@ def test_a_poster_over_the_removed_box_stays() -> None:
     assert gone.vertices[:, 2].min() < -900
 
 
-def test_floor_shown_as_wall_counts_as_fog() -> None:
-    """Floor 100, wall 200: the floor's left half is shown at 190, its right half at 110."""
-    true = np.full((60, 80, 3), 200, np.uint8)
-    true[30:] = 100
-    floor = np.zeros((60, 80), bool)
-    floor[30:] = True
-    shown = true.copy()
-    shown[30:, :40], shown[30:, 40:] = 190, 110
-    fog = fog_pixels(shown, true, floor, ~floor)
-    # The mean of nine columns changes sides at the border itself.
-    assert fog[:, :39].sum() == 30 * 39 and fog[:, 41:].sum() == 0
-    assert not fog_pixels(true, true, floor, ~floor).any()
-    assert not fog_pixels(shown, true, floor, np.zeros_like(floor)).any()
-
-
-def test_surfaces_by_height(corridor: teleop_worlds.Course) -> None:
-    """1.2 m over the floor at 90°, 90 rows: the floor is met below the horizon, 4 m of corridor walls beside."""
-    pose = pose_matrix(0.0, 0.0, 1.2)
-    truth = EquirectRenderer(corridor.world).render_perspective(pose, 160, 90, RIGHT_ANGLE)
-    floor, wall = surfaces(truth, pose, RIGHT_ANGLE)
-    assert floor[89, 80] and not floor[:45].any() and not wall[89, 80]
-    assert wall[45, 2] and wall[45, 157] and not wall[0, 80]
-    assert score(truth.rgb, truth, pose, RIGHT_ANGLE).fog == 0
-
-
 # -- figures
 
 
 def frame(distance_m: float | None, db: float, expected: float = 25.0) -> IllusionFrame:
-    scores = dict.fromkeys(SOURCES, Score(db, 0.5, 10, 100))
+    scores = dict.fromkeys(SOURCES, Score(db, 0.5))
     return IllusionFrame(0, 1.0, 1.0, distance_m, False, scores, dict.fromkeys(SOURCES, 0.1), expected)
 
 
 def test_figures_by_hand() -> None:
     frames = [frame(0.1, 20.0), frame(0.2, 24.0), frame(0.4, 28.0), frame(None, 24.0)]
     whole = illusion.figures(frames, LIVE)
-    assert whole["psnr_mean_db"] == 24.0 and whole["frames"] == 4 and whole["floor_fog_share"] == 0.1
+    assert whole["psnr_mean_db"] == 24.0 and whole["frames"] == 4
     assert whole["psnr_p05_db"] == pytest.approx(20.6)  # 0.15 of the way from the first to the second of four
     rows = illusion.by_distance(frames, TRUE_DEPTH)
     assert [(row["distance_m"], row["frames"], row["psnr_mean_db"]) for row in rows] == [(0.0, 2, 22.0), (0.5, 1, 28.0)]
-    ready = illusion.readiness(frames)  # errors 5, 1, −3, 1
-    assert ready["mean_error_db"] == 1.0 and ready["rms_error_db"] == 3.0 and ready["share_within_2_db"] == 0.5
     figures = illusion.report([illusion.Film(0, True, [frame(None, 24.0)])], illusion.TeleopSettings(methods=("ic",)))
     assert figures["by_distance"] == [] and figures["frames_without_obstacle"] == 1
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
@@ -185,15 +157,14 @@ def test_a_short_film(corridor: teleop_worlds.Course, tmp_path: Path) -> None:
     assert figures["frames"] >= 8 and figures["frames_without_obstacle"] == 0
     rows = [row["distance_m"] for row in figures["by_distance"]]
     assert rows[0] < 0 <= rows[-1]
-    filled, true_depth = figures["with_true_depth_and_fill"], figures["with_true_depth"]
-    assert filled["psnr_mean_db"] > true_depth["psnr_mean_db"] > figures["psnr_mean_db"] > 12
-    assert 0 < figures["unseen_share_mean"] < 0.5 and filled["unseen_share_mean"] == 0
+    assert figures["with_true_depth"]["psnr_mean_db"] > figures["psnr_mean_db"] > 12
+    assert 0 < figures["unseen_share_mean"] < 0.5
     assert all(each["with_obstacle"] == (each["distance_m"] < 0) for each in figures["each"])
     save_json(tmp_path / "film.json", figures)
     assert json.loads((tmp_path / "film.json").read_text()) == figures
     save_strip(tmp_path / "strip.png", [first])
     strip = cv2.imread(str(tmp_path / "strip.png"))
-    assert strip.shape == (24 + 225 * len(rows), 64 + 4 * 400, 3) and strip.std() > 20
+    assert strip.shape == (24 + 225 * len(rows), 64 + 3 * 400, 3) and strip.std() > 20
     save_plot(tmp_path / "plot.png", figures)
     assert cv2.imread(str(tmp_path / "plot.png")).std() > 10
     with pytest.raises(ValueError, match="no obstacle was passed"):

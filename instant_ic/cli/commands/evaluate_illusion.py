@@ -25,9 +25,8 @@ def add_kind(kinds: Any) -> None:
         "ic evaluate illusion --episodes 4 --json illusion.json --strip strip.png --plot plot.png",
         "The drive of ic evaluate teleop with illusory control. Every frame in which the page shows the virtual "
         "space is rendered by the CPU and compared with the simulator's image from the same pose: with the obstacle "
-        "before its near face, without it from there on. The same frames are also rendered with true depth, and "
-        "with true depth and exact fill of unseen places. Reports PSNR, SSIM, unseen share, floor shown "
-        "as fog, and the error of the expected PSNR. The same seed gives the same figures.",
+        "before its near face, without it from there on. The same frames are also rendered with true "
+        "depth. Reports PSNR, SSIM and the share that no keyframe has seen. The same seed gives the same figures.",
     )  # fmt: skip
     add_options(parser, 20, 1, 7200.0, "PSNR by distance")
     worlds = "as ic evaluate teleop: corridors (random), or one where the operator drives straight on"
@@ -46,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
-    from instant_ic.experiments import illusion, illusion_plot
+    from instant_ic.experiments import illusion
     from instant_ic.experiments.results import save_json
 
     settings = illusion.TeleopSettings(
@@ -62,9 +61,9 @@ def _evaluate(args: argparse.Namespace) -> int:
     if args.json:
         save_json(args.json, figures)
     if args.plot:
-        illusion_plot.save_plot(args.plot, figures)
+        illusion.save_plot(args.plot, figures)
     figures.pop("each")
     print_figures(figures)
     if args.strip:  # last: without an obstacle there is none
-        illusion_plot.save_strip(args.strip, films)
+        illusion.save_strip(args.strip, films)
     return 0
