@@ -13,6 +13,35 @@ from console_pages import (
     release_by_enter,
     watched_page,
 )
+from console_servers import DRIVE, PATIENT, WATCH, Backend, token_file
+
+from instant_ic.console import ConsoleServer, ConsoleServerConfig
+from instant_ic.console.access import AccessConfig
+
+
+@pytest.fixture
+def files(tmp_path):
+    return {
+        "token_file": token_file(tmp_path, "drive", DRIVE),
+        "watch_token_file": token_file(tmp_path, "watch", WATCH),
+    }
+
+
+@pytest.fixture
+def serve():
+    """Starts servers, and stops them."""
+    servers = []
+
+    def start(access=None, drive=PATIENT, page=None, **config):
+        access = AccessConfig(**({"simulated": True} | (access or {})))
+        server = ConsoleServer(Backend(), ConsoleServerConfig(port=0, drive=drive, access=access, **config), page)
+        server.start()
+        servers.append(server)
+        return server
+
+    yield start
+    for server in servers:
+        server.stop()
 
 
 @pytest.fixture(scope="module")

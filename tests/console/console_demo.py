@@ -1,13 +1,7 @@
-"""The page with a synthetic robot, for the browser tests and for work on it: ``python tests/console/console_demo.py``.
-
-The operator drives a robot in a room with an obstacle ahead. Its behaviour at the obstacle is only a sketch of the
-method, enough to try the page; instant_ic.control implements it.
-"""
+"""The page's server with a synthetic robot in a room, for the browser tests, which choose the mode."""
 
 from __future__ import annotations
 
-import argparse
-import logging
 import math
 import threading
 import time
@@ -18,7 +12,6 @@ import demo_world
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.console.access import AccessConfig
 from instant_ic.console.config import ConsoleServerConfig
 from instant_ic.console.gridimage import GridImage, grid_image
 from instant_ic.console.protocol import FrameKind
@@ -30,7 +23,6 @@ from instant_ic.geometry.projections import equirect_directions, perspective_dir
 
 CAMERA_HEIGHT_M = 1.2
 STEP_S = 0.05
-KEYFRAME_M = 1.5  # distance between two keyframes
 Pose = NDArray[np.float64]
 
 
@@ -40,7 +32,6 @@ class DemoConfig:
 
     panorama_width: int = 640
     panorama_hz: float = 5.0
-    layers: bool = False  # pages that can render the virtual space by themselves
     view: ViewConfig = field(default_factory=ViewConfig)
 
 
@@ -90,13 +81,12 @@ class Demo:
         self.look = Look()
         self.estop = False
         self.button = False  # e-stop button on the robot
-        self.forced_mode: str | None = None
+        self.forced_mode = "real"
         self.faults: list[dict[str, str]] = []
         self.pace = ""
         self.nodes = [{"name": "nerf", "cpu_percent": 12.0}]
         self.images = True
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
-        self._layers_at: Pose | None = None  # keyframe of the layers that were sent
         self.version = 0
         self.mode = "real"
         self.reason = ""
@@ -182,10 +172,6 @@ class Demo:
             if now >= due and self.images:
                 due = now + 1.0 / self.config.panorama_hz
                 self._send_panorama()
-            if self.config.layers and self.mode == "real":
-                far = self._layers_at is None or math.hypot(*(self.robot - self._layers_at)[:2]) > KEYFRAME_M
-                if far:
-                    self.send_layers(self.robot)
             rate_hz = self.config.view.virtual_rate_hz if self.mode == "virtual" else PROBE_HZ
             if self.images and self.server.needs_views() and now >= view_due:
                 view_due = now + 1.0 / rate_hz
@@ -195,7 +181,6 @@ class Demo:
         """Send the layers round a keyframe at this pose (m, rad)."""
         from demo_layers import demo_layers  # takes seconds to import
 
-        self._layers_at = keyframe.copy()
         self.version += 1
         self.server.send_layers(demo_layers(self.version, _camera(keyframe)))
 
@@ -223,49 +208,17 @@ class Demo:
         if stopped:
             text = "emergency stop button is pressed: release it, then release the stop here"
             self.mode, self.reason = "stopped", text if self.button else "emergency stop: release it to continue"
-        elif self.forced_mode is not None:
+        else:
             self.mode, self.reason = self.forced_mode, ""
-        elif self.mode == "stopped":
-            self.mode, self.reason = "real", ""
-        elif self.mode == "real" and v > 0 and _hits(_ahead(self.robot, v, w, 1.0)):
-            self.mode, self.reason = "virtual", "Obstacle ahead: the robot goes round it"
-        elif self.mode == "virtual" and self._met() and not _hits(_ahead(self.robot, v, w, 0.5)):
-            self.mode, self.reason = "real", "Robot and virtual robot met"
         self._transitions += before != self.mode
         if self.mode == "virtual":
             if before != "virtual":
                 self.vbot = self.robot.copy()
             self.vbot = _moved(self.vbot, v, w, seconds)
-            self._follow(seconds)
         elif self.mode == "real":
             self.robot = _moved(self.robot, v, w, seconds)
-            self.plan["path"], self.plan["subgoal"] = [], None
         shown = self.vbot if self.mode == "virtual" else self.robot
         self.plan["trajectory"] = _ahead(shown, v, w, 3.0 * abs(v)).round(3).tolist() if v else []
-
-    def _met(self) -> bool:
-        gap = np.hypot(*(self.vbot - self.robot)[:2])
-        return bool(gap < 0.12 and abs(wrap_angle(self.vbot[2] - self.robot[2])) < 0.1)
-
-    def _follow(self, seconds: float) -> None:
-        """Follow the v-bot, round the obstacle's left side if the straight line is blocked."""
-        box = demo_world.OBSTACLE
-        goal = self.vbot[:2].copy()
-        if _hits(goal[None]):
-            goal = np.array([box.high[0] + 0.75, 0.0])
-        points = [self.robot[:2], goal]
-        side = box.high[1] + 0.55
-        if self.robot[0] < box.high[0] + 0.3 < goal[0] + 0.3 and abs(goal[1]) < side:
-            points[1:1] = [np.array([box.low[0] - 0.1, side]), np.array([box.high[0] + 0.35, side])]
-            points[1:-1] = [p for p in points[1:-1] if p[0] > self.robot[0] + 0.05]
-        self.plan["path"] = [p.round(3).tolist() for p in points]
-        self.plan["subgoal"] = [*goal.round(3).tolist(), float(self.vbot[2])]
-        reach = points[1] - self.robot[:2]
-        distance = float(np.hypot(*reach))
-        far = distance > 0.08
-        turn = wrap_angle((math.atan2(reach[1], reach[0]) if far else self.vbot[2]) - self.robot[2])
-        speed = min(0.4, 1.5 * distance) * max(0.0, math.cos(turn)) if far else 0.0
-        self.robot = _moved(self.robot, speed, float(np.clip(2.5 * turn, -1.2, 1.2)), seconds)
 
     def _publish_state(self) -> None:
         now = time.monotonic()
@@ -367,28 +320,3 @@ def _ahead(pose: Pose, v: float, w: float, metres: float) -> Pose:
         points.append(pose[:2])
         pose = _moved(pose, math.copysign(1.0, v) if v else 0.0, w / abs(v) if v else w, metres / 40)
     return np.array(points)
-
-
-def _hits(points: Pose) -> bool:
-    box, margin = demo_world.OBSTACLE, 0.35
-    low, high = np.array(box.low[:2]) - margin, np.array(box.high[:2]) + margin
-    return bool(((points > low) & (points < high)).all(axis=1).any())
-
-
-def main() -> None:
-    """Serve the demo until Ctrl-C."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
-    arguments = parser.parse_args()
-    logging.basicConfig(level=logging.INFO)
-    demo = Demo(ConsoleServerConfig(port=arguments.port, access=AccessConfig(simulated=True)), DemoConfig(layers=True))
-    demo.start()
-    logging.getLogger("console_demo").info("open %s (Ctrl-C stops)", demo.server.url)
-    try:
-        threading.Event().wait()
-    except KeyboardInterrupt:
-        demo.stop()
-
-
-if __name__ == "__main__":
-    main()

@@ -11,10 +11,10 @@ import demo_world
 import numpy as np
 import pytest
 from console_demo import Demo, DemoConfig
+from console_servers import PATIENT
 
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.config import ConsoleServerConfig
-from instant_ic.console.drive import DriveConfig
 from instant_ic.console.view import ViewConfig
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import perspective_directions
@@ -43,19 +43,11 @@ BROWSER_TEST = [
 ]
 
 
-class Patient(DriveConfig):
-    """Takes time-outs that no robot may have, so that a busy machine does not trip them."""
-
-    def __post_init__(self):
-        pass
-
-
 def make_demo(port=0, panorama_width=192, view_width=160, **access):
     # No watchdog in the server's way: what stops the robot here must be the page.
-    drive = Patient(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
     view = ViewConfig(width=view_width, height=view_width * 5 // 8, virtual_rate_hz=5)
     config = DemoConfig(panorama_width=panorama_width, panorama_hz=4, view=view)
-    demo = Demo(ConsoleServerConfig(port=port, drive=drive, access=AccessConfig(simulated=True, **access)), config)
+    demo = Demo(ConsoleServerConfig(port=port, drive=PATIENT, access=AccessConfig(simulated=True, **access)), config)
     demo.start()
     return demo
 

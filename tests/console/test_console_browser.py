@@ -13,7 +13,6 @@ from console_pages import (
     likeness,
     make_demo,
     moving,
-    picture_of,
     room_seen,
     wait_alike,
     wait_until,
@@ -45,8 +44,7 @@ def test_page_draws_picture_and_map_without_errors(open_page):
     assert floor[0] > floor[2] + 10
 
 
-@pytest.mark.parametrize("press", ["button", "space"])
-def test_without_webgl_the_page_says_what_to_do_and_only_stops_the_robot(browser, demo, press):
+def test_without_webgl_the_page_says_what_to_do_and_only_stops_the_robot(browser, demo):
     context = browser.new_context(viewport=SIZE)
     page = context.new_page()
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
@@ -54,56 +52,13 @@ def test_without_webgl_the_page_says_what_to_do_and_only_stops_the_robot(browser
     page.get_by_text("WebGL 2 is missing. Use a current Chrome, Edge, Firefox or Safari").wait_for(timeout=WAIT_MS)
     expect_body(page, "link", "up")
     page.keyboard.down("w")
-    if press == "button":
-        page.locator("#estop").click()
-    else:
-        page.keyboard.press("Space")
+    for press in (lambda: page.keyboard.press("Space"), lambda: page.locator("#estop").click()):
+        demo.estop = False
+        press()
+        wait_until(lambda: demo.estop, page, "the emergency stop")
     expect_body(page, "estop", "set")
-    assert demo.estop
     assert demo.server.drive.gate.driver is None and not demo.commands
     context.close()
-
-
-def test_passage_to_the_rendered_view_and_back(open_page, demo):
-    page = open_page(bypass_csp=True)
-    expect_body(page, "image", "live")
-    demo.forced_mode = "real"
-    real = picture_of(page)
-    demo.forced_mode = "virtual"
-    expect_body(page, "mode", "virtual")
-    expect_body(page, "blend", "1.00")
-    page.wait_for_timeout(700)
-    virtual = picture_of(page)
-    # Same place, same direction, other picture: alike as a whole, not the same.
-    assert 0.5 < np.abs(virtual - real).mean() < 25
-    assert np.corrcoef(real[::4, ::4].ravel(), virtual[::4, ::4].ravel())[0, 1] > 0.85
-    demo.forced_mode = "real"
-    expect_body(page, "mode", "real")
-    expect_body(page, "blend", "0.00")
-
-
-def test_looking_round_by_drag_turns_the_picture_at_once_and_tells_the_robot(open_page, demo):
-    page = open_page(bypass_csp=True)
-    expect_body(page, "image", "live")
-    before = picture_of(page)
-    page.mouse.move(480, 300)
-    page.mouse.down()
-    page.mouse.move(680, 300, steps=4)
-    page.mouse.up()
-    wait_until(lambda: demo.look.yaw > np.radians(19), page, "the look direction arrives")
-    # The picture follows the pointer: 200 of 600 pixels of a 60° high picture are 20°, to the left.
-    assert demo.look.yaw == pytest.approx(np.radians(20), abs=0.01)
-    turned = picture_of(page)
-    assert np.abs(turned - before).mean() > 3
-    # What was in the middle has moved to the right with the pointer.
-    strip = before[200:260, 380:580].mean(axis=2)
-    scores = {
-        shift: np.corrcoef(strip.ravel(), turned[200:260, 380 + shift : 580 + shift].mean(axis=2).ravel())[0, 1]
-        for shift in range(-240, 241, 20)
-    }
-    assert 120 <= max(scores, key=scores.get) <= 240
-    page.keyboard.press("c")
-    wait_until(lambda: abs(demo.look.yaw) < 0.01, page, "straight ahead again")
 
 
 @pytest.mark.parametrize("mode", ["real", "virtual"])
@@ -126,18 +81,6 @@ def test_picture_is_what_stands_in_the_look_direction(open_page, sharp_demo, mod
     # The test can fail: the mirrored room, and a look 10° beside, are less alike.
     assert likeness(page, room_seen(demo.robot, look.yaw, look.pitch)[:, ::-1]) < 0.93
     assert likeness(page, room_seen(demo.robot, look.yaw + math.radians(10), look.pitch)) < 0.95
-
-
-def test_old_panorama_is_aimed_anew_when_the_robot_turns(open_page, sharp_demo):
-    demo = sharp_demo
-    demo.forced_mode = "real"
-    page = open_page(at=demo, bypass_csp=True)
-    expect_body(page, "image", "live")
-    demo.images = False
-    page.wait_for_timeout(300)
-    page.add_style_tag(content="#view { filter: none !important }")  # grey when old: here too soon
-    demo.place(0.0, 0.0, 0.5)
-    wait_alike(page, lambda: room_seen(demo.robot, 0.0, math.radians(-10)))
 
 
 def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(browser, tmp_path):

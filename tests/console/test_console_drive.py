@@ -65,12 +65,6 @@ def test_watchdog_counts_and_lets_a_fresh_command_through():
     assert gate.take_due(0.6) == (0.2, 0.0)
 
 
-def test_fault_dead_man_release_sends_no_zero():
-    gate = driving_gate()
-    gate.receive(1, 2, 0.0, 0.0, 0.0, 0.01)
-    assert gate.take_due(0.01) == (0.0, 0.0)
-
-
 def test_one_zero_goes_out_even_without_repetition():
     gate = DriveGate(DriveConfig(stop_repeat_s=0.0))
     gate.request(1, 0.0)
@@ -218,15 +212,6 @@ def test_emergency_stop_is_latched_and_only_the_driver_releases_it():
     assert gate.receive(2, 1, 0.0, 0.3, 0.0, 0.04) is Verdict.ACCEPTED
 
 
-def test_deadlines():
-    gate = driving_gate(now=10.0)
-    assert gate.next_deadline(10.0) == pytest.approx(10.05)  # the next of 20 Hz
-    gate.take_due(10.2)
-    assert gate.next_deadline(10.2) == pytest.approx(10.25)  # both
-    assert gate.next_deadline(10.3) == pytest.approx(10.3)  # overdue: now
-    assert DriveGate(CONFIG).next_deadline(0.0) is None
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [
@@ -308,11 +293,3 @@ def test_what_a_thawed_console_handles_first_does_not_matter(first):
     assert look_and_drive(gate, now + 0.6, 102) is Verdict.HELD  # silence is no release: no page was heard
     gate.touch(1, now + 0.7)
     assert look_and_drive(gate, now + 0.86, 103) is Verdict.ACCEPTED
-
-
-def test_a_console_without_a_driver_may_rest():
-    gate = DriveGate(CONFIG)
-    gate.look(0.0)
-    gate.look(60.0)
-    gate.request(1, 60.0)
-    assert look_and_drive(gate, 60.0, 1) is Verdict.ACCEPTED

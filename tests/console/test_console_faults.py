@@ -38,11 +38,8 @@ STOPPED = (0.0, 0.0)
         "window.dispatchEvent(new Event('blur'))",
         "Object.defineProperty(document, 'hidden', {get: () => true, configurable: true});"
         "document.dispatchEvent(new Event('visibilitychange'))",
-        "window.dispatchEvent(new PageTransitionEvent('pagehide'))",
-        "window.dispatchEvent(new Event('contextmenu'))",
-        "window.dispatchEvent(new KeyboardEvent('keydown', {code: 'KeyW', metaKey: true}))",
     ],
-    ids=["blur", "hidden", "pagehide", "menu", "system key"],
+    ids=["blur", "hidden"],
 )
 def test_fault_key_held_window_loses_focus_robot_drives_on(driver, shared_demo, event):
     start_driving(driver, shared_demo)
@@ -50,8 +47,8 @@ def test_fault_key_held_window_loses_focus_robot_drives_on(driver, shared_demo, 
     wait_stopped(driver, shared_demo)  # although the key is still down
 
 
-@pytest.mark.parametrize("end", ["pointercancel", "lostpointercapture"])
-def test_fault_touch_is_cancelled_robot_drives_on(driver, shared_demo, end):
+@pytest.mark.parametrize("end", ["pointerup", "pointercancel", "lostpointercapture"])
+def test_fault_touch_ends_or_is_cancelled_robot_drives_on(driver, shared_demo, end):
     push_stick(driver, shared_demo)
     release_stick(driver, end)
     wait_stopped(driver, shared_demo)
@@ -93,12 +90,6 @@ def test_fault_dead_man_release_sends_no_zero_by_key(driver, shared_demo):
     driver.keyboard.up("ArrowDown")
     wait_stopped(driver, shared_demo)
     driver.keyboard.press("Equal")
-
-
-def test_fault_dead_man_release_sends_no_zero_by_stick(driver, shared_demo):
-    push_stick(driver, shared_demo)
-    release_stick(driver)
-    wait_stopped(driver, shared_demo)
 
 
 def test_fault_dead_man_release_sends_no_zero_by_gamepad(pad, shared_demo):
@@ -238,16 +229,6 @@ def wait_for_banner(page, title, text):
     page.locator("#banner:visible").filter(has_text=title).filter(has_text=text).wait_for()
 
 
-def test_the_button_on_the_robot_is_told_with_where_to_let_it_out(driver, shared_demo):
-    shared_demo.button = True
-    expect_body(driver, "estop", "set")
-    words = "Emergency stop button is pressed: release it, then release the stop here"
-    wait_for_banner(driver, "EMERGENCY STOP", words)
-    driver.locator("#mode-reason", has_text=words).wait_for()
-    shared_demo.button = False
-    expect_body(driver, "estop", "free")
-
-
 def test_controls_held_through_a_stop_are_told_to_be_let_go(driver, shared_demo):
     """The arbiter starts again only with hands off; whoever still holds a key must be told why nothing moves."""
     start_driving(driver, shared_demo)
@@ -259,16 +240,6 @@ def test_controls_held_through_a_stop_are_told_to_be_let_go(driver, shared_demo)
     driver.locator("#banner").wait_for(state="hidden")
     shared_demo.forced_mode = "real"
     expect_body(driver, "mode", "real")
-
-
-def test_the_pace_of_a_simulation_is_shown_beside_the_mode(driver, shared_demo):
-    pace = driver.locator("#mode #pace")
-    pace.wait_for(state="hidden")
-    shared_demo.pace = "simulation at 0.6 of real time: this machine is busy"
-    pace.wait_for()
-    assert pace.inner_text() == shared_demo.pace
-    shared_demo.reset()
-    pace.wait_for(state="hidden")
 
 
 def test_faults_and_a_silent_camera_are_told(driver, shared_demo):

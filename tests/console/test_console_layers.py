@@ -7,18 +7,16 @@ import math
 import aiohttp
 import numpy as np
 import pytest
+from console_servers import WAIT_S, until
 
-from instant_ic.console import ConsoleClient, ConsoleServer, ConsoleServerConfig, FrameKind, PageProtocolError
+from instant_ic.console import ConsoleClient, FrameKind, PageProtocolError
 from instant_ic.console import pages as pages_module
-from instant_ic.console.access import AccessConfig
 from instant_ic.console.layer_meshes import LayerMeshes
 from instant_ic.console.layers import PageLayer, PageLayers
 from instant_ic.console.protocol import Parts, decode_frame
 from instant_ic.console.session import PART_BYTES
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace.layers import Content, DecodedLayer, Kind, Layer, Layers
-
-WAIT_S = 20.0
 
 
 def layer(image=b"JPEG", **values):
@@ -90,31 +88,15 @@ def test_version_number_of_layers_and_pose_are_checked():
     layers(1).check()
 
 
-class Nobody:
-    """Backend that does nothing."""
-
-    def __getattr__(self, name):
-        return lambda *args: None
-
-
 @pytest.fixture
-def server():
-    server = ConsoleServer(Nobody(), ConsoleServerConfig(port=0, access=AccessConfig(simulated=True)))
-    server.start()
-    yield server
-    server.stop()
+def server(serve):
+    return serve()
 
 
 def sent_parts(client):
     """Version of the newest frame, and which layers came with their parts."""
     header = client.frames[FrameKind.LAYERS].header
     return header["version"], [one["parts"] is not None for one in header["layers"]]
-
-
-async def until(predicate):
-    async with asyncio.timeout(WAIT_S):
-        while not predicate():
-            await asyncio.sleep(0.01)
 
 
 async def next_layers(client, count):

@@ -33,7 +33,6 @@ from instant_ic.msg import (
     twist_message,
     twist_values,
 )
-from instant_ic.util import pace
 from nodes.console import ConsoleNode
 
 START = 1_000_000_000
@@ -204,12 +203,6 @@ def test_panorama_passes_as_it_came_with_the_cameras_heading_and_age(setup):
     assert frame_header["captured_ms"] == pytest.approx(server.now_ms() - 80.0)
     rotation = matrix_from_quaternion(frame_header["q"])[:3, :3]
     np.testing.assert_allclose(rotation[:, 0], [0, 1, 0], atol=1e-9)  # looks along the map's y
-
-
-def test_panorama_without_a_pose_is_shown_all_the_same(setup):
-    bus, _, server = setup
-    bus.publish("/camera/image/compressed", compressed_image_message(b"JPEG", "camera", bus.clock.now_ns()))
-    assert server.frames[-1][1]["q"] is None
 
 
 def test_state_tells_mode_poses_and_reason(setup):
@@ -410,13 +403,6 @@ def test_real_mode_keeps_the_renderer_warm_once_a_second(setup, vspace, counts):
     assert len(bus.messages("/view/request")) in counts
 
 
-def test_view_with_an_impossible_field_of_view_is_dropped_and_told(setup):
-    bus, node, server = setup
-    bus.publish("/vspace/view", view_message(bus, 1, fov=0.0))
-    assert not [f for f in server.frames if f[0] is FrameKind.VIEW]
-    assert "field of view" in node.diagnoses()["view"][1]
-
-
 def test_map_is_sent_when_changed_and_at_most_twice_a_second(setup):
     bus, _, server = setup
     grid = np.zeros((10, 10), np.int8)
@@ -521,15 +507,6 @@ def test_vspace_and_battery_are_told(setup):
     assert health["battery"] == {"voltage": 24.5, "percent": None}
 
 
-def test_configuration_file_holds_the_defaults():
-    from pathlib import Path
-
-    from instant_ic.config.params import configure, gather
-
-    file = Path(__file__).resolve().parents[2] / "config" / "console.yaml"
-    assert configure(ConsoleConfig, gather("console", [file], []))[0] == ConsoleConfig()
-
-
 def test_without_a_page_nothing_is_sent_or_requested(setup):
     bus, node, server = setup
     publish_tree(bus)
@@ -548,15 +525,3 @@ def test_without_a_page_nothing_is_sent_or_requested(setup):
     bus.advance(1.0)
     assert "state" in server.texts and len(bus.messages("/view/request")) == 1
     assert 20 <= len(bus.messages("/view/shown")) <= 22
-
-
-def test_the_page_shows_the_pace_of_a_simulation(setup):
-    bus, _, server = setup
-    bus.advance(1.1)
-    assert server.texts["health"]["pace"] == ""
-    pace.use(pace.Pace.from_now(0.4))
-    try:
-        bus.advance(1.1)
-    finally:
-        pace.use(pace.Pace())
-    assert server.texts["health"]["pace"] == "simulation at 0.4 of real time"

@@ -53,11 +53,6 @@ def test_a_full_disk_and_a_missing_recorder_are_told_in_plain_words(driver, shar
     assert recorder.state == "disk full"  # it was asked for nothing
 
 
-def test_a_bookmark_by_key(driver):
-    driver.keyboard.press("b")
-    driver.get_by_text("Bookmark set: bookmark 12:00:00 (not recording)").wait_for(state="attached")
-
-
 def test_the_last_minute_is_kept(driver, shared_demo):
     driver.locator("#more-open").click()
     driver.get_by_role("button", name="Save the last minute").click()

@@ -10,7 +10,6 @@ import pytest
 from console_demo import Demo, DemoConfig
 from console_pages import (
     BROWSER_TEST,
-    PAD,
     WAIT_MS,
     expect_body,
     likeness,
@@ -84,7 +83,7 @@ def pass_to(page, demo, mode):
     expect_body(page, "blend", "1.00" if mode == "virtual" else "0.00")
 
 
-def test_a_tinted_view_has_the_cameras_colours_at_the_switch_and_the_camera_the_views(open_page, passages):
+def test_a_tinted_view_has_the_cameras_colours_at_the_switch(open_page, passages):
     # The colours are not released, however long a busy machine takes for a picture.
     demo = passages(colour_release_s=3600, dissolve_ms=300, ease_ms=300)
     demo.tint = TINT
@@ -98,60 +97,6 @@ def test_a_tinted_view_has_the_cameras_colours_at_the_switch_and_the_camera_the_
     virtual = picture_of(page).mean(axis=(0, 1))
     # Untreated it would be red +8 %, green -10 %, blue -28 %.
     assert virtual == pytest.approx(real, rel=0.03)
-    # The view has let go of the camera's colours by the time of the way back: then the camera comes in the view's.
-    page.reload()
-    expect_body(page, "blend", "1.00")
-    never_grey(page)
-    page.wait_for_timeout(500)
-    own = picture_of(page).mean(axis=(0, 1))
-    pass_to(page, demo, "real")
-    assert picture_of(page).mean(axis=(0, 1)) == pytest.approx(own, rel=0.03)
-
-
-def test_the_matched_colour_is_let_go_of(open_page, passages):
-    demo = passages(dissolve_ms=100, colour_release_s=2)
-    demo.tint = TINT
-    page = open_page(at=demo, bypass_csp=True)
-    expect_body(page, "image", "live")
-    never_grey(page)
-    page.wait_for_timeout(300)
-    real = picture_of(page).mean(axis=(0, 1))
-    pass_to(page, demo, "virtual")
-
-    def tint():
-        return picture_of(page).mean(axis=(0, 1)) / real
-
-    wait_until(lambda: tint() == pytest.approx(TINT[::-1], rel=0.06), page, "the view's own colours")
-
-
-FIT = """async ({from, to, weights}) => {
-    const {fitColour} = await import("/static/colour.js");
-    return fitColour(from, to, weights);
-}"""
-
-
-def test_colour_is_fitted_in_spite_of_what_moved(open_page, demo):
-    page = open_page(bypass_csp=True)
-    random = np.random.default_rng(1)
-    cells = random.uniform(0.1, 0.8, (400, 3))
-    gain, offset = np.array([0.8, 1.0, 1.25]), np.array([0.05, 0.0, -0.04])
-    other = cells * gain + offset + random.normal(0, 0.01, cells.shape)
-    other[:80] = random.uniform(0, 1, (80, 3))  # a fifth of them shows something else
-
-    def fit(to, weights, seen=cells):
-        values = {"from": seen.ravel().tolist(), "to": to.ravel().tolist(), "weights": weights.tolist()}
-        return page.evaluate(FIT, values)
-
-    found = fit(other, np.ones(400))
-    assert found["gain"] == pytest.approx(gain, abs=0.04)
-    assert found["offset"] == pytest.approx(offset, abs=0.02)
-    # Hardly anything in common: nothing is matched.
-    assert fit(other, np.r_[np.ones(15), np.zeros(385)]) == {"gain": [1, 1, 1], "offset": [0, 0, 0]}
-    # A flat wall does not tell gain and offset apart: its colour is met, by the gain for the most part.
-    wall = np.full((400, 3), 0.4) + random.normal(0, 0.004, (400, 3))
-    flat = fit(wall * 1.2, np.ones(400), wall)
-    assert 0.4 * np.array(flat["gain"]) + flat["offset"] == pytest.approx(np.full(3, 0.48), abs=0.003)
-    assert np.abs(flat["offset"]).max() < 0.03
 
 
 def steps(seen, what):
@@ -195,40 +140,14 @@ def test_the_picture_never_jumps_at_a_switch_and_the_rest_of_the_pose_is_eased_o
     assert step < 0.35 * total + 0.5
 
 
-def test_reduced_motion_cuts(open_page, passages):
-    demo = passages()
-    page = open_page(at=demo, reduced_motion="reduce")
-    expect_body(page, "image", "live")
-    page.evaluate(WATCH)
-    pass_to(page, demo, "virtual")
-    pass_to(page, demo, "real")
-    assert set(page.evaluate("window.seen.map((one) => one.blend)")) == {0, 1}
-
-
-def look_pictureless(open_page, demo, **options):
-    """A page that gets no new pictures any more: what turns now is turned by the page."""
-    demo.forced_mode = "real"
-    page = open_page(at=demo, bypass_csp=True, **options)
+def test_finger_turns_the_picture_and_two_zoom_it(open_page, sharp_demo):
+    # It gets no new pictures any more: what turns now is turned by the page.
+    sharp_demo.forced_mode = "real"
+    page = open_page(at=sharp_demo, bypass_csp=True, has_touch=True)
     expect_body(page, "image", "live")
     never_grey(page)
     page.wait_for_timeout(500)
-    demo.images = False
-    return page
-
-
-def test_gamepad_turns_the_picture_without_a_new_one(open_page, sharp_demo):
-    page = look_pictureless(open_page, sharp_demo)
-    page.evaluate(f"() => {{ {PAD} }}")
-    page.bring_to_front()
-    page.evaluate("plug('standard'); pad.axes = [0, 0, -1, 0]")
-    wait_until(lambda: sharp_demo.look.yaw > 0.4, page, "the look turns left")
-    page.evaluate("pad.axes = [0, 0, 0, 0]")
-    page.wait_for_timeout(300)
-    wait_alike(page, lambda: room_seen((0, 0, 0), sharp_demo.look.yaw, sharp_demo.look.pitch))
-
-
-def test_finger_turns_the_picture_and_two_zoom_it(open_page, sharp_demo):
-    page = look_pictureless(open_page, sharp_demo, has_touch=True)
+    sharp_demo.images = False
 
     def fingers(*points):
         page.evaluate(

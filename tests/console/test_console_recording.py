@@ -7,16 +7,14 @@ import threading
 import time
 
 import pytest
+from console_servers import DRIVE, WAIT_S, WATCH
 
 from instant_ic.bus.control import ControlServer
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.console import ConsoleClient, ConsoleServer, ConsoleServerConfig
-from instant_ic.console.access import AccessConfig
+from instant_ic.console import ConsoleClient
 from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from nodes.console import ConsoleNode
-
-WAIT_S = 20.0
 
 
 class FakeRecorder:
@@ -82,19 +80,6 @@ def test_a_missing_recorder_and_a_refusal_are_told_in_words_and_the_next_wish_co
     assert wait_for(lambda m: m["notice"]["number"] == 2)["notice"]["level"] == "ok"
 
 
-def test_a_full_disk_is_told(desk):
-    _, recorder, wait_for = desk
-    recorder.state, recorder.error = "disk full", "only 90 MB are free where /d is"
-    assert wait_for(lambda m: m["state"] == "disk full")["text"] == "only 90 MB are free where /d is"
-
-
-def test_a_recorder_that_records_all_the_time_is_no_recorder_for_the_button():
-    statuses = []
-    made = RecordingDesk(lambda command, **arguments: {"path": "/d/drive"}, statuses.append)
-    statuses.append(made.status())
-    assert statuses[0]["recorder"] == "missing" and "drive continuously" in statuses[0]["text"]
-
-
 # ---- the node --------------------------------------------------------------------------------------
 
 
@@ -139,88 +124,26 @@ def test_the_recorder_is_asked_over_its_control_channel(node, tmp_path, monkeypa
 # ---- the server ------------------------------------------------------------------------------------
 
 
-class Backend:
-    def __init__(self):
-        self.done = []
-        self._news = threading.Condition()
-
-    def on_drive(self, linear, angular):
-        pass
-
-    def on_operator(self, there):
-        pass
-
-    def on_estop(self, stop):
-        self._add(("estop", stop))
-
-    def on_look(self, look):
-        pass
-
-    def on_record(self, on):
-        self._add(("record", on))
-
-    def on_snapshot(self):
-        self._add(("snapshot",))
-
-    def on_bookmark(self):
-        self._add(("bookmark",))
-
-    def _add(self, what):
-        with self._news:
-            self.done.append(what)
-            self._news.notify_all()
-
-    def wait(self, count):
-        with self._news:
-            assert self._news.wait_for(lambda: len(self.done) >= count, WAIT_S), self.done
-
-
-@pytest.fixture
-def served(tmp_path):
-    tokens = {}
-    for role in ("token_file", "watch_token_file"):
-        tokens[role] = tmp_path / role
-        tokens[role].write_text(f"{role}-0123456789")
-        tokens[role].chmod(0o600)
-    backend = Backend()
-    access = AccessConfig(**{role: str(path) for role, path in tokens.items()})
-    server = ConsoleServer(backend, ConsoleServerConfig(port=0, access=access))
-    server.start()
-    yield server, backend
-    server.stop()
-
-
-def test_drivers_record_and_watchers_may_not(served):
-    server, backend = served
+def test_drivers_record_and_watchers_may_not(serve, files):
+    server = serve(access=files)
 
     async def scenario():
         async with (
-            ConsoleClient(server.url, token="token_file-0123456789") as driver,
-            ConsoleClient(server.url, token="watch_token_file-0123456789") as watcher,
+            ConsoleClient(server.url, token=DRIVE) as driver,
+            ConsoleClient(server.url, token=WATCH) as watcher,
         ):
             for message in ({"type": "record", "on": True}, {"type": "snapshot"}, {"type": "bookmark"}):
                 await watcher.send(message)
             await watcher.wait_for(lambda c: c.refused == ["watch_only"] * 3, WAIT_S)
-            assert backend.done == []
+            assert server.backend.recorder == []
             await driver.send({"type": "record", "on": True})
             await driver.send({"type": "snapshot"})
             await driver.send({"type": "bookmark"})
             await driver.send({"type": "record", "on": False})
-            await asyncio.to_thread(backend.wait, 4)
-            assert backend.done == [("record", True), ("snapshot",), ("bookmark",), ("record", False)]
+            await asyncio.to_thread(server.backend.wait, lambda b: len(b.recorder) == 4)
+            assert server.backend.recorder == [("record", True), ("snapshot",), ("bookmark",), ("record", False)]
             for bad in ({"type": "record"}, {"type": "record", "on": 1}):
                 await driver.send(bad)
             await driver.wait_for(lambda c: len(c.errors) == 2, WAIT_S)
 
     asyncio.run(scenario())
-
-
-def test_rate_of_the_drivers_commands_is_told():
-    from instant_ic.console.drive import DriveConfig, DriveGate
-
-    gate = DriveGate(DriveConfig())
-    gate.request(1, 0.0)
-    for n in range(40):  # 20 Hz for two seconds
-        gate.receive(1, n, 0.0, 0.1, 0.0, n * 0.05)
-    assert gate.rate_hz(1.96) == 20.0
-    assert gate.rate_hz(3.0) == 0.0

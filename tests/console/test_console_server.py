@@ -2,88 +2,19 @@
 
 import asyncio
 import socket
-import threading
-import time
 
 import aiohttp
 import pytest
+from console_servers import WAIT_S, Backend, Patient, until
 
 from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, ConsoleServerConfig, FrameKind
-from instant_ic.console.access import AccessConfig
-from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import origin_allowed
 from instant_ic.util import pace
 from instant_ic.util.web_access import host_allowed
 
-WAIT_S = 20.0
-
-
-class Patient(DriveConfig):
-    """Takes time-outs that no robot may have: where a test does not look at them, a busy machine must not trip them."""
-
-    def __post_init__(self):
-        pass
-
-
-PATIENT = Patient(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
-
-
-class Recorder:
-    """Backend that keeps what it is told."""
-
-    def __init__(self):
-        self.commands, self.estops, self.looks, self.operator = [], [], [], []
-        self._news = threading.Condition()
-
-    def on_drive(self, linear, angular):
-        self._add(self.commands, (linear, angular))
-
-    def on_operator(self, there):
-        self._add(self.operator, there)
-
-    def on_estop(self, stop):
-        self._add(self.estops, stop)
-
-    def on_look(self, look):
-        self._add(self.looks, look)
-
-    def _add(self, target, value):
-        with self._news:
-            target.append(value)
-            self._news.notify_all()
-
-    def wait(self, predicate):
-        with self._news:
-            assert self._news.wait_for(lambda: predicate(self), WAIT_S), (self.commands[-5:], self.estops, self.looks)
-
-
-@pytest.fixture
-def serve():
-    servers = []
-
-    def start(drive=PATIENT, access=AccessConfig(simulated=True), **config):  # noqa: B008
-        backend = Recorder()
-        server = ConsoleServer(
-            backend, ConsoleServerConfig(port=0, drive=drive, access=access, **config), {"dissolve_ms": 1}
-        )
-        server.start()
-        servers.append(server)
-        return server, backend
-
-    yield start
-    for server in servers:
-        server.stop()
-
 
 def frame_number(client, kind):
     return client.frames[kind].header["n"] if kind in client.frames else None
-
-
-async def until(condition):
-    """Waits for something on the server's side."""
-    async with asyncio.timeout(WAIT_S):
-        while not condition():
-            await asyncio.sleep(0.01)
 
 
 def motion(backend):
@@ -101,7 +32,7 @@ def in_thread(function, *args):
 
 
 def test_page_and_modules_are_served_with_a_content_policy(serve):
-    server, _ = serve()
+    server = serve()
 
     async def scenario():
         async with aiohttp.ClientSession() as http:
@@ -120,7 +51,7 @@ def test_page_and_modules_are_served_with_a_content_policy(serve):
 
 
 def test_the_first_page_and_the_end_of_the_last_are_reported(serve):
-    server, _ = serve()
+    server = serve()
     watched = []
     server.pages.on_watched = watched.append
 
@@ -136,19 +67,22 @@ def test_the_first_page_and_the_end_of_the_last_are_reported(serve):
 
 
 def test_fault_any_client_drives(serve):
-    server, backend = serve()
+    server = serve()
 
     async def scenario():
         async with ConsoleClient(server.url) as first, ConsoleClient(server.url) as second:
             await first.acquire()
             await second.send({"type": "lease", "take": False})
+            await second.look(1.0)
             await second.send_drive(0.2, 0.0)
             await second.wait_for(lambda c: c.refused == ["not_driver"] and c.session["driver"] == "other", WAIT_S)
-            assert motion(backend) == []
+            assert motion(server.backend) == [] and server.backend.looks == []
+            await first.look(-0.5, 0.1)
             await first.send_drive(0.3, 0.1)
-            await in_thread(backend.wait, lambda b: (0.3, 0.1) in b.commands)
+            await in_thread(server.backend.wait, lambda b: (0.3, 0.1) in b.commands)
+            assert [(look.yaw, look.pitch) for look in server.backend.looks] == [(-0.5, 0.1)]
             await second.acquire(take=True)
-            await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+            await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
             await first.wait_for(lambda c: c.session["driver"] == "other", WAIT_S)
             await first.send_drive(0.3, 0.1)
             await first.wait_for(lambda c: c.refused == ["not_driver"], WAIT_S)
@@ -159,32 +93,32 @@ def test_fault_any_client_drives(serve):
 
 
 def test_fault_robot_runs_its_last_command_when_its_page_falls_silent(serve):
-    server, backend = serve(Patient(watchdog_s=0.25, lease_timeout_s=60.0, max_command_age_s=10.0))
+    server = serve(drive=Patient(watchdog_s=0.25, lease_timeout_s=60.0, max_command_age_s=10.0))
 
     async def scenario():
         async with ConsoleClient(server.url) as client:
             await client.acquire()
             await client.send_drive(0.3, 0.0)  # one command, then none
             await client.wait_for(lambda c: c.session["watchdog_trips"] == 1, WAIT_S)
-            await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+            await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
 
     asyncio.run(scenario())
-    assert (0.3, 0.0) in backend.commands
+    assert (0.3, 0.0) in server.backend.commands
 
 
 def test_the_watchdog_follows_the_pace_of_a_simulation(serve):
     """A busy machine slows the simulation; it must not take the operator's command for lost."""
     pace.use(pace.Pace.from_now(0.02))
     try:
-        server, backend = serve(Patient(watchdog_s=0.25, lease_timeout_s=60.0, max_command_age_s=10.0))
+        server = serve(drive=Patient(watchdog_s=0.25, lease_timeout_s=60.0, max_command_age_s=10.0))
 
         async def scenario():
             async with ConsoleClient(server.url) as client:
                 await client.acquire()
                 await client.send_drive(0.3, 0.0)
-                await in_thread(backend.wait, lambda b: (0.3, 0.0) in b.commands)
+                await in_thread(server.backend.wait, lambda b: (0.3, 0.0) in b.commands)
                 await asyncio.sleep(0.6)
-                assert client.session["watchdog_trips"] == 0 and backend.commands[-1] == (0.3, 0.0)
+                assert client.session["watchdog_trips"] == 0 and server.backend.commands[-1] == (0.3, 0.0)
 
         asyncio.run(scenario())
     finally:
@@ -192,129 +126,58 @@ def test_the_watchdog_follows_the_pace_of_a_simulation(serve):
 
 
 def test_fault_socket_cut_leaves_the_throttle(serve):
-    server, backend = serve()
+    server = serve()
 
     async def scenario():
         client = ConsoleClient(server.url)
         await client.connect()
         await client.acquire()
         await client.send_drive(0.3, 0.0)
-        await in_thread(backend.wait, lambda b: b.commands)
+        await in_thread(server.backend.wait, lambda b: b.commands)
         cut(client)  # no closing handshake
-        await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+        await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
         await client.close()
-
-    asyncio.run(scenario())
-
-
-async def silent_for(backend, seconds, quiet_s=0.3):
-    """Waits until nothing was given on for ``quiet_s``."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        count = len(backend.commands)
-        await asyncio.sleep(quiet_s)
-        if len(backend.commands) == count:
-            return
-    raise AssertionError(f"commands go on: {len(backend.commands)}")
-
-
-def test_an_idle_driver_is_told_by_zeros_until_its_connection_is_cut(serve):
-    server, backend = serve()
-
-    async def scenario():
-        async with ConsoleClient(server.url) as watcher:
-            client = ConsoleClient(server.url)
-            await client.connect()
-            await asyncio.sleep(0.3)
-            assert backend.commands == []  # nobody drives
-            await client.acquire()
-            await in_thread(backend.wait, lambda b: len(b.commands) >= 5)
-            cut(client)  # no closing handshake
-            await watcher.wait_for(lambda c: c.session["driver"] == "none", WAIT_S)
-            count = len(backend.commands)
-            await asyncio.sleep(0.5)
-            assert len(backend.commands) == count
-            await client.close()
-
-    asyncio.run(scenario())
-    assert set(backend.commands) == {(0.0, 0.0)}
-
-
-def test_zeros_end_when_the_drivers_page_beats_no_more_and_come_back_with_it(serve):
-    """A dead path closes no socket for minutes: only the beats tell. PATIENT's lease lasts on."""
-    server, backend = serve()
-
-    async def scenario():
-        async with ConsoleClient(server.url) as client:
-            await client.acquire()
-            await in_thread(backend.wait, lambda b: len(b.commands) >= 3)
-            client.beats.cancel()  # the beats
-            await silent_for(backend, WAIT_S)
-            assert client.session["driver"] == "you"
-            # A page that is hidden says so: it is no sign of an operator.
-            count = len(backend.commands)
-            await client.send({"type": "ping", "client_ms": 0, "away": True})
-            await client.look(0.1)  # nor is what it says besides
-            await asyncio.sleep(0.3)
-            assert len(backend.commands) == count
-            await client.send({"type": "ping", "client_ms": 0})
-            await in_thread(backend.wait, lambda b: len(b.commands) > count)
 
     asyncio.run(scenario())
 
 
 def test_a_console_that_starts_again_names_its_clients_anew():
     """Behind a bridge the arbiter notices the restart by these names alone."""
-    first, second = (ConsoleServer(Recorder(), ConsoleServerConfig(port=0)).drive.client for _ in range(2))
+    first, second = (ConsoleServer(Backend(), ConsoleServerConfig(port=0)).drive.client for _ in range(2))
     assert first != second
 
 
 @pytest.mark.parametrize("how", ["silent", "hidden", "given back", "cut"])
 def test_the_loss_of_the_driver_is_told_at_once(serve, how):
     """Not by the silence alone: that has to last before it counts. The page's beats are made by the test."""
-    server, backend = serve()
+    server = serve()
 
     async def scenario():
         async with ConsoleClient(server.url) as client:
             await client.acquire()
-            await in_thread(backend.wait, lambda b: b.operator[:1] == [True])
+            await in_thread(server.backend.wait, lambda b: b.operator[:1] == [True])
             client.beats.cancel()  # the beats
-            await silent_for(backend, WAIT_S)
-            assert backend.operator[-1] is False
+            await in_thread(server.backend.wait, lambda b: b.operator[-1] is False)
             if how != "silent":
-                told = len(backend.operator)
+                told = len(server.backend.operator)
                 await client.send({"type": "ping", "client_ms": 0})
-                await in_thread(backend.wait, lambda b: len(b.operator) > told)
+                await in_thread(server.backend.wait, lambda b: len(b.operator) > told)
             if how == "hidden":
                 await client.send({"type": "ping", "client_ms": 0, "away": True})
             elif how == "given back":
                 await client.send({"type": "yield"})
             elif how == "cut":
                 cut(client)
-            await in_thread(backend.wait, lambda b: b.operator[-1] is False)
+            await in_thread(server.backend.wait, lambda b: b.operator[-1] is False)
             await client.close()
 
     asyncio.run(scenario())
     # Each turn once.
-    assert backend.operator == [True, False] * (1 if how == "silent" else 2)
-
-
-def test_driving_client_repeats_its_command_and_stops(serve):
-    server, backend = serve()
-
-    async def scenario():
-        async with ConsoleClient(server.url) as client:
-            await client.acquire()
-            client.drive(0.25, -0.5)
-            await in_thread(backend.wait, lambda b: b.commands.count((0.25, -0.5)) >= 5)
-            await client.stop()
-            await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
-
-    asyncio.run(scenario())
+    assert server.backend.operator == [True, False] * (1 if how == "silent" else 2)
 
 
 def test_fault_old_commands_are_obeyed(serve):
-    server, backend = serve(Patient(max_command_age_s=5.0, lease_timeout_s=60.0))
+    server = serve(drive=Patient(max_command_age_s=5.0, lease_timeout_s=60.0))
 
     async def scenario():
         async with ConsoleClient(server.url) as client:
@@ -325,34 +188,34 @@ def test_fault_old_commands_are_obeyed(serve):
             await client.wait_for(lambda c: c.refused == ["old", "future"], WAIT_S)
 
     asyncio.run(scenario())
-    assert motion(backend) == []
+    assert motion(server.backend) == []
 
 
 def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_releases_it(serve):
-    server, backend = serve()
+    server = serve()
 
     async def scenario():
         async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
             await driver.acquire()
             await driver.send_drive(0.3, 0.0)
-            await in_thread(backend.wait, lambda b: b.commands)
+            await in_thread(server.backend.wait, lambda b: b.commands)
             await watcher.estop()
-            await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0) and b.estops == [True])
+            await in_thread(server.backend.wait, lambda b: b.commands[-1] == (0.0, 0.0) and b.estops == [True])
             await driver.wait_for(lambda c: c.session["estop"], WAIT_S)
             await driver.send_drive(0.3, 0.0)
             await driver.wait_for(lambda c: c.refused == ["stopped"], WAIT_S)
             await watcher.release_estop()
             await watcher.wait_for(lambda c: c.refused == ["not_driver"], WAIT_S)
-            assert backend.estops == [True]
+            assert server.backend.estops == [True]
             await driver.release_estop()
-            await in_thread(backend.wait, lambda b: b.estops == [True, False])
+            await in_thread(server.backend.wait, lambda b: b.estops == [True, False])
 
     asyncio.run(scenario())
-    assert backend.commands.count((0.3, 0.0)) >= 1
+    assert server.backend.commands.count((0.3, 0.0)) >= 1
 
 
 def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(serve):
-    server, backend = serve()
+    server = serve()
     released = []
     server.drive.on_released = released.append
 
@@ -360,7 +223,7 @@ def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(se
         async with ConsoleClient(server.url) as client, ConsoleClient(server.url) as second:
             server.follow_robot("host_bridge/tablet/console/page 1 abc", False)
             await client.send({"type": "lease", "take": False})
-            await in_thread(backend.wait, lambda b: b.commands)  # zeros ask the robot for its lease
+            await in_thread(server.backend.wait, lambda b: b.commands)  # zeros ask the robot for its lease
             name = server.drive.client
             other = ("other", "host_bridge/tablet/console")
             for one in (client, second):
@@ -369,7 +232,7 @@ def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(se
             await client.wait_for(lambda c: c.refused == ["not_driver"], WAIT_S)
             await client.release_estop()
             await client.wait_for(lambda c: c.refused == ["not_driver"] * 2, WAIT_S)
-            assert backend.estops == []
+            assert server.backend.estops == []
             server.follow_robot(f"console/{name}", False)
             await client.wait_for(lambda c: (c.session["driver"], c.session["door"]) == ("you", ""), WAIT_S)
             await second.wait_for(lambda c: (c.session["driver"], c.session["door"]) == ("other", ""), WAIT_S)
@@ -384,7 +247,7 @@ def test_a_page_shows_who_drives_the_robot_and_not_who_has_this_servers_lease(se
 
 
 def test_a_page_shows_the_robots_emergency_stop_whoever_pressed_or_released_it(serve):
-    server, backend = serve()
+    server = serve()
 
     async def scenario():
         async with ConsoleClient(server.url) as client:
@@ -398,7 +261,7 @@ def test_a_page_shows_the_robots_emergency_stop_whoever_pressed_or_released_it(s
             server.follow_robot(f"console/{server.drive.client}", True)  # and pressed it
             await client.wait_for(lambda c: c.session["estop"], WAIT_S)
             await client.release_estop()
-            await in_thread(backend.wait, lambda b: b.estops == [True, False])
+            await in_thread(server.backend.wait, lambda b: b.estops == [True, False])
             await client.send_drive(0.3, 0.0)
             await client.wait_for(lambda c: c.refused == ["stopped"], WAIT_S)  # the robot has not released it
             assert client.session["estop"]
@@ -408,9 +271,9 @@ def test_a_page_shows_the_robots_emergency_stop_whoever_pressed_or_released_it(s
     asyncio.run(scenario())
 
 
-@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "file://"])
+@pytest.mark.parametrize("origin", ["http://evil.example", "null"])
 def test_fault_origin_is_unchecked(serve, origin):
-    server, _ = serve()
+    server = serve()
 
     async def scenario():
         async with aiohttp.ClientSession() as http:
@@ -423,7 +286,7 @@ def test_fault_origin_is_unchecked(serve, origin):
 
 def test_fault_host_is_unchecked(serve):
     """A foreign page may point its own name at 127.0.0.1; its Origin then equals its Host."""
-    server, _ = serve()
+    server = serve()
 
     async def scenario():
         host = f"evil.example:{server.port}"
@@ -464,7 +327,7 @@ def test_origins():
 
 
 def test_pictures_wait_for_the_acknowledgement_and_only_the_newest_is_sent(serve):
-    server, _ = serve()
+    server = serve()
 
     async def scenario():
         async with ConsoleClient(server.url, acknowledge=False) as client:
@@ -484,7 +347,7 @@ def test_pictures_wait_for_the_acknowledgement_and_only_the_newest_is_sent(serve
 
 
 def test_fault_slow_client_slows_another(serve):
-    server, _ = serve()
+    server = serve()
     picture = bytes(300_000)
 
     async def scenario():
@@ -504,7 +367,7 @@ def test_fault_slow_client_slows_another(serve):
 
 
 def test_hidden_picture_is_sent_rarely(serve):
-    server, _ = serve(background_picture_hz=0.001)
+    server = serve(background_picture_hz=0.001)
 
     async def scenario():
         async with ConsoleClient(server.url) as client:
@@ -521,7 +384,7 @@ def test_hidden_picture_is_sent_rarely(serve):
 
 
 def test_late_client_gets_the_newest_state_and_map(serve):
-    server, _ = serve()
+    server = serve(page={"dissolve_ms": 1})
     server.publish("state", {"mode": "virtual"})
     server.send_frame(FrameKind.MAP, {"resolution": 0.05}, b"png")
 
@@ -534,37 +397,9 @@ def test_late_client_gets_the_newest_state_and_map(serve):
     asyncio.run(scenario())
 
 
-def test_look_of_the_driver_counts(serve):
-    server, backend = serve()
-
-    async def scenario():
-        async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
-            await driver.acquire()
-            await watcher.look(1.0)
-            await watcher.send({"type": "lease", "take": False})
-            await watcher.wait_for(lambda c: c.session["driver"] == "other", WAIT_S)
-            await driver.look(-0.5, 0.1)
-            await in_thread(backend.wait, lambda b: b.looks)
-            assert [(look.yaw, look.pitch) for look in backend.looks] == [(-0.5, 0.1)]
-
-    asyncio.run(scenario())
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "no json",
-        "[]",
-        '{"type":"warp"}',
-        '{"type":"drive","seq":1,"time_ms":0,"linear":NaN,"angular":0}',
-        '{"type":"lease","take":1}',
-        '{"type":"ping","client_ms":0,"away":1}',
-        '{"type":"ack","kind":9,"seq":1}',
-        '{"type":"look","yaw":99,"pitch":0,"hfov":1,"vfov":1}',
-    ],
-)
+@pytest.mark.parametrize("text", ["no json", '{"type":"warp"}', '{"type":"lease","take":1}'])
 def test_bad_message_is_answered_and_many_end_the_connection(serve, text):
-    server, backend = serve()
+    server = serve()
 
     async def scenario():
         async with ConsoleClient(server.url) as client:
@@ -577,38 +412,26 @@ def test_bad_message_is_answered_and_many_end_the_connection(serve, text):
                 await client.wait_for(lambda c: False, WAIT_S)
 
     asyncio.run(scenario())
-    assert motion(backend) == []
-
-
-def test_too_many_clients_are_refused(serve):
-    server, _ = serve(max_clients=1)
-
-    async def scenario():
-        async with ConsoleClient(server.url), aiohttp.ClientSession() as http:
-            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-                await http.ws_connect(server.url + "ws")
-            assert refused.value.status == 503
-
-    asyncio.run(scenario())
+    assert motion(server.backend) == []
 
 
 def test_end_of_the_server_stops_the_robot_and_closes_the_clients(serve):
-    server, backend = serve()
+    server = serve()
 
     async def scenario():
         async with ConsoleClient(server.url) as client:
             await client.acquire()
             await client.send_drive(0.3, 0.0)
-            await in_thread(backend.wait, lambda b: b.commands)
+            await in_thread(server.backend.wait, lambda b: b.commands)
             await in_thread(server.stop)
             with pytest.raises(ConnectionError):
                 await client.wait_for(lambda c: False, WAIT_S)
 
     asyncio.run(scenario())
-    assert backend.commands[-1] == (0.0, 0.0)
+    assert server.backend.commands[-1] == (0.0, 0.0)
 
 
 def test_used_port_is_told(serve):
-    server, _ = serve()
+    server = serve()
     with pytest.raises(ConsoleError, match=f"{server.port}.*server.port"):
-        ConsoleServer(Recorder(), ConsoleServerConfig(port=server.port)).start()
+        ConsoleServer(Backend(), ConsoleServerConfig(port=server.port)).start()

@@ -15,61 +15,21 @@ from types import SimpleNamespace
 import aiohttp
 import pytest
 from aiohttp import WSMsgType
-from test_console_access import DRIVE, WATCH, Nobody, certificate, token_file
+from console_servers import DRIVE, WAIT_S, WATCH, run, token_file, until
+from test_console_access import certificate
 
-from instant_ic.console import ConsoleClient, ConsoleServer, ConsoleServerConfig, FrameKind
+from instant_ic.console import ConsoleClient, ConsoleServerConfig, FrameKind
 from instant_ic.console import connections as connections_module
-from instant_ic.console.access import AccessConfig
 from instant_ic.console.connections import AddressBuckets, network_of
-from instant_ic.console.drive import DriveConfig
 from instant_ic.console.faults import MOST_NAMES, FaultList
 from instant_ic.console.log_rate import LogRate
 from instant_ic.console.pages import WATCHER_SHARE
 from instant_ic.util.web_access import TokenBucket
 
 __all__ = ["certificate"]  # a fixture
-WAIT_S = 60.0
-
-
-class Patient(DriveConfig):
-    """Takes time-outs that no robot may have, so that a busy machine does not trip them."""
-
-    def __post_init__(self):
-        pass
-
-
-PATIENT = Patient(watchdog_s=30.0, lease_timeout_s=60.0, beat_timeout_s=30.0, max_command_age_s=60.0)
 PING = b'{"type":"ping","client_ms":0}'
 TEXT, CONTINUATION, PING_FRAME = 0x1, 0x0, 0x9
 ELSEWHERE = ("127.0.0.2", 0)  # another address on this machine
-
-
-@pytest.fixture
-def serve():
-    servers = []
-
-    def start(access=AccessConfig(simulated=True), **config):  # noqa: B008
-        server = ConsoleServer(Nobody(), ConsoleServerConfig(port=0, drive=PATIENT, access=access, **config))
-        server.start()
-        servers.append(server)
-        return server
-
-    yield start
-    for server in servers:
-        server.stop()
-
-
-def run(scenario):
-    async def bounded():
-        async with asyncio.timeout(WAIT_S):
-            await scenario()
-
-    asyncio.run(bounded())
-
-
-async def until(condition):
-    while not condition():
-        await asyncio.sleep(0.01)
 
 
 def frame(payload, opcode=TEXT, fin=True):
@@ -139,10 +99,9 @@ def test_a_token_bucket_lets_its_rate_through():
     [
         (frame(PING), True),
         (frame(b"", PING_FRAME), True),  # of the protocol itself
-        (frame(b'{"type":"nonsense"}'), True),
         (frame(b"", CONTINUATION, fin=False) * 200, False),  # of the message begun below: it never comes
     ],
-    ids=["pings", "protocol pings", "bad messages", "endless fragments"],
+    ids=["pings", "protocol pings", "endless fragments"],
 )
 def test_fault_a_flood_closes_its_own_socket_with_a_reason_and_no_other(serve, flood, messages, caplog):
     server = serve(max_messages_per_s=100.0)
@@ -261,25 +220,6 @@ def test_an_emergency_stop_comes_by_a_connection_of_its_own(serve):
     assert server.backend.estops == [True]
 
 
-def test_an_emergency_stop_needs_a_sign_in_and_a_watchers_suffices(serve, tmp_path):
-    files = {
-        "token_file": token_file(tmp_path, "drive", DRIVE),
-        "watch_token_file": token_file(tmp_path, "watch", WATCH),
-    }
-    server = serve(access=AccessConfig(**files))
-
-    async def scenario():
-        async with aiohttp.ClientSession() as http:
-            async with http.post(server.url + "estop") as response:
-                assert response.status == 401
-            assert server.backend.estops == []
-            async with http.post(server.url + "estop", headers={"Authorization": f"Bearer {WATCH}"}) as response:
-                assert response.status == 204
-
-    run(scenario)
-    assert server.backend.estops == [True]
-
-
 def test_fault_a_client_that_does_not_read_grows_the_servers_memory(serve, monkeypatch):
     for limit in ("BYTES_PER_S", "BURST_BYTES"):  # which would close it before
         monkeypatch.setattr(connections_module, limit, 1e9)
@@ -304,53 +244,6 @@ def test_fault_a_client_that_does_not_read_grows_the_servers_memory(serve, monke
     run(scenario)
 
 
-class Heard(dict):
-    """Messages of a client, whose types are kept in a list."""
-
-    def __init__(self, types, messages):
-        super().__init__(messages)
-        self.types = types
-
-    def __setitem__(self, kind, message):
-        self.types.append(kind)
-        super().__setitem__(kind, message)
-
-
-def test_what_changes_nothing_is_not_sent_to_all(serve):
-    """Or one watcher's message would make one for everybody."""
-    server = serve()
-
-    async def scenario():
-        async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
-            await driver.acquire()
-            await watcher.wait_for(lambda c: c.session["driver"] == "other")
-            heard = []
-            driver.messages = Heard(heard, driver.messages)
-            await watcher.send({"type": "lease", "take": False})
-            await watcher.send({"type": "yield"})
-            await watcher.send({"type": "estop_release"})
-            await watcher.wait_for(lambda c: c.refused == ["not_driver"])
-            driver.messages.pop("pong", None)
-            await driver.wait_for(lambda c: "pong" in c.messages)
-            assert "session" not in heard
-
-    run(scenario)
-
-
-# ---- connections -------------------------------------------------------------------------------------
-
-
-async def ask_and_leave(server, path, begun):
-    """Sends a request and closes the connection as soon as the server works on it, without an answer."""
-    _, writer = await asyncio.open_connection("127.0.0.1", server.port)
-    writer.write(
-        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n".encode()
-    )
-    await until(begun)
-    writer.close()
-
-
 def test_fault_requests_whose_clients_have_left_wait_for_ever(serve, monkeypatch):
     """The limits count connections; a client that opens and closes them could leave any number of waiting requests."""
     asked = Counter()
@@ -367,15 +260,21 @@ def test_fault_requests_whose_clients_have_left_wait_for_ever(serve, monkeypatch
     server = serve()
 
     async def scenario():
-        for _ in range(10):
+        for _ in range(5):
             before = asked["waiting"]
-            await ask_and_leave(server, "/ws", lambda before=before: asked["waiting"] > before)
+            _, writer = await asyncio.open_connection("127.0.0.1", server.port)
+            writer.write(b"GET /ws HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            await until(lambda before=before: asked["waiting"] > before)
+            writer.close()
         before = -1
         while asked["waiting"] > before:  # nobody asks any more
             before = asked["waiting"]
-            await asyncio.sleep(1.0)
+            await asyncio.sleep(0.2)
 
     run(scenario)
+
+
+# ---- connections -------------------------------------------------------------------------------------
 
 
 def test_fault_another_machines_reports_grow_the_consoles_memory():
@@ -428,23 +327,10 @@ def test_fault_idle_connections_starve_the_driver(serve, sent):
     run(scenario)
 
 
-def test_a_request_that_is_no_websockets_keeps_no_place(serve):
-    server = serve()
-
-    async def scenario():
-        async with aiohttp.ClientSession() as http:
-            async with http.get(server.url + "ws") as response:
-                assert response.status == 400
-            (connection,) = server.listener.admitted
-            assert not connection.kept and not server.pages.sessions
-
-    run(scenario)
-
-
 def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, tmp_path):
-    monkeypatch.setattr(connections_module, "HEADERS_S", 0.7)
-    monkeypatch.setattr("instant_ic.console.server.HEADERS_S", 0.7)
-    server = serve(access=AccessConfig(token_file=token_file(tmp_path, "drive", DRIVE)))
+    monkeypatch.setattr(connections_module, "HEADERS_S", 0.3)
+    monkeypatch.setattr("instant_ic.console.server.HEADERS_S", 0.3)
+    server = serve(access={"token_file": token_file(tmp_path, "drive", DRIVE)})
     slow = b"POST /sign-in HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/x-www-form-urlencoded\r\n"
 
     async def trickle(start, more):
@@ -468,7 +354,7 @@ def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, t
 
 def test_fault_a_tls_handshake_takes_for_ever(serve, monkeypatch, certificate):
     monkeypatch.setattr(connections_module, "HEADERS_S", 0.5)
-    server = serve(access=AccessConfig(simulated=True, **certificate))
+    server = serve(access=certificate)
 
     async def scenario():
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
@@ -479,12 +365,8 @@ def test_fault_a_tls_handshake_takes_for_ever(serve, monkeypatch, certificate):
     run(scenario)
 
 
-def test_a_page_that_may_only_watch_leaves_places_for_drivers(serve, tmp_path):
-    files = {
-        "token_file": token_file(tmp_path, "drive", DRIVE),
-        "watch_token_file": token_file(tmp_path, "watch", WATCH),
-    }
-    server = serve(max_clients=4, access=AccessConfig(**files))
+def test_a_page_that_may_only_watch_leaves_places_for_drivers(serve, files):
+    server = serve(max_clients=4, access=files)
 
     async def scenario():
         async with ConsoleClient(server.url, token=WATCH), ConsoleClient(server.url, token=WATCH):
@@ -521,12 +403,11 @@ STRANGERS = {
     "wrong token": STOP + b"Authorization: Bearer wrong\r\n\r\n",
     "none": STOP + b"\r\n",
     "half": STOP,
-    "": b"",
+    "nothing": b"",
 }
 
 
-@pytest.mark.parametrize("tls", [False, True], ids=["http", "https"])
-@pytest.mark.parametrize("sent", STRANGERS.values(), ids=STRANGERS)
+@pytest.mark.parametrize(("sent", "tls"), [("wrong token", False), ("none", True), ("half", False), ("nothing", True)])
 def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
     serve, monkeypatch, tmp_path, certificate, sent, tls
 ):
@@ -534,8 +415,9 @@ def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
     monkeypatch.setattr(connections_module, "BURST_CONNECTIONS", 5.0)
     monkeypatch.setattr(connections_module, "CONNECTIONS_PER_S", 1e-5)
     monkeypatch.setattr(connections_module, "BURST_HANDSHAKES", 1e5)
+    sent = STRANGERS[sent]
     drive = token_file(tmp_path, "drive", DRIVE)
-    server = serve(access=AccessConfig(token_file=drive, **(certificate if tls else {})))
+    server = serve(access={"token_file": drive} | (certificate if tls else {}))
     trusting = ssl.create_default_context(cafile=certificate["tls_certificate"]) if tls else None
 
     async def stranger():
@@ -547,8 +429,8 @@ def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
     async def answer(request):
         async with aiohttp.ClientSession() as http:  # a new connection
             method, path, headers = request
-            sent = {"headers": headers, "ssl": trusting or True, "allow_redirects": False}
-            async with http.request(method, server.url + path, **sent) as response:
+            given = {"headers": headers, "ssl": trusting or True, "allow_redirects": False}
+            async with http.request(method, server.url + path, **given) as response:
                 return response.status, response.headers.get("Set-Cookie", "").partition(";")[0]
 
     async def scenario():
@@ -556,7 +438,7 @@ def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
         entered, cookie = await answer(("GET", f"?token={DRIVE}", {}))
         assert entered == 303
         ways = {"Authorization": f"bearer  {DRIVE}"}, {"Cookie": f"other=1; {cookie}; more"}
-        for number in range(20):
+        for number in range(6):
             held += await asyncio.gather(*(stranger() for _ in range(15)))
             assert (await answer(("POST", "estop", ways[number % 2])))[0] == 204
         assert (await answer(("GET", f"?token={DRIVE}", {})))[0] == 303
@@ -567,7 +449,7 @@ def test_fault_a_right_stop_is_refused_because_of_strangers_at_its_address(
             writer.close()
 
     run(scenario)
-    assert server.backend.estops == [True] * 20
+    assert server.backend.estops == [True] * 6
 
 
 def test_without_a_sign_in_only_stops_are_admitted_above_the_rate_of_an_address(serve, monkeypatch):
@@ -669,12 +551,6 @@ def test_log_lines_of_one_place_come_once_a_second_with_a_count():
     assert rate.filter(after) and after.getMessage() == "from a"
 
 
-def test_fault_asyncio_and_aiohttp_log_as_often_as_a_stranger_likes(serve):
-    serve()
-    for name in ("instant_ic.console", "asyncio", "aiohttp.server"):
-        assert any(isinstance(each, LogRate) for each in logging.getLogger(name).filters)
-
-
 # ---- messages ----------------------------------------------------------------------------------------
 
 
@@ -682,14 +558,9 @@ def test_fault_asyncio_and_aiohttp_log_as_often_as_a_stranger_likes(serve):
     "text",
     [
         "[" * 4000,
-        '{"a":' * 800,
         '{"type":"drive","seq":9,"time_ms":TIME,"linear":NaN,"angular":0}',
-        '{"type":"drive","seq":9,"time_ms":TIME,"linear":0,"angular":Infinity}',
-        '{"type":"drive","seq":9,"time_ms":TIME,"linear":1e999,"angular":0}',
         '{"type":"drive","seq":9,"time_ms":NaN,"linear":0.1,"angular":0}',
         '{"type":"drive","seq":9,"time_ms":TIME,"linear":' + "9" * 3900 + ',"angular":0}',
-        '{"type":"drive","seq":-1,"time_ms":TIME,"linear":0.1,"angular":0}',
-        '{"type":"drive","seq":9,"time_ms":TIME,"linear":"0.1","angular":0}',
         '{"type":"\\ud800"}',
     ],
 )

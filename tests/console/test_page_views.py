@@ -19,18 +19,24 @@ from tests import box_room
 pytestmark = BROWSER_TEST
 WIDTH, HEIGHT, FOV = 480, 270, math.pi / 2
 KEYFRAME = pose_matrix(0.0, -0.3, 0.1, yaw=0.4)
-STEPS = [(0, 0, 0), (0.5, 0, 0), (1.0, 0.2, 0.1), (0.4, -0.5, -0.6), (-0.3, 0.2, 2.5)]  # ahead, left (m), turn (rad)
+STEPS = [(0, 0, 0), (1.0, 0.2, 0.1), (0.4, -0.5, -0.6)]  # ahead, left (m), turn (rad)
 
 
-@pytest.mark.parametrize("full", [True, False])
-def test_the_page_shows_what_the_cpu_renders(browser, full):
+@pytest.fixture(scope="module")
+def keyframe():
+    """A keyframe of a room: its virtual space, and its layers for the page."""
     room = box_room.panorama(KEYFRAME, 512)
     space = VirtualSpace(VirtualSpaceConfig(source="warp", device="cpu"))
     space.set_keyframe(room.rgb, cv2.resize(room.depth_m, (512, 256), interpolation=cv2.INTER_NEAREST), KEYFRAME, 0.02)
     png = cv2.imencode(".png", room.rgb[..., ::-1])[1].tobytes()  # both sides have the same colours
-    layers = LayerMeshes().layers(encode(space.shown.newest, 1, png, 1))
+    return space, PageLayers(1, (0.0, 0.0, 0.0), LayerMeshes().layers(encode(space.shown.newest, 1, png, 1)))
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_the_page_shows_what_the_cpu_renders(browser, keyframe, full):
+    space, layers = keyframe
     page = PageRenderer(browser, WIDTH, HEIGHT, full)
-    page.load(PageLayers(1, (0.0, 0.0, 0.0), layers))
+    page.load(layers)
     for ahead, left, turn in STEPS:
         pose = KEYFRAME @ pose_matrix(ahead, left, yaw=turn)
         truth = box_room.perspective(pose, WIDTH, HEIGHT, FOV).rgb
