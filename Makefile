@@ -3,7 +3,7 @@
 # make check  format, lint and types; the page too, where Node.js is installed
 # make lock   write requirements*.lock anew after a change of constraints.txt or pyproject.toml (needs network)
 # make newest the unit tests with the newest version of everything, in .venv-newest/ (PYTHON=; default the newest here)
-# make fuzz   a million mutated inputs for each parser of outside bytes: hours (ARGS="--jobs 4 --target glb --count 1000")
+# make fuzz   a thousand times the mutated inputs of `make test` for each parser of outside bytes: hours (ARGS="-k glb")
 # make clean  take away what these made
 PYTHON ?= python3
 VENV   := .venv
@@ -41,7 +41,7 @@ check: $(STAMP)
 	scripts/check_js.sh
 
 fuzz: $(STAMP)
-	$(BIN)/python -m tests.fuzz $(ARGS)
+	FUZZ=1000 $(BIN)/python -m pytest -n auto --timeout 0 tests/fuzz/test_fuzz.py $(ARGS)
 
 install: $(STAMP)
 

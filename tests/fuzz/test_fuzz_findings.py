@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 import struct
 from pathlib import Path
 
@@ -68,7 +67,7 @@ def test_type_whose_full_name_is_damaged_is_unknown() -> None:
 def test_recover_takes_messages_whose_definition_is_damaged(bag: Path, tmp_path: Path) -> None:
     file = next(bag.glob("*.mcap"))
     content = file.read_bytes().replace(b"string data", b"str'ng data")
-    file.write_bytes(fix_chunk(content, random.Random(0)))  # without check sums, or the chunk would be left out
+    file.write_bytes(fix_chunk(content))  # without check sums, or the chunk would be left out
     recover(file, tmp_path / "new")
     with BagReader(tmp_path / "new") as found:
         assert found.count == 3
@@ -85,10 +84,8 @@ def test_parameter_file_that_is_no_utf8_is_an_error_with_its_name(tmp_path: Path
     ("key", "value", "why"),
     [
         ("port", "9" * 400, "port must have at most 64 bits"),
-        ("port", "-" + "9" * 400, "port must have at most 64 bits"),
         ("silence_s", "9" * 400, "silence_s must be a finite number"),
         ("port", "0x" + "f" * 5000, "port must have at most 64 bits"),
-        ("silence_s", "[0x" + "f" * 5000 + "]", "silence_s must be float"),
         ("port", "1:" + "59:" * 3000 + "59", "port must be int"),  # in base 60
     ],
 )
@@ -122,6 +119,7 @@ def test_manifest_with_a_value_that_is_none_is_an_error(tmp_path: Path, value: s
         "resolution: " + "1" * 5000,
         "resolution: " + "1" * 400,
         "resolution: 0.1\noccupied_thresh: .nan",
+        "image: m.pgm\norigin: [" + "1" * 400 + ", 0]",
         "[" * 3000,
     ],
 )
@@ -129,13 +127,6 @@ def test_map_file_with_a_value_that_is_none_is_an_error(tmp_path: Path, text: st
     path = tmp_path / "map.yaml"
     path.write_text("origin: [0, 0]\n" + ("" if "resolution" in text else "resolution: 0.05\n") + text + "\n")
     with pytest.raises(MapError):
-        load_grid(path)
-
-
-def test_map_origin_that_no_float_can_hold_is_an_error(tmp_path: Path) -> None:
-    path = tmp_path / "map.yaml"
-    path.write_text(f"image: m.pgm\nresolution: 0.05\norigin: [{'1' * 400}, 0]\n")
-    with pytest.raises(MapError, match="origin"):
         load_grid(path)
 
 
