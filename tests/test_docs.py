@@ -99,7 +99,7 @@ def test_pages_name_the_command_in_one_way(page):
 @pytest.mark.parametrize("page", PAGES)
 def test_launch_commands_of_a_page_pass_the_check_in_the_order_given(page, tmp_path, monkeypatch, capsys):
     """All of ``ic launch`` except the start: file, arguments and every node's parameters."""
-    monkeypatch.setattr(parameters, "check_parameters_quickly", parameters.check_parameters)  # in this process
+    monkeypatch.setattr(parameters, "check_parameters_apart", parameters.check_parameters)  # in this process
     monkeypatch.chdir(tmp_path)
     mount = {"theta_camera": {"ros__parameters": {"camera_mount": {"xyz": [0.0, 0.0, 1.2]}}}}
     (tmp_path / "mount.yaml").write_text(json.dumps(mount))  # by the page's `ic calibrate`

@@ -117,14 +117,6 @@ def size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def seconds(text: str) -> float:
-    """Read a duration in seconds: ``90``, ``90s``, ``10m``, ``2h``, ``1d``."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", text)
-    if not match:
-        raise argparse.ArgumentTypeError(f"must look like 90, 30s, 10m, 2h or 1d (got {text})")
-    return float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600, "d": 86400}[match[2]]
-
-
 def launch_values(words: Sequence[str]) -> dict[str, str]:
     """Return the values of a launch file's arguments, given as ``KEY:=VALUE``.
 

@@ -6,80 +6,19 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from instant_ic.bus import Node
 from instant_ic.bus.control import ControlError, NodeBusyError, NodeControl
 from instant_ic.bus.node_files import node_class
 from instant_ic.bus.process import run as run_node
 from instant_ic.bus.registry import NodeInfo, list_nodes
 from instant_ic.cli.commands.bag import argument_of, topic_names
 from instant_ic.cli.errors import UserError
-from instant_ic.cli.terminal import Terminal
 from instant_ic.util.paths import run_dir
 
 _STARTING_S = 10.0  # grace period for a node that is just starting
 _STEERED = ("bag_recorder", "bag_player")
-
-
-def _attended(name: str, attend: Callable[[Node[Any]], Terminal]) -> type[Node[Any]]:
-    """Return a node class extended with keys and a status line."""
-    base = node_class(name)
-
-    def setup(self: Any) -> None:
-        base.setup(self)
-        self.terminal = attend(self)
-        self.terminal.start()
-
-    def teardown(self: Any) -> None:
-        if hasattr(self, "terminal"):
-            self.terminal.close()
-        base.teardown(self)
-
-    return type(base.__name__, (base,), {"setup": setup, "teardown": teardown, "__module__": base.__module__})
-
-
-def _recorder_terminal(node: Node[Any]) -> Terminal:
-    def line() -> str:
-        status = node.commands["status"]()
-        words = f"{status['state']}  {status['messages']} messages  {status['topics']} topics"
-        if "bytes" in status:
-            words += f"  {status['bytes'] / 1e6:.1f} MB  {status['files']} files   [space] pause"
-        else:
-            words += f"  last {status['cached_s']:g} s in memory   [s] snapshot [space] pause"
-        left_out = sum(status["overflow"].values()) + sum(status["disk_full"].values())
-        return words + (f"   LEFT OUT {left_out}" if left_out else "") + ("   LOST" if status["lost"] else "")
-
-    # The recorder may only be used from the node's thread.
-    keys = {" ": lambda: node.call_soon(node.commands["toggle"])}
-    if getattr(node.config, "snapshot", False):
-        keys["s"] = lambda: node.call_soon(node.commands["snapshot"], "key")
-    return Terminal(keys, line)
-
-
-def _player_terminal(node: Node[Any]) -> Terminal:
-    do = node.commands
-
-    def line() -> str:
-        status = do["status"]()
-        done = status["position_s"] / max(status["length_s"], 1e-9)
-        bar = "█" * round(20 * done) + "·" * (20 - round(20 * done))
-        return (
-            f"{status['state']:<7} {bar} {status['position_s']:.1f} / {status['length_s']:.1f} s  x{status['rate']:.2g}"
-            "   [space] pause [→] step [↑↓] rate [←] back 5 s [q] quit"
-        )
-
-    keys = {
-        " ": do["toggle"],
-        "right": do["step"],
-        "up": lambda: do["rate"](do["status"]()["rate"] * 1.1),
-        "down": lambda: do["rate"](do["status"]()["rate"] / 1.1),
-        "left": lambda: do["seek"](max(0.0, do["status"]()["position_s"] - 5.0)),
-        "q": node.stop,
-    }
-    return Terminal(keys, line)
 
 
 def record(args: argparse.Namespace) -> int:
@@ -102,7 +41,7 @@ def record(args: argparse.Namespace) -> int:
     if args.snapshot:
         words += _parameters(snapshot_seconds=args.snapshot_seconds, snapshot_after_s=args.snapshot_after)
     words += _parameters(use_sim_time=True) if args.use_sim_time else []
-    return run_node(_attended("bag_recorder", _recorder_terminal), words)
+    return run_node(node_class("bag_recorder"), words)
 
 
 def play(args: argparse.Namespace) -> int:
@@ -126,7 +65,7 @@ def play(args: argparse.Namespace) -> int:
     )
     for remap in args.remap:
         words += ["-r", remap]
-    return run_node(_attended("bag_player", _player_terminal), words)
+    return run_node(node_class("bag_player"), words)
 
 
 def snapshot(args: argparse.Namespace) -> int:

@@ -45,7 +45,7 @@ class Finding:
 def run_checks(
     run_dir: Path, serial_port: Path, camera_url: str, lidar_port: int, listen_s: float, missing: str
 ) -> Iterator[Finding]:
-    """Run every check but that of a running stack, the slow ones last.
+    """Run every check, the slow ones last.
 
     Args:
         run_dir: run directory of the stack.

@@ -1,10 +1,9 @@
-"""Log lines of the nodes: from the launcher's files, and live from ``/rosout`` where there is no file."""
+"""Log lines of the nodes, from the launcher's files."""
 
 from __future__ import annotations
 
 import os
 import re
-import time
 from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -131,19 +130,3 @@ class LogFolder:
                 self._files.setdefault(path, GrowingLog(path))
         lines = [line for file in self._files.values() for line in file.new_lines()]
         return sorted(lines, key=lambda line: line.stamp_s)
-
-    def has(self, node: str, since_s: float) -> bool:
-        """Return whether a node that was started at ``since_s`` has a log file here."""
-        try:
-            return (self._folder / f"{node}.log").stat().st_mtime >= since_s
-        except FileNotFoundError:
-            return False
-
-
-def from_rosout(message: object) -> LogLine:
-    """Return the entry of a ``/rosout`` message (rcl_interfaces/Log)."""
-    from instant_ic.msg import stamp_ns
-
-    level = min(max(int(message.level) // 10 - 1, 0), len(LEVELS) - 1)  # type: ignore[attr-defined]
-    stamp_s = stamp_ns(message) / 1e9 or time.time()
-    return LogLine(stamp_s, LEVELS[level], message.name.strip("/"), message.msg)  # type: ignore[attr-defined]

@@ -1,11 +1,10 @@
-"""Rows of ``ic top``, from the heartbeats of the nodes and their processes; the live table."""
+"""Rows of ``ic top``, from the heartbeats of the nodes; the live table."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 import os
-import select
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -26,47 +25,18 @@ SORT_KEYS: dict[str, Callable[[NodeRow], Any]] = {
     "name": lambda row: row.node,
     "lost": lambda row: (-row.lost, row.node),
 }
-_KEYS = {"c": "cpu", "m": "memory", "n": "name", "l": "lost"}
 
 
-class Processes:
-    """CPU and memory of processes, read from the operating system: also available for a hanging node."""
-
-    def __init__(self) -> None:
-        self._known: dict[int, Any] = {}
-
-    def look(self, pid: int) -> tuple[float, float]:
-        """Return CPU in percent of one core since the last call, and memory in MB.
-
-        The CPU is nan at the first call; both are nan when there is no such process.
-        """
-        import psutil
-
-        try:
-            first = pid not in self._known
-            process = self._known.setdefault(pid, psutil.Process(pid))
-            with process.oneshot():
-                cpu = process.cpu_percent()
-                return math.nan if first else cpu, process.memory_info().rss / 1e6
-        except psutil.Error:
-            self._known.pop(pid, None)
-            return math.nan, math.nan
-
-
-def make_rows(
-    infos: Sequence[NodeInfo], beats: Mapping[str, Heartbeat], look: Callable[[int], tuple[float, float]]
-) -> list[NodeRow]:
+def make_rows(infos: Sequence[NodeInfo], beats: Mapping[str, Heartbeat]) -> list[NodeRow]:
     """Return the rows of the running nodes.
 
     Args:
         infos: nodes listed in the registry.
         beats: newest heartbeat of each node.
-        look: returns CPU and memory of a process.
     """
     rows = []
     for info in infos:
-        cpu, rss = look(info.pid)
-        row = NodeRow(info.name, "silent", "", cpu, rss)
+        row = NodeRow(info.name, "silent")
         beat = beats.get(info.name)
         if beat is None or beat.pid != info.pid:
             row.message = "no heartbeat yet"
@@ -77,7 +47,7 @@ def make_rows(
                 row.message = f"no heartbeat for {time.monotonic() - beat.seen_s:.0f} s"
             else:
                 row.state, row.message = beat.state, beat.message
-                row.cpu_percent = beat.cpu_percent if math.isnan(cpu) else cpu
+                row.cpu_percent, row.rss_mb = beat.cpu_percent, beat.rss_mb
             row.message = row.message or "; ".join(f"{t.topic} {t.fault}" for t in row.outputs if t.fault)
         rows.append(row)
     return rows
@@ -117,28 +87,17 @@ def as_json(rows: Sequence[NodeRow]) -> list[dict[str, Any]]:
 
 
 def show_live(rows: Callable[[float], list[NodeRow]], period_s: float, sort: str) -> None:
-    """Show the table until ``q`` or Ctrl-C.
+    """Show the table until Ctrl-C.
 
     Args:
         rows: returns the newest rows; its argument is the listening time in seconds.
         period_s: time between two updates.
         sort: a key of ``SORT_KEYS``.
     """
-    from rich.console import Console, Group
+    from rich.console import Console
     from rich.live import Live
-    from rich.text import Text
 
-    from instant_ic.cli.terminal import single_keys
-
-    next_s, newest = 0.0, rows(0.7)
-    keys = Text("q quit   c CPU   m memory   n name   l losses", style="dim")
-    with single_keys(), Live(console=Console(file=direct(sys.stdout)), screen=True, auto_refresh=False) as live:
+    console = Console(file=direct(sys.stdout))
+    with Live(table(rows(0.7), sort), console=console, screen=True, auto_refresh=False) as live:
         while True:
-            if time.monotonic() >= next_s:
-                newest, next_s = rows(0.05), time.monotonic() + period_s
-            live.update(Group(table(newest, sort), keys), refresh=True)
-            ready, _, _ = select.select([sys.stdin], [], [], max(0.0, min(0.2, next_s - time.monotonic())))
-            key = os.read(sys.stdin.fileno(), 1).decode(errors="replace") if ready else ""
-            if key in ("q", "Q", "\x1b", "\x03", "\x04"):
-                return
-            sort = _KEYS.get(key, sort)
+            live.update(table(rows(period_s), sort), refresh=True)

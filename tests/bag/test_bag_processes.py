@@ -1,16 +1,12 @@
 """Recorder and player as processes: killed, asked for snapshots, paused and stepped from another terminal."""
 
 import contextlib
-import fcntl
 import io
 import json
 import os
-import pty
-import select
 import signal
 import subprocess
 import sys
-import termios
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -217,38 +213,3 @@ def test_player_is_steered_from_another_terminal(talker: Talker, tmp_path: Path)
     assert clock[-1] == 1_009 * S + 9 * S // 10
     talker.node.drop(listener)
     talker.node.drop(ticks)
-
-
-def test_keys_in_a_terminal(talker: Talker, tmp_path: Path) -> None:
-    ours, theirs = pty.openpty()
-    before = termios.tcgetattr(theirs)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "instant_ic.cli.main", "bag", "record", "-o", tmp_path / "bag", "/count"],
-        stdin=theirs, stdout=theirs, stderr=theirs, env=talker.environment, start_new_session=True,
-        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
-    )  # fmt: skip
-    text = ""
-
-    def shows(words: str) -> bool:
-        nonlocal text
-        while select.select([ours], [], [], 0.05)[0]:
-            text += os.read(ours, 65536).decode(errors="replace")
-        return words in text.rpartition("\r\x1b[K")[2] + text[-400:]
-
-    try:
-        wait_for(lambda: shows("[space] pause") and shows("recording"), "the status line")
-        os.write(ours, b" ")
-        wait_for(lambda: shows("paused") and left_out(talker), "the pause")
-        os.write(ours, b"\x1b[A")  # a key that means nothing here
-        os.write(ours, b" ")
-        text = ""
-        wait_for(lambda: shows("recording"), "the end of the pause")
-        os.write(ours, b"\x03")  # Ctrl-C, by the terminal itself
-        assert process.wait(40) == 0
-        assert termios.tcgetattr(theirs)[3] == before[3]  # echo and line mode are back
-    finally:
-        process.kill()
-        process.wait(10)
-        os.close(ours)
-        os.close(theirs)
-    assert json.loads(BagReader(tmp_path / "bag").custom["instant_ic.paused"])["/count"] >= 1

@@ -1,17 +1,13 @@
 import http.server
 import json
 import os
-import shutil
 import socket
-import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from cli_helpers import talking
 
 from instant_ic.cli import doctor
 from instant_ic.cli.doctor import FAIL, OK, WARN, Finding
@@ -168,48 +164,3 @@ def test_addresses_come_from_the_shipped_configuration(monkeypatch: pytest.Monke
     assert camera_url.startswith("http://") and str(serial_port).startswith("/dev/")
     assert (lidar_port, missing) == (9, FAIL)
     assert given[1][3:] == (2368, 1.0, WARN)  # a missing device is a failure only where the real ones are asked for
-
-
-def test_faults_of_a_running_stack_are_told_with_what_to_do() -> None:
-    from instant_ic.bus import RELIABLE, registry
-    from instant_ic.bus.local_transport import LocalTransport
-    from instant_ic.cli.doctor_running import ADVICE, check_running
-    from instant_ic.control.states import SOURCES, Reason
-    from instant_ic.msg import DiagnosticArray, DiagnosticStatus, KeyValue, header, serialize
-
-    run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
-    registry.prepare(run_dir)
-    assert list(check_running(run_dir, 0.1)) == []
-    words = "stopped: no LiDAR scan for 2.0 s"
-    level, ended = [0], threading.Event()
-    with talking(run_dir):
-        transport = LocalTransport(run_dir, "arbiter", time.time_ns)
-        out = transport.advertise("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", RELIABLE)
-
-        def tell() -> None:
-            while not ended.wait(0.1):
-                status = DiagnosticStatus(
-                    level=level[0],
-                    name="arbiter: control",
-                    message=words,
-                    hardware_id="",
-                    values=[KeyValue(key="reason", value=Reason.SCAN_STALE.name)],
-                )
-                out.send(serialize(DiagnosticArray(header=header("", 1), status=[status])))
-
-        teller = threading.Thread(target=tell)
-        teller.start()
-        try:
-            assert one(check_running(run_dir, 1.5)).text == "1 nodes, no faults"
-            level[0] = 1
-            found = one(check_running(run_dir, 1.5))
-        finally:
-            ended.set()
-            teller.join()
-            transport.close()
-    shutil.rmtree(run_dir)
-    assert (found.level, found.subject, found.text) == (WARN, "arbiter: control", words)
-    assert "VLP-16" in found.advice
-    # Whatever the arbiter may miss, there is something to do about it.
-    assert {source.reason for source in SOURCES} <= set(ADVICE)
-    assert {Reason.ESTOP, Reason.ESTOP_BUTTON, Reason.RELEASE_CONTROLS} <= set(ADVICE)

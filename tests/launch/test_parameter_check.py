@@ -1,8 +1,6 @@
-"""What the nodes would refuse is told before anything starts, at its place, all at once; cheaply the second time."""
+"""What the nodes would refuse is told before anything starts, at its place, all at once."""
 
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -11,7 +9,7 @@ from instant_ic.launch import find_launch_file, parameters, read_launch_file
 from instant_ic.launch.parameters import (
     ParameterCheckError,
     check_parameters,
-    check_parameters_quickly,
+    check_parameters_apart,
     existing_bags,
 )
 
@@ -31,7 +29,6 @@ STACK = """launch:
 @pytest.fixture
 def stack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "params.yaml").write_text("virtual_robot:\n  ros__parameters:\n    rate_hz: fast\n    nothing: 1\n")
     (tmp_path / "stack.yaml").write_text(STACK)
     (tmp_path / "own.py").touch()
@@ -60,38 +57,10 @@ def test_nothing_starts_while_a_parameter_is_wrong(stack: Path, capsys: pytest.C
     assert not (stack.parent / "r").exists()
 
 
-def test_a_valid_stack_is_checked_once_until_something_changes(stack: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    answers = iter(['["bad"]', "[]", "[]", "[]"])
-    monkeypatch.setattr(
-        parameters.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0, stdout=next(answers))
-    )
-    nodes = read_launch_file(stack).nodes
-    assert check_parameters_quickly(nodes) == ["bad"]
-    assert check_parameters_quickly(nodes) == []  # only a valid stack is remembered
-    assert check_parameters_quickly(nodes) == []
-    stack.with_name("params.yaml").write_text("virtual_robot:\n  ros__parameters: {rate_hz: 20}\n")
-    assert check_parameters_quickly(nodes) == []
-    monkeypatch.setattr(sys, "version", "another version")
-    assert check_parameters_quickly(nodes) == []
-    assert next(answers, None) is None  # the two changes were checked, the unchanged stack was not
-
-
-def test_a_broken_cache_costs_only_time(stack: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache = stack.with_name("cache.json")
-    cache.write_text("[1, null")
-    nodes = read_launch_file(stack).nodes
-    assert check_parameters_quickly(nodes, cache) == check_parameters(nodes)  # in a process of its own
-    monkeypatch.setattr(parameters.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0, stdout="[]"))
-    for content in ("", "{}", "[1, null]", "\x00"):
-        cache.write_text(content)
-        assert check_parameters_quickly(nodes, cache) == []
-    assert check_parameters_quickly(nodes, Path("/proc/no/cache.json")) == []  # it cannot be written
-
-
 def test_a_check_that_does_not_end_is_reported(stack: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parameters, "CHECK_TIMEOUT_S", 0.01)
     with pytest.raises(ParameterCheckError, match="could not be checked within"):
-        check_parameters_quickly(read_launch_file(stack).nodes)
+        check_parameters_apart(read_launch_file(stack).nodes)
 
 
 @pytest.mark.parametrize(

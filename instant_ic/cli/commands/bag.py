@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from instant_ic.cli import completion
 from instant_ic.cli.arguments import group, verb
 from instant_ic.cli.errors import UserError
 
@@ -28,7 +27,7 @@ def add_parser(subparsers: Any) -> None:
 def _add_record(verbs: Any) -> None:
     """Add ``ic bag record``."""
     example = "ic bag record -o drive /scan '/camera/*' -x /camera/raw --max-bag-size 2GB"
-    recording = verb(verbs, "record", "record topics until Ctrl-C; space pauses", "bag_run.record", example)
+    recording = verb(verbs, "record", "record topics until Ctrl-C", "bag_run.record", example)
     _topics(recording)
     add = recording.add_argument
     add("-o", "--output", default="", metavar="DIR", help="default: runs/bag_DATE_TIME")
@@ -49,16 +48,16 @@ def _add_record(verbs: Any) -> None:
 
 def _add_play(verbs: Any) -> None:
     """Add ``ic bag play``."""
-    text, example = "play a bag with /clock; space pauses, → steps, ↑ ↓ change the rate", "ic bag play drive --rate 2"
+    text, example = "play a bag with /clock", "ic bag play drive --rate 2"
     playing = verb(verbs, "play", text, "bag_run.play", f"{example} --start 10")
     add = playing.add_argument
-    add("bag", metavar="BAG", help="folder, .mcap or .db3 file", completer=completion.bags)
+    add("bag", metavar="BAG", help="folder, .mcap or .db3 file")
     _topics(playing)
     add("-r", "--rate", type=float, default=1.0, help="speed factor (default: %(default)s)")
     add("--start", **_SPAN, default=0.0, help="start at this offset")
     add("--duration", **_SPAN, default=0.0, help="play this many seconds")
     add("--loop", action="store_true", help="restart at the end")
-    add("--start-paused", action="store_true", help="wait for space, → or ic bag control resume")
+    add("--start-paused", action="store_true", help="wait for ic bag control resume")
     add("--remap", **_MANY, metavar="FROM:=TO", help="rename a topic; repeatable")
     text = "publish commands and states even though a base is running: the robot may move"
     add("--force", action="store_true", help=text)
@@ -72,13 +71,13 @@ def _add_inspection(verbs: Any) -> None:
     looking = verb(
         verbs, "info", "topics, types, counts, files and losses of a bag", "bag_look.info", "ic bag info drive"
     )
-    looking.add_argument("bag", metavar="BAG", completer=completion.bags)
+    looking.add_argument("bag", metavar="BAG")
     looking.add_argument("--json", action="store_true", help="print JSON")
 
     example = "ic bag diff first second --stamp-tolerance 0.01 --tolerance 'ranges=0.01' --ignore-field header.stamp"
     comparing = verb(verbs, "diff", "compare two bags; exit status 1 if they differ", "bag_look.diff", example)
-    comparing.add_argument("a", metavar="A", completer=completion.bags)
-    comparing.add_argument("b", metavar="B", completer=completion.bags)
+    comparing.add_argument("a", metavar="A")
+    comparing.add_argument("b", metavar="B")
     comparing.add_argument("--common", action="store_true", help="compare only topics that both bags have")
     tolerances(comparing)
     comparing.add_argument("--json", action="store_true", help="print JSON")
@@ -88,7 +87,7 @@ def _add_recovery(verbs: Any) -> None:
     """Add ``ic bag recover``."""
     text, example = "recover a readable bag from one that was cut short or damaged", "ic bag recover broken -o saved"
     rescuing = verb(verbs, "recover", text, "bag_look.recover", example)
-    rescuing.add_argument("bag", metavar="BAG", completer=completion.bags)
+    rescuing.add_argument("bag", metavar="BAG")
     rescuing.add_argument("-o", "--output", default="", metavar="DIR", help="default: BAG_recovered")
 
 

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.cli import completion
 from instant_ic.cli.arguments import check_files, group, numbers, positive_int, verb
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.tables import print_table
@@ -29,7 +28,7 @@ def add_parser(subparsers: Any) -> None:
         "which degrees of freedom the recording constrains, and write the camera's mount as a parameter file. "
         "Record a minute of slow driving in a furnished room (docs/calibration.md).",
     ).add_argument  # fmt: skip
-    add("bag", type=Path, metavar="BAG", completer=completion.bags)
+    add("bag", type=Path, metavar="BAG")
     text = "parameter file to write (%(default)s)"
     add("-o", "--out", type=Path, default=Path("camera_mount.yaml"), metavar="FILE", help=text)
     add("--plot", type=Path, metavar="PNG", help="LiDAR points over the images, before and after")

@@ -1,10 +1,8 @@
-"""``ic config``: check configuration files, and show where each value of a node comes from."""
+"""``ic config``: show where each value of a node comes from."""
 
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli import completion
@@ -18,17 +16,10 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: Any) -> None:
     verbs = group(
-        subparsers, "config", "check configuration files, show the values of a node",
-        "Check configuration files, and show the values that a node would start with.",
+        subparsers, "config", "show the values of a node",
+        "Show the values that a node would start with (ic launch FILE --check checks them).",
         "ic config show arbiter --changed",
     )  # fmt: skip
-    check = verb(
-        verbs, "check", "report all mistakes in launch and parameter files", check_files,
-        "ic config check my_robot.yaml",
-        "Report all mistakes in launch and parameter files, with file and line; status 1 if there are any.",
-    )  # fmt: skip
-    text = "launch file, shipped launch file by name, or parameter file (default: all shipped files)"
-    check.add_argument("files", nargs="*", metavar="LAUNCH_OR_FILE", help=text, completer=completion.launch_files)
     add = verb(
         verbs, "show", "effective value of each parameter of a node, and where it comes from", show_node,
         "ic config show vlp16_driver --launch robot lidar_port:=3000",
@@ -40,52 +31,6 @@ def add_parser(subparsers: Any) -> None:
     form = ("FILE", "KEY:=VALUE")
     add("--launch", nargs="+", default=[], metavar=form, help=text, completer=completion.launch_files)
     add("--changed", action="store_true", help="only values that differ from the default")
-
-
-def check_files(args: argparse.Namespace) -> int:
-    from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
-    from instant_ic.launch.parameters import check_parameter_file, check_parameters_quickly
-    from instant_ic.util import paths
-
-    files = [_found(text) for text in args.files]
-    if not files:
-        launch_files = sorted(paths.share_dir("launch").glob("*.yaml"))
-        files = [file for file in launch_files if all(a.default is not None for a in read_arguments(file))]
-        files += [file for file in sorted(paths.share_dir("config").glob("*.yaml")) if file.name != "topics.yaml"]
-    problems: list[str] = []
-    for file in files:
-        if _is_launch_file(file):
-            try:
-                problems += check_parameters_quickly(read_launch_file(file.resolve(), {}).nodes)
-            except LaunchFileError as error:
-                problems += map(str, error.problems)
-        else:
-            problems += check_parameter_file(file)
-    problems = list(dict.fromkeys(problems))
-    for problem in problems:
-        print(f"ic: {problem}", file=sys.stderr)
-    if not problems:
-        print(f"{len(files)} file{'s' if len(files) > 1 else ''}, no errors")
-    return 1 if problems else 0
-
-
-def _found(text: str) -> Path:
-    from instant_ic.launch import find_launch_file
-
-    return Path(text) if Path(text).is_file() else find_launch_file(text)
-
-
-def _is_launch_file(file: Path) -> bool:
-    """Return whether the top level has the key ``launch``; False also if it is not YAML, which the check reports."""
-    import yaml
-
-    from instant_ic.config.yaml_text import compose_yaml
-
-    try:
-        root = compose_yaml(file.read_text())
-    except (OSError, ValueError, yaml.YAMLError):
-        return False
-    return isinstance(root, yaml.MappingNode) and any(key.value == "launch" for key, _ in root.value)
 
 
 def show_node(args: argparse.Namespace) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,6 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from instant_ic.cli.doctor import FAIL, OK, WARN, run_checks
-    from instant_ic.cli.doctor_running import check_running
     from instant_ic.util import paths
 
     colours = {OK: "32", WARN: "33", FAIL: "31"} if sys.stdout.isatty() else {}
@@ -38,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     lidar_port = args.lidar_port or _shipped("vlp16_driver", "port", 2368)
     missing = FAIL if args.robot else WARN
     checks = run_checks(paths.run_dir(), serial_port, camera_url, lidar_port, args.listen, missing)
-    for finding in itertools.chain(checks, check_running(paths.run_dir())):
+    for finding in checks:
         counts[finding.level] += 1
         level = f"{finding.level:<4}"
         if finding.level in colours:

@@ -61,9 +61,9 @@ def run(args: argparse.Namespace) -> int:
     run_dir = (args.run_dir or paths.run_dir()).absolute()
     description = read_launch_file(file, launch_values(args.arguments), run_dir)
     if args.check or not args.no_check:
-        from instant_ic.launch.parameters import check_parameters_quickly, existing_bags
+        from instant_ic.launch.parameters import check_parameters_apart, existing_bags
 
-        problems = check_parameters_quickly(description.nodes) + existing_bags(description.nodes)
+        problems = check_parameters_apart(description.nodes) + existing_bags(description.nodes)
         for problem in problems:
             print(f"ic: {problem}", file=sys.stderr)
         if problems:

@@ -7,7 +7,6 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from instant_ic.cli import completion
 from instant_ic.cli.arguments import verb
 from instant_ic.cli.commands.bag import tolerances, topic_names
 from instant_ic.cli.errors import UserError
@@ -21,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
         "The result does not depend on the speed of the machine: repeating a command gives the same bytes.",
     )  # fmt: skip
     add, many = parser.add_argument, {"action": "append", "default": []}
-    add("bag", metavar="BAG", completer=completion.bags)
+    add("bag", metavar="BAG")
     add("--nodes", required=True, metavar="A,B,...", help="nodes, in the order in which they run")
     add("-o", "--output", required=True, metavar="DIR", help="new bag")
     text = "parameter file; repeatable; default: the nodes' files in config/"

@@ -18,7 +18,7 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     add = verb(
         subparsers, "top", "CPU, memory, rates and losses of every node, live", show, "ic top --once",
-        "Show CPU, memory, threads, rates (measured/nominal) and losses of every node, once a second.",
+        "Show CPU, memory, rates (measured/nominal) and losses of every node, once a second.",
     ).add_argument  # fmt: skip
     add("--once", action="store_true", help="print one table and exit (default without a terminal)")
     add("--json", action="store_true", help="print one table as JSON and exit")
@@ -50,12 +50,11 @@ def show(args: argparse.Namespace) -> int:
     from instant_ic.cli.errors import UserError
     from instant_ic.cli.heartbeats import Heartbeats
     from instant_ic.cli.names import nobody_runs
-    from instant_ic.cli.top import SORT_KEYS, Processes, as_json, make_rows, show_live, table
+    from instant_ic.cli.top import SORT_KEYS, as_json, make_rows, show_live, table
     from instant_ic.util import paths
     from instant_ic.util.safe_text import direct
 
     run_dir = paths.run_dir()
-    processes = Processes()
     if not registry.list_nodes(run_dir):
         raise UserError(nobody_runs())
     with Heartbeats(run_dir) as heartbeats:
@@ -63,7 +62,7 @@ def show(args: argparse.Namespace) -> int:
         def rows(seconds: float, until_all: bool = False) -> list[NodeRow]:
             infos = registry.list_nodes(run_dir)
             beats = heartbeats.listen(seconds, [info.name for info in infos] if until_all else ())
-            made = make_rows(infos, beats, processes.look)
+            made = make_rows(infos, beats)
             for row in made:
                 if row.state == "silent":
                     _ask(row, run_dir)
@@ -72,7 +71,6 @@ def show(args: argparse.Namespace) -> int:
         if sys.stdin.isatty() and sys.stdout.isatty() and not (args.once or args.json):
             show_live(rows, args.delay, args.sort)
             return 0
-        rows(0.3)  # the CPU is measured from here on
         newest = rows(1.5, until_all=True)
     if args.json:
         print(json.dumps(as_json(sorted(newest, key=SORT_KEYS[args.sort]))))
