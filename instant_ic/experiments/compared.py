@@ -23,7 +23,7 @@ UNSHOWN = ("fill", "slam-pose")
 """Sources left out of the strips: they look like others."""
 LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
 _TILE_PX = 240
-_COST_S = {"tripod": 12.0, "phone": 3.0, "no-depth": 8.0, "paper": 8.0, "paper-no-scale": 8.0}
+_COST_S = {"tripod": 12.0, "no-depth": 8.0, "paper": 8.0, "paper-no-scale": 8.0}
 """Expected CPU seconds of a source; others take one."""
 _BASE_COST_S = 7.0
 

@@ -11,7 +11,7 @@ from typing import Any
 from instant_ic.experiments.compared import command_of
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.report import Part, Section, Table, Text
-from instant_ic.experiments.scan import QUALITIES, scan_world
+from instant_ic.experiments.scan import ScanQuality, scan_world
 from instant_ic.experiments.teleop import TeleopSettings, run_episode
 from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS
 
@@ -45,7 +45,7 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
         if method == "mesh":
             course, file = settings.course(0), Path(folder) / "scan.glb"
             start = course.world.spawn  # where the map begins
-            scan_world(course.free_world, start, QUALITIES["tripod"], seed, file, start)
+            scan_world(course.free_world, start, ScanQuality(), seed, file, start)
             settings = replace(settings, overrides=("nerf.space.source:=mesh", f"nerf.space.mesh:={file}"))
         (drive,) = run_episode(settings, 0)
     return {"drive": {key: value for key, value in asdict(drive).items() if key != "tracks"}}

@@ -36,15 +36,13 @@ _GRAZING = 0.08
 _BAND_CELLS = 2
 _AT_ONCE = 500_000
 """Cells that are fused together, which bounds the memory."""
-_PICTURE_M = 0.5
-"""Clamped textures above this height are posters; lower ones are doors."""
 _SHIFT_M = 0.4
 """Largest displacement of a moved object along each axis."""
 
 
 @dataclass(frozen=True)
 class ScanQuality:
-    """How well a place was scanned.
+    """Errors of a scan; by default those of a tripod scanner registered by its clouds alone, a year ago (paper, V.A).
 
     Attributes:
         noise_m: standard deviation of a range.
@@ -54,25 +52,17 @@ class ScanQuality:
         spacing_m: distance between stations.
         width: of the stations' panoramas, pixels.
         colour: standard deviation of the logarithm of the white balance; twice of the exposure, half of each texture.
-        older: share of the free-standing objects that stood elsewhere, and of the posters that were others.
+        older: share of the free-standing objects that stood elsewhere.
     """
 
-    noise_m: float
-    registration_m: float
-    registration_deg: float
-    cell_m: float
-    spacing_m: float
-    width: int
-    colour: float
-    older: float
-
-
-QUALITIES = {
-    "tripod": ScanQuality(0.004, 0.01, 0.1, 0.04, 3.0, 4096, 0.12, 0.5),
-    "phone": ScanQuality(0.02, 0.06, 1.0, 0.08, 3.0, 1024, 0.15, 0.5),
-}
-"""Both scans are a year old. ``tripod``: a scanner registered by its clouds alone, as in the paper; ``phone``: a
-telephone with a LiDAR."""
+    noise_m: float = 0.004
+    registration_m: float = 0.01
+    registration_deg: float = 0.1
+    cell_m: float = 0.04
+    spacing_m: float = 3.0
+    width: int = 4096
+    colour: float = 0.12
+    older: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -99,16 +89,11 @@ class Station:
 
 
 def aged(world: World, quality: ScanQuality, rng: np.random.Generator) -> World:
-    """Return the world at the time of its scan: other light, colours and posters, objects elsewhere."""
+    """Return the world at the time of its scan: other light and colours, objects elsewhere."""
     drift = np.exp(rng.normal(0, 0.5 * quality.colour, (int(world.texture.max()) + 1, 3)))[world.texture]
     light = np.exp(rng.normal(0, quality.colour, 3) + rng.normal(0, 2 * quality.colour))
     tint, emission = world.tint * drift * light, world.emission * np.float32(light.mean())
-    texture = world.texture.copy()
-    lowest = world.vertices.reshape(len(world.normal), -1, 3)[..., 2].min(axis=1)
-    posters = (world.textures.clamp[texture] > 0) & (world.emission == 0) & (lowest > _PICTURE_M)
-    others = np.flatnonzero(posters & (rng.random(len(texture)) < quality.older))
-    texture[others] = rng.permutation(texture[others])
-    older = replace(world, tint=tint.astype(np.float32), emission=emission.astype(np.float32), texture=texture)
+    older = replace(world, tint=tint.astype(np.float32), emission=emission.astype(np.float32))
     found, _, _ = things(world)
     for label in range(1, int(found.max(initial=0)) + 1):
         if rng.random() < quality.older:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.experiments.scan import QUALITIES, aged, scan_world
+from instant_ic.experiments.scan import ScanQuality, aged, scan_world
 from instant_ic.experiments.worlds import CAMERA_HEIGHT_M, LIDAR_HEIGHT_M
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ SOURCES = {
     "panorama": "the panorama turned, without depth",
     "depth-warp": "the panorama warped by the depth of `ours`, as a mesh",
     "mesh": "conventional IC with a perfect scan: exact geometry, obstacle not there yet, colours fitted",
-    **{name: f"conventional IC with a real scan: {name}" for name in QUALITIES},
+    "tripod": "conventional IC with a real scan of a tripod scanner",
 }
 FILLED = ("fill", "exact-fill")
 """Sources that show the truth where no keyframe has seen the place."""
@@ -186,8 +186,8 @@ def make_source(
         colours = ColourOnlyField(shot.rgb, shot.pose, config)
         colours.train(settings.seconds)
         render = _view_of(colours)
-    elif name in QUALITIES and place is not None:
-        render = _view_of(_scanned_space(name, shot, settings, config, place))
+    elif name == "tripod" and place is not None:
+        render = _view_of(_scanned_space(shot, settings, config, place))
     elif name == "mesh" and place is not None:
         render = _perfect_mesh(shot, settings, place)
     elif name in ("panorama", "depth-warp"):
@@ -279,7 +279,7 @@ def _perfect_mesh(shot: Shot, settings: VspaceSettings, place: Place) -> RenderV
     """Return the world's own geometry in other colours, which are fitted to the keyframe as ``MeshSpace`` does."""
     from instant_ic.sim.render import EquirectRenderer
 
-    quality = replace(QUALITIES["tripod"], older=0.0)
+    quality = ScanQuality(older=0.0)
     renderer = EquirectRenderer(aged(place.before, quality, np.random.default_rng([73, settings.seed])))
     theirs, seen = (one.render(shot.pose, 256, 128).rgb / 255 + 1e-3 for one in (place.renderer, renderer))
     gain = np.median(theirs / seen, axis=(0, 1))
@@ -291,11 +291,11 @@ def _perfect_mesh(shot: Shot, settings: VspaceSettings, place: Place) -> RenderV
     return render
 
 
-def _scanned_space(name: str, shot: Shot, settings: VspaceSettings, config: VirtualSpaceConfig, place: Place) -> Any:
+def _scanned_space(shot: Shot, settings: VspaceSettings, config: VirtualSpaceConfig, place: Place) -> Any:
     """Return the stack's own space of a scanned mesh, its colours fitted to the keyframe."""
     from instant_ic.vspace.mesh_space import MeshSpace
 
-    quality = replace(QUALITIES[name], width=min(QUALITIES[name].width, 4 * settings.panorama_width))
+    quality = ScanQuality(width=min(ScanQuality.width, 4 * settings.panorama_width))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "scan.glb"
         scan_world(place.before, place.start, quality, settings.seed, file)

@@ -30,7 +30,6 @@ from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.plots import curves_svg, image_strip
 from instant_ic.experiments.recorded_drive import Moment
 from instant_ic.experiments.scan import (
-    QUALITIES,
     ScanQuality,
     Station,
     aged,
@@ -108,7 +107,7 @@ def test_an_object_moves_with_its_looks() -> None:
     assert np.abs(ours.depth_m - theirs.depth_m).max() < 1e-3
 
 
-def test_an_older_world_has_other_posters_and_objects_elsewhere() -> None:
+def test_an_older_world_has_other_colours_and_objects_elsewhere() -> None:
     world = box_world(1.5)
     same = aged(world, FINE, np.random.default_rng(0))
     assert np.array_equal(same.vertices, world.vertices) and np.allclose(same.tint, world.tint)
@@ -116,7 +115,6 @@ def test_an_older_world_has_other_posters_and_objects_elsewhere() -> None:
     shift = np.abs(older.vertices - world.vertices).max(axis=0)
     assert 0 < shift[:2].max() <= 0.4 and shift[2] == 0
     assert not np.allclose(older.tint, world.tint)
-    assert sorted(older.texture) == sorted(world.texture)
 
 
 def test_stations_keep_their_distance() -> None:
@@ -131,12 +129,12 @@ def test_a_good_scan_shows_the_room_and_a_bad_one_less(tmp_path) -> None:
     world, pose = box_world(1.5), pose_matrix(-0.5, 0.2, 1.2)
     truth = EquirectRenderer(world).render_perspective(pose, 96, 54, math.pi / 2, supersample=2).rgb
     seen = {}
-    for name, quality in (("fine", FINE), ("phone", dataclasses.replace(QUALITIES["phone"], width=512))):
+    for name, quality in (("fine", FINE), ("bad", ScanQuality(0.02, 0.06, 1.0, 0.08, width=512))):
         made = scan_world(world, (0.0, 0.0, 0.0), quality, 0, tmp_path / f"{name}.glb")
         assert made["stations"] >= 1 and made["triangles"] > 1000
         space = MeshSpace(VirtualSpaceConfig(source="mesh", mesh=str(tmp_path / f"{name}.glb"), mesh_fit_colours=False))
         seen[name] = psnr_db(space.render(pose, 96, 54, math.pi / 2).rgb, truth)
-    assert seen["fine"] > 22 and seen["fine"] > seen["phone"] + 3
+    assert seen["fine"] > 22 and seen["fine"] > seen["bad"] + 3
 
 
 def test_a_scan_in_the_frame_of_a_start_shows_the_same(tmp_path) -> None:

@@ -33,7 +33,7 @@ def make_scan(folder: Path, world: str, seed: int) -> Path:
     Raises:
         StudyError: there is no such world, or it has no course straight ahead.
     """
-    from instant_ic.experiments.scan import QUALITIES, scan_world
+    from instant_ic.experiments.scan import ScanQuality, scan_world
     from instant_ic.experiments.teleop_worlds import straight_ahead
     from instant_ic.experiments.worlds import named_world
 
@@ -44,7 +44,7 @@ def make_scan(folder: Path, world: str, seed: int) -> Path:
         course = straight_ahead(named_world(world))
         make_folder(file.parent, exist_ok=True)
         beside = file.with_suffix(".part")
-        scan_world(course.free_world, course.world.spawn, QUALITIES["tripod"], seed, beside, course.world.spawn)
+        scan_world(course.free_world, course.world.spawn, ScanQuality(), seed, beside, course.world.spawn)
     except ValueError as error:
         raise StudyError(f"{folder / 'study.yaml'}: world {world}: {error}") from None
     beside.replace(file)
