@@ -15,7 +15,6 @@ from instant_ic.camera.files import FileCamera
 from instant_ic.camera.loop import CameraLoop
 from instant_ic.camera.source import CameraError
 from instant_ic.camera.video import VideoCamera
-from instant_ic.util.reconnect import Backoff
 
 
 def test_folder_in_the_order_of_names_with_jpegs_byte_for_byte(tmp_path: Path) -> None:
@@ -30,13 +29,6 @@ def test_folder_in_the_order_of_names_with_jpegs_byte_for_byte(tmp_path: Path) -
     assert abs(int(cv2.imdecode(np.frombuffer(frames[2].jpeg, np.uint8), 1).mean()) - 200) <= 2
     assert frames[3].jpeg == jpeg(40)  # from the start again
     assert {frame.stamp_ns for frame in frames} == {7}
-
-
-def test_without_loop_the_last_picture_stays(tmp_path: Path) -> None:
-    for name, value in (("a.jpg", 40), ("b.jpg", 80)):
-        (tmp_path / name).write_bytes(jpeg(value))
-    with FileCamera(tmp_path, FilesConfig(loop=False)) as camera:
-        assert [camera.next_frame().jpeg for _ in range(3)] == [jpeg(40), jpeg(80), jpeg(80)]
 
 
 def test_rate_is_kept_and_late_readers_are_not_flooded(tmp_path: Path) -> None:
@@ -147,10 +139,10 @@ def readers() -> int:
 
 def test_a_device_that_opens_and_sends_nothing_is_given_up_after_the_read_timeout(device: Device) -> None:
     """OpenCV's read of a device blocked for 10 s; here it never returns by itself."""
-    camera = VideoCamera("0", VideoConfig(read_timeout_s=0.3))
+    camera = VideoCamera("0", VideoConfig(read_timeout_s=0.1))
     assert camera.connect() == "video 0, 32x32 by V4L2"
     assert camera.read().width == 32
-    with pytest.raises(CameraError, match=r"0: is open, but sends no image for 0.3 s. Check .* live streaming mode"):
+    with pytest.raises(CameraError, match=r"0: is open, but sends no image for 0.1 s. Check .* live streaming mode"):
         camera.read()
     assert camera.connect()  # the driver still blocks the first read
     assert camera.read().width == 32
@@ -164,7 +156,7 @@ def test_a_device_that_opens_and_sends_nothing_is_given_up_after_the_read_timeou
 def test_reads_that_hang_are_bounded_and_the_camera_returns_when_the_driver_does(device: Device) -> None:
     device.images = 0
     before = readers()
-    camera = VideoCamera("0", VideoConfig(read_timeout_s=0.3))
+    camera = VideoCamera("0", VideoConfig(read_timeout_s=0.1))
     for _ in range(2):
         camera.connect()
         with pytest.raises(CameraError, match="sends no image"):
@@ -205,21 +197,6 @@ def test_a_camera_ends_while_its_device_blocks(device: Device, opens: bool, monk
     assert loop.end(30.0)
     assert not device.let_go.is_set()
     assert [connected for connected, _ in events] == [True] * opens
-
-
-def test_the_loop_reconnects_to_a_device_that_stops_sending(device: Device) -> None:
-    again = threading.Event()
-    events: list[str] = []
-    loop = CameraLoop(
-        VideoCamera("0", VideoConfig(read_timeout_s=0.3)),
-        lambda frame: again.set() if len(device.opened) == 2 else None,
-        lambda connected, text: events.append(text),
-        Backoff(0.01, 0.01),
-    )
-    loop.start()
-    assert again.wait(30.0)
-    assert loop.end(30.0)
-    assert "sends no image for 0.3 s" in events[1]
 
 
 def test_video_that_cannot_be_opened_is_told(tmp_path: Path) -> None:

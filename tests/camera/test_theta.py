@@ -34,24 +34,14 @@ def test_frames_pass_byte_for_byte_and_the_newest_counts(chunked: bool, boundary
                 camera.read()
 
 
-def test_options_are_set_then_a_second_is_waited_then_the_preview_starts() -> None:
-    waits: list[float] = []
-    with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]])) as theta:
-        camera = ThetaCamera(ThetaClient(theta.url, ThetaConfig(), sleep=waits.append))
-        text = camera.connect()
-        camera.close()
-        assert theta.behaviour.commands == ["camera.getOptions", "camera.setOptions", "camera.getLivePreview"]
-    assert waits == [1.0]
-    assert theta.behaviour.options.values == {"captureMode": "image", "sleepDelay": NEVER, "offDelay": NEVER}
-    assert theta.behaviour.options.preview == (1024, 512, 30)
-    assert text.startswith("RICOH THETA Z1 (firmware 3.10.2)")
-
-
 def test_a_camera_with_the_right_options_starts_its_preview_at_once() -> None:
     waits: list[float] = []
     with FakeTheta(Behaviour(previews=[[part(FRAMES[0])], [part(FRAMES[1])]])) as theta:
         camera = ThetaCamera(ThetaClient(theta.url, ThetaConfig(), sleep=waits.append))
-        camera.connect()
+        assert camera.connect().startswith("RICOH THETA Z1 (firmware 3.10.2)")
+        assert theta.behaviour.commands == ["camera.getOptions", "camera.setOptions", "camera.getLivePreview"]
+        assert theta.behaviour.options.values == {"captureMode": "image", "sleepDelay": NEVER, "offDelay": NEVER}
+        assert theta.behaviour.options.preview == (1024, 512, 30)
         camera.connect()
         camera.close()
         assert theta.behaviour.commands[3:] == ["camera.getOptions", "camera.getLivePreview"]
@@ -98,14 +88,6 @@ def test_old_firmware_gets_a_format_that_it_knows_and_the_operator_the_version_t
     assert behaviour.options.preview == (1024, 512, 8)
     assert text.endswith("preview 1024x512 at 8 Hz")
     assert "1024x512 at 30 Hz" in camera.advice and "2.21.1 or later; it has 1.60.1" in camera.advice
-
-
-def test_a_small_preview_of_old_firmware_falls_back_to_a_larger_one() -> None:
-    config = ThetaConfig(640, 320, 8, settle_s=0.0)
-    with FakeTheta(Behaviour(firmware="2.20.1", previews=[[part(FRAMES[0])]])) as theta:
-        with ThetaCamera(ThetaClient(theta.url, config)) as camera:
-            assert theta.behaviour.options.preview == (1024, 512, 8)
-            assert "640x320 at 8 Hz" in camera.advice
 
 
 def test_another_refusal_is_not_taken_for_old_firmware() -> None:
@@ -167,31 +149,14 @@ def test_state_with_errors() -> None:
         assert client.state().battery is None
 
 
-def test_stall_is_given_up_after_the_read_timeout() -> None:
-    config = ThetaConfig(settle_s=0.0, read_timeout_s=0.2)
-    with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]], stall=True)) as theta:
-        with ThetaCamera(ThetaClient(theta.url, config)) as camera:
-            assert camera.read().jpeg == FRAMES[0]
-            with pytest.raises(CameraError, match=r"preview ended: .*[Tt]ime"):
-                camera.read()
-
-
 def test_frame_that_stalls_in_the_middle_is_never_given_out() -> None:
     config = ThetaConfig(settle_s=0.0, read_timeout_s=0.2)
     half = part(FRAMES[1])[:300]
     with FakeTheta(Behaviour(previews=[[part(FRAMES[0]) + half]], stall=True)) as theta:
         with ThetaCamera(ThetaClient(theta.url, config)) as camera:
             assert camera.read().jpeg == FRAMES[0]
-            with pytest.raises(CameraError):
+            with pytest.raises(CameraError, match=r"preview ended: .*[Tt]ime"):
                 camera.read()
-
-
-def test_cut_frame_is_counted_and_the_next_one_given() -> None:
-    stream = part(FRAMES[0][:200], length=len(FRAMES[0])) + part(FRAMES[1])
-    with FakeTheta(Behaviour(previews=[[stream]])) as theta:
-        with ThetaCamera(ThetaClient(theta.url, CONFIG)) as camera:
-            assert camera.read().jpeg == FRAMES[1]
-            assert camera.bad_frames == 1
 
 
 def test_nobody_there_is_told_in_words() -> None:
@@ -217,7 +182,7 @@ def test_loop_connects_again_after_each_end_and_backs_off() -> None:
             ThetaCamera(ThetaClient(theta.url, CONFIG)),
             lambda frame: received.append(frame.jpeg),
             on_event,
-            Backoff(0.1, 0.4),
+            Backoff(0.02, 0.08),
         )
         loop.start()
         assert enough.wait(60.0)
@@ -225,22 +190,8 @@ def test_loop_connects_again_after_each_end_and_backs_off() -> None:
     assert received == FRAMES
     waits = [text.rsplit(" in ", 1)[1] for connected, text in events if not connected]
     # A picture makes the next wait short again; refusals make it longer.
-    assert waits[:7] == ["0.1 s"] * 4 + ["0.2 s", "0.4 s", "0.4 s"]
+    assert waits[:7] == ["0.02 s"] * 4 + ["0.04 s", "0.08 s", "0.08 s"]
     assert [connected for connected, _ in events[:8]] == [True, False] * 4
-
-
-def test_loop_ends_while_it_waits() -> None:
-    with FakeTheta() as theta:
-        failed = threading.Event()
-        loop = CameraLoop(
-            ThetaCamera(ThetaClient(theta.url, CONFIG)),
-            lambda frame: None,
-            lambda connected, text: failed.set(),
-            Backoff(600.0, 600.0),
-        )
-        loop.start()
-        assert failed.wait(30.0)
-        assert loop.end(30.0)
 
 
 class FlakyCamera(Camera):
@@ -275,8 +226,3 @@ def test_loop_outlives_and_tells_unexpected_exceptions() -> None:
     assert loop.end(30.0)
     assert events[0].startswith("unexpected RuntimeError('a bug')")
     assert events[2] == "works"
-
-
-def test_a_preview_format_that_no_theta_has_is_refused() -> None:
-    with pytest.raises(ValueError, match="1024x512@30"):
-        ThetaConfig(width=800)

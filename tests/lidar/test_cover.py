@@ -56,14 +56,6 @@ def test_a_cover_is_found_at_once_and_lifted_at_once() -> None:
     assert not watch.covered.any()
 
 
-def test_a_hand_that_comes_slowly_is_found_too() -> None:
-    watch = CoverWatch()
-    for k in range(35):
-        share = shares(**{f"s{s}": max(0.0, 0.6 - max(0, k - 10) * 0.04) for s in range(10, 18)})
-        watch.update(revolution(k, share), HERE)
-    assert watch.covered[10:18].all()
-
-
 @pytest.mark.parametrize("step", [(0.0, 0.0, 0.1), (0.04, 0.0, 0.0)])
 def test_a_tape_on_the_sensor_stays_found_while_the_robot_moves(step: tuple[float, float, float]) -> None:
     watch, pose = CoverWatch(), np.zeros(3)

@@ -82,7 +82,7 @@ def test_file_that_is_no_capture_is_refused_in_words(tmp_path: Path) -> None:
         read(tmp_path, b"")
 
 
-@settings(max_examples=150)
+@settings(max_examples=40)
 @given(cut=st.integers(0, 400), flips=st.lists(st.tuples(st.integers(0, 399), st.integers(0, 255)), max_size=8))
 @pytest.mark.parametrize("make", [pcap, pcapng])
 def test_damaged_captures_never_raise(tmp_path_factory: pytest.TempPathFactory, make, cut: int, flips) -> None:  # type: ignore[no-untyped-def]

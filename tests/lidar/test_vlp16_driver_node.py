@@ -13,17 +13,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from lidar_streams import SECOND, limited_stream, pcap, retimed, udp_frame, wall_stream
+from lidar_streams import SECOND, limited_stream, pcap, udp_frame, wall_stream
 
 from instant_ic.bus import ERROR, OK, RELIABLE, WARN, Node, NodeError
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.config.params import build, load_file
-from instant_ic.config.robot import Mount
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.lidar.config import DecoderConfig, FlatScanConfig
-from instant_ic.lidar.packets import HOUR_US, PACKET_PERIOD_US, encode_position_packet
+from instant_ic.lidar.packets import PACKET_PERIOD_US, encode_position_packet
 from instant_ic.lidar.sources import SourceGuard
 from instant_ic.msg import (
     LaserScan,
@@ -206,34 +204,6 @@ def test_a_limited_field_of_view_gives_no_scan_and_says_why_until_it_is_configur
     assert level == WARN and "270 to 90 degrees only" in text and "does not see" in text
 
 
-def test_a_field_of_view_of_three_quarters_gives_a_scan_each_turn_and_a_warning(tmp_path: Path) -> None:
-    """With 45 to 315 degrees there was never a scan: each turn was cut twice."""
-    bus, node = played(limited(tmp_path / "most.pcap", (45.0, 315.0)), scan=FlatScanConfig(min_coverage=0.7))
-    bus.advance(1.15)
-    assert len(bus.messages("/scan")) >= 10
-    assert node.diagnoses()["view"][0] == WARN
-    assert "45 to 315 degrees only" in node.diagnoses()["view"][1]
-
-
-def test_time_past_the_hour_is_reported_once(tmp_path: Path) -> None:
-    frames = [
-        (RECORDED + round((index + 1) * PACKET_PERIOD_US * 1000.0), udp_frame(retimed(payload, HOUR_US + index * 1327)))
-        for index, payload in enumerate(wall_stream(1600, 5.0))
-    ]
-    path = tmp_path / "late.pcap"
-    path.write_bytes(pcap(frames, nano=True))
-    bus, node = played(path)
-    seen = []
-    for _ in range(4):
-        bus.advance(0.5)
-        seen.append(node.diagnoses().get("clock", (None, ""))[:2])
-    levels = [level for level, _ in seen]
-    assert WARN in levels and levels[-1] == OK and levels.count(WARN) <= 2  # for one second
-    assert "beyond 3600 s" in seen[-1][1]
-    assert len(bus.messages("/scan")) >= 18
-    assert node.diagnoses()["packets"][2]["bad"] == 0
-
-
 def test_capture_that_is_missing_or_none_is_told(tmp_path: Path) -> None:
     with pytest.raises(NodeError, match=r"nowhere\.pcap"):
         played(tmp_path / "nowhere.pcap")
@@ -307,9 +277,9 @@ def test_udp_over_real_sockets(run_dir: Path) -> None:
     with listened(run_dir, silence_s=0.05) as pair:
         driver, probe = pair.driver, pair.probe
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sensor:
-            for payload in wall_stream(400, 3.0):  # 5.3 turns
+            for payload in wall_stream(200, 3.0):  # 2.6 turns
                 pair.send(sensor, payload)
-        pair.spin_until(lambda: len(probe.scans) >= 4 and len(probe.clouds) >= 4)
+        pair.spin_until(lambda: len(probe.scans) >= 2 and len(probe.clouds) >= 2)
         ranges = probe.scans[-1].ranges
         np.testing.assert_allclose(ranges[np.isfinite(ranges)], 3.0, atol=2e-3)
         assert np.isfinite(ranges).sum() > 300
@@ -322,13 +292,13 @@ def test_udp_over_real_sockets(run_dir: Path) -> None:
         level, text, values = driver.diagnoses()["packets"]
         assert level == ERROR
         assert f"127.0.0.1:{driver.receiver.port}" in text and "rp_filter" in text
-        assert values["packets"] == 400
+        assert values["packets"] == 200
     assert not driver.thread.is_alive()
 
 
 def test_packets_of_a_second_address_ahead_of_the_sensor_withhold_the_scan(run_dir: Path) -> None:
     """A wall at 1.0 m became one at 20.0 m: 90 ms ahead, the stranger made every packet of the sensor late."""
-    real, forged = wall_stream(430, 1.0), wall_stream(430, 20.0, start_us=90_000)
+    real, forged = wall_stream(300, 1.0), wall_stream(300, 20.0, start_us=90_000)
     with (
         listened(run_dir) as pair,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sensor,
@@ -342,11 +312,11 @@ def test_packets_of_a_second_address_ahead_of_the_sensor_withhold_the_scan(run_d
         pair.spin_until(lambda: len(probe.scans) >= 2)
         pair.spin_until(lambda: driver.waiting == 0)
         before = len(probe.scans)
-        for index in range(200, 430):
+        for index in range(200, 300):
             stranger.sendto(forged[index], ("127.0.0.1", driver.receiver.port))
             pair.spin_until(lambda count=index - 199: driver.feed.sources.foreign >= count)  # type: ignore[misc]
             pair.send(sensor, real[index])
-        pair.spin_until(lambda: driver.report.withheld >= 3)
+        pair.spin_until(lambda: driver.report.withheld >= 1)
         assert len(probe.scans) == before
         level, text, _ = driver.diagnoses()["source"]
         assert level == ERROR and "127.0.0.3" in text and "No scan" in text
@@ -386,17 +356,6 @@ def test_forged_packets_with_the_sensors_address_withhold_points_and_scan(
         np.testing.assert_allclose(ranges, 1.0, atol=2e-3)
     # The forged clock ran 90 ms ahead; the stamps of what follows are the sensor's again.
     assert stamp_ns(after[-1]) == pytest.approx(bus.records("/scan")[-1].stamp_ns, abs=2e7)
-
-
-@pytest.mark.parametrize("rpy_deg", [(0.0, 6.0, 0.0), (180.0, 0.0, 0.0)])
-def test_a_tilted_mount_is_refused(rpy_deg: tuple[float, float, float]) -> None:
-    with pytest.raises(Exception, match=r"mounted .*° off the vertical"):
-        LockstepBus().add(Vlp16DriverNode, Vlp16DriverConfig(source="topic", lidar_mount=Mount(rpy_deg=rpy_deg)))
-
-
-def test_shipped_parameters_are_the_defaults() -> None:
-    path = Path(__file__).resolve().parents[2] / "config" / "robot.yaml"
-    assert build(Vlp16DriverConfig, load_file(path, "vlp16_driver")) == Vlp16DriverConfig()
 
 
 def test_a_sensor_that_repeats_one_revolution_gives_no_scan_and_no_points() -> None:

@@ -79,11 +79,6 @@ def test_too_close_is_told_apart_from_nothing() -> None:
     assert np.isneginf(scan[beam(45.0)]) or scan[beam(45.0)] == pytest.approx(0.3 * 2**0.5)
 
 
-def test_points_nearer_than_range_min_are_too_close() -> None:
-    scan = flat_scan(revolution([(0.2, 0.2, 0.0, 0.03)]), MOUNT, CONFIG)
-    assert np.isneginf(scan[beam(45.0)])
-
-
 def test_mount_on_its_side_keeps_the_height_band_level() -> None:
     # The sensor looks to the robot's left: ahead of it is at 0 degrees of its own frame.
     mount = pose_matrix(x=0.2, z=0.6, yaw=np.pi / 2, pitch=np.radians(10.0))
@@ -150,8 +145,3 @@ def test_motion_interpolates_goes_on_and_ends_somewhere() -> None:
         PlanarMotion(np.array([2, 1]), np.zeros((2, 3)))
     alone = PlanarMotion(np.array([START]), np.array([[1.0, 2.0, 0.5]]))
     np.testing.assert_allclose(alone.at([START, START + 1000]), [[1.0, 2.0, 0.5]] * 2)
-
-
-def test_a_height_band_without_height_is_refused() -> None:
-    with pytest.raises(ValueError, match="min_height must be below max_height"):
-        FlatScanConfig(min_height=0.5, max_height=0.5)

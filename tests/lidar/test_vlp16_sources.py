@@ -44,30 +44,12 @@ def test_configured_address_drops_the_others_without_stopping_the_robot() -> Non
     assert guard.foreign == 1
 
 
-def test_position_packet_of_another_address_withholds() -> None:
-    guard = SourceGuard()
-    assert admit(guard, (SENSOR, 2368), 0)
-    assert admit(guard, (SENSOR, 8308), 0, is_data=False)
-    assert not admit(guard, (STRANGER, 8308), 1, is_data=False)
-    assert guard.doubt(1) is not None
-
-
 @pytest.mark.parametrize("sensor", ["", SENSOR])
 def test_same_address_with_another_port_is_a_second_sender_while_the_first_is_heard(sensor: str) -> None:
     guard = SourceGuard(sensor)
     admit(guard, (SENSOR, 2368), 0)
     assert not admit(guard, (SENSOR, 40000), SECOND)
     assert guard.doubt(SECOND) is not None
-
-
-def test_sensor_that_was_restarted_is_taken_again() -> None:
-    guard = SourceGuard()
-    admit(guard, (SENSOR, 2368), 0)
-    assert admit(guard, (SENSOR, 2368), 60 * SECOND)
-    assert guard.doubt(60 * SECOND) is None
-    # The simulator's port changes with a restart.
-    assert admit(guard, (SENSOR, 40000), 60 * SECOND + QUIET_NS)
-    assert guard.doubt(60 * SECOND + QUIET_NS) is None
 
 
 def test_datagrams_that_are_no_packets_neither_lock_nor_withhold() -> None:
@@ -86,7 +68,7 @@ def fed(stream: PacketStream, guard: SourceGuard, payload: bytes, now_ns: int) -
     guard.count(after[0] - before[0], after[1] - before[1], now_ns)
 
 
-@pytest.mark.parametrize("ahead_us", [90_000, 150_000, 700_000, HOUR_US - 90_000, 0, 663, 1000, 300])
+@pytest.mark.parametrize("ahead_us", [90_000, 700_000, HOUR_US - 90_000, 0, 663])
 def test_forged_sender_with_the_sensors_own_address_is_found_by_the_order_of_packets(ahead_us: int) -> None:
     real = wall_stream(150, 1.0, start_us=5_000_000)
     forged = wall_stream(150, 20.0, start_us=(5_000_000 + ahead_us) % HOUR_US)

@@ -10,11 +10,10 @@ from instant_ic.lidar.head import Sector
 from instant_ic.lidar.stream import PacketStream, Revolution
 
 START = 1_700_000_000 * SECOND
-VIEWS = [
-    (270.0, 90.0), (90.0, 270.0), (45.0, 315.0), (0.0, 359.0), (5.0, 4.0), (350.0, 340.0), (300.0, 60.0),
-    (170.0, 190.0), (185.0, 175.0), (100.0, 111.0), (0.0, 360.0),
+CASES = [  # field of view and speed
+    ((270.0, 90.0), 600.0), ((45.0, 315.0), 1200.0), ((0.0, 359.0), 300.0), ((170.0, 190.0), 600.0),
+    ((100.0, 111.0), 600.0), ((0.0, 360.0), 600.0),
 ]  # fmt: skip
-RPMS = [300.0, 600.0, 1200.0]
 
 
 def feed(stream: PacketStream, made: Limited, lost: frozenset[int] = frozenset()) -> list[Revolution]:
@@ -48,8 +47,7 @@ def check_rays(revolutions: list[Revolution], made: Limited, lost: frozenset[int
 
 
 @pytest.mark.parametrize("dual", [False, True])
-@pytest.mark.parametrize("rpm", RPMS)
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize(("view", "rpm"), CASES)
 def test_every_field_of_view_gives_one_revolution_a_turn_and_each_ray_where_it_was(
     view: tuple[float, float], rpm: float, dual: bool
 ) -> None:
@@ -66,8 +64,7 @@ def test_every_field_of_view_gives_one_revolution_a_turn_and_each_ray_where_it_w
         check_rays(revolutions if last is None else [*revolutions, last], made)
 
 
-@pytest.mark.parametrize("rpm", RPMS)
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize(("view", "rpm"), CASES)
 def test_a_field_of_view_that_nobody_configured_is_learned_from_the_packets(
     view: tuple[float, float], rpm: float
 ) -> None:
@@ -86,11 +83,10 @@ def test_a_field_of_view_that_nobody_configured_is_learned_from_the_packets(
     assert found.resembles(Sector(round(view[1] * 100.0), round(blocked_deg * 100.0)))
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("view", [(270.0, 90.0), (45.0, 315.0), (170.0, 190.0), (0.0, 360.0)])
-def test_lost_packets_are_counted_at_the_gap_too(view: tuple[float, float], seed: int) -> None:
+@pytest.mark.parametrize("view", [(270.0, 90.0), (45.0, 315.0), (0.0, 360.0)])
+def test_lost_packets_are_counted_at_the_gap_too(view: tuple[float, float]) -> None:
     made = limited_stream(9.0, view, 600.0)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     turn = (made.block_deg[:, 0] - made.block_deg[0, 0]) / 360.0
     spans = np.flatnonzero(np.ptp(made.block_deg, axis=1) > 10.0)
     candidates = np.flatnonzero((turn > 3.0) & (turn < 8.0))
@@ -103,18 +99,6 @@ def test_lost_packets_are_counted_at_the_gap_too(view: tuple[float, float], seed
     assert len(revolutions) == passages(made, 180.0, lost)
     last = stream.finish()
     check_rays(revolutions if last is None else [*revolutions, last], made, lost)
-
-
-@pytest.mark.parametrize("rpm", [300.0, 600.0])
-def test_a_field_of_view_smaller_than_a_packet_shows_nothing_elsewhere(rpm: float) -> None:
-    """A packet then spans the gap more than once; it ends one revolution."""
-    made = limited_stream(12.3, (10.0, 13.0), rpm)
-    stream = PacketStream()
-    revolutions = [*feed(stream, made), stream.finish()]
-    points = np.concatenate([revolution.points for revolution in revolutions if revolution is not None])
-    found = np.degrees(np.arctan2(-points["y"].astype(float), points["x"].astype(float)))
-    np.testing.assert_allclose(found, made.azimuth_deg.reshape(-1) % 360.0, atol=0.03)
-    assert stream.counters.missing == 0
 
 
 def test_a_gap_that_always_falls_between_two_packets_is_learned() -> None:
@@ -142,26 +126,3 @@ def test_a_sensor_that_is_set_back_to_all_around_is_noticed() -> None:
     assert stream.head.blocked is None
     assert stream.counters.missing < 80  # less than a turn
     assert revolution is None or revolution.complete
-
-
-def test_coverage_is_of_the_configured_field_of_view() -> None:
-    made = limited_stream(3.0, (300.0, 60.0), 600.0)
-    revolution = feed(PacketStream(), made)[1]
-    assert coverage(revolution) == pytest.approx(1 / 3, abs=0.01)
-    assert coverage(revolution, DecoderConfig(fov_start_deg=270.0, fov_end_deg=90.0).blocked) == pytest.approx(
-        2 / 3, abs=0.01
-    )
-    assert coverage(revolution, DecoderConfig(fov_start_deg=300.0, fov_end_deg=60.0).blocked) == 1.0
-
-
-@pytest.mark.parametrize(("start", "end", "width"), [(0, 360, 0), (0, 359, 0), (10, 10.5, 35950), (270, 90, 18000)])
-def test_blocked_sector_of_the_configuration(start: float, end: float, width: int) -> None:
-    blocked = DecoderConfig(fov_start_deg=start, fov_end_deg=end).blocked
-    assert (0 if blocked is None else blocked.width) == width
-    if blocked is not None:
-        assert (blocked.start, blocked.end) == (round(end * 100), round(start * 100))
-
-
-def test_a_field_of_view_without_a_width_is_refused() -> None:
-    with pytest.raises(ValueError, match="fov_start_deg and fov_end_deg must differ"):
-        DecoderConfig(fov_start_deg=90.0, fov_end_deg=90.0)
