@@ -27,10 +27,10 @@ from typing import Any
 import psutil
 from browser import launch_chromium
 from cpu_usage import ReferenceLoop, Usage, cpu_percent, usage
+from drive import DriveRecorder
 from reporting import note, parser_for, report
 
 from instant_ic.bus import LATCHED, RELIABLE
-from instant_ic.experiments.drive import DriveRecorder
 from instant_ic.experiments.stack import Stack, StackError, free_ports, processes_of
 from instant_ic.msg import ControlState, message_type, twist_values
 

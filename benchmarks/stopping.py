@@ -48,6 +48,7 @@ from typing import Any, NamedTuple
 
 import aiohttp
 import numpy as np
+from drive import pump
 from impaired_link import ImpairedLink
 from reporting import note, parser_for, report
 
@@ -56,7 +57,6 @@ from instant_ic.base.protocol import ESTOP_BITS, Command, encode_reply, read_req
 from instant_ic.bus import LATCHED, registry
 from instant_ic.console.client import ConsoleClient
 from instant_ic.control.states import Reason
-from instant_ic.experiments.drive import pump
 from instant_ic.experiments.stack import Stack, StackError, free_port
 from instant_ic.launch.pacing import machine_pace
 from instant_ic.msg import ControlState, message_type, pose2_from_message, stamp_ns, twist_values

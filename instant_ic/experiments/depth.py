@@ -80,11 +80,8 @@ class Scored:
         truth_m: true depth, (H', W') float32; 0 is unknown; None without ground truth.
         before: metrics of the network's metres before scaling; None if it estimates none, or without ground truth.
         after: metrics of the result; None without ground truth.
-        shape: metrics of the result after division by its median ratio to the truth, which show the error that no
-            scale can remove; None without ground truth.
-        within_sigma: shares of pixels with an error within one, two and three sigma; None without LiDAR or truth.
-        seconds_model: wall time of the network.
-        seconds_source: wall time of scaling and fusion.
+        within_sigma: share of pixels with an error within one sigma; None without LiDAR or truth.
+        seconds: wall time of network, scaling and fusion.
         fit: ``ok``, ``message``, ``scale``, ``shift``, ``quality``, ``relative_sigma`` and ``points`` of the scaling;
             None without LiDAR.
     """
@@ -95,26 +92,20 @@ class Scored:
     truth_m: NDArray[np.float32] | None
     before: DepthMetrics | None
     after: DepthMetrics | None
-    shape: DepthMetrics | None
-    within_sigma: tuple[float, float, float] | None
-    seconds_model: float
-    seconds_source: float
+    within_sigma: float | None
+    seconds: float
     fit: dict[str, Any] | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values; the metrics after scaling are repeated at the top level."""
-        row: dict[str, Any] = {"name": self.name, **(self.after.as_dict() if self.after else {})}
-        row["seconds"] = round(self.seconds_model + self.seconds_source, 4)
-        row["seconds_model"], row["seconds_source"] = round(self.seconds_model, 4), round(self.seconds_source, 4)
-        for name, metrics in zip(_METRICS, (self.before, self.after, self.shape), strict=True):
-            row[name] = metrics.as_dict() if metrics is not None else None
-        for number, name in enumerate(("one", "two", "three")):
-            row[f"within_{name}_sigma"] = _rounded(self.within_sigma[number]) if self.within_sigma else None
-        row["fit"] = self.fit
-        return row
-
-
-_METRICS = ("before", "after", "after_best_scale")
+        """Return plain values."""
+        return {
+            "name": self.name,
+            "seconds": round(self.seconds, 4),
+            "before": self.before.as_dict() if self.before else None,
+            "after": self.after.as_dict() if self.after else None,
+            "within_one_sigma": _rounded(self.within_sigma),
+            "fit": self.fit,
+        }
 
 
 class Evaluator:
@@ -170,20 +161,17 @@ class Evaluator:
             self._warm = True
         begin = time.perf_counter()
         raw = self.model.estimate(rgb) if self.model is not None else None
-        between = time.perf_counter()
         depth, sigma, fit = self._depth(rgb, raw, points)
-        end = time.perf_counter()
-        before = after = shape = shares = None
+        seconds = time.perf_counter() - begin
+        before = after = share = None
         if truth is not None:
-            known, at_truth = truth > 0, look_up(depth, truth.shape)
-            after = depth_metrics(at_truth, truth, known)
-            ratio = at_truth[known & (at_truth > 0)] / truth[known & (at_truth > 0)]
-            shape = depth_metrics(at_truth / np.median(ratio) if len(ratio) else at_truth, truth, known)
+            known = truth > 0
+            after = depth_metrics(look_up(depth, truth.shape), truth, known)
             if raw is not None and self.model is not None and self.model.manifest.output_kind == "metric":
                 before = depth_metrics(look_up(raw, truth.shape), truth, known)
             if sigma is not None:
-                shares = _within_sigma(depth, sigma, nearest(truth, depth.shape))
-        return Scored(name, rgb, depth, truth, before, after, shape, shares, between - begin, end - between, fit)
+                share = _within_sigma(depth, sigma, nearest(truth, depth.shape))
+        return Scored(name, rgb, depth, truth, before, after, share, seconds, fit)
 
     def _depth(
         self, rgb: NDArray[np.uint8], raw: NDArray[np.float32] | None, points: Floats | None
@@ -236,21 +224,16 @@ def nearest(values: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
     return values[np.ix_(rows, columns)]
 
 
-def _within_sigma(depth: Floats, sigma: Floats, truth: Floats) -> tuple[float, float, float] | None:
+def _within_sigma(depth: Floats, sigma: Floats, truth: Floats) -> float | None:
     known = (truth > 0) & (depth > 0) & np.isfinite(sigma)
     if not known.any():
         return None
-    ratio = np.abs(depth[known] - truth[known]) / (sigma[known] * truth[known])
-    return float((ratio <= 1).mean()), float((ratio <= 2).mean()), float((ratio <= 3).mean())
+    error = np.abs(depth[known] - truth[known])
+    return float((error <= sigma[known] * truth[known]).mean())
 
 
 def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: DepthModel | None) -> dict[str, Any]:
     """Summarise ``Scored.as_dict`` of panoramas: means before and after scaling, and each image."""
-    means = {key: _mean([row[key] for row in scored if row.get(key)]) for key in _METRICS}
-    mean: dict[str, Any] = dict(means["after"] or {})
-    for key in ("seconds", "seconds_model", "seconds_source"):
-        if scored:
-            mean[key] = round(float(np.mean([row[key] for row in scored])), 4)
     shares = [row["within_one_sigma"] for row in scored if row["within_one_sigma"] is not None]
     return {
         "model": model.manifest.name if model else None,
@@ -260,8 +243,9 @@ def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: Dep
         "camera_height_m": settings.camera_height_m,
         "count": len(scored),
         "fits_ok": sum(bool(row["fit"]["ok"]) for row in scored) if settings.lidar else None,
-        "mean": mean,
-        **means,
+        "seconds": round(float(np.mean([row["seconds"] for row in scored])), 4) if scored else None,
+        "before": _mean([row["before"] for row in scored if row["before"]]),
+        "after": _mean([row["after"] for row in scored if row["after"]]),
         "within_one_sigma": _rounded(float(np.mean(shares))) if shares else None,
         "images": list(scored),
     }

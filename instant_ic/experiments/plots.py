@@ -32,41 +32,6 @@ def perspective_crop(
     return np.clip(np.rint(sample_equirect(panorama, directions)), 0, 255).astype(np.uint8)
 
 
-def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Return the Pearson correlation of two images' values, −1..1; 0 if one of them is uniform."""
-    x, y = (picture.astype(np.float64).ravel() - float(picture.mean()) for picture in (a, b))
-    norm = float(np.sqrt((x @ x) * (y @ y)))
-    return float(x @ y) / norm if norm > 0 else 0.0
-
-
-def save_view_strip(path: Path, rows: Sequence[tuple[str, NDArray[np.uint8], NDArray[np.uint8]]]) -> None:
-    """Save rows of (label, rendered view, crop of the photo), side by side."""
-    figure, axes = new_figure(len(rows), 2, (10.0, 2.95 * len(rows)))
-    for (label, view, crop), (left, right) in zip(rows, axes, strict=True):
-        for axis, picture, title in ((left, view, f"virtual space, {label}"), (right, crop, "photo")):
-            axis.imshow(picture)
-            axis.set_title(title, fontsize=9)
-            axis.set_axis_off()
-    save_figure(figure, path)
-
-
-def save_depth(path: Path, panorama: NDArray[np.uint8], depth_m: NDArray[np.float32], title: str) -> None:
-    """Save the panorama above its depth in colours with a scale in metres; unknown depth is grey."""
-    import matplotlib
-
-    figure, axes = new_figure(2, 1, (9.0, 9.4))
-    axes[0, 0].imshow(panorama)
-    axes[0, 0].set_axis_off()
-    known = np.ma.masked_less_equal(depth_m, 0)
-    colours = matplotlib.colormaps["turbo_r"].with_extremes(bad="0.6")
-    top = float(np.percentile(known.compressed(), 99.5)) if known.count() else 1.0
-    drawn = axes[1, 0].imshow(known, cmap=colours, vmin=0, vmax=top)
-    axes[1, 0].set_axis_off()
-    axes[1, 0].set_title(title, fontsize=9)
-    figure.colorbar(drawn, ax=axes[1, 0], orientation="horizontal", label="m", fraction=0.05, pad=0.03)
-    save_figure(figure, path)
-
-
 def save_depth_sheet(path: Path, rows: Sequence[Scored]) -> None:
     """Save a row for each panorama: image and depth, with true depth and relative error if there is ground truth."""
     columns = 4 if any(row.truth_m is not None for row in rows) else 2

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.experiments.plots import new_figure, perspective_crop, save_figure, save_map
+from instant_ic.experiments.recorded import opened
 from instant_ic.experiments.teleop_figures import STEP_S, DriveLog, TeleopDrive, judge
 from instant_ic.experiments.teleop_plot import plot_modes
 from instant_ic.geometry.poses import pose_matrix
@@ -56,7 +57,6 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
     Raises:
         ValueError: no bag, or a topic is missing; names it.
     """
-    from instant_ic.experiments.bags import opened
     from instant_ic.msg import deserialize
 
     begin_ns = 0

@@ -16,17 +16,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
-from instant_ic.experiments.plots import (
-    correlation,
-    perspective_crop,
-    save_depth,
-    save_map,
-    save_view_strip,
-)
+from instant_ic.depth.colour import depth_picture
+from instant_ic.experiments.plots import image_strip, perspective_crop, save_map
 from instant_ic.experiments.stack import Stack, StackError, free_ports
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix, yaw_of
@@ -54,8 +50,6 @@ FloatArray: TypeAlias = NDArray[np.float64]
 T = TypeVar("T")
 
 _YAWS_DEG = (0, 90, 180, -90)
-_AHEAD_M = 0.4
-"""Distance in metres of the last two views from the photo's position, to show the effect of the estimated depth."""
 _WIDTH, _HEIGHT, _FOV = 640, 360, math.radians(90)
 
 
@@ -194,9 +188,13 @@ def _results(run: _Run, out: Path) -> dict[str, Any]:
     ready_s = run.reach_ready()
     keyframe = run.keyframes[-1]
     photo = decode_panorama(np.asarray(keyframe.panorama.data, np.uint8))
-    scores, likeness, rows = _compare_views(run, photo, matrix_from_pose(keyframe.pose))
-    save_view_strip(out / "view.png", rows)
-    save_depth(out / "depth.png", photo, image_array(keyframe.depth), f"depth: {keyframe.message}")
+    scores, strip = _compare_views(run, photo, matrix_from_pose(keyframe.pose))
+    cv2.imwrite(str(out / "view.png"), strip[..., ::-1])
+    depth_m = np.asarray(image_array(keyframe.depth), np.float32)
+    near_m, far_m = np.percentile(depth_m[depth_m > 0], (1, 99))
+    colours = depth_picture(depth_m, near_m, far_m)
+    small = cv2.resize(photo, colours.shape[1::-1], interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(out / "depth.png"), np.vstack([small, colours])[..., ::-1])
     grid, resolution, origin = grid_array(run.maps[-1])
     robot = matrix_from_pose(run.poses[-1])
     shown = OccupancyGrid(grid, resolution, np.array(origin))
@@ -211,7 +209,7 @@ def _results(run: _Run, out: Path) -> dict[str, Any]:
         "keyframe_to_ready_s": round(ready_s, 2),
         "training_psnr_db": round(float(status.psnr_db), 2),
         "view_psnr_db": scores,
-        "view_correlation": likeness,
+        "depth_png_m": [round(float(near_m), 2), round(float(far_m), 2)],
         "depth_scale": round(float(keyframe.scale), 4),
         "depth_quality": round(float(keyframe.quality), 3),
         "depth_fit": bool(keyframe.fit),
@@ -222,26 +220,16 @@ def _results(run: _Run, out: Path) -> dict[str, Any]:
 
 def _compare_views(
     run: _Run, photo: NDArray[np.uint8], map_from_camera: FloatArray
-) -> tuple[dict[str, float], dict[str, float], list[tuple[str, NDArray[np.uint8], NDArray[np.uint8]]]]:
-    """Compare views with the photo's own crops.
-
-    Returns:
-        PSNR in dB and correlation by yaw in degrees, and rows of label, view and crop. Views ahead of the photo's
-        position have no score, because the photo was taken elsewhere.
-    """
-    scores, likeness, rows = {}, {}, []
-    places = [(yaw, 0.0) for yaw in _YAWS_DEG] + [(yaw, _AHEAD_M) for yaw in (0, -90)]
-    for number, (yaw_deg, ahead_m) in enumerate(places, start=1):
-        camera_from_view = pose_matrix(yaw=math.radians(yaw_deg)) @ pose_matrix(x=ahead_m)
+) -> tuple[dict[str, float], NDArray[np.uint8]]:
+    """Compare views with the photo's own crops; return PSNR in dB by yaw in degrees, and an image of both."""
+    scores, rows = {}, []
+    for number, yaw_deg in enumerate(_YAWS_DEG, start=1):
+        camera_from_view = pose_matrix(yaw=math.radians(yaw_deg))
         rendered = run.view(number, map_from_camera @ camera_from_view)
         crop = perspective_crop(photo, camera_from_view[:3, :3], rendered.shape[1], rendered.shape[0], _FOV)
-        label = f"{yaw_deg}°, {ahead_m} m ahead of the photo's place"
-        if not ahead_m:
-            scores[str(yaw_deg)] = round(psnr_db(rendered, crop), 2)
-            likeness[str(yaw_deg)] = round(correlation(rendered, crop), 3)
-            label = f"{yaw_deg}°  ({scores[str(yaw_deg)]} dB)"
-        rows.append((label, rendered, crop))
-    return scores, likeness, rows
+        scores[str(yaw_deg)] = round(psnr_db(rendered, crop), 2)
+        rows.append((f"{yaw_deg} deg", [rendered, crop]))
+    return scores, image_strip(("virtual space", "photo"), rows, _WIDTH)
 
 
 def _reasons(diagnostics: Sequence[Any]) -> str:

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from benchmarks.cpu_usage import ReferenceLoop, cpu_percent, usage
+from benchmarks.drive import DriveRecorder, pump
 from instant_ic.bus import registry
 from instant_ic.console.client import ConsoleClient
-from instant_ic.experiments.drive import DriveRecorder, pump
 from instant_ic.experiments.stack import Stack, free_ports, processes_of
 from instant_ic.geometry.poses import compose2
 from instant_ic.launch.pacing import machine_pace
