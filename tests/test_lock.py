@@ -108,11 +108,3 @@ def test_make_install_takes_packages_from_the_lock_alone():
         "--no-deps --no-build-isolation -e .",
         "--require-hashes --only-binary :all: -r requirements-test.lock",
     ]
-
-
-def test_a_run_does_not_install_what_only_the_tests_need():
-    """Triton is 200 MB: ``make test`` installs it, ``make run`` does not."""
-    assert "triton" not in (ROOT / "requirements.lock").read_text()
-    rules = dict(re.findall(r"^(\w+|\$\(\w+\)):(.*)$", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
-    assert "install-tests" in rules["test"] and rules["run"].strip() == "$(STAMP)"
-    assert "test.lock" in rules["$(TESTS_STAMP)"] and "test.lock" not in rules["$(STAMP)"]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import os
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -90,19 +89,15 @@ class NodeLog:
         path: the log file.
         report: called with a text when writing fails and when it works again; runs on the writing thread.
         max_bytes: a larger file is renamed to ``.log.1``, and a new one is started.
-        retry_s: wait after a failed write before the next attempt.
     """
 
-    def __init__(
-        self, path: Path, report: Callable[[str], None], max_bytes: int = 64 << 20, retry_s: float = 5.0
-    ) -> None:
+    def __init__(self, path: Path, report: Callable[[str], None], max_bytes: int = 64 << 20) -> None:
         self.path = path
         self._report = report
-        self._max_bytes, self._retry_s = max_bytes, retry_s
+        self._max_bytes = max_bytes
         self._file: FileIO | None = None
         self._size = 0
-        self._lost_bytes = 0
-        self._next_try_s = 0.0
+        self._failed = False
         self._rotate()
 
     def write(self, data: bytes) -> None:
@@ -112,21 +107,17 @@ class NodeLog:
                 self.close()
                 self._rotate()
             if self._file is None:
-                if time.monotonic() < self._next_try_s:
-                    self._lost_bytes += len(data)
-                    return
                 self._open()
-            if self._lost_bytes:
-                self._put(f"[launch: {self._lost_bytes} bytes are missing here: writing failed]\n".encode())
-                self._report(f"{self.path} can be written again; {self._lost_bytes} bytes are missing in it")
-                self._lost_bytes = 0
             self._put(data)
         except OSError as error:
-            if not self._lost_bytes:
-                self._report(f"{self.path} cannot be written ({error.strerror}). Free some space; its lines are lost.")
-            self._lost_bytes += len(data)
-            self._next_try_s = time.monotonic() + self._retry_s
             self.close()
+            if not self._failed:
+                self._report(f"{self.path} cannot be written ({error.strerror}). Free some space; its lines are lost.")
+            self._failed = True
+            return
+        if self._failed:
+            self._failed = False
+            self._report(f"{self.path} can be written again; lines are missing in it")
 
     def close(self) -> None:
         """Close the file; a later write opens it again."""

@@ -1,13 +1,12 @@
 """Substitutions of launch files: ``$(var NAME)``, ``$(config FILE)``, ``$(run-dir)`` and ``$(eval EXPRESSION)``.
 
-Nothing is ever executed. An expression compares variables, texts and numbers, and combines the results by ``and``,
-``or`` and ``not``. The value of a variable is one operand, whatever it looks like.
+Nothing is ever executed. An expression compares variables and texts by ``==`` and ``!=``, and combines the results by
+``and``, ``or`` and ``not``. The value of a variable is one operand, whatever it looks like.
 """
 
 from __future__ import annotations
 
 import ast
-import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,7 +119,7 @@ def _evaluated(expression: str, variables: Mapping[str, str]) -> str:
     except InvalidExpression as error:
         reason = str(error)
     except (SubstitutionError, ValueError, KeyError) as error:
-        reason = str(error) if isinstance(error, SubstitutionError) else "only comparisons, and, or, not are supported"
+        reason = str(error) if isinstance(error, SubstitutionError) else "only ==, !=, and, or, not are supported"
     except (RecursionError, MemoryError):
         reason = "it is nested too deeply"
     raise SubstitutionError(f"$(eval {expression}): {reason}")
@@ -135,27 +134,9 @@ def _text(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _numbers(compare: Callable[[float, float], bool]) -> Callable[[object, object], bool]:
-    def compared(left: object, right: object) -> bool:
-        return compare(_number(left), _number(right))
-
-    return compared
-
-
-def _number(value: object) -> float:
-    try:
-        return float(_text(value))
-    except ValueError:
-        raise SubstitutionError(f"{_text(value)!r} is not a number") from None
-
-
 _OPERATORS: dict[type[ast.AST], Callable[..., bool]] = {
     ast.Eq: lambda left, right: _text(left) == _text(right),
     ast.NotEq: lambda left, right: _text(left) != _text(right),
-    ast.Lt: _numbers(operator.lt),
-    ast.LtE: _numbers(operator.le),
-    ast.Gt: _numbers(operator.gt),
-    ast.GtE: _numbers(operator.ge),
     ast.Not: lambda value: not truth(_text(value)),
 }
-"""Operators of ``$(eval ...)``: ``==`` compares texts, ``<`` numbers."""
+"""Operators of ``$(eval ...)``; ``==`` compares texts."""

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import functools
 import math
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
-from instant_ic.config.scalars import to_float
-from instant_ic.launch.source import LaunchProblem, YamlPlace, load
+from instant_ic.config.yaml_text import read_yaml
 from instant_ic.util import paths
 
 ALIVE_PERIODS = 10.0
@@ -17,10 +14,6 @@ ALIVE_PERIODS = 10.0
 
 FREQ_OK_SHARE = 0.9
 """Share of the nominal rate above which a rate is right."""
-
-
-class TopicTableError(ValueError):
-    """The table of rates is invalid; the message says where and why."""
 
 
 @dataclass(frozen=True)
@@ -59,39 +52,11 @@ class TopicRate:
         return ""
 
 
-def read_topic_rates(file: Path) -> dict[str, TopicRate]:
-    """Read a table of rates: topic to expected rate.
-
-    Raises:
-        TopicTableError: the first mistake: an unreadable file, an unknown key, or a rate that is not a number > 0.
-    """
-    try:
-        return {topic: _topic_rate(topic, entry) for topic, entry in load(file).fields().items()}
-    except LaunchProblem as problem:
-        raise TopicTableError(str(problem)) from None
-
-
-def _topic_rate(topic: str, entry: YamlPlace) -> TopicRate:
-    fields = entry.fields(("rate_hz", "when"), required=("rate_hz",))
-    given = fields["rate_hz"].spelled()
-    number = 0.0
-    with suppress(ValueError):
-        number = to_float(given)
-    if number <= 0:
-        raise entry.problem(f"{topic}: rate_hz must be a number > 0 (got {given!r})")
-    if not topic.startswith("/"):
-        raise entry.problem(f"topic {topic!r} must begin with /")
-    return TopicRate(number, fields["when"].text() if "when" in fields else "")
-
-
 @functools.cache
 def topic_rates() -> dict[str, TopicRate]:
-    """Return the shipped table, ``config/topics.yaml``; it is read once.
-
-    Raises:
-        TopicTableError: see :func:`read_topic_rates`.
-    """
-    return read_topic_rates(paths.shipped_file("config", "topics.yaml"))
+    """Return the shipped table, ``config/topics.yaml``; it is read once."""
+    table = read_yaml(paths.shipped_file("config", "topics.yaml").read_text())
+    return {topic: TopicRate(**entry) for topic, entry in table.items()}
 
 
 def nominal_rate(topic: str, namespace: str = "") -> TopicRate | None:

@@ -38,12 +38,9 @@ def bag(tmp_path):
     "words",
     [
         ("bag", "info", "BAG"),
-        ("bag", "info", "BAG", "--json"),
         ("bag", "diff", "BAG", "BAG"),
-        ("bag", "info", EVIL),
         ("topic", "info", f"/x{EVIL}"),
         ("node", "info", EVIL),
-        ("param", "list", EVIL),
     ],
     ids=lambda words: " ".join(words[:2]),
 )

@@ -4,12 +4,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import pytest
-import yaml
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from instant_ic.config import params
-from instant_ic.config.yaml_text import compose_yaml
 
 
 @dataclass(frozen=True)
@@ -112,20 +108,6 @@ def test_values_that_break_yaml_readers_are_told(tmp_path, body, message):
         load(tmp_path, f"driver:\n  ros__parameters:\n{body}\n")
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=200)
-@given(st.text(alphabet=st.sampled_from("ab:- []{}!&*'\"\n#,?|>%@0123.e~"), max_size=60), st.text(max_size=30))
-def test_any_file_and_any_word_give_values_or_words(tmp_path, body, word):
-    """What comes out is a configuration or an error with words, whatever the file holds."""
-    try:
-        load(tmp_path, f"driver:\n  ros__parameters:\n    {body}\n")
-    except params.ParameterError as error:
-        assert str(error)
-    try:
-        params.build(Config, dict([params.parse_override(word)]))
-    except params.ParameterError as error:
-        assert str(error)
-
-
 def test_change_keeps_the_rest():
     config = Config(rate=5.0, matcher=Matcher(0.7))
     changed, different = params.change(config, {"matcher": {"window_m": 0.4}, "beams": 720}, lambda key: True, "set")
@@ -165,23 +147,3 @@ def test_all_mistakes_at_once_each_at_the_value_without_which_it_disappears():
         ("f:3", "first.low", "the span is empty"),
         ("f:2", "first.step", "it is too coarse"),
     ]
-
-
-def test_a_huge_number_is_refused():
-    with pytest.raises(params.ParameterError, match="rate must be a finite number"):
-        params.build(Config, {"rate": params.Value(10**400, "here")})
-
-
-@pytest.mark.parametrize("text", ["", "a: {b: [1, two], c: ~}\n'd': \"x\"\ne: |\n  y\n", "a: &x {b: 1}\nc: *x\n"])
-def test_the_fast_parser_gives_the_nodes_and_lines_of_the_python_parser(text: str) -> None:
-    def flat(node: yaml.Node | None) -> object:
-        if isinstance(node, yaml.ScalarNode):
-            return node.tag, node.value, node.style or None, node.start_mark.line
-        children = (
-            []
-            if node is None
-            else [part for entry in node.value for part in (entry if isinstance(entry, tuple) else (entry,))]
-        )
-        return getattr(node, "tag", None), [flat(child) for child in children]
-
-    assert flat(compose_yaml(text)) == flat(yaml.compose(text, Loader=yaml.SafeLoader))

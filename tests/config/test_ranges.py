@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from instant_ic.bus import ParameterError
 from instant_ic.config import params
 from instant_ic.config.params import ProcessParameters
-from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges, range_of
+from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,3 @@ def test_file_and_line_of_a_value_outside(tmp_path):
         params.build(ProcessParameters, {"nice": values["nice"]})
     with pytest.raises(ParameterError, match=r"x\.yaml:4: margins\[1\] must be >= 0 \(got -2\)"):
         params.build(Ranged, {"margins": values["margins"]})
-
-
-def test_range_of_types():
-    assert range_of(Positive) == Range(above=0)
-    assert range_of(Positive | None) == Range(above=0)
-    assert range_of(float) is None and range_of(tuple[Positive, Positive]) is None

@@ -18,9 +18,8 @@ from instant_ic.cli.message_input import parse
 from instant_ic.config import params
 from instant_ic.config.params import ParameterError, Value, parse_override
 from instant_ic.config.scalars import Scalar
-from instant_ic.config.yaml_text import one_line, read_spelled, read_yaml
+from instant_ic.config.yaml_text import one_line, read_spelled
 from instant_ic.launch import read_launch_file
-from instant_ic.launch.parameters import check_parameters
 from instant_ic.slam.map_files import load_grid
 
 
@@ -50,8 +49,7 @@ def from_file(tmp_path: Path, word: str) -> Mixed:
     return params.build(Mixed, params.load_file(file, "node"))
 
 
-TEXTS = ["0123", "00105307", "1:30", "1:30:00.5", "5e-06", "1_000", "0x1F", "0b11", "0o17", "2001-13-45", "2001-12-14"]
-TEXTS += ["yes", "no", "On", "off", "True", "null", "~", ".nan", ".inf", "-.INF", "nan", "1.", "1.0", "1e3", "=", "<<"]
+TEXTS = ["0123", "1:30", "5e-06", "1_000", "0x1F", "2001-13-45", "no", "~", ".nan", "1.0", "<<"]
 
 
 @pytest.mark.parametrize("text", TEXTS)
@@ -72,16 +70,7 @@ def test_text_keeps_its_spelling(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "number"),
     [
-        *(
-            ("5e-06", 5e-6),
-            ("5.e-6", 5e-6),
-            ("5E3", 5000),
-            ("+5e+3", 5000),
-            (".5", 0.5),
-            ("-.5e1", -5),
-            ("1_000", 1000),
-        ),
-        *(("0123", 123), ("010.5", 10.5), ("7", 7), ("0x10", 16), ("1_0.5", 10.5), ("-0", 0)),
+        *(("5e-06", 5e-6), ("+5e+3", 5000), ("-.5e1", -5), ("1_000", 1000), ("010.5", 10.5), ("0x10", 16)),
     ],
 )
 def test_a_number_takes_every_spelling(tmp_path: Path, text: str, number: float) -> None:
@@ -95,20 +84,13 @@ def test_a_number_takes_every_spelling(tmp_path: Path, text: str, number: float)
     [
         ("number:=1:30", r"number must be float \(got 1:30\)"),
         ("number:=.inf", r"number must be a finite number \(got .inf\)"),
-        ("number:=nan", r"number must be a finite number \(got 'nan'\)"),
-        ("number:=1e400", "number must be a finite number"),
         ("number:='5'", r"number must be float \(got '5'\)"),
         ("number:=yes", r"number must be float \(got 'yes'\)"),
-        ("number:=2001-12-14", r"number must be float \(got 2001-12-14\)"),
-        ("number:=~", r"number must be float \(got '~'\)"),
         ("count:=0123", r"count must be int, without a leading zero \(got 0123\)"),
-        ("count:=1:30", r"count must be int \(got 1:30\)"),
         ("count:=1e3", r"count must be int \(got 1e3\)"),
         ("count:=0x1ffffffffffffffff", "count must have at most 64 bits"),
         ("flag:=1", r"flag must be bool \(got 1\)"),
-        ("flag:='yes'", r"flag must be bool \(got 'yes'\)"),
         ("text:=", r"text must be str \(\"\" for empty text\)"),
-        ("text:=[a]", "text must be str"),
         ("mode:=maybe", "mode must be one of on, off, 1:30"),
         ("anything:=2001-13-45", "anything: the value is not YAML: month must be in"),
     ],
@@ -128,12 +110,6 @@ def test_the_other_types() -> None:
     assert from_word("anything:=[1, yes, ~]").anything == [1, True, None]
 
 
-@given(st.floats(allow_nan=False, allow_infinity=False), st.sampled_from(["{!r}", "{:e}", "{:g}", "{:.17g}", "{:E}"]))
-def test_each_float_as_python_writes_it(number: float, form: str) -> None:
-    text = form.format(number)
-    assert from_word(f"number:={text}").number == float(text)
-
-
 @given(st.from_regex(r"[-+.:_0-9a-zA-Z~=<]{1,20}", fullmatch=True).filter(lambda text: text not in ("-", "---", "...")))
 def test_each_word_arrives_in_its_spelling(text: str) -> None:
     try:
@@ -144,11 +120,6 @@ def test_each_word_arrives_in_its_spelling(text: str) -> None:
         assert params.build(Mixed, {"text": Value(value, "here")}).text == text.strip()
         assert read_spelled(one_line([value])) in ([value], [value.text])
         assert parse_override(f"text:={one_line(value)}")[1].given in (value, value.text)
-
-
-@given(st.recursive(st.none() | st.booleans() | st.integers() | st.text("ab01:.e", max_size=5), st.lists, max_leaves=6))
-def test_plain_values_are_what_they_were(value: Any) -> None:
-    assert parse_override(f"x:={one_line(value)}")[1].value == value == read_yaml(one_line(value))
 
 
 LAUNCH = """launch:
@@ -174,13 +145,6 @@ def test_launch_files_and_their_arguments_keep_the_spelling(tmp_path: Path) -> N
         assert params.typed_value(Mixed, "text", values["frame"].given) == "0017"
         assert params.typed_value(Mixed, "number", values["silence_s"].given) == 0.5
         assert params.typed_value(Mixed, "numbers", values["lidar_mount.xyz"].given) == (0.1, 0.2, 0.5)
-
-
-def test_a_shared_value_agrees_with_itself_in_any_spelling(tmp_path: Path) -> None:
-    (tmp_path / "robot.yaml").write_text("/**:\n  ros__parameters:\n    limits: {max_linear_m_s: 4e-1}\n")
-    stack = tmp_path / "stack.yaml"
-    stack.write_text("launch:\n- node: {exec: navigator, param: [{from: robot.yaml}]}\n")
-    assert check_parameters(read_launch_file(stack).nodes) == []
 
 
 def test_messages_and_maps_take_the_same_spellings(tmp_path: Path) -> None:

@@ -25,7 +25,6 @@ def run_file(folder: Path, code: str, *arguments: str) -> "subprocess.CompletedP
 @pytest.mark.parametrize(
     ("end", "status", "told"),
     [
-        ("sys.exit()", 0, ""),
         ("sys.exit(2)", 2, ""),
         ("sys.exit('no such port')", 1, "no such port"),
         ("raise ValueError('broken')", 1, "ValueError: broken"),
@@ -61,7 +60,7 @@ def test_a_signal_while_a_node_is_still_imported_ends_it_quietly(tmp_path: Path)
         process.stdout.close()
 
 
-@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGHUP])
 def test_a_signal_before_the_stack_is_up_ends_the_launcher_with_0(
     monkeypatch: pytest.MonkeyPatch, signum: signal.Signals
 ) -> None:

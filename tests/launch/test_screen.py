@@ -107,12 +107,6 @@ def test_warnings_of_a_start_that_does_not_end_are_shown(out: io.StringIO, monke
     assert out.getvalue().splitlines()[0] == f"  slam │ {WARNED}"
 
 
-def test_verbose_shows_every_line(out: io.StringIO) -> None:
-    with screen_on(out, live=False, verbose=True) as screen:
-        screen.node_line("slam", "12:00:00.000 INFO    slam: running")
-    assert out.getvalue() == "  slam │ 12:00:00.000 INFO    slam: running\n"
-
-
 def test_table_of_nodes(out: io.StringIO) -> None:
     rows = (
         NodeRow("slam", "running", "", 12.3, 99.6, outputs=[TopicRow("/pose", 9.96, 0.1, 10.0)]),
@@ -215,21 +209,6 @@ def test_each_group_is_heard_in_its_own_run_directory(tmp_path: Path) -> None:
         hear(monitor, lambda: monitor.nodes, lambda: publisher.send(serialize(beat("slam"))))
         assert list(monitor.nodes) == ["left/slam"]
         assert monitor.nodes_missing() == ["slam"] and monitor.waiting_for() == ["map"]
-
-
-def test_one_message_reaches_a_milestone(tmp_path: Path) -> None:
-    monitor = HealthMonitor([NodeSpec("my_slam", "grid_slam", ())], tmp_path)
-    try:
-        monitor.nodes["my_slam"] = from_message(beat("my_slam", rate_hz=0.0, age_s=float("inf")))
-        monitor.poll()
-        assert monitor.waiting_for() == ["map"]
-        monitor.nodes["my_slam"] = from_message(
-            beat("my_slam", rate_hz=0.0, age_s=40.0)
-        )  # a single message has no rate
-        monitor.poll()
-        assert monitor.waiting_for() == []
-    finally:
-        monitor.close()
 
 
 def test_a_topic_that_flowed_and_slows_down_or_stops_is_a_fault_after_a_while(
