@@ -218,7 +218,7 @@ def pty_controller():  # type: ignore[no-untyped-def]
 
 
 def test_driver_over_a_real_pseudo_terminal(pty_controller: PtyController) -> None:
-    with closing(Roboclaw(RoboclawConfig(port=pty_controller.path, reply_timeout_s=2.0))) as roboclaw:
+    with closing(Roboclaw(RoboclawConfig(port=pty_controller.path, reply_timeout_s=0.5))) as roboclaw:
         roboclaw.connect()
         roboclaw.drive([1000.0, -1000.0], 0.0)
         assert pty_controller.emulator.target_speed_pps.tolist() == [1000.0, -1000.0]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from test_frozen_nodes import KEY, MODES, stack_in
+from test_frozen_nodes import KEY, stack_in
 
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.commands import CommandRules
@@ -135,7 +135,7 @@ def test_the_robot_stands_when_a_person_arrives(place_m: float, time_s: float, s
     assert watched.limit((0.2, 0.0), person, moving=MovingPoints(person, -moving.velocities)).action == "free"
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [Mode.REAL, Mode.VIRTUAL, Mode.RETURNING])
 def test_every_command_of_every_mode_passes_the_monitor(mode: Mode) -> None:
     """The corridor's walls are in a polygon that slows the key's speed to a quarter."""
     stack = stack_in(mode)

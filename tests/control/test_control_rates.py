@@ -38,15 +38,11 @@ def into_virtual(world: RateWorld) -> None:
 @pytest.mark.parametrize(
     "rates",
     [
-        *({"camera_hz": hz} for hz in (1, 2, 3, 5, 10, 15, 30)),
-        *({"camera_hz": hz, "view_hz": hz} for hz in (1, 2, 3, 30)),
+        {"camera_hz": 30},
+        {"camera_hz": 1, "view_hz": 1},
         {"camera_hz": 5, "view_hz": 1.2, "view_delay_s": 0.8},
-        {"camera_hz": 10, "camera_delay_s": 0.8},
-        {"camera_hz": 15, "camera_delay_s": 0.5, "view_delay_s": 0.3, "jitter": 0.5},
-        {"camera_hz": 5, "view_delay_s": 0.2, "jitter": 1.0},
+        {"camera_hz": 15, "camera_delay_s": 0.8, "view_delay_s": 0.3, "jitter": 0.5},
         {"camera_hz": 10, "lost": 0.15, "seed": 2},  # no three views in a row are lost
-        {"camera_hz": 10, "scan_jitter_s": 0.3},
-        {"camera_hz": 10, "stall_s": 0.4},
         {"camera_hz": 5, "view_delay_s": 0.2, "jitter": 0.5, "scan_jitter_s": 0.1, "stall_s": 0.8},
     ],
     ids=lambda rates: " ".join(f"{key}={value}" for key, value in rates.items()),
@@ -55,26 +51,18 @@ def test_one_switch_each_way_at_every_rate(world: Callable[..., RateWorld], rate
     made = world(**rates)
     made.drive(FORWARD, 60.0, lambda: made.modes[-1] in ("REAL", "STOPPED") and len(made.modes) > 2)
     assert made.modes == THROUGH, made.changes
-    made.drive(FORWARD, 2.0)
+    made.drive(FORWARD, 1.0)
     assert made.modes == THROUGH, made.changes
     assert not made.contact
     assert made.base.pose[0] > BOX[2]  # round the box, not back
 
 
-def test_two_boxes_make_two_switches_each_way_at_one_image_per_second(world: Callable[..., RateWorld]) -> None:
-    made = world(boxes=(BOX, (9.0, -0.25, 9.5, 0.25)), camera_hz=1)
-    made.drive(FORWARD, 90.0, lambda: made.base.pose[0] > 10.0 and made.modes[-1] == "REAL")
-    assert made.modes == THROUGH + THROUGH[2:], made.changes
-    assert not made.contact
-
-
-@pytest.mark.parametrize("factor", [0.02, 10.0])
-def test_nothing_depends_on_the_pace_of_the_process(world: Callable[..., RateWorld], factor: float) -> None:
+def test_nothing_depends_on_the_pace_of_the_process(world: Callable[..., RateWorld]) -> None:
     """Every threshold is in the stack's time: at another pace of the machine's clock the same happens, bit for bit."""
     as_always = world(camera_hz=5)
     into_virtual(as_always)
     try:
-        pace.use(pace.Pace.from_now(factor))
+        pace.use(pace.Pace.from_now(0.02))
         paced = world(camera_hz=5)
         into_virtual(paced)
     finally:
@@ -84,7 +72,7 @@ def test_nothing_depends_on_the_pace_of_the_process(world: Callable[..., RateWor
     ]
 
 
-@pytest.mark.parametrize("camera_hz", [1, 2, 3, 5, 10, 30])
+@pytest.mark.parametrize("camera_hz", [1, 3, 30])
 def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_distance(
     world: Callable[..., RateWorld], camera_hz: float
 ) -> None:
@@ -111,16 +99,13 @@ def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_di
     assert made.base.pose[0] - began_x <= travel_m + braking_m
 
 
-@pytest.mark.parametrize("one_image_of", [4, 5])
-def test_a_camera_that_becomes_slow_slows_the_robot_after_two_late_images(
-    world: Callable[..., RateWorld], one_image_of: int
-) -> None:
+def test_a_camera_that_becomes_slow_slows_the_robot_after_two_late_images(world: Callable[..., RateWorld]) -> None:
     made = world(boxes=(), camera_hz=5)
-    made.drive(FORWARD, 3.0)
-    made.one_image_of = one_image_of
-    made.drive(FORWARD, 3.5 * one_image_of / 5)
+    made.drive(FORWARD, 2.0)
+    made.one_image_of = 5
+    made.drive(FORWARD, 3.5)
     began = len(made.speeds)
-    made.drive(FORWARD, 5.0)
+    made.drive(FORWARD, 3.0)
     assert made.modes == ["STOPPED", "REAL"], made.changes
     assert min(speed for _, speed in made.speeds[began:]) > 0.2  # slower, without a stop at each image
     assert "slowed to" in made.state.reason
@@ -149,11 +134,10 @@ def test_lost_views_stop_both_robots_in_the_virtual_space_at_one_view_per_second
     assert made.run(3.0, lambda: made.modes[-1] == "STOPPED")
 
 
-@pytest.mark.parametrize("camera_hz", [0.4, 0.7])
-def test_images_that_are_too_rare_are_refused_and_the_reason_says_so(camera_hz: float) -> None:
-    made = RateWorld([BOX], Rates(camera_hz=camera_hz))
-    made.drive(NOTHING, 25.0)
-    made.drive(FORWARD, 5.0)
+def test_images_that_are_too_rare_are_refused_and_the_reason_says_so() -> None:
+    made = RateWorld([BOX], Rates(camera_hz=0.7))
+    made.drive(NOTHING, 15.0)
+    made.drive(FORWARD, 4.0)
     assert made.modes == ["STOPPED"]
     assert any("waiting for a camera image every 1.1 s or more often" in s.reason for s in made.states[-60:])
     assert made.base.pose[0] == 0.0

@@ -22,7 +22,6 @@ from instant_ic.util.step_gap import StepGap
 
 KEY, NOTHING = (0.4, 0.0), (0.0, 0.0)
 ALL = ("arbiter", "navigator", "virtual_robot")
-MODES = (Mode.REAL, Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
 
 
 def stack_in(mode: Mode) -> Stack:
@@ -75,9 +74,9 @@ def commands(stack: Stack, since: int) -> list[tuple[float, float]]:
 
 
 def assert_waits_for_a_release(stack: Stack, text: str) -> None:
-    """Nothing moves under the held key for 3 s; after its release the robot can be driven again."""
+    """Nothing moves under the held key for 2 s; after its release the robot can be driven again."""
     since = len(stack.bus.records("/cmd_vel"))
-    states = stack.drive(3.0, KEY)
+    states = stack.drive(2.0, KEY)
     assert set(commands(stack, since)) == {NOTHING}
     assert {message.header.frame_id for message in stack.bus.messages("/cmd_vel")[since:]} == {HARD_STOP}
     assert states[-1].mode == Mode.STOPPED
@@ -87,21 +86,21 @@ def assert_waits_for_a_release(stack: Stack, text: str) -> None:
     assert stack.drive(1.0, NOTHING)[-1].mode == Mode.REAL
 
 
-@pytest.mark.parametrize(("mode", "seconds"), [*((mode, 2.0) for mode in MODES), (Mode.REAL, 1.6), (Mode.REAL, 8.0)])
+@pytest.mark.parametrize(("mode", "seconds"), [(Mode.REAL, 1.6), (Mode.VIRTUAL, 2.0)])
 def test_a_frozen_arbiter_waits_for_a_release(mode: Mode, seconds: float) -> None:
     stack = stack_in(mode)
     freeze(stack, ["arbiter"], seconds)
     assert_waits_for_a_release(stack, "the robot's control stood still for")
 
 
-@pytest.mark.parametrize("names", [("navigator",), ("virtual_robot",), ALL], ids="+".join)
+@pytest.mark.parametrize("names", [("virtual_robot",), ALL], ids="+".join)
 def test_frozen_nodes_in_virtual_wait_for_a_release(names: tuple[str, ...]) -> None:
     stack = stack_in(Mode.VIRTUAL)
     freeze(stack, names, 2.0)
     assert_waits_for_a_release(stack, "stood still for" if "arbiter" in names else "")
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [Mode.REAL, Mode.RETURNING])
 def test_a_suspended_machine_waits_for_a_release(mode: Mode) -> None:
     """The steady clock stands still in suspend: every age looks as before."""
     stack = stack_in(mode)
@@ -117,8 +116,9 @@ def test_a_machine_that_is_suspended_while_the_arbiter_is_frozen_waits_for_a_rel
     assert_waits_for_a_release(stack, "this computer was suspended")
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", ["navigator", "virtual_robot"])
+@pytest.mark.parametrize(
+    ("name", "mode"), [("navigator", Mode.REAL), ("navigator", Mode.VIRTUAL), ("virtual_robot", Mode.REAL)]
+)
 def test_a_restarted_node_waits_for_a_release(name: str, mode: Mode) -> None:
     """Back within 1.5 s, so that no source counts as lost."""
     stack = stack_in(mode)
@@ -134,7 +134,7 @@ def test_a_restarted_arbiter_waits_for_a_release() -> None:
     stack.drive(0.3, KEY)
     stack.bus.add(type(arbiter))
     since = len(stack.bus.records("/cmd_vel"))
-    assert stack.drive(3.0, KEY)[-1].reason_code == Reason.RELEASE_CONTROLS
+    assert stack.drive(2.0, KEY)[-1].reason_code == Reason.RELEASE_CONTROLS
     assert set(commands(stack, since)) == {NOTHING}
 
 
@@ -155,7 +155,7 @@ def test_short_freezes_that_repeat_never_let_the_robot_move() -> None:
     stack = stack_in(Mode.REAL)
     freeze(stack, ["arbiter"], 0.4)
     since = len(stack.bus.records("/cmd_vel"))
-    for _ in range(10):
+    for _ in range(5):
         stack.drive(0.2, KEY)
         freeze(stack, ["arbiter"], 0.4)
     assert set(commands(stack, since)) == {NOTHING}
@@ -199,17 +199,16 @@ def test_a_single_zero_of_a_page_that_comes_back_is_no_release() -> None:
     assert ControlState.REAL not in {state.mode for state in stack.drive(1.0, KEY)}
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", [Mode.REAL, Mode.VIRTUAL])
 def test_a_key_held_through_a_long_silence_of_the_commands_waits_for_a_release(mode: Mode) -> None:
     stack = stack_in(mode)
     stack.drive(2.0, None)
     assert_waits_for_a_release(stack, "the operator's link")
 
 
-@pytest.mark.parametrize("mode", [Mode.REAL, Mode.VIRTUAL])
-def test_a_key_held_while_its_commands_are_late_for_long_waits_for_a_release(mode: Mode) -> None:
+def test_a_key_held_while_its_commands_are_late_for_long_waits_for_a_release() -> None:
     """Each of them is old, but none is older than stop_after_s."""
-    stack = stack_in(mode)
+    stack = stack_in(Mode.REAL)
     for _ in range(60):
         stack.operate(KEY, ahead_s=-0.5)
         stack.step(None)
@@ -245,7 +244,7 @@ def test_a_page_that_is_lost_and_comes_back_with_its_key_held_waits_for_a_releas
     assert_waits_for_a_release(stack, "the operator's link was lost")
 
 
-@pytest.mark.parametrize("before", [(NOTHING, 0.3), (NOTHING, 2.0), (None, 2.0)], ids=["let go", "idle", "no page"])
+@pytest.mark.parametrize("before", [(NOTHING, 0.3), (None, 2.0)], ids=["let go", "no page"])
 def test_who_held_nothing_before_a_silence_need_not_release_it(before: tuple[tuple[float, float], float]) -> None:
     stack = stack_in(Mode.REAL)
     stack.drive(0.3, NOTHING)
@@ -259,7 +258,7 @@ def test_a_client_that_sends_nothing_at_rest_is_not_asked_to_release_what_it_doe
     """Its silence is its release, as that of Foxglove's Teleop panel."""
     stack = Stack(rectangle(9.0, -0.25, 9.5, 0.25))
     stack.drive(1.5, None)
-    for _ in range(3):
+    for _ in range(2):
         assert {state.mode for state in stack.drive(1.0, KEY)[1:]} == {Mode.REAL}
         stack.drive(2.0, None)
 

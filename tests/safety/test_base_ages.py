@@ -31,7 +31,7 @@ from nodes.virtual_robot import VirtualRobotNode
 
 S = 1_000_000_000
 START_NS = 1_700_000_000 * S
-JUMPS = pytest.mark.parametrize("jump_s", [-3600, -1, 1, 3600])
+JUMPS = pytest.mark.parametrize("jump_s", [-3600, 3600])
 
 
 def clocked() -> tuple[LockstepBus, SetClock]:
@@ -99,9 +99,7 @@ def test_silent_scans_are_reported_after_the_clock_was_set(jump_s: int) -> None:
 def test_images_from_files_go_on_when_the_clock_is_set_back(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((16, 32, 3), np.uint8))
     now, waits = [START_NS], []
-    camera = FileCamera(tmp_path, now_ns=lambda: now[0])
-    camera._sleep = waits.append  # type: ignore[method-assign]
-    with camera:
+    with FileCamera(tmp_path, now_ns=lambda: now[0], sleep=waits.append) as camera:
         camera.read()
         now[0] -= 3600 * S
         camera.read()

@@ -10,9 +10,7 @@ from instant_ic.base.protocol import STATUS_FAULTS, STATUS_FAULTS_2_BYTES
 from instant_ic.bus import ERROR, OK, WARN
 from nodes.crawler_base import CrawlerBaseConfig
 
-FAULTS = [(bit, 4, text) for bit, text in STATUS_FAULTS.items()] + [
-    (bit, 2, STATUS_FAULTS_2_BYTES[bit]) for bit in (0x0008, 0x0100)
-]
+FAULTS = [(0x1000, 4, STATUS_FAULTS[0x1000]), (0x0008, 2, STATUS_FAULTS_2_BYTES[0x0008])]
 
 
 def driving() -> NodeBench:
@@ -90,16 +88,6 @@ def test_a_button_that_does_not_latch_is_an_error_that_says_how_to_set_it(
     assert base.line.travelled_m == 0.0 and not any(state.connected for state in base.states)
     text = next(state.link for state in base.states if state.link)
     assert f"Set {pin} to E-Stop (latching)" in text and "The robot does not drive" in text
-    bench = NodeBench(roboclaw=RoboclawConfig(port="memory", estop_pin=pin))
-    bench.line.emulator.pins, bench.line.emulator.status_bytes = pins, status_bytes
-    bench.run(7.5)  # a controller may be late at the start
-    level, text = bench.diagnosis("link")
-    assert level == ERROR and f"Set {pin} to E-Stop (latching)" in text
-
-
-def test_a_pin_that_is_none_of_the_controllers_is_refused() -> None:
-    with pytest.raises(ValueError, match="estop_pin"):
-        RoboclawConfig(estop_pin="S6")
 
 
 @pytest.mark.parametrize(("bit", "status_bytes", "name"), FAULTS)
@@ -129,7 +117,7 @@ def test_a_fault_of_the_controller_stops_and_latches_with_its_name(bit: int, sta
     assert bench.diagnosis("controller") == (OK, "no faults")
 
 
-@pytest.mark.parametrize("silent_s", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("silent_s", [0.0, 1.0])
 def test_a_controller_that_restarted_stops_and_latches_with_its_name(silent_s: float) -> None:
     """A brown-out is a fault that takes its own status bits with it; the key is held all the time."""
     bench = driving()

@@ -16,14 +16,13 @@ LOST: Callable[[bytes], bytes] = lambda data: b""  # noqa: E731 - a line, not a 
 
 def driving(v: float = 0.5, phase_s: float = 0.0, **roboclaw: object) -> Base:
     base = Base(ControllerConfig(roboclaw=RoboclawConfig(port="memory", **roboclaw)))  # type: ignore[arg-type]
-    base.run(2.0 + phase_s, v)
+    base.run(1.5 + phase_s, v)
     assert base.line.speed == pytest.approx(v, abs=0.01)
     return base
 
 
-@pytest.mark.parametrize("phase_s", [0.0, 0.008, 0.017, 0.025, 0.032])
-@pytest.mark.parametrize("command", [0.0, 0.5], ids=["zero", "drive"])
-def test_lost_replies_stop_the_tracks_within_0_45_s(phase_s: float, command: float) -> None:
+@pytest.mark.parametrize(("command", "phase_s"), [(0.0, 0.008), (0.5, 0.0), (0.5, 0.017)])
+def test_lost_replies_stop_the_tracks_within_0_45_s(command: float, phase_s: float) -> None:
     base = driving(phase_s=phase_s)
     base.line.back = LOST
     stand_s, distance_m = base.until_standing(command)
@@ -31,9 +30,8 @@ def test_lost_replies_stop_the_tracks_within_0_45_s(phase_s: float, command: flo
     assert distance_m <= 0.15
 
 
-@pytest.mark.parametrize("phase_s", [0.0, 0.017])
-def test_a_cut_line_stops_the_tracks_by_the_controllers_watchdog(phase_s: float) -> None:
-    base = driving(phase_s=phase_s)
+def test_a_cut_line_stops_the_tracks_by_the_controllers_watchdog() -> None:
+    base = driving()
     base.line.back = base.line.forward = LOST
     stand_s, _ = base.until_standing(0.5)
     assert base.line.emulator.watchdog_fired
@@ -100,7 +98,7 @@ def test_a_command_to_drive_is_not_repeated_after_a_missing_reply() -> None:
     assert len(drives) <= 1
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_noisy_line_never_lets_the_tracks_run_on(seed: int) -> None:
     """Each frame and each reply is lost, damaged or cut at random; no command comes any more: the tracks stand."""
     base = driving()
@@ -148,7 +146,7 @@ def late_line(seed: int) -> tuple[Roboclaw, Line, list[int]]:
     return roboclaw, line, understood
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_an_acknowledgement_110_ms_late_never_acknowledges_the_next_command(seed: int) -> None:
     """The controller has understood each command that counts as acknowledged; a command to drive, or a stop for it."""
     roboclaw, line, understood = late_line(seed)

@@ -11,11 +11,11 @@ from instant_ic.msg import HARD_STOP
 
 
 def driving(bench: NodeBench, phase_s: float = 0.0) -> None:
-    bench.run(2.0 + phase_s, v=0.38)
+    bench.run(1.5 + phase_s, v=0.38)
     assert bench.line.robot.twist[0] == pytest.approx(0.38, abs=0.005)
 
 
-@pytest.mark.parametrize("phase_s", [0.0, 0.008, 0.017, 0.025, 0.032])
+@pytest.mark.parametrize("phase_s", [0.0, 0.017])
 def test_the_emergency_stop_stands_within_0_25_s_and_0_06_m(phase_s: float) -> None:
     bench = NodeBench()
     driving(bench, phase_s)
@@ -25,7 +25,7 @@ def test_the_emergency_stop_stands_within_0_25_s_and_0_06_m(phase_s: float) -> N
     assert distance_m <= 0.06
 
 
-@pytest.mark.parametrize("phase_s", [0.0, 0.008, 0.017, 0.025, 0.032])
+@pytest.mark.parametrize("phase_s", [0.0, 0.017])
 def test_a_lost_arbiter_commands_zero_within_0_3_s_and_stands_within_0_55_s(phase_s: float) -> None:
     bench = NodeBench()
     driving(bench, phase_s)
@@ -42,11 +42,10 @@ def test_a_lost_arbiter_commands_zero_within_0_3_s_and_stands_within_0_55_s(phas
     assert distance_m <= 0.16
 
 
-@pytest.mark.parametrize("phase_s", [0.0, 0.017, 0.032])
-def test_a_hard_stop_of_the_arbiter_stands_within_0_25_s(phase_s: float) -> None:
+def test_a_hard_stop_of_the_arbiter_stands_within_0_25_s() -> None:
     """0.3 s to notice a loss and this make 0.55 s."""
     bench = NodeBench()
-    driving(bench, phase_s)
+    driving(bench)
     bench.command(0.0, frame_id=HARD_STOP)
     for _ in range(10):
         bench.run(0.05)

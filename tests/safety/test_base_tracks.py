@@ -34,13 +34,8 @@ def stops(base: Base, v: float, w: float = 0.0) -> tuple[float, float]:
     ("v", "w", "side"),
     [
         (0.005, 0.0, "left"),
-        (0.01, 0.0, "right"),
-        (-0.02, 0.0, "both"),
-        (0.05, 0.0, "left"),
-        (0.1, 0.0, "both"),
+        (-0.05, 0.0, "both"),
         (0.38, 0.0, "right"),
-        (-0.38, 0.0, "both"),
-        (0.0, 0.02, "both"),
         (0.0, -0.6, "right"),
         (0.3, 0.6, "left"),
     ],
@@ -57,16 +52,15 @@ def test_a_runaway_track_stands_within_0_6_s_and_0_4_m_at_every_command(
     assert distance_m <= 0.4
 
 
-@pytest.mark.parametrize("v", [0.005, 0.01, 0.02])
-def test_a_slow_wind_up_at_a_creeping_command_stands_within_0_6_s(v: float) -> None:
+def test_a_slow_wind_up_at_a_creeping_command_stands_within_0_6_s() -> None:
     """A tuned loop takes a second to wind up at 0.005 m/s; the currents are too low for a track that stands."""
-    base = driving(v)
+    base = driving(0.005)
     base.line.motors.encoders[0] = 0.0
-    stand_s, distance_m = stops(base, v)
+    stand_s, distance_m = stops(base, 0.005)
     assert stand_s <= 0.6 and distance_m <= 0.05
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_creeping_tracks_stand_within_0_6_s_of_running_away(seed: int) -> None:
     """Count from when a track is 0.02 m/s too fast; one that sticks when its encoder dies runs away later."""
     _, distance_m, away_s, _ = runaway(seed, fastest_m_s=0.03)
@@ -138,12 +132,11 @@ def test_the_stop_is_an_emergency_stop_that_the_operator_releases() -> None:
     assert bench.diagnosis("tracks") == (OK, "both follow")
 
 
-@pytest.mark.parametrize("seed", [19, 23])
-def test_a_loop_that_comes_late_makes_no_fault(seed: int) -> None:
+def test_a_loop_that_comes_late_makes_no_fault() -> None:
     """On a busy machine a step may come 0.28 s after the last, and only then the tracks hear of the next speed."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(19)
     base = Base()
-    for _ in range(12):
+    for _ in range(8):
         v, w = rng.uniform(-0.5, 0.5), rng.uniform(-1.0, 1.0)
         for _ in range(rng.integers(1, 30)):
             base.line.advance(rng.uniform(1 / 30, 0.28) if rng.random() < 0.3 else 1 / 30)
@@ -164,11 +157,11 @@ def test_a_loop_that_comes_late_still_finds_a_fault(counts: float) -> None:
     assert found and not base.line.motors.power.any()  # the controller's own limit may be the first to stop
 
 
-@pytest.mark.parametrize("counts", [0.0, -1.0], ids=["dead", "reversed"])
-@pytest.mark.parametrize("v", [0.02, 0.1, 0.38])
-@pytest.mark.parametrize("late_s", [0.005, 0.008, 0.011])
+@pytest.mark.parametrize(
+    ("late_s", "v", "counts"), [(0.011, 0.02, 0.0), (0.011, 0.38, 0.0), (0.011, 0.1, -1.0), (0.005, 0.38, -1.0)]
+)
 def test_a_runaway_track_stands_within_0_6_s_and_0_4_m_on_a_line_with_late_replies(
-    v: float, counts: float, late_s: float
+    late_s: float, v: float, counts: float
 ) -> None:
     base = Base()
     base.line.late_s = lambda: late_s
@@ -182,13 +175,12 @@ def test_a_runaway_track_stands_within_0_6_s_and_0_4_m_on_a_line_with_late_repli
     assert base.line.travelled_m - start_m <= 0.4
 
 
-@pytest.mark.parametrize("late_s", [(0.017, 0.017), (0.024, 0.030)])
-def test_a_line_too_slow_to_watch_the_tracks_stops_the_base(late_s: tuple[float, float]) -> None:
+def test_a_line_too_slow_to_watch_the_tracks_stops_the_base() -> None:
     """Replies as late as this let a runaway track go for 1.3 s and 0.8 m."""
     rng = np.random.default_rng(7)
     base = driving(0.38)
     start_s = base.line.time_s
-    base.line.late_s = lambda: rng.uniform(*late_s)
+    base.line.late_s = lambda: rng.uniform(0.024, 0.030)
     base.run(1.5, 0.38)
     assert base.line.speed == 0.0 and base.line.moved_s - start_s <= 0.8
     faults = [state.fault for state in base.states if state.fault]
@@ -207,29 +199,27 @@ def test_a_line_too_slow_to_watch_the_tracks_stops_the_base(late_s: tuple[float,
 def test_single_late_replies_stop_nothing() -> None:
     base, late = Base(), cycle([0.06, *[0.001] * 19])  # in every fourth cycle
     base.line.late_s = lambda: next(late)
-    base.run(10.0, 0.3)
+    base.run(4.0, 0.3)
     assert not any(state.fault for state in base.states)
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_healthy_tracks_that_stick_and_slip_are_never_stopped(seed: int) -> None:
-    """Random commands from 0.005 m/s on, loads, stiction, batteries, loops; a share of the steps comes late."""
-    assert healthy(seed, late=(0.0, 0.1, 0.3)[seed % 3], commands=5) == ""
+@pytest.mark.parametrize("noise_a", [0.0, 0.2])
+@pytest.mark.parametrize("seed", range(6))
+def test_healthy_tracks_that_stick_and_slip_are_never_stopped(seed: int, noise_a: float) -> None:
+    """Random commands from 0.005 m/s on, loads, stiction, batteries, loops; a share of the steps comes late.
+
+    With noise, an offset of 0.2 A too, and a scale up to 30 % wrong.
+    """
+    assert healthy(seed, late=(0.0, 0.1, 0.3)[seed % 3], commands=4, noise_a=noise_a) == ""
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_healthy_tracks_with_noisy_currents_are_never_stopped(seed: int) -> None:
-    """Noise and offset of 0.2 A, scale up to 30 % wrong."""
-    assert healthy(seed, late=(0.0, 0.1, 0.3)[seed % 3], commands=5, noise_a=0.2) == ""
-
-
-@pytest.mark.parametrize("seed", [*range(6), 311, 360])
+@pytest.mark.parametrize("seed", [0, 1, 311, 360])
 def test_a_simulation_that_comes_late_or_pauses_makes_no_fault(seed: int) -> None:
     """Seeds 311 and 360: it pauses while the base itself comes late, so that one reading lacks 0.2 s of motion."""
     assert healthy(seed, late=0.1, pauses=True, commands=5) == ""
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(12))
 def test_no_runaway_is_missed(seed: int) -> None:
     """Loops of all tunings: 0.4 m at most from the fault on, 0.6 s from when a track is 0.02 m/s too fast."""
     _, distance_m, away_s, _ = runaway(seed)

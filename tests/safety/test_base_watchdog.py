@@ -5,7 +5,7 @@ import pytest
 from base_line import RATE_HZ, Base
 
 from instant_ic.base.config import ControllerConfig, RoboclawConfig
-from instant_ic.base.protocol import Command
+from instant_ic.base.protocol import Command, write_frame
 from nodes.crawler_base import CrawlerBaseConfig
 
 
@@ -17,7 +17,7 @@ def test_the_shipped_watchdog_stops_the_motors_within_0_3_s_and_outlasts_missed_
         CrawlerBaseConfig(rate_hz=8.0)
 
 
-@pytest.mark.parametrize(("asked_s", "tenths"), [(0.1, 1), (0.19, 1), (0.26, 2), (0.3, 3), (1.0, 10)])
+@pytest.mark.parametrize(("asked_s", "tenths"), [(0.19, 1), (0.3, 3), (1.0, 10)])
 def test_the_watchdog_is_never_longer_than_asked_for(asked_s: float, tenths: int) -> None:
     """Command 14 counts tenths of a second."""
     base = Base(ControllerConfig(roboclaw=RoboclawConfig(port="memory", watchdog_s=asked_s)))
@@ -27,7 +27,7 @@ def test_the_watchdog_is_never_longer_than_asked_for(asked_s: float, tenths: int
     assert base.line.emulator.timeout_s == pytest.approx(tenths / 10)
 
 
-@pytest.mark.parametrize("phase_s", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize("phase_s", [0.0, 0.1])
 def test_a_watchdog_that_was_cleared_stops_the_tracks_and_is_set_again(phase_s: float) -> None:
     base = Base()
     base.run(2.0 + phase_s, 0.4)
@@ -45,7 +45,7 @@ def test_a_watchdog_that_was_cleared_stops_the_tracks_and_is_set_again(phase_s: 
     assert base.line.emulator.timeout_s == pytest.approx(0.3) and base.states[-1].connected
 
 
-@pytest.mark.parametrize("driven_s", [0.3, 0.5, 3.0], ids=["few counts", "some counts", "many counts"])
+@pytest.mark.parametrize("driven_s", [0.3, 3.0], ids=["few counts", "many counts"])
 def test_counts_that_jump_to_zero_force_a_reconnect_at_once(driven_s: float) -> None:
     base = Base()
     base.run(driven_s, 0.4)
@@ -91,14 +91,8 @@ def test_a_restart_during_a_lost_link_makes_no_leap_of_the_odometry() -> None:
 
 def test_a_controller_that_takes_no_watchdog_is_not_driven() -> None:
     base = Base()
-    base.line.back = lambda reply: reply
-    set_timeout = base.line.emulator._write
-
-    def ignore(command: int, data: bytes) -> None:
-        if command != Command.SET_TIMEOUT:
-            set_timeout(command, data)
-
-    base.line.emulator._write = ignore  # type: ignore[method-assign]
+    off = write_frame(0x80, Command.SET_TIMEOUT, bytes((0,)))
+    base.line.forward = lambda frame: off if frame[1] == Command.SET_TIMEOUT else frame  # acknowledged, and of no use
     base.run(3.0, 0.4)
     assert base.line.travelled_m == 0.0
     assert not any(state.connected for state in base.states)

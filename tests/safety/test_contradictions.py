@@ -92,14 +92,13 @@ def test_a_robot_that_moves_otherwise_than_its_tracks_stops(
     assert math.hypot(moved[0], moved[1]) < within and abs(wrap_angle(float(moved[2]))) < within
 
 
-@pytest.mark.parametrize("tracks", [[0], [0, 1]], ids=["one", "both"])
 @pytest.mark.parametrize(
-    ("command", "within_s", "within_m"),
-    [((0.03, 0.0), 2.0, 0.2), ((0.1, 0.0), 0.9, 0.3), (FORWARD, 0.8, 0.85), ((0.0, 0.4), 1.4, 0.55)],
-    ids=["0.03 m/s", "0.1 m/s", "0.38 m/s", "turning"],
+    ("command", "tracks", "within_s", "within_m"),
+    [((0.03, 0.0), [0], 2.0, 0.2), (FORWARD, [0, 1], 0.8, 0.85), ((0.0, 0.4), [0], 1.4, 0.55)],
+    ids=["0.03 m/s", "0.38 m/s", "turning"],
 )
 def test_an_encoder_that_counts_30_percent_stops_the_robot(
-    stack: Stack, command: tuple[float, float], within_s: float, within_m: float, tracks: list[int]
+    stack: Stack, command: tuple[float, float], tracks: list[int], within_s: float, within_m: float
 ) -> None:
     """The base sees a track that follows, which in truth is three times too fast: only the scans contradict it."""
     stack.drive(command, 1.5)
@@ -134,13 +133,12 @@ def test_tracks_that_slip_on_the_spot_stop_and_the_operator_drives_free_slowly(s
     assert abs(robot.tracks).min() > 0.3 and not stack.stopped
 
 
-@pytest.mark.parametrize("speed_m_s", [0.02, 0.01])
-def test_fault_slow_tracks_that_slip_on_the_spot_run_on(stack: Stack, speed_m_s: float) -> None:
-    """At 0.02 m/s they ran 0.25 m, at 0.01 m/s for ever."""
+def test_fault_slow_tracks_that_slip_on_the_spot_run_on(stack: Stack) -> None:
+    """At 0.02 m/s they ran 0.25 m; slower ones: ``slam/test_slam_contradiction.py``."""
     stack.drive(FORWARD, 2.0)
     stack.drive(NOTHING, 1.0)
     stack.simulation.robot.touches = lambda pose: True
-    assert stack.drive((speed_m_s, 0.0), 0.16 / speed_m_s, until=lambda: stack.stopped) * speed_m_s < 0.15
+    assert stack.drive((0.02, 0.0), 8.0, until=lambda: stack.stopped) * 0.02 < 0.15
     assert stack.stopped and stack.state.reason_code == Reason.RELEASE_CONTROLS
 
 

@@ -13,7 +13,6 @@ import pytest
 from instant_ic.experiments.teleop_stack import SimulatedStack, StackConfig
 from instant_ic.geometry.poses import compose2, pose2_from_matrix, wrap_angle
 from instant_ic.msg import ControlState, matrix_from_pose
-from instant_ic.sim.simulation import Simulation, SimulationConfig
 from instant_ic.sim.worlds import make_world
 
 FORWARD, NOTHING = (0.38, 0.0), (0.0, 0.0)
@@ -73,9 +72,3 @@ def test_a_robot_that_is_carried_off_while_it_drives_stops_and_says_so() -> None
         assert stack.drive((0.0, 0.3), 3.0, until=lambda: stack.stopped) <= 10 * SCAN_S
         stack.drive((0.0, 0.3), 0.6)
         assert stack.stopped and stack.stands and "the robot" in stack.page.state["reason"]
-
-
-def test_no_robot_is_put_down_on_a_thing() -> None:
-    simulation = Simulation(SimulationConfig(world="corridor"))
-    with pytest.raises(ValueError, match=r"x=4.25, y=0.00 collides"):
-        simulation.put_down((4.25, 0.0, 0.0))  # on the white box

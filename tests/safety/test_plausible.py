@@ -25,43 +25,20 @@ ABSURD = [
     ("arbiter", "footprint.length_m:=0.001", r"footprint.length_m must lie in 0.1..3 \(got 0.001\); did you mean 0.1"),
     ("arbiter", "footprint.width_m:=500", "did you mean 0.5?"),
     ("arbiter", "limits.max_linear_m_s:=50", r"must lie in 0.02..3 \(got 50\); did you mean 0.5\?"),
-    ("arbiter", "limits.max_linear_m_s:=3.8", r"did you mean 0.38\?"),
-    ("arbiter", "limits.max_linear_accel_m_s2:=1e6", "max_linear_accel_m_s2 must lie in"),
     ("arbiter", "timeouts.scan:=300", r"timeouts.scan must lie in 0.05..2 \(got 300\); did you mean 0.3\?"),
-    ("arbiter", "timeouts.command:=9", "timeouts.command must lie in"),
-    ("arbiter", "collision_monitor.source_timeout:=1e6", "source_timeout must lie in"),
-    ("arbiter", "collision_monitor.stop.min_points:=100000", "min_points must lie in 1..10"),
     ("arbiter", "collision_monitor.approach.min_points:=20", r"did you mean 2\?"),
-    ("arbiter", "costmap.points.mark_threshold:=20", "mark_threshold must lie in 1..10"),
-    ("arbiter", "costmap.points.ground_tilt_deg:=8", r"did you mean 0.8\?"),
-    ("arbiter", "costmap.update_frequency:=0.5", "update_frequency must lie in"),
     ("arbiter", "collision_monitor.blind_radius_m:=450", r"did you mean 0.45\?"),
     ("arbiter", "pose_trust.stop:=1.0", "pose_trust.stop must lie in"),
-    ("arbiter", "rate_hz:=0.1", "rate_hz must lie in 5..200"),
-    ("arbiter", "costmap.points.min_obstacle_height:=5", r"did you mean 0.5\?"),
-    ("crawler_base", "health_period_s:=1e6", "health_period_s must lie in 0.02..1"),
     ("crawler_base", "limits.hard_decel_m_s2:=0.01", "hard_decel_m_s2 must lie in"),
     ("crawler_base", "command_timeout_s:=250", r"did you mean 0.25\?"),
     ("crawler_base", "geometry.track_width:=400", r"did you mean 0.4\?"),
-    ("crawler_base", "geometry.pulses_per_metre:=4", "pulses_per_metre must lie in"),
     ("crawler_base", "roboclaw.retries:=1000", "retries must lie in"),
-    ("navigator", "state_timeout_s:=1e6", "state_timeout_s must lie in"),
-    ("navigator", "limits.max_angular_rad_s:=57", r"did you mean 5.7\?"),
     ("virtual_robot", "state_timeout_s:=1e6", "state_timeout_s must lie in"),
     ("navigator", "costmap_timeout_s:=10", r"did you mean 1\?"),
     ("vlp16_driver", "scan.min_height:=1", r"did you mean 0.1\?"),
-    ("vlp16_driver", "scan.max_height:=0.13", r"did you mean 1.3\?"),
-    ("vlp16_driver", "scan.beams:=4", "scan.beams must lie in 90..7200"),
-    ("vlp16_driver", "scan.min_coverage:=0", "scan.min_coverage must lie in"),
     ("vlp16_driver", "lidar_mount.xyz:=[0, 0, 60]", r"xyz\[2\] must lie in -5..5 \(got 60\); did you mean 0.6\?"),
-    ("vlp16_driver", "decoder.max_range:=1", "decoder.max_range must lie in"),
-    ("vlp16_driver", "scan.range_max:=1", "scan.range_max must lie in"),
-    ("vlp16_driver", "scan.min_height:=5", "scan.min_height must lie in"),
-    ("vlp16_driver", "decoder.min_range:=40", r"did you mean 0.4\?"),
     ("theta_camera", "theta.latency_s:=200", "theta.latency_s must lie in"),
     ("console", "server.drive.watchdog_s:=250", r"did you mean 0.25\?"),
-    ("console", "server.drive.max_linear_mps:=40", r"did you mean 0.4\?"),
-    ("console", "server.drive.beat_timeout_s:=1e9", "beat_timeout_s must lie in"),
 ]
 
 
@@ -141,7 +118,7 @@ def test_protection_that_is_off_warns_as_long_as_it_is_off() -> None:
     with LockstepBus() as bus:
         arbiter = bus.add(node_class("arbiter"), ArbiterConfig(collision_monitor=monitor, unprotected=True))
         for _ in range(3):
-            bus.advance(60.0)
+            bus.advance(2.0)
             level, text = state_of(arbiter, "protection")
             assert level == WARN and "Protection is off (collision_monitor.stop)" in text
         arbiter.parameters.set({"collision_monitor.stop.enabled": True})
@@ -161,13 +138,13 @@ def test_a_base_that_obeys_anybody_warns_and_needs_a_word() -> None:
         with pytest.raises(ParameterError, match="protection is off, so that commands of any node or of any age"):
             configured("crawler_base", word)
     bench = NodeBench(command_source="", unprotected=True)
-    bench.run(30.0)
+    bench.run(1.0)
     assert bench.diagnosis("protection")[0] == WARN
 
 
 def test_a_base_without_a_stop_button_warns() -> None:
     bench = NodeBench(roboclaw=RoboclawConfig(port="memory", estop_pin=""))
-    bench.run(30.0)
+    bench.run(1.0)
     level, text = bench.diagnosis("button")
     assert level == WARN and "No stop button" in text
 
