@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +25,7 @@ from instant_ic.control.states import Mode, VbotAction
 from instant_ic.control.static_map import StaticMap
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
+from instant_ic.msg import VspaceStatus, header, pose_message, to_time
 from instant_ic.util.contradiction import Contradiction
 
 LENGTH_M, WIDTH_M = 0.60, 0.50
@@ -91,6 +92,23 @@ def draw_map(segments: np.ndarray, inside: tuple[float, float, float, float], re
         index = np.floor((a + (b - a) * np.linspace(0, 1, n)[:, None] - origin) / resolution).astype(int)
         grid[index[:, 1], index[:, 0]] = 100
     return StaticMap(grid, resolution, origin)
+
+
+def ready_vspace(now_ns: int) -> VspaceStatus:
+    """The status of a virtual space that is ready everywhere."""
+    numbers = {field.name: 0 for field in fields(VspaceStatus) if field.name != "__msgtype__"}
+    floats = ("psnr_db", "expected_psnr_db", "unseen_share", "train_seconds", "ready_seconds")
+    numbers |= dict.fromkeys((*floats, "ms_per_iteration", "render_ms", "render_fps"), 0.0)
+    given = {
+        "header": header("map", now_ns),
+        "state": VspaceStatus.READY,
+        "keyframe_pose": pose_message(np.eye(4)),
+        "keyframe_stamp": to_time(now_ns),
+        "ready_radius_m": 100.0,
+        "device": "cpu",
+        "message": "",
+    }
+    return VspaceStatus(**numbers | given)
 
 
 def matrix(pose: np.ndarray) -> np.ndarray:

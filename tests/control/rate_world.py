@@ -14,7 +14,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor, draw_map, matrix, rectangle
+from control_world import (
+    BEAMS,
+    LIDAR_MAX_M,
+    LIDAR_MIN_M,
+    Base,
+    World,
+    corridor,
+    draw_map,
+    matrix,
+    ready_vspace,
+    rectangle,
+)
 
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.console.config import ConsoleConfig, ConsoleServerConfig
@@ -26,7 +37,6 @@ from instant_ic.msg import (
     PoseWithCovarianceStamped,
     RenderedView,
     TFMessage,
-    VspaceStatus,
     compressed_image_message,
     deserialize,
     grid_message,
@@ -34,7 +44,6 @@ from instant_ic.msg import (
     odometry_message,
     pose_message,
     scan_message,
-    to_time,
     transform_message,
     twist_values,
 )
@@ -115,7 +124,7 @@ class RateWorld:
         self._every(0.05, self._move)
         self._every(0.05, self._operate)
         self._every(0.1, self._scan, 0.003)
-        self._every(0.5, self._status)
+        self._every(0.5, lambda: self.bus.publish("/vspace/status", ready_vspace(self.now), latched=True))
         self._every(1.0 / rates.camera_hz, self._expose, 0.007)
 
     def close(self) -> None:
@@ -279,27 +288,3 @@ class RateWorld:
 
         self._late("view", takes_s, send)
         self._at(self.now + round(free_s * 1e9), free)
-
-    def _status(self) -> None:
-        fields = {field.name: 0 for field in dataclasses.fields(VspaceStatus)}
-        fields |= dict.fromkeys(
-            ("ready_radius_m", "psnr_db", "expected_psnr_db", "unseen_share", "train_seconds", "ready_seconds"), 0.0
-        )
-        fields |= dict.fromkeys(("ms_per_iteration", "render_ms", "render_fps"), 0.0)
-        fields.pop("__msgtype__", None)
-        message = VspaceStatus(
-            **fields
-            | {
-                "header": header("map", self.now),
-                "state": VspaceStatus.READY,
-                "keyframe_pose": pose_message(np.eye(4)),
-                "keyframe_stamp": to_time(self.now),
-                "ready_radius_m": 100.0,
-                "device": "cpu",
-                "message": "",
-            }
-        )
-        self.bus.publish("/vspace/status", message, latched=True)
-
-
-MODES = {0: "REAL", 1: "VIRTUAL", 2: "STOPPED", 3: "ENTERING", 4: "RETURNING"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from itertools import pairwise
@@ -46,7 +47,7 @@ def drive(made: Loop, seconds: float, command: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize(
     ("box", "mapped"),
-    [(BOX, True), (BOX, False), ((2.2, -0.6, 3.0, 0.1), True), ((2.5, -1.2, 3.0, 0.1), False)],
+    [(BOX, True), ((2.5, -1.2, 3.0, 0.1), False)],
 )
 def test_through_the_box_and_back(box: tuple[float, float, float, float], mapped: bool) -> None:
     made = loop(box, mapped)
@@ -79,7 +80,7 @@ def test_through_the_box_and_back(box: tuple[float, float, float, float], mapped
 def test_without_a_virtual_space_the_robot_stops_and_says_why(vspace: Vspace, words: str) -> None:
     made = loop()
     made.vspace = vspace
-    drive(made, 14.0, FORWARD)
+    drive(made, 10.0, FORWARD)
     assert made.modes() == ["STOPPED", "REAL"]
     end = made.frames[-1]
     assert end.decision.blocked
@@ -94,7 +95,7 @@ def test_without_a_virtual_space_the_robot_stops_and_says_why(vspace: Vspace, wo
 def test_a_silent_virtual_space_is_no_virtual_space() -> None:
     made = loop()
     made.ages["vspace"] = math.inf
-    drive(made, 12.0, FORWARD)
+    drive(made, 8.0, FORWARD)
     assert made.modes() == ["STOPPED", "REAL"]
     assert "no virtual space is running" in made.frames[-1].decision.reason
 
@@ -148,13 +149,10 @@ def test_tapping_forward_before_the_obstacle_does_not_flicker() -> None:
         drive(made, 0.3, FORWARD)
         drive(made, 0.5, NOTHING)
     assert made.modes() == THROUGH[:4]
-    drive(made, 23.0, FORWARD)
-    assert made.modes() == THROUGH
 
 
 def test_stopping_inside_the_obstacle_the_robot_waits_and_goes_on() -> None:
-    made = loop()
-    drive(made, 7.0, FORWARD)
+    made = in_virtual()
     drive(made, 5.5, NOTHING)
     assert BOX[0] < made.vbot.pose[0] < BOX[2]
     waiting = made.frames[-1]
@@ -189,10 +187,21 @@ def test_emergency_stop_in_both_modes() -> None:
         assert made.frames[-1].decision.mode == Mode.REAL
 
 
-@pytest.mark.parametrize("key", [source.key for source in SOURCES if Mode.VIRTUAL in source.modes])
-def test_each_source_lost_while_virtual_holds_then_stops(key: str) -> None:
+@functools.cache
+def _virtual() -> Loop:
     made = loop()
     drive(made, 7.0, FORWARD)
+    return made
+
+
+def in_virtual() -> Loop:
+    """A loop after 7 s of driving forward, in VIRTUAL."""
+    return copy.deepcopy(_virtual())
+
+
+@pytest.mark.parametrize("key", [source.key for source in SOURCES if Mode.VIRTUAL in source.modes])
+def test_each_source_lost_while_virtual_holds_then_stops(key: str) -> None:
+    made = in_virtual()
     timeout = getattr(TimeoutConfig(), key)
     made.ages[key] = timeout + 0.01
     frame = made.step(FORWARD)
@@ -215,9 +224,7 @@ def test_a_stale_command_stops_the_robot_and_the_vbot() -> None:
 
 
 def test_a_lost_operator_makes_the_robot_wait_in_virtual_mode_and_then_stop() -> None:
-    made = loop()
-    drive(made, 5.5, FORWARD)
-    assert made.modes()[-1] == "VIRTUAL"
+    made = in_virtual()
     assert made.frames[-1].command != NOTHING
     for age in (0.31, 1.5):
         made.ages["command"] = age
@@ -336,8 +343,7 @@ def test_a_vbot_beyond_what_the_space_can_show_is_told() -> None:
 
 
 def test_a_failed_virtual_space_gives_the_real_view_back_by_way_of_a_stop() -> None:
-    made = loop()
-    drive(made, 6.0, FORWARD)
+    made = in_virtual()
     made.vspace = Vspace(failed=True, message="out of memory")
     frame = made.step(FORWARD)
     assert frame.decision.mode == Mode.STOPPED
@@ -347,12 +353,10 @@ def test_a_failed_virtual_space_gives_the_real_view_back_by_way_of_a_stop() -> N
 
 
 def test_the_vbot_waits_for_a_robot_that_cannot_follow() -> None:
-    made = loop()
-    drive(made, 5.0, FORWARD)
-    assert made.modes()[-1] == "VIRTUAL"
+    made = in_virtual()
     held = made.base.pose.copy()
     made.base.step = lambda command, dt: None  # type: ignore[method-assign]  # tracks off the ground
-    drive(made, 30.0, (0.5, 0.0))
+    drive(made, 20.0, (0.5, 0.0))
     assert 2.5 < np.linalg.norm(made.vbot.pose[:2] - held[:2]) <= 3.0
 
 
@@ -363,10 +367,9 @@ def test_nothing_moves_before_everything_is_there() -> None:
     assert "no LiDAR scan yet" in decision.reason
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_one_switch_each_way_with_noise(seed: int) -> None:
+def test_one_switch_each_way_with_noise() -> None:
     """Scan noise of 1.5 cm, a pose that wanders by centimetres: still one switch in, one out, no contact."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     y, side = rng.uniform(-0.3, 0.3), rng.uniform(0.3, 0.7)
     walls, x = corridor(), rng.uniform(2.0, 3.0)
     world = World(np.concatenate([walls, rectangle(x, y - side / 2, x + 0.5, y + side / 2)]))
@@ -376,11 +379,10 @@ def test_one_switch_each_way_with_noise(seed: int) -> None:
     assert made.modes() == THROUGH
 
 
-@pytest.mark.parametrize("edge_y", [0.18, 0.22, 0.26])
-def test_box_that_the_path_only_grazes_makes_one_switch_each_way(edge_y: float) -> None:
+def test_box_that_the_path_only_grazes_makes_one_switch_each_way() -> None:
     """The robot's half width is 0.25 m: with noise, a way along the box's edge is now free and now not."""
     walls = corridor()
-    world = World(np.concatenate([walls, rectangle(2.5, edge_y, 3.0, edge_y + 0.5)]))
+    world = World(np.concatenate([walls, rectangle(2.5, 0.22, 3.0, 0.72)]))
     made = Loop(world, draw_map(walls, (-2, -1.2, 14, 1.2)), noise=np.random.default_rng(4))
     made.start()
     drive(made, 26.0, FORWARD)
@@ -428,9 +430,10 @@ class TestTable:
         assert {row.action for row in TRANSITIONS} == set(ACTIONS) == set(Arbiter()._actions)
 
     def test_every_moving_state_can_be_stopped_first(self) -> None:
+        stops = ["estop_pressed", "interrupted", "source_lost", "pose_lost", "contradicted"]
         for mode in set(Mode) - {Mode.STOPPED}:
             rows = [row for row in TRANSITIONS if row.source == mode]
-            assert (rows[0].guard, rows[0].target) == ("estop_pressed", Mode.STOPPED)
+            assert [(row.guard, row.target) for row in rows[:5]] == [(guard, Mode.STOPPED) for guard in stops]
 
     @pytest.mark.parametrize(
         "text", [diagram.state_diagram(), diagram.state_table(), diagram.guard_table(), diagram.source_table()]

@@ -9,7 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor, draw_map, matrix, rectangle
+from control_world import (
+    BEAMS,
+    LIDAR_MAX_M,
+    LIDAR_MIN_M,
+    Base,
+    World,
+    corridor,
+    draw_map,
+    matrix,
+    ready_vspace,
+    rectangle,
+)
 
 from instant_ic.bus import OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
@@ -20,7 +31,6 @@ from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import LETHAL
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.states import Reason
-from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.msg import (
     Bool,
@@ -30,13 +40,11 @@ from instant_ic.msg import (
     PoseWithCovarianceStamped,
     ShownPictures,
     TFMessage,
-    VspaceStatus,
     cloud_message,
     compressed_image_message,
     grid_array,
     grid_message,
     header,
-    matrix_from_pose,
     odometry_message,
     pose_message,
     scan_message,
@@ -151,7 +159,7 @@ class Stack:
             points["x"], points["y"], points["z"] = seen.T
             self.send("/lidar/points", cloud_message(points, "velodyne", now))
         if self.k % 10 == 0:
-            self.send("/vspace/status", self.status(now))
+            self.send("/vspace/status", ready_vspace(now))
         if self.page:
             self.show(now)
 
@@ -183,26 +191,6 @@ class Stack:
             ),
         )
 
-    def status(self, now: int) -> VspaceStatus:
-        fields = {field.name: 0 for field in dataclasses.fields(VspaceStatus)}
-        fields |= dict.fromkeys(
-            ("ready_radius_m", "psnr_db", "expected_psnr_db", "unseen_share", "train_seconds", "ready_seconds"), 0.0
-        )
-        fields |= dict.fromkeys(("ms_per_iteration", "render_ms", "render_fps"), 0.0)
-        fields.pop("__msgtype__", None)
-        return VspaceStatus(
-            **fields
-            | {
-                "header": header("map", now),
-                "state": VspaceStatus.READY,
-                "keyframe_pose": pose_message(np.eye(4)),
-                "keyframe_stamp": to_time(now),
-                "ready_radius_m": 100.0,
-                "device": "cpu",
-                "message": "",
-            }
-        )
-
     def drive(self, seconds: float, command: tuple[float, float] | None) -> list[ControlState]:
         return [self.step(command) for _ in range(round(seconds * 20))]
 
@@ -212,40 +200,16 @@ def modes(states: list[ControlState]) -> list[int]:
     return [mode for i, mode in enumerate(listed) if i == 0 or listed[i - 1] != mode]
 
 
-def test_the_nodes_together_bring_the_operator_through_and_back() -> None:
-    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
-    states = stack.drive(1.5, None) + stack.drive(20.0, (0.4, 0.0))
-    said = ControlState
-    assert modes(states) == [said.STOPPED, said.REAL, said.ENTERING, said.VIRTUAL, said.RETURNING, said.REAL]
-    assert not stack.contact
-    assert states[-1].transitions == 5
-    # The v-bot went straight through the box, the r-bot round it.
-    virtual = [s for s in states if s.mode == ControlState.VIRTUAL]
-    vbot = np.array([pose2_from_matrix(matrix_from_pose(s.vbot_pose)) for s in virtual])
-    robot = np.array([pose2_from_matrix(matrix_from_pose(s.robot_pose)) for s in virtual])
-    assert np.abs(vbot[:, 1]).max() < 0.01
-    assert ((vbot[:, 0] > 2.5) & (vbot[:, 0] < 3.0)).sum() > 10
-    assert np.abs(robot[:, 1]).max() > 0.5
-    # No leap of what the operator sees: 0.5 m/s for 50 ms is 2.5 cm.
-    assert np.linalg.norm(np.diff(vbot[:, :2], axis=0), axis=1).max() < 0.03
-    for topic in ("/ic/subgoal", "/ic/trajectory", "/costmap", "/nav/cmd_vel", "/nav/path"):
-        assert stack.bus.messages(topic), topic
-
-
 @pytest.mark.parametrize(
     ("topic", "reason", "period_s"),
     [
-        ("/scan", Reason.SCAN_STALE, 0.1),
-        ("/lidar/points", Reason.POINTS_STALE, 0.1),
         ("/wheel/odom", Reason.ODOMETRY_STALE, 0.05),
         ("/operator/cmd_vel", Reason.DRIVE_ROBOT, 0.05),
         ("/camera/image/compressed", Reason.CAMERA_STALE, 0.1),
-        ("/pose", Reason.POSE_STALE, 0.1),
     ],
 )
 def test_each_loss_sends_zero_within_0_3_s_of_the_next_message(topic: str, reason: Reason, period_s: float) -> None:
     stack = Stack(np.zeros((0, 2, 2)))
-    stack.cloud = kerb(8.0)
     stack.drive(1.5, None)
     assert twist_values(stack.drive(1.0, (0.4, 0.0))[-1].applied_command)[0] == pytest.approx(0.4)
     stack.silent.add(topic)
@@ -254,7 +218,7 @@ def test_each_loss_sends_zero_within_0_3_s_of_the_next_message(topic: str, reaso
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
     assert states[-1].reason_code == reason
     assert states[-1].mode == ControlState.REAL  # a short gap changes no view
-    states = stack.drive(2.0, (0.4, 0.0))
+    states = stack.drive(1.3, (0.4, 0.0))
     expected = ControlState.REAL if topic == "/operator/cmd_vel" else ControlState.STOPPED
     assert states[-1].mode == expected
 
@@ -273,7 +237,7 @@ def test_a_doubt_about_the_pose_holds_until_the_next_report() -> None:
         return twist_values(stack.drive(seconds, (0.4, 0.0))[-1].applied_command)[0]
 
     report(0.2)
-    assert speed_m_s(4.0) == pytest.approx(ArbiterConfig().pose_trust.speed_m_s)  # poses go on, reports do not
+    assert speed_m_s(1.5) == pytest.approx(ArbiterConfig().pose_trust.speed_m_s)  # poses go on, reports do not
     report(0.0)
     assert speed_m_s(1.0) == pytest.approx(0.4)
 
@@ -333,26 +297,13 @@ def test_a_changed_command_is_obeyed_before_the_next_timer() -> None:
     assert len(stack.bus.records("/cmd_vel")) == count + 1
 
 
-def test_the_robot_goes_on_after_a_long_loss_only_when_the_controls_were_let_go() -> None:
-    stack = Stack(np.zeros((0, 2, 2)))
-    stack.drive(1.5, None)
-    stack.drive(0.5, (0.4, 0.0))
-    stack.silent.add("/scan")
-    assert stack.drive(2.5, (0.4, 0.0))[-1].mode == ControlState.STOPPED
-    stack.silent.clear()
-    state = stack.drive(2.0, (0.4, 0.0))[-1]
-    assert state.mode == ControlState.STOPPED
-    assert state.reason_code == Reason.RELEASE_CONTROLS
-    assert stack.drive(0.2, (0.0, 0.0))[-1].mode == ControlState.REAL
-
-
 def test_emergency_stop_acts_at_once_and_holds() -> None:
     stack = Stack(np.zeros((0, 2, 2)))
     stack.drive(1.5, None)
     stack.drive(1.0, (0.4, 0.0))
     stack.bus.publish("/operator/estop", Bool(data=True), latched=True)
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)  # before any timer
-    states = stack.drive(3.0, (0.4, 0.0))
+    states = stack.drive(1.0, (0.4, 0.0))
     assert {s.mode for s in states} == {ControlState.STOPPED}
     assert states[-1].estop
     stack.bus.publish("/operator/estop", Bool(data=False), latched=True)
@@ -374,44 +325,6 @@ def test_an_old_release_of_one_client_does_not_end_the_emergency_stop_of_another
     stack.bus.publish("/operator/cmd_vel", twist_stamped(0.0, 0.0, stack.now), publisher="host_bridge")
     stack.arbiter.on_estop(release._replace(publish_ns=3_000))  # its latest word
     assert not stack.arbiter.latch.pressed
-
-
-def test_the_robot_stands_when_the_navigator_or_the_vbot_dies() -> None:
-    for dead in (NavigatorNode, VirtualRobotNode):
-        stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
-        stack.drive(1.5, None)
-        assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
-        victim = next(node for node in stack.bus.nodes if isinstance(node, dead))
-        victim.close()
-        stack.bus.nodes.remove(victim)
-        stack.drive(0.35, (0.4, 0.0))
-        assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
-        assert stack.drive(2.0, (0.4, 0.0))[-1].mode == ControlState.STOPPED
-
-
-def test_a_lost_operator_stops_the_robot_in_virtual_mode_within_its_time() -> None:
-    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
-    stack.drive(1.5, None)
-    assert stack.drive(5.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
-    # Hands off with the page open: zeros go on at the console's 10 Hz, and the robot closes up.
-    states = []
-    for _ in range(10):
-        states += [stack.step((0.0, 0.0)), stack.step(None)]
-    assert all(state.reason_code != Reason.OPERATOR_LOST for state in states)
-    assert twist_values(states[-1].applied_command) != (0.0, 0.0)
-    states = stack.drive(0.35, None)  # the page is gone
-    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
-    assert states[-1].mode == ControlState.VIRTUAL
-    assert states[-1].reason_code == Reason.OPERATOR_LOST
-    stood = stack.base.pose.copy()
-    stack.drive(0.5, (0.0, 0.0))  # back
-    assert twist_values(stack.bus.last("/cmd_vel")) != (0.0, 0.0)
-    assert np.abs(stack.base.pose - stood).max() > 0.01  # it may have to turn first
-    assert stack.drive(3.0, None)[-1].mode == ControlState.STOPPED
-    stood = stack.base.pose.copy()
-    assert stack.drive(3.0, None)[-1].reason_code == Reason.OPERATOR_LOST
-    np.testing.assert_allclose(stack.base.pose, stood, atol=1e-12)
-    assert stack.drive(0.2, (0.0, 0.0))[-1].mode == ControlState.REAL
 
 
 def lose_the_operator(stack: Stack, beats_end_s: float, hidden: bool = False, console_dies: bool = False) -> float:
@@ -464,8 +377,8 @@ def virtual_stack() -> Iterator[Stack]:
 
 @pytest.mark.parametrize(
     ("fault", "beats_end_s", "most_s"),
-    [({}, 0.4, 0.26), ({}, 0.449, 0.26), ({"hidden": True}, 0.43, 0.005), ({"console_dies": True}, 0.43, 0.305)],
-    ids=["page falls silent", "page falls silent at another time", "page is hidden", "console dies"],
+    [({}, 0.449, 0.26), ({"hidden": True}, 0.43, 0.005), ({"console_dies": True}, 0.43, 0.305)],
+    ids=["page falls silent", "page is hidden", "console dies"],
 )
 def test_the_robot_stands_within_0_3_s_of_the_loss_of_the_operators_page(
     virtual_stack: Stack, fault: dict[str, bool], beats_end_s: float, most_s: float
@@ -492,18 +405,9 @@ def test_diagnoses_of_the_start_are_cleared() -> None:
     assert arbiter.diagnoses()["pose"][0] == WARN
     stack.silent.clear()
     stack.drive(2.0, None)
-    stack.drive(6.0, (0.4, 0.0))
+    stack.drive(1.0, (0.4, 0.0))
     for node in stack.bus.nodes:
         assert {name: d for name, d in node.diagnoses().items() if d[0] != OK} == {}, node.name
-
-
-def test_the_arbiter_leaves_a_zero_behind() -> None:
-    stack = Stack(np.zeros((0, 2, 2)))
-    stack.drive(1.5, None)
-    stack.drive(1.0, (0.4, 0.0))
-    assert twist_values(stack.bus.last("/cmd_vel"))[0] > 0
-    stack.bus.close()
-    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
 
 
 def kerb(x: float) -> np.ndarray:
@@ -515,7 +419,7 @@ def kerb(x: float) -> np.ndarray:
 def test_a_kerb_that_the_flat_scan_does_not_see_stops_the_robot() -> None:
     stack = Stack(np.zeros((0, 2, 2)))
     stack.cloud = kerb(2.5)
-    states = stack.drive(1.5, None) + stack.drive(12.0, (0.4, 0.0))
+    states = stack.drive(1.5, None) + stack.drive(6.0, (0.4, 0.0))
     assert stack.base.pose[0] + 0.30 < 2.5
     assert stack.base.pose[0] > 1.5
     assert states[-1].blocked
@@ -537,7 +441,7 @@ def test_3d_points_are_needed_once_they_have_come() -> None:
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
     assert states[-1].reason_code == Reason.POINTS_STALE
     assert stack.drive(1.5, (0.4, 0.0))[-1].mode == ControlState.STOPPED
-    assert stack.drive(12.0, (0.0, 0.0))[-1].mode == ControlState.STOPPED  # however long they are gone
+    assert stack.drive(5.0, (0.0, 0.0))[-1].mode == ControlState.STOPPED  # however long they are gone
     stack.silent.clear()
     assert stack.drive(1.0, (0.0, 0.0))[-1].mode == ControlState.REAL
 

@@ -118,17 +118,14 @@ class TestFollower:
     @pytest.mark.parametrize(
         "goal",
         [
-            (2.0, 0.0, 0.0),
             (1.5, 1.0, 0.0),
             (-1.5, 0.3, 0.5),
-            (0.0, 1.2, -2.0),
             (0.0, 0.0, 3.0),
             (0.4, 0.1, 0.0),
-            (-0.4, 0.0, 0.0),
         ],
     )
     def test_it_arrives_with_the_yaw_asked_for_and_stays(self, goal: tuple[float, float, float]) -> None:
-        log = follow(goal, 20.0)
+        log = follow(goal, 15.0)
         assert {state for state, *_ in log[-20:]} == {"arrived"}
         end = log[-1][1]
         assert np.linalg.norm(end[:2] - goal[:2]) < 0.12

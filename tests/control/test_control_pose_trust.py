@@ -14,7 +14,7 @@ FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)
 
 def loop() -> Loop:
     walls = corridor(16.0)
-    world = World(np.concatenate([walls, rectangle(7.0, -0.25, 7.5, 0.25)]))
+    world = World(np.concatenate([walls, rectangle(4.0, -0.25, 4.5, 0.25)]))
     made = Loop(world, draw_map(walls, (-2, -1.2, 14.0, 1.2)))
     made.start()
     return made
@@ -91,7 +91,7 @@ def test_what_the_robot_can_have_driven_during_a_pause_is_no_jump() -> None:
 def test_no_switch_with_a_pose_in_doubt() -> None:
     made = loop()
     made.pose_lost = 0.2
-    drive(made, 45.0, FORWARD)
+    drive(made, 30.0, FORWARD)
     assert made.modes() == ["STOPPED", "REAL"]
     assert made.frames[-1].decision.reason_code == Reason.POSE_DOUBTFUL
     assert made.frames[-1].command == NOTHING

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from control_world import rectangle
 from test_control_nodes import Stack, modes
@@ -13,7 +14,8 @@ from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bag.replay import make_node, replay
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.lockstep import Record
-from instant_ic.msg import ControlState, deserialize, serialize, twist_stamped, twist_values
+from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.msg import ControlState, deserialize, matrix_from_pose, serialize, twist_stamped, twist_values
 
 NODES = ("virtual_robot", "navigator", "arbiter")  # in the order in which the drive starts them
 MADE = ("/cmd_vel", "/ic/state", "/ic/subgoal", "/ic/trajectory", "/costmap", "/nav/cmd_vel", "/nav/path", "/vbot/odom")
@@ -34,6 +36,7 @@ class Drive:
 
         stack.bus.route = keep  # type: ignore[method-assign]
         self.states = stack.drive(1.5, None) + stack.drive(15.0, (0.4, 0.0))
+        self.contact = stack.contact
         self.made = {topic: [(r.stamp_ns, r.payload) for r in stack.bus.records(topic)] for topic in MADE}
 
     def replayed(
@@ -56,9 +59,22 @@ def drive() -> Drive:
     return Drive()
 
 
-def test_a_replay_makes_every_message_of_the_drive_again_bit_for_bit(drive: Drive, tmp_path: Path) -> None:
+def test_the_nodes_together_bring_the_operator_through_and_back(drive: Drive) -> None:
     said = ControlState
-    assert modes(drive.states)[:5] == [said.STOPPED, said.REAL, said.ENTERING, said.VIRTUAL, said.RETURNING]
+    assert modes(drive.states) == [said.STOPPED, said.REAL, said.ENTERING, said.VIRTUAL, said.RETURNING, said.REAL]
+    assert not drive.contact and drive.states[-1].transitions == 5
+    # The v-bot went straight through the box, the r-bot round it.
+    virtual = [s for s in drive.states if s.mode == ControlState.VIRTUAL]
+    vbot = np.array([pose2_from_matrix(matrix_from_pose(s.vbot_pose)) for s in virtual])
+    robot = np.array([pose2_from_matrix(matrix_from_pose(s.robot_pose)) for s in virtual])
+    assert np.abs(vbot[:, 1]).max() < 0.01
+    assert ((vbot[:, 0] > 2.5) & (vbot[:, 0] < 3.0)).sum() > 10
+    assert np.abs(robot[:, 1]).max() > 0.5
+    # No leap of what the operator sees: 0.5 m/s for 50 ms is 2.5 cm.
+    assert np.linalg.norm(np.diff(vbot[:, :2], axis=0), axis=1).max() < 0.03
+
+
+def test_a_replay_makes_every_message_of_the_drive_again_bit_for_bit(drive: Drive, tmp_path: Path) -> None:
     again = drive.replayed(tmp_path)
     for topic in MADE:
         live = [made for made in drive.made[topic] if made[0] <= drive.sent[-1].stamp_ns]

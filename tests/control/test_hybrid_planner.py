@@ -142,7 +142,7 @@ def test_every_reason_says_why() -> None:
     assert "within 5 steps of the search" in plan(maze, (0, 0, 0), (3.0, 0, 0), max_iterations=5).reason
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_pose_of_any_path_touches_anything(seed: int) -> None:
     """Random posts and blocks; every pose and every 5 cm between them by the oracle above."""
     rng = np.random.default_rng(seed)

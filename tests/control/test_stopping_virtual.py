@@ -46,7 +46,7 @@ LOSSES: dict[str, Callable[[Stack], None]] = {
 def test_each_loss_in_virtual_commands_a_hard_zero_within_0_3_s(loss: str) -> None:
     stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
     stack.drive(1.5, None)
-    assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
+    assert stack.drive(5.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
     assert twist_values(stack.bus.last("/cmd_vel")) != (0.0, 0.0)
     LOSSES[loss](stack)
     began_ns, before = stack.now, len(stack.bus.records("/cmd_vel"))
