@@ -87,11 +87,11 @@ class _Subscription:
 
 
 class _Transport(threading.Event):
-    run_dir: Path | None = None
     patient = False
 
-    def __init__(self, bus: LockstepBus, node: str) -> None:
+    def __init__(self, bus: LockstepBus, node: str, run_dir: Path | None) -> None:
         super().__init__()
+        self.run_dir = run_dir
         self._bus = bus
         self._node = node
         self.waiting = 0
@@ -118,11 +118,17 @@ class LockstepBus(Closing):
         start_ns: the clock's first value.
         keep: keep all messages for :meth:`messages`; switch it off for long replays.
         on_record: called with every message that a node publishes, for a recorder.
+        run_dir: run directory of the nodes; None: they have none.
     """
 
     def __init__(
-        self, start_ns: int = 1_000_000_000, keep: bool = True, on_record: Callable[[Record], None] | None = None
+        self,
+        start_ns: int = 1_000_000_000,
+        keep: bool = True,
+        on_record: Callable[[Record], None] | None = None,
+        run_dir: Path | None = None,
     ) -> None:
+        self._run_dir = run_dir
         self.clock = ManualClock(start_ns)
         self.nodes: list[Node[Any]] = []
         self._transports: dict[Node[Any], _Transport] = {}
@@ -155,7 +161,7 @@ class LockstepBus(Closing):
         """
         configuration = node_class.config_class()() if config is None else config
         label = name or node_class.name
-        transport = _Transport(self, label)
+        transport = _Transport(self, label, self._run_dir)
         node = node_class(configuration, transport, self.clock, name, namespace, remaps, lockstep=True, **parts)
         self.nodes.append(node)
         self._transports[node] = transport
@@ -211,6 +217,15 @@ class LockstepBus(Closing):
         """Return the newest message of a topic, decoded; None before the first."""
         records = self._records.get(topic)
         return deserialize(records[-1].payload, records[-1].type_name) if records else None
+
+    def kill(self, node: Node[Any]) -> None:
+        """Remove a node as SIGKILL does: no teardown, and nobody gets its latched values any more."""
+        self.nodes.remove(node)
+        transport = self._transports.pop(node)
+        for subscriptions in self.subscriptions.values():
+            subscriptions[:] = [each for each in subscriptions if each.transport is not transport]
+        for values in self.latched.values():
+            values.pop(node.node_name, None)
 
     def close(self) -> None:
         """Run every node's ``teardown``, the last added first."""

@@ -126,13 +126,13 @@ class Arbiter:
             self._since_ns = now_ns
         self._interrupted = self._interruption(inputs, now_ns)
         self._awaits_operator |= self._interrupted is not None
-        snapshot = self._assess(inputs, now_ns)
+        snapshot = self.assess(inputs, now_ns)
         rows = (row for row in TRANSITIONS if row.source == self.mode)
         row = next((row for row in rows if GUARD_FUNCTIONS[row.guard](snapshot)), None)
         if row is not None:
             self._take(row, snapshot, now_ns)
             # The driven robot has changed, and with it prediction and gap.
-            snapshot = self._assess(inputs, now_ns)
+            snapshot = self.assess(inputs, now_ns)
         self._yaw_gap_before = snapshot.yaw_gap_rad
         if self.mode == Mode.STOPPED:
             self._contradictions = inputs.contradictions
@@ -214,7 +214,7 @@ class Arbiter:
 
     # -- assessing the inputs
 
-    def _assess(self, inputs: ArbiterInputs, now_ns: int) -> Snapshot:
+    def assess(self, inputs: ArbiterInputs, now_ns: int) -> Snapshot:
         """Return the snapshot of this step; keeps the instants from which its durations count."""
         in_mode_s = self._since_s(self._since_ns, now_ns, 0.0)
         operator = self._operator

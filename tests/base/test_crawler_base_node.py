@@ -70,21 +70,6 @@ def test_drives_forward_and_tells_odometry_transform_and_battery(bench: Bench) -
     assert bench.level("link") == bench.level("battery") == bench.level("controller") == OK
 
 
-def test_turning_left_turns_the_odometry_left(bench: Bench) -> None:
-    bench.run(1.0, v=0.0, w=0.5)
-    left, right = bench.emulator.target_speed_pps
-    assert (left, right) == (-600, 600)  # 0.5 rad/s * 0.3 m * 4000 pulses/m
-    assert twist_values(bench.bus.last("/wheel/odom"))[1] == pytest.approx(0.5, abs=0.03)
-
-
-def test_stops_when_commands_cease(bench: Bench) -> None:
-    bench.run(1.0, v=0.5)
-    assert bench.emulator.speed_pps.min() > 1900
-    bench.run(0.25 + 0.1 + 0.5 / 4.0)  # the time-out and steps, then the hard ramp
-    assert np.abs(bench.emulator.speed_pps).max() == 0.0
-    assert not bench.emulator.watchdog_fired  # it was the node that stopped, in time
-
-
 def test_old_and_senseless_commands_are_dropped_and_told(bench: Bench) -> None:
     bench.run(0.2)
     now_ns = bench.bus.clock.now_ns()
@@ -115,13 +100,6 @@ def test_unstamped_twist_is_refused_or_counts_from_its_arrival() -> None:
     refusing.run(0.2)
     assert refusing.emulator.target_speed_pps.max() == 0.0
     assert "has no stamp" in refusing.node.diagnoses()["command"][1] and refusing.node.source.dropped == 2
-
-
-def test_controllers_watchdog_stops_the_motors_when_the_node_is_dead(bench: Bench) -> None:
-    bench.run(1.0, v=0.5)
-    bench.emulator.advance(0.31)  # nothing on the line: the node hangs or was killed
-    assert bench.emulator.watchdog_fired
-    assert np.abs(bench.emulator.speed_pps).max() == 0.0
 
 
 def test_closing_the_node_stops_the_motors_at_once(bench: Bench) -> None:
@@ -156,13 +134,6 @@ def test_low_battery_and_faults_are_told(bench: Bench) -> None:
     assert bench.bus.last("/battery").percentage == 0.0
 
 
-def test_the_controllers_emergency_stop_input_is_told_on_each_change(bench: Bench) -> None:
-    for status in (0, 0x0001, 0x0001, 0):
-        bench.emulator.status = status
-        bench.run(1.5)
-    assert [message.data for message in bench.bus.messages("/robot/estop")] == [False, True, False]
-
-
 def test_recent_events_leave_the_window() -> None:
     recent = RecentCount(10.0)
     assert recent.count(0) == 0
@@ -184,18 +155,6 @@ def test_repeats_are_told() -> None:
     assert bench.level("replies") == WARN
     bench.run(1.1)
     assert bench.level("replies") == OK
-
-
-def test_a_warning_of_what_is_over_is_taken_back() -> None:
-    bench = Bench(recent_s=2.0)
-    bench.run(0.2)
-    bench.command(twist_stamped(0.5, 0.0, bench.bus.clock.now_ns() - 500 * MILLISECOND))
-    bench.emulator.encoder += 10_000_000.0  # 2.5 km in no time
-    bench.run(1.0, v=0.1)
-    assert bench.level("command") == bench.level("encoders") == WARN
-    bench.run(3.1)
-    assert bench.node.diagnoses()["command"][:2] == (OK, "none dropped in the last 2 s")
-    assert bench.level("encoders") == OK
 
 
 def test_a_controller_that_is_not_there_yet_is_an_error_only_after_a_while(bench: Bench) -> None:
@@ -239,15 +198,6 @@ def test_thread_stops_the_motors_when_its_work_fails() -> None:
     assert told == ["broken", ""]
     assert emulator.target_speed_pps.tolist() == [0.0, 0.0]
     assert port.closed
-
-
-def test_shipped_parameters_are_the_defaults() -> None:
-    from pathlib import Path
-
-    from instant_ic.config.params import build, load_file
-
-    path = Path(__file__).resolve().parents[2] / "config" / "robot.yaml"
-    assert build(CrawlerBaseConfig, load_file(path, "crawler_base")) == CrawlerBaseConfig()
 
 
 def test_clock_set_back_delays_neither_the_next_connection_nor_the_next_battery_reading() -> None:

@@ -16,7 +16,6 @@ from instant_ic.base.protocol import (
     MOTORS_OFF,
     Command,
     ProtocolError,
-    crc16,
     decode_reply,
     describe_status,
     encode_reply,
@@ -25,11 +24,6 @@ from instant_ic.base.protocol import (
 )
 from instant_ic.base.roboclaw import ControllerStatus, LinkError, Roboclaw
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
-
-
-def test_crc_has_the_check_value_of_xmodem() -> None:
-    assert crc16(b"123456789") == 0x31C3
-    assert crc16(b"") == 0
 
 
 @pytest.mark.parametrize(
@@ -133,16 +127,6 @@ def test_driver_reads_and_writes_what_the_emulator_holds() -> None:
     assert emulator.target_speed_pps.tolist() == [0.0, 0.0]
 
 
-def test_driver_tells_two_and_four_byte_status_apart() -> None:
-    emulator = RoboclawEmulator()
-    emulator.status, emulator.status_bytes = 0x0020, 2
-    old, _ = connected(emulator)
-    assert old.status().faults == ["main voltage high"]
-    emulator.status, emulator.status_bytes = 0x0020, 4
-    new, _ = connected(emulator)
-    assert new.status().faults == ["logic voltage low"]
-
-
 @pytest.mark.parametrize("limit_bytes", [0, 2, 4])
 def test_the_speed_error_limit_is_set_and_read_back_in_each_firmwares_form(limit_bytes: int) -> None:
     emulator = RoboclawEmulator()
@@ -225,11 +209,6 @@ def test_driver_over_a_real_pseudo_terminal(pty_controller: PtyController) -> No
         assert roboclaw.battery_v() == pytest.approx(24.1)
         roboclaw.stop()
     assert pty_controller.emulator.target_speed_pps.tolist() == [0.0, 0.0]
-
-
-def test_port_that_is_not_there_is_told() -> None:
-    with pytest.raises(LinkError, match=r"/dev/no_such_port: cannot be opened"):
-        Roboclaw(RoboclawConfig(port="/dev/no_such_port")).connect()
 
 
 def test_vendors_library_understands_the_emulator(pty_controller: PtyController) -> None:

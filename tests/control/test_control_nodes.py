@@ -24,8 +24,6 @@ from control_world import (
 
 from instant_ic.bus import OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.bus.transport import Received
-from instant_ic.config import params
 from instant_ic.console.drive import DriveConfig, DriveGate
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import LETHAL
@@ -48,15 +46,14 @@ from instant_ic.msg import (
     odometry_message,
     pose_message,
     scan_message,
-    serialize,
     to_time,
     transform_message,
     twist_stamped,
     twist_values,
 )
 from nodes.arbiter import ArbiterNode
-from nodes.navigator import NavigatorConfig, NavigatorNode
-from nodes.virtual_robot import VirtualRobotConfig, VirtualRobotNode
+from nodes.navigator import NavigatorNode
+from nodes.virtual_robot import VirtualRobotNode
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "control.yaml"
 STEP_NS = 50_000_000
@@ -74,14 +71,6 @@ def test_parameters_that_cannot_be_used_change_nothing(monkeypatch: pytest.Monke
         arbiter.parameters.set({"limits.max_linear_m_s": 0.4, "prediction.padding_m": 0.1})
     assert arbiter.config is before and arbiter.arbiter.config is before
     assert arbiter.parameters.set({"switch.min_real_s": 2.0}) == {"switch.min_real_s": 2.0}
-
-
-@pytest.mark.parametrize(
-    ("name", "config_class"),
-    [("arbiter", ArbiterConfig), ("virtual_robot", VirtualRobotConfig), ("navigator", NavigatorConfig)],
-)
-def test_shipped_parameters_are_the_defaults(name: str, config_class: type) -> None:
-    assert params.build(config_class, params.load_file(CONFIG, name)) == config_class()
 
 
 class Stack:
@@ -309,22 +298,6 @@ def test_emergency_stop_acts_at_once_and_holds() -> None:
     stack.bus.publish("/operator/estop", Bool(data=False), latched=True)
     assert stack.drive(1.0, (0.4, 0.0))[-1].mode == ControlState.STOPPED  # the key is still down
     assert stack.drive(0.5, (0.0, 0.0))[-1].mode == ControlState.REAL
-
-
-@pytest.mark.parametrize("release_first", [True, False])
-def test_an_old_release_of_one_client_does_not_end_the_emergency_stop_of_another(release_first: bool) -> None:
-    """As after a restart of the arbiter, when the latched values of all clients come in any order."""
-    stack = Stack(np.zeros((0, 2, 2)))
-    stop, release = (
-        Received("/operator/estop", "std_msgs/msg/Bool", bytes(serialize(Bool(data=data))), stamp, 0, 0, node)
-        for data, stamp, node in ((True, 2_000, "console"), (False, 1_000, "host_bridge"))
-    )
-    for received in (release, stop) if release_first else (stop, release):
-        stack.arbiter.on_estop(received)
-    assert stack.arbiter.latch.pressed
-    stack.bus.publish("/operator/cmd_vel", twist_stamped(0.0, 0.0, stack.now), publisher="host_bridge")
-    stack.arbiter.on_estop(release._replace(publish_ns=3_000))  # its latest word
-    assert not stack.arbiter.latch.pressed
 
 
 def lose_the_operator(stack: Stack, beats_end_s: float, hidden: bool = False, console_dies: bool = False) -> float:

@@ -5,7 +5,6 @@ The operator holds the key all the time. A frozen node is taken off the bus, and
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -108,14 +107,6 @@ def test_a_suspended_machine_waits_for_a_release(mode: Mode) -> None:
     assert_waits_for_a_release(stack, "this computer was suspended")
 
 
-def test_a_machine_that_is_suspended_while_the_arbiter_is_frozen_waits_for_a_release() -> None:
-    stack = stack_in(Mode.REAL)
-    freeze(stack, ["arbiter"], 0.2)
-    stack.bus.clock.suspend(0.5)
-    freeze(stack, ["arbiter"], 0.2)
-    assert_waits_for_a_release(stack, "this computer was suspended")
-
-
 @pytest.mark.parametrize(
     ("name", "mode"), [("navigator", Mode.REAL), ("navigator", Mode.VIRTUAL), ("virtual_robot", Mode.REAL)]
 )
@@ -172,14 +163,6 @@ def test_a_source_that_ended_in_a_freeze_moves_nothing_even_if_the_clock_was_set
     assert set(commands(stack, since)) == {NOTHING}
 
 
-def test_a_command_that_is_no_number_is_no_release() -> None:
-    stack = stack_in(Mode.REAL)
-    freeze(stack, ["arbiter"], 2.0)
-    stack.drive(0.5, KEY)
-    assert {state.mode for state in stack.drive(2.0, (math.nan, 0.0))} == {Mode.STOPPED}
-    assert_waits_for_a_release(stack, "stood still")
-
-
 def test_silence_after_a_held_key_is_no_release() -> None:
     """The console is frozen, or its link is cut, while the arbiter waits."""
     stack = stack_in(Mode.REAL)
@@ -227,13 +210,6 @@ def test_a_page_that_is_lost_for_a_moment_is_no_release_after_another_loss() -> 
     assert_waits_for_a_release(stack, "no camera image")
 
 
-def test_a_key_held_through_a_short_silence_of_the_commands_drives_on() -> None:
-    stack = stack_in(Mode.REAL)
-    stack.drive(1.2, None)
-    states = stack.drive(1.0, KEY)
-    assert {state.mode for state in states} == {Mode.REAL} and stack.base.v > 0.2
-
-
 def test_a_page_that_is_lost_and_comes_back_with_its_key_held_waits_for_a_release() -> None:
     """The console sends a zero at the loss, and another one before it hears of the key."""
     stack = stack_in(Mode.REAL)
@@ -252,15 +228,6 @@ def test_who_held_nothing_before_a_silence_need_not_release_it(before: tuple[tup
     stack.drive(3.0, None)
     assert {state.mode for state in stack.drive(1.0, KEY)} == {Mode.REAL}
     assert stack.base.v > 0.2
-
-
-def test_a_client_that_sends_nothing_at_rest_is_not_asked_to_release_what_it_does_not_hold() -> None:
-    """Its silence is its release, as that of Foxglove's Teleop panel."""
-    stack = Stack(rectangle(9.0, -0.25, 9.5, 0.25))
-    stack.drive(1.5, None)
-    for _ in range(2):
-        assert {state.mode for state in stack.drive(1.0, KEY)[1:]} == {Mode.REAL}
-        stack.drive(2.0, None)
 
 
 @pytest.mark.parametrize("order", ["command first", "timer first"])

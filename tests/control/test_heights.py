@@ -209,6 +209,16 @@ class TestLayer:
         layer.update(sweep, np.array([0.5, -1.0, math.pi / 2]), self.origin)  # odom in the map
         assert self.marked(layer) == [(0.475, 1.025)]  # (0.5 - 0.01, -1 + 2.0)
 
+    def test_a_low_thing_may_begin_before_where_the_lowest_ring_meets_its_top_and_a_wall_does_not(self) -> None:
+        # -15° ends at 1.605 m on a top of 0.17 m, or on a wall; -13° on the floor at 2.6 m, or on the same wall.
+        top, floor, wall = (1.605, 0.02, 0.17), (2.6, 0.032, 0.0), (1.605, 0.02, 0.2295)
+        low, high = self.layer(), self.layer()
+        for _ in range(3):
+            self.seen(low, top, floor)
+            self.seen(high, top, wall)
+        assert {(1.625, 0.025), (1.575, 0.025), (1.525, 0.025)} == set(self.marked(low))
+        assert {(1.625, 0.025)} == set(self.marked(high))
+
 
 def test_low_and_hanging_things_are_lethal_where_the_flat_scan_sees_free_ground() -> None:
     config = CostmapConfig(width=6.0)
@@ -225,16 +235,6 @@ def test_low_and_hanging_things_are_lethal_where_the_flat_scan_sees_free_ground(
     rolling.reset()
     assert rolling.update(np.zeros(3), None, wall).cost_at(np.array([1.0, 0.01])) == FREE
     assert len(rolling.update(np.zeros(3), None, wall).remembered) == 0
-
-    def test_a_low_thing_may_begin_before_where_the_lowest_ring_meets_its_top_and_a_wall_does_not(self) -> None:
-        # -15° ends at 1.605 m on a top of 0.17 m, or on a wall; -13° on the floor at 2.6 m, or on the same wall.
-        top, floor, wall = (1.605, 0.02, 0.17), (2.6, 0.032, 0.0), (1.605, 0.02, 0.2295)
-        low, high = self.layer(), self.layer()
-        for _ in range(3):
-            self.seen(low, top, floor)
-            self.seen(high, top, wall)
-        assert {(1.625, 0.025), (1.575, 0.025), (1.525, 0.025)} == set(self.marked(low))
-        assert {(1.625, 0.025)} == set(self.marked(high))
 
 
 def test_a_scan_hit_where_3d_points_show_noise_of_a_surface_is_no_obstacle() -> None:

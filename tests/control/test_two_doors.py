@@ -79,13 +79,6 @@ def test_idle_zeros_of_a_second_console_do_not_keep_the_robot_driving_in_virtual
     assert states[-1].holder == SECOND and states[-1].mode == ControlState.REAL  # it may drive, and does not
 
 
-def test_opposing_commands_of_two_doors_do_not_alternate(free: Stack) -> None:
-    states = drive(free, 2.0, 0.3, -0.3)
-    assert {state.holder for state in states} == {FIRST}
-    assert min(sent(free)) >= 0.0 and sent(free)[-1] == pytest.approx(0.3)
-    assert free.arbiter.diagnoses()["operator"][1] == f"{FIRST} drives; refused: {SECOND}"
-
-
 def test_a_command_of_who_does_not_drive_refreshes_no_age_and_is_not_shown(free: Stack) -> None:
     drive(free, 0.5, 0.3, None)
     states = drive(free, 1.0, None, 0.3)
@@ -128,23 +121,6 @@ def test_the_lease_of_a_lost_driver_is_taken_once_the_robot_stands_by_hands_that
     states = drive(free, 0.2, None, 0.0)
     assert states[-1].holder == SECOND
     assert twist_values(drive(free, 0.5, 0.4, 0.3)[-1].applied_command)[0] == pytest.approx(0.3)
-
-
-def test_no_lease_passes_while_the_robot_moves(free: Stack) -> None:
-    drive(free, 1.0, 0.4, None)
-    free.silent.add("/wheel/odom")  # as far as known, it moves on
-    assert drive(free, LEASE_S + 1.0, None, 0.0)[-1].holder == FIRST
-    free.silent.clear()
-    assert drive(free, 0.3, None, 0.0)[-1].holder == SECOND
-
-
-def test_a_lease_that_is_given_back_is_free_at_once(free: Stack) -> None:
-    drive(free, 0.2, 0.0, 0.0)
-    command(free, 0.0, FIRST + RELEASED)
-    assert drive(free, 0.1, None, 0.0)[-1].holder == SECOND
-    command(free, 0.0, FIRST + RELEASED)  # by one who has it no longer
-    assert drive(free, 0.5, None, 0.3)[-1].holder == SECOND
-    assert sent(free)[-1] == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(("after_s", "ends"), [(0.3, "cleanly"), (1.9, "killed"), (3.0, "killed")])
@@ -220,21 +196,6 @@ def test_zeros_of_the_sender_before_are_no_release() -> None:
         )
         notices.append(operator.step(inputs, True, MotionLimits(), 1.5, k * 60_000_000))
     assert notices == [None] * 4 + [Notice(Reason.OPERATOR_LOST, "the operator's link was lost")]
-
-
-def test_who_sends_no_zeros_need_not_release_what_another_held(free: Stack) -> None:
-    drive(free, 1.0, 0.4, None)
-    command(free, 0.0, FIRST + RELEASED)
-    drive(free, LEASE_S + 0.5, None, None)
-    states = drive(free, 1.0, None, 0.4)
-    assert {state.mode for state in states} == {ControlState.REAL} and free.base.v > 0.2
-
-
-def test_a_release_that_moves_is_neither(free: Stack) -> None:
-    drive(free, 0.5, 0.0, None)
-    command(free, 0.3, FIRST + RELEASED)
-    assert drive(free, 0.2, None, None)[-1].holder == FIRST
-    assert not any(sent(free))
 
 
 def test_a_driver_who_gives_the_lease_back_while_driving_stops_the_robot(free: Stack) -> None:

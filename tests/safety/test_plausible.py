@@ -219,3 +219,8 @@ def test_fault_only_the_last_of_two_nodes_of_one_kind_is_compared(tmp_path: Path
     (tmp_path / "stack.yaml").write_text(f"launch:\n- node: {{exec: crawler_base}}\n{consoles}")
     found = check_parameters(read_launch_file(tmp_path / "stack.yaml").nodes)
     assert len(found) == 1 and f"stack.yaml:{3 + order.index('true')}: node console: server.access" in found[0], found
+
+
+def test_overriding_one_value_of_a_polygon_keeps_its_others() -> None:
+    slowdown = configured("arbiter", "collision_monitor.slowdown.slowdown_ratio:=0.5").collision_monitor.slowdown
+    assert (slowdown.slowdown_ratio, slowdown.enabled, slowdown.padding_m) == (0.5, True, 0.10)
