@@ -34,7 +34,7 @@ class ArbiterNode(Node[ArbiterConfig]):
         self.arbiter = Arbiter(c)
         self.surroundings = Surroundings(c.costmap, c.footprint, self.tf)
         self.view = OperatorView(self.tf)
-        self.walls = WallSearch(c.wall_min_length_m, c.costmap.lethal_cost_threshold)
+        self.walls = WallSearch()
         self.walls.submit = self.background(self.walls.find, self.walls.on_found).submit
         self.latch = KeptEstop(self.run_dir, self.clock.now_ns())
         if self.latch.pressed:

@@ -25,12 +25,10 @@ class VirtualRobotConfig(Checked):
     Attributes:
         rate_hz: steps and messages on /vbot/odom, per second.
         state_timeout_s: s without /ic/state after which the v-bot stands still.
-        wall_min_length_m: m; as for the arbiter.
     """
 
     rate_hz: Annotated[float, Plausible(2, 200)] = 20.0
     state_timeout_s: Annotated[float, Plausible(0.05, 2)] = 0.5
-    wall_min_length_m: Annotated[float, Plausible(0.2, 20)] = 1.5
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     vbot: VbotConfig = field(default_factory=VbotConfig)
@@ -44,7 +42,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
 
     def setup(self) -> None:
         self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
-        self.walls = WallSearch(self.config.wall_min_length_m)
+        self.walls = WallSearch()
         self.walls.submit = self.background(self.walls.find, self.walls.on_found).submit
         self.action: VbotAction | None = None
         self.stepped_ns = self.clock.steady_ns()

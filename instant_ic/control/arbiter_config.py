@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, TypeAlias
+from typing import Annotated
 
-from instant_ic.config.ranges import Checked, Plausible, Range, check_ranges, require_protection
+from instant_ic.config.ranges import Checked, Plausible, check_ranges, require_protection
 from instant_ic.control.costmap import CostmapConfig
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.freshness import TimeoutConfig
@@ -18,7 +18,6 @@ from instant_ic.control.subgoal import SubgoalConfig
 
 MOST_BLIND_M = 1.0
 """Longest way at full speed until a source that is lost stops the robot."""
-_Probability: TypeAlias = Annotated[float, Range(above=0, high=1)]
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,6 @@ class SwitchConfig(Checked):
         stop_margin_m: distance in metres kept to an obstacle when no switch is possible.
         min_expected_psnr_db: expected quality in dB that a view of the robot's place needs; 0: not checked.
         ready_hold_s: seconds for which a virtual space that learns its next keyframe counts as ready with the last one.
-        require_view: false: nobody shows the virtual space; views are not waited for and may be missing.
     """
 
     position_m: Annotated[float, Plausible(0.01, 1)] = 0.15
@@ -70,7 +68,6 @@ class SwitchConfig(Checked):
     stop_margin_m: Annotated[float, Plausible(0, 2)] = 0.15
     min_expected_psnr_db: Annotated[float, Plausible(0, 60)] = 12.0
     ready_hold_s: Annotated[float, Plausible(0, 60)] = 2.0
-    require_view: bool = True
 
 
 @dataclass(frozen=True)
@@ -108,7 +105,6 @@ class ArbiterConfig(Checked):
         timeouts: s; with an older message the command is zero. Images (camera, view): late_s after their usual arrival,
             if longer.
         rate_hz: steps of the state machine and messages on /cmd_vel, per second; while the robot rests, at most 10.
-        wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
         unprotected: allows that the polygons stop and approach, the blind radius, the memory or the 3D points are off,
             with a permanent warning.
     """
@@ -124,7 +120,6 @@ class ArbiterConfig(Checked):
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     pose_trust: PoseTrustConfig = field(default_factory=PoseTrustConfig)
     rate_hz: Annotated[float, Plausible(5, 200)] = 20.0
-    wall_min_length_m: Annotated[float, Plausible(0.2, 20)] = 1.5
     costmap: CostmapConfig = field(default_factory=CostmapConfig)
     unprotected: bool = False
 

@@ -14,10 +14,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Percent, Plausible, Range, check_ranges
+from instant_ic.config.ranges import Plausible, Range, check_ranges
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import HeightConfig, HeightLayer, SortedPoints, shifted
-from instant_ic.control.static_map import StaticMap
+from instant_ic.control.static_map import OCCUPIED, StaticMap
 
 FREE = 0
 INSCRIBED = 253
@@ -43,9 +43,6 @@ class CostmapConfig:
         cost_scaling_factor: 1/m; higher: costs fall off faster, paths come closer to obstacles.
         obstacle_max_range: m; farther hits are not marked.
         raytrace_max_range: m; beams clear no farther than this.
-        inf_is_valid: true: +inf (no return) clears too. Not for a VLP-16: anything nearer than 0.4 m gives no return
-            either.
-        lethal_cost_threshold: 0..100; /map cells from this value on are obstacles.
         footprint_clearing_enabled: the cells under the robot are free.
         static_seen_through: consecutive scans that must look through a cell that only the map holds, until it counts as
             free; 0: never.
@@ -60,8 +57,6 @@ class CostmapConfig:
     cost_scaling_factor: Annotated[float, Plausible(0.1, 100)] = 3.0
     obstacle_max_range: Annotated[float, Plausible(1, 100)] = 8.0
     raytrace_max_range: Annotated[float, Plausible(1, 100)] = 8.5
-    inf_is_valid: bool = False
-    lethal_cost_threshold: Percent = 65
     footprint_clearing_enabled: bool = True
     static_seen_through: Annotated[int, Range(0, 255)] = 40
     points: HeightConfig = field(default_factory=HeightConfig)
@@ -196,11 +191,9 @@ def scan_rays(
     map_from_lidar: NDArray[np.float64],
     config: CostmapConfig,
 ) -> ScanRays:
-    """Return the beams of a scan in the map frame.
+    """Return the measured beams of a scan in the map frame (REP-117).
 
-    +inf (nothing within range, REP-117) clears to ``raytrace_max_range`` if ``inf_is_valid``. Use that only with
-    sensors that distinguish «nothing there» from «too near to be seen»; a VLP-16 does not. NaN, -inf and ranges
-    below ``range_min`` neither mark nor clear.
+    A beam without a return neither marks nor clears: a VLP-16 returns nothing from nearer than 0.4 m either.
 
     Args:
         ranges: (N,) metres.
@@ -214,14 +207,11 @@ def scan_rays(
     r = np.asarray(ranges, dtype=np.float64)
     angle = angle_min + angle_increment * np.arange(r.size)
     measured = np.isfinite(r) & (r >= range_min) & (r <= range_max)
-    nothing = np.isposinf(r) if config.inf_is_valid else np.zeros(r.size, dtype=bool)
-    keep = measured | nothing
-    reach = np.where(measured, np.where(np.isfinite(r), r, 0.0), config.raytrace_max_range)
-    hits = measured & (reach <= config.obstacle_max_range)
-    reach = np.minimum(reach, config.raytrace_max_range)[keep]
-    ends_lidar = np.stack([reach * np.cos(angle[keep]), reach * np.sin(angle[keep])], axis=-1)
+    hits = r[measured] <= config.obstacle_max_range
+    reach = np.minimum(r[measured], config.raytrace_max_range)
+    ends_lidar = np.stack([reach * np.cos(angle[measured]), reach * np.sin(angle[measured])], axis=-1)
     ends = ends_lidar @ map_from_lidar[:2, :2].T + map_from_lidar[:2, 3]
-    return ScanRays(map_from_lidar[:2, 3].copy(), ends, hits[keep])
+    return ScanRays(map_from_lidar[:2, 3].copy(), ends, hits)
 
 
 class RollingCostmap:
@@ -353,7 +343,6 @@ class RollingCostmap:
             float(shift[1]),
             self.config.resolution,
             resolution,
-            self.config.lethal_cost_threshold,
             self._through,
             self.config.static_seen_through or 256,
         )
@@ -390,7 +379,6 @@ def _join(
     shift_y: float,
     resolution: float,
     map_resolution: float,
-    lethal_threshold: int,
     through: NDArray[np.uint8],
     seen_through: int,
 ) -> NDArray[np.uint8]:
@@ -408,7 +396,7 @@ def _join(
             if 0 <= row < height and 0 <= columns[c] < width:
                 known = occupancy[row, columns[c]]
             seen = observed[r, c]
-            held = known >= lethal_threshold and through[r, c] < seen_through
+            held = known >= OCCUPIED and through[r, c] < seen_through
             if seen == 254 and dismissed[r, c]:
                 seen = 0
             if held or seen == 254 or occupied[r, c]:

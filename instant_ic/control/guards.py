@@ -159,11 +159,9 @@ def images_agree(s: Snapshot, within_m: float, within_deg: float) -> bool:
     They arrive at different times. The distance driven between the two arrivals is motion, not an error; but the
     operator sees even that as a jump when it is large.
     """
-    inputs, switch = s.inputs, s.config.switch
+    inputs = s.inputs
     if inputs.robot_pose is None or abs(s.yaw_gap_rad) > math.radians(within_deg):
         return False
-    if not switch.require_view:
-        return True
     if inputs.age("view") > s.config.timeouts.allowed_s("view", inputs.usual.get("view")):
         return False
     if inputs.view_position is None or inputs.image_position is None:

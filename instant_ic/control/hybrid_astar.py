@@ -42,7 +42,6 @@ class GridPose(NamedTuple):
 class SearchRules(NamedTuple):
     """Prices and limits of the search; lengths in cells (`planner.PlannerTuning`)."""
 
-    may_reverse: bool
     max_iterations: int
     escape: float
     change_price: float
@@ -75,7 +74,7 @@ ROOM = 4096
 TURNS = np.array([0, 1, -1, 2, -2, 1, -1, 0, 1, -1])
 """Change of heading of each primitive, in bins."""
 LENGTHS = np.array([3.0, 3.0, 3.0, 3.0, 3.0, 0.0, 0.0, -3.0, -3.0, -3.0])
-"""Signed length of each primitive in cells; 0 turns on the spot. The last three need ``may_reverse``."""
+"""Signed length of each primitive in cells; 0 turns on the spot."""
 
 
 @njit(cache=True)
@@ -92,7 +91,7 @@ def cell_weights(
     Args:
         costs: the costmap, (H, W).
         near: mask (H, W) of the previous path.
-        unknown: cost of one cell length in unseen cells; 0: they are walls.
+        unknown: cost of one cell length in unseen cells.
         cost_penalty: extra price of a cell length at cost 252.
         tight: cost above which the robot cannot turn on the spot, and the further price at cost 252.
         retrospective_gain: discount along the previous path.
@@ -312,7 +311,7 @@ def search(
         total, backwards = _straight_to_goal(grid, nodes, node, goal, rules, opened, left, goal_price)
         if total < goal_price:
             goal_price, goal_parent, goal_backwards = total, node, backwards
-        for k in range(len(TURNS) if rules.may_reverse else 7):
+        for k in range(len(TURNS)):
             new_x, new_y = _moved(x, y, heading, k, per_bin)
             c, r = math.floor(new_x), math.floor(new_y)
             if c < 0 or r < 0 or c >= width or r >= height or not np.isfinite(to_go[r, c]):
@@ -373,7 +372,7 @@ def _straight_to_goal(
     backwards = 0
     away = math.hypot(goal.x - nodes.place[node, 0], goal.y - nodes.place[node, 1])
     if nodes.overlap[node] == 0 and (away < 20.0 or opened % max(1, int(away / 12.0)) == 0):
-        for way in range(2 if rules.may_reverse and 0.2 < away < 20.0 else 1):
+        for way in range(2 if 0.2 < away < 20.0 else 1):
             total = _price_to_goal(grid, nodes, node, goal, rules, way, left, goal_price)
             if total < goal_price:
                 goal_price, backwards = total, way

@@ -90,14 +90,10 @@ class PlannerConfig(Checked):
     """Limits of the planner, with the names of nav2's Smac planner.
 
     Attributes:
-        allow_unknown: plan through unseen cells; the driven path still ends before them.
-        allow_reverse_expansion: allow driving backwards, out of dead ends for example.
         footprint_padding: m round the footprint.
         max_iterations: poses after which the search gives up.
     """
 
-    allow_unknown: bool = True
-    allow_reverse_expansion: bool = True
     footprint_padding: NotNegative = 0.02
     max_iterations: PositiveInt = 5000
 
@@ -132,10 +128,10 @@ class HybridPlanner:
     A step costs its length times (1 + cost_penalty·cost/252). Above ``tight_cost``, where the robot cannot turn on the
     spot, up to ``tight_penalty`` is added. Reversing, changing direction and turning cost more.
     No pose puts the footprint (with ``footprint_padding``) on a lethal cell. A robot that stands on lethal cells may
-    leave them, but never go deeper. With ``allow_unknown`` a way may cross unknown cells, but the path ends
-    ``unknown_standoff_m`` before the first of them: the robot drives up, sees more, and plans again. Without it,
-    unknown cells are walls. Cells near the previous path are a little cheaper (``retrospective_gain``), so that the
-    planner does not alternate between two equally good ways. (Prices: `PlannerTuning`.)
+    leave them, but never go deeper. A way may cross unknown cells, but the path ends ``unknown_standoff_m`` before the
+    first of them: the robot drives up, sees more, and plans again. Cells near the previous path are a little cheaper
+    (``retrospective_gain``), so that the planner does not alternate between two equally good ways. (Prices:
+    `PlannerTuning`.)
     """
 
     def __init__(self, config: PlannerConfig, footprint: Footprint | None = None) -> None:
@@ -168,9 +164,7 @@ class HybridPlanner:
         if near == (row, column) and not outside:
             return self._at_the_goal(start, goal)
         grid = _PlannerGrid(self, costmap, before)
-        goal_cost = int(costmap.costs[near])
-        unseen = goal_cost == UNKNOWN and not self.config.allow_unknown
-        taken = goal_cost in (INSCRIBED, LETHAL) or unseen
+        taken = int(costmap.costs[near]) in (INSCRIBED, LETHAL)
         connected = grid.connected(row, column)
         reachable = bool(connected[near])
         target = goal
@@ -194,10 +188,10 @@ class HybridPlanner:
         if on_obstacle:
             reason = f"the goal is on an obstacle; the path ends {gap:.1f} m from it"
         else:
-            reason = self._why_short(gap, opened, outside=outside, reachable=reachable, unseen=unseen)
+            reason = self._why_short(gap, opened, outside=outside, reachable=reachable)
         return Plan(poses, False, reason, length if on_obstacle else math.inf, reverse, opened)
 
-    def _why_short(self, gap_m: float, opened: int, *, outside: bool, reachable: bool, unseen: bool) -> str:
+    def _why_short(self, gap_m: float, opened: int, *, outside: bool, reachable: bool) -> str:
         """Return why a path ends ``gap_m`` metres before the goal."""
         if outside:
             return f"the goal is outside the costmap, {gap_m:.1f} m beyond the path"
@@ -205,8 +199,6 @@ class HybridPlanner:
             return f"no way found within {opened} steps of the search; the path ends {gap_m:.1f} m before the goal"
         if reachable:
             return f"no way to the goal: it is too narrow for the robot {gap_m:.1f} m before it"
-        if unseen:
-            return f"the goal is in space not seen yet; the path ends {gap_m:.1f} m before it"
         return f"no way to the goal: obstacles close it off {gap_m:.1f} m before it"
 
     def _at_the_goal(self, start: NDArray[np.float64], goal: NDArray[np.float64]) -> Plan:
@@ -248,7 +240,7 @@ class _PlannerGrid:
             line = np.clip(np.stack([columns, rows], axis=-1), -10000, 10000).astype(np.int32)
             cv2.polylines(near, [line], False, 1, thickness=round(0.3 / costmap.resolution))
         tight = (TUNING.tight_cost, TUNING.tight_penalty)
-        unknown = 1.0 + TUNING.unknown_penalty if config.allow_unknown else 0.0
+        unknown = 1.0 + TUNING.unknown_penalty
         self.weights = cell_weights(costmap.costs, near, unknown, TUNING.cost_penalty, tight, TUNING.retrospective_gain)
         # The body in cells at each heading, filled: posts inside the outline count too. At a spacing of 0.7 cells
         # every cell whose middle is covered holds a point.
@@ -311,7 +303,6 @@ class _PlannerGrid:
             self.costmap.costs, self.weights, near, (row, column), escape, TUNING.least_weight, TUNING.closed_weight
         )
         rules = SearchRules(
-            may_reverse=self.config.allow_reverse_expansion,
             max_iterations=self.config.max_iterations,
             escape=escape,
             change_price=TUNING.change_penalty_m / resolution,

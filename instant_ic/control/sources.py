@@ -31,7 +31,7 @@ class SourceMonitor:
         The v-bot has been shown for ``shown_s``.
         """
         found = []
-        for source in self._required(mode):
+        for source in _required(mode):
             if source.optional and source.key not in inputs.ages:
                 continue
             age_s = _age_s(source, inputs, in_mode_s, shown_s)
@@ -53,9 +53,7 @@ class SourceMonitor:
     def stale_in_s(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float, shown_s: float = math.inf) -> float:
         """Return seconds until the first fresh source becomes stale; inf for none."""
         left = [
-            self._allowed_s(source, inputs) - _age_s(source, inputs, in_mode_s, shown_s)
-            for source in SOURCES
-            if mode in source.modes
+            self._allowed_s(source, inputs) - _age_s(source, inputs, in_mode_s, shown_s) for source in _required(mode)
         ]
         left.append(self._command_s - inputs.age("command"))
         # 0: not stale yet, but right after this step.
@@ -66,7 +64,7 @@ class SourceMonitor:
 
         Rare images therefore slow the robot, instead of stopping it at each late one.
         """
-        images = [source for source in self._required(mode) if source.key in IMAGES]
+        images = [source for source in _required(mode) if source.key in IMAGES]
         longest_s = max((self._allowed_s(source, inputs) for source in images), default=0.0)
         most = self.config.limits.max_linear_m_s
         return min(most, self.config.timeouts.image_travel_m / longest_s) if longest_s > 0 else most
@@ -77,7 +75,7 @@ class SourceMonitor:
         if speed_m_s <= limit:
             return ""
         rare = max(
-            (source for source in self._required(mode) if source.key in IMAGES),
+            (source for source in _required(mode) if source.key in IMAGES),
             key=lambda source: self._allowed_s(source, inputs),
         )
         usual_s = inputs.usual.get(rare.key, math.inf)
@@ -88,10 +86,6 @@ class SourceMonitor:
         """Return the speed limit of the v-bot; below full speed it is slow enough for the r-bot to catch up."""
         limit = self.speed_limit_m_s(inputs, mode)
         return limit if limit >= self.config.limits.max_linear_m_s else _CATCH_UP * limit
-
-    def _required(self, mode: Mode) -> list[Source]:
-        unused = "" if self.config.switch.require_view else "view"
-        return [source for source in SOURCES if mode in source.modes and source.key != unused]
 
     def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
         return self.config.timeouts.allowed_s(source.key, _usual_s(source, inputs)) - STEP_AFTER_S
@@ -105,6 +99,10 @@ class SourceMonitor:
 def images_too_rare(inputs: ArbiterInputs, config: ArbiterConfig) -> bool:
     """Return whether camera images are too rare to drive by, or their rate is not known yet."""
     return inputs.usual.get("camera", 0.0) > config.timeouts.slowest_image_s
+
+
+def _required(mode: Mode) -> list[Source]:
+    return [source for source in SOURCES if mode in source.modes]
 
 
 def _usual_s(source: Source, inputs: ArbiterInputs) -> float | None:

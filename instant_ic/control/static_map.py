@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+OCCUPIED = 65
+"""Cells from this probability on are obstacles."""
+
 
 @dataclass(frozen=True)
 class StaticMap:

@@ -27,11 +27,9 @@ class SubgoalConfig(Checked):
 
     Attributes:
         extend_m: m; length searched straight on for a free place behind the obstacle.
-        anticipate: send the r-bot behind an obstacle as soon as the v-bot is about to pass it.
     """
 
     extend_m: NotNegative = 3.0
-    anticipate: bool = True
 
 
 @dataclass(frozen=True)
@@ -91,13 +89,13 @@ def choose_subgoal(
     """Return the subgoal for the v-bot's pose (3,) and its predicted trajectory.
 
     The v-bot's pose if free; else the farthest free point of the trajectory; else the first free point straight on
-    from its end, before any wall; else the nearest free cell round the v-bot; else None. With ``anticipate``, a free
-    v-bot that is about to pass an obstacle already sends the r-bot behind it. The r-bot then does not first follow up
-    to the obstacle and turn there.
+    from its end, before any wall; else the nearest free cell round the v-bot; else None. A free v-bot that is about to
+    pass an obstacle already sends the r-bot behind it. The r-bot then does not first follow up to the obstacle and
+    turn there.
     """
     vbot_pose = np.asarray(vbot_pose, dtype=np.float64)
     if _free(costmap, vbot_pose[:2]):
-        if config.anticipate and prediction.hit_index is not None:
+        if prediction.hit_index is not None:
             behind = _straight_on(costmap, prediction.poses[prediction.hit_index], forward, walls, config.extend_m)
             if behind is not None:
                 return Subgoal(behind, "ahead")

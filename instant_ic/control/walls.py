@@ -8,8 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.static_map import StaticMap
+from instant_ic.control.static_map import OCCUPIED, StaticMap
 
+WALL_LENGTH_M = 1.5
+"""A straight run of occupied map cells this long is a wall, a shorter one is an obstacle."""
 WALL_PERIOD_S = 2.0
 """Walls are searched for in a changed map at most this often."""
 
@@ -17,18 +19,18 @@ WALL_PERIOD_S = 2.0
 class WallMap:
     """Distance to the nearest wall of a map.
 
-    Only length separates the two: a straight run of at least ``min_length_m`` is a wall, which the v-bot does not
+    Only length separates the two: a straight run of at least ``WALL_LENGTH_M`` is a wall, which the v-bot does not
     pass. A box, a chair or a person is an obstacle, even where it touches a wall. Curved walls count as obstacles.
     """
 
-    def __init__(self, static: StaticMap, min_length_m: float = 1.5, occupied_threshold: int = 65) -> None:
+    def __init__(self, static: StaticMap) -> None:
         import cv2
 
         self.static = static
-        self.occupied: NDArray[np.bool_] = static.occupancy >= occupied_threshold
+        self.occupied: NDArray[np.bool_] = static.occupancy >= OCCUPIED
         """(H, W) cells that may be part of a wall."""
         occupied = self.occupied.astype(np.uint8)
-        length = max(2, math.ceil(min_length_m / static.resolution))
+        length = max(2, math.ceil(WALL_LENGTH_M / static.resolution))
         lines = cv2.HoughLinesP(occupied * 255, 1.0, math.pi / 180.0, length // 2, minLineLength=length, maxLineGap=3)
         drawn = np.zeros_like(occupied)
         for x0, y0, x1, y1 in np.zeros((0, 4), np.int32) if lines is None else np.reshape(lines, (-1, 4)):
@@ -56,9 +58,7 @@ class WallSearch:
     Finding walls in a large map takes tens of milliseconds, and a map comes each second; most bring nothing new.
     """
 
-    def __init__(self, min_length_m: float = 1.5, occupied_threshold: int = 65) -> None:
-        self.min_length_m = min_length_m
-        self.occupied_threshold = occupied_threshold
+    def __init__(self) -> None:
         self.map: StaticMap | None = None
         self.found: WallMap | None = None
         self.submit: Callable[[StaticMap], None] = lambda static: None
@@ -72,9 +72,9 @@ class WallSearch:
             before is None
             or before.static.resolution != static.resolution
             or not np.array_equal(before.static.origin, static.origin)
-            or not np.array_equal(before.occupied, static.occupancy >= self.occupied_threshold)
+            or not np.array_equal(before.occupied, static.occupancy >= OCCUPIED)
         ):
-            return WallMap(static, self.min_length_m, self.occupied_threshold)
+            return WallMap(static)
         return before
 
     def on_map(self, grid: NDArray[np.int8], resolution: float, origin: tuple[float, float]) -> None:

@@ -109,14 +109,13 @@ def test_the_robot_stands_on_free_ground() -> None:
 
 
 def test_scan_values_by_rep_117() -> None:
-    ranges = np.array([1.0, np.inf, -np.inf, np.nan, 0.1, 30.0])
-    config = CostmapConfig(raytrace_max_range=5.0, obstacle_max_range=4.0, inf_is_valid=True)
+    ranges = np.array([1.0, np.inf, -np.inf, np.nan, 0.1, 30.0, 6.0])
+    config = CostmapConfig(raytrace_max_range=5.0, obstacle_max_range=4.0)
     rays = scan_rays(ranges, 0.0, 0.0, 0.5, 20.0, np.eye(4), config)
-    # The hit, and the beam that met nothing; not the near, the absent, the one out of range.
+    # The two measured ones: the near one marks, the far one only clears.
     np.testing.assert_allclose(rays.ends, [[1.0, 0.0], [5.0, 0.0]])
     assert rays.hits.tolist() == [True, False]
-    assert len(scan_rays(ranges, 0.0, 0.0, 0.5, 20.0, np.eye(4), CONFIG).ends) == 1
-    np.testing.assert_allclose(scan_points(ranges, 0.0, 0.0, 0.5, 20.0), [[1.0, 0.0]])
+    np.testing.assert_allclose(scan_points(ranges, 0.0, 0.0, 0.5, 20.0), [[1.0, 0.0], [6.0, 0.0]])
 
 
 def test_scan_is_placed_by_the_sensors_pose() -> None:

@@ -46,13 +46,13 @@ class TestSubgoal:
     def choose(self, pose: list[float], command: tuple[float, float], **parameters: object) -> object:
         vbot = np.array(pose)
         prediction = PREDICTOR.predict(vbot, command, command, self.costmap)
-        config = SubgoalConfig(**{"anticipate": False} | parameters)  # type: ignore[arg-type]
+        config = SubgoalConfig(**parameters)  # type: ignore[arg-type]
         return choose_subgoal(self.costmap, vbot, prediction, command[0] >= 0, None, config)
 
     def test_a_free_vbot_is_the_subgoal(self) -> None:
-        found = self.choose([0.5, 0.0, 0.1], (0.4, 0.0))
+        found = self.choose([0.0, 0.0, 0.1], (0.4, 0.0))
         assert found.rule == "vbot"
-        np.testing.assert_allclose(found.pose, [0.5, 0.0, 0.1])
+        np.testing.assert_allclose(found.pose, [0.0, 0.0, 0.1])
 
     def test_a_vbot_leaving_the_obstacle_sends_the_robot_to_the_farthest_free_point(self) -> None:
         found = self.choose([2.2, 0.0, 0.0], (0.4, 0.0))
@@ -73,7 +73,7 @@ class TestSubgoal:
         assert np.linalg.norm(found.pose[:2] - [1.75, 0.0]) < 0.9
 
     def test_anticipation_looks_behind_the_obstacle_but_not_behind_a_wall(self) -> None:
-        assert self.choose([0.7, 0.0, 0.0], (0.4, 0.0), anticipate=True).rule == "ahead"
+        assert self.choose([0.7, 0.0, 0.0], (0.4, 0.0)).rule == "ahead"
         walls = WallMap(draw_map(np.array([[[1.5, -1.2], [1.5, 1.2]]]), (-2, -1.2, 6, 1.2)))
         vbot = np.array([0.7, 0.0, 0.0])
         prediction = PREDICTOR.predict(vbot, (0.4, 0.0), (0.4, 0.0), self.costmap)

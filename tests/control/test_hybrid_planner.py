@@ -62,9 +62,6 @@ def test_out_of_a_dead_end_too_narrow_to_turn_in_it_backs() -> None:
     assert found.reverse[1:25].all()
     assert np.ptp(found.poses[:25, 2]) < 0.25
     assert not any(touches(costmap, pose) for pose in found.poses)
-    stuck = plan(costmap, (0.6, 0.0, 0.0), (2.5, 0.0, 0.0), allow_reverse_expansion=False)
-    assert not stuck.reached
-    assert "too narrow" in stuck.reason
 
 
 @pytest.mark.parametrize("width", [0.60, 0.70, 0.90])
@@ -112,17 +109,13 @@ def test_a_robot_that_stands_on_an_obstacle_leaves_it_and_never_goes_deeper() ->
     assert (costmap.cost_at(through.poses[:, :2]) != LETHAL).all()
 
 
-def test_unknown_space_is_driven_up_to_and_without_leave_not_planned_into() -> None:
+def test_unknown_space_is_driven_up_to() -> None:
     costmap = room(unknown=(1.5, -4.0, 4.0, 4.0))
     found = plan(costmap, (0.0, 0.0, 0.0), (2.5, 0.0, 0.0))
     assert not found.reached
     assert found.reason == "the way leads through space not seen yet"
     assert found.poses[-1, 0] == pytest.approx(1.5 - 0.3, abs=0.06)
     assert found.whole_length_m == pytest.approx(2.5, abs=0.05)
-    strict = plan(costmap, (0.0, 0.0, 0.0), (2.5, 0.0, 0.0), allow_unknown=False)
-    assert not strict.reached
-    assert "the goal is in space not seen yet" in strict.reason
-    assert (costmap.cost_at(strict.poses[:, :2]) != UNKNOWN).all()
     # Round an unknown patch rather than through it.
     patch = room(unknown=(1.0, -0.5, 1.6, 0.5))
     round_it = plan(patch, (0.0, 0.0, 0.0), (3.0, 0.0, 0.0))
