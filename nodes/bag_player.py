@@ -48,10 +48,8 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         self.commands = {
             "pause": self.player.pause,
             "resume": self.player.resume,
-            "toggle": self.player.toggle,
             "step": self.player.step,
             "rate": self.player.set_rate,
-            "seek": self.player.seek,
             "status": self.status,
         }
         self._thread = threading.Thread(target=self._run, name="player", daemon=True)

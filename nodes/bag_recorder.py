@@ -45,7 +45,6 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         self.commands = {
             "pause": self.recorder.pause,
             "resume": self.recorder.resume,
-            "toggle": self.recorder.toggle,
             "snapshot": self._snapshot,
             "record": self._record,
             "stop": lambda: {"path": str(self._on_request().stop())},

@@ -23,7 +23,6 @@ class Tolerance:
 
     Attributes:
         atol: allowed absolute difference of numbers.
-        rtol: allowed relative difference, as a share of the first bag's value; added to ``atol``.
         fields: pattern → absolute tolerance of the fields that match it.
         ignore: patterns of fields that are not compared.
         stamp_s: pair the messages of a topic by stamp, where stamps may differ by this many seconds; None pairs them by
@@ -34,13 +33,12 @@ class Tolerance:
     """
 
     atol: float = 0.0
-    rtol: float = 0.0
     fields: dict[str, float] = field(default_factory=dict)
     ignore: tuple[str, ...] = ()
     stamp_s: float | None = None
 
     def __post_init__(self) -> None:
-        for name, value in (("atol", self.atol), ("rtol", self.rtol), ("stamp_s", self.stamp_s or 0.0)):
+        for name, value in (("atol", self.atol), ("stamp_s", self.stamp_s or 0.0)):
             if not value >= 0:
                 raise ValueError(f"{name} must be >= 0 (got {value})")
         for name, value in self.fields.items():
@@ -50,17 +48,17 @@ class Tolerance:
     @property
     def exact(self) -> bool:
         """True if no difference is allowed."""
-        return not (self.atol or self.rtol or self.fields or self.ignore)
+        return not (self.atol or self.fields or self.ignore)
 
     def ignores(self, topic: str, path: str) -> bool:
         return any(_matches(pattern, topic, path) for pattern in self.ignore)
 
-    def of(self, topic: str, path: str) -> tuple[float, float]:
-        """Return the absolute and relative tolerance of a field."""
+    def of(self, topic: str, path: str) -> float:
+        """Return the absolute tolerance of a field."""
         for pattern, atol in self.fields.items():
             if _matches(pattern, topic, path):
-                return atol, 0.0
-        return self.atol, self.rtol
+                return atol
+        return self.atol
 
 
 EXACT = Tolerance()
@@ -242,10 +240,10 @@ class _Comparison:
         elif isinstance(a, float) and isinstance(b, float) and not isinstance(a, bool):
             yield from self._arrays(np.array([a]), np.array([b]), path, scalar=True)
         elif a != b:
-            atol, rtol = self.tolerance.of(self.topic, path)
+            atol = self.tolerance.of(self.topic, path)
             numbers = isinstance(a, int) and isinstance(b, int) and not isinstance(a, bool)
             size = float(abs(a - b)) if numbers else float("nan")
-            if not (numbers and size <= atol + rtol * abs(a)):
+            if not (numbers and size <= atol):
                 yield path, (f"{path} is {a!r} and {b!r}", size)
 
     def _arrays(
@@ -257,12 +255,12 @@ class _Comparison:
         if not a.size:
             return
         a, b = a.ravel(), b.ravel()
-        atol, rtol = self.tolerance.of(self.topic, path)
+        atol = self.tolerance.of(self.topic, path)
         wide = (a.astype(np.float64), b.astype(np.float64))
         with np.errstate(invalid="ignore"):  # inf - inf
             gap = np.abs(wide[0] - wide[1])
-            if atol or rtol:
-                equal = (a == b) | (np.isnan(wide[0]) & np.isnan(wide[1])) | (gap <= atol + rtol * np.abs(wide[0]))
+            if atol:
+                equal = (a == b) | (np.isnan(wide[0]) & np.isnan(wide[1])) | (gap <= atol)
             else:  # bit for bit: -0.0 differs from 0.0, and two nan are equal only when their bits are
                 bits = [np.ascontiguousarray(x).view(np.uint8).reshape(a.size, -1) for x in (a, b)]
                 equal = (bits[0] == bits[1]).all(axis=1)

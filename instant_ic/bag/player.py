@@ -1,4 +1,4 @@
-"""Plays a bag in real time or at another rate; can be paused, stepped and moved to another position."""
+"""Plays a bag in real time or at another rate; can be paused and stepped."""
 
 from __future__ import annotations
 
@@ -118,14 +118,11 @@ class BagPlayer:
         """Current time in the bag."""
         self.sent = 0
         """Messages sent."""
-        self.rounds = 0
-        """Number of times that playback reached the end."""
         self.latest_s = 0.0
         """Lag of the latest message in seconds: positive when the machine or the receiver is slower than the bag."""
         self._rate = options.rate
         self._paused = options.start_paused
         self._steps = 0
-        self._seek_ns: int | None = None
         self._anchor_s = 0.0
         self._anchor_ns = self.start_ns
         self._lock = threading.Lock()
@@ -174,12 +171,6 @@ class BagPlayer:
             self._anchor(self.position_ns)
             self._paused = False
 
-    def toggle(self) -> None:
-        if self._paused:
-            self.resume()
-        else:
-            self.pause()
-
     def step(self, count: int = 1) -> None:
         """Send the next ``count`` messages, then pause.
 
@@ -192,17 +183,6 @@ class BagPlayer:
             self._paused = True
             self._steps += count
 
-    def seek(self, offset_s: float) -> None:
-        """Jump to a position, in seconds from the start of playback, and send the latched values valid there.
-
-        Raises:
-            ValueError: the position is outside the played span.
-        """
-        length_s = (self.end_ns - self.start_ns) / 1e9
-        if not 0 <= offset_s <= length_s:
-            raise ValueError(f"offset_s must lie in 0..{length_s:.3f} (got {offset_s})")
-        self._seek_ns = self.start_ns + int(offset_s * 1e9)
-
     def status(self) -> dict[str, Any]:
         return {
             "state": "paused" if self.paused else "playing",
@@ -210,7 +190,6 @@ class BagPlayer:
             "length_s": round((self.end_ns - self.start_ns) / 1e9, 3),
             "rate": self.rate,
             "sent": self.sent,
-            "rounds": self.rounds,
             "late_s": round(self.latest_s, 3),
         }
 
@@ -236,39 +215,27 @@ class BagPlayer:
             Whether playback reached the end.
         """
         self._now_s = now_s
-        begin_ns = self.start_ns
         while True:
-            self.position_ns = begin_ns
-            on_clock(begin_ns)
-            self._send_latched_before(begin_ns, send)
+            self.position_ns = self.start_ns
+            on_clock(self.start_ns)
+            self._send_latched_before(send)
             with self._lock:
-                self._anchor(begin_ns)
-            messages = self._messages(set(self._types), begin_ns, self.end_ns + 1)
-            finished = self._play_once(messages, send, stop, on_clock)
+                self._anchor(self.start_ns)
+            self._play_once(send, stop, on_clock)
             if stop.is_set():
                 return False
-            if not finished:
-                begin_ns, self._seek_ns = self._seek_ns or self.start_ns, None
-                continue
-            self.rounds += 1
             if not self.options.loop:
                 return True
-            begin_ns = self.start_ns
 
     def _play_once(
-        self,
-        messages: Iterator[BagMessage],
-        send: Callable[[BagMessage], None],
-        stop: threading.Event,
-        on_clock: Callable[[int], None],
-    ) -> bool:
-        """Return True at the end of the messages, False when playback must stop or jump."""
+        self, send: Callable[[BagMessage], None], stop: threading.Event, on_clock: Callable[[int], None]
+    ) -> None:
         period_s = 1.0 / CLOCK_HZ
         next_clock_s = self._now_s() + period_s
-        for message in messages:
+        for message in self._messages(set(self._types), self.start_ns, self.end_ns + 1):
             while True:
-                if stop.is_set() or self._seek_ns is not None:
-                    return False
+                if stop.is_set():
+                    return
                 now_s = self._now_s()
                 with self._lock:
                     if self._steps and self._paused:
@@ -289,7 +256,6 @@ class BagPlayer:
             self.position_ns = max(self.position_ns, message.stamp_ns)
             send(message)
             self.sent += 1
-        return self._seek_ns is None
 
     def _messages(self, topics: set[str], start_ns: int | None, stop_ns: int) -> Iterator[BagMessage]:
         messages = self._reader.current_messages(topics, start_ns, stop_ns)
@@ -298,13 +264,13 @@ class BagPlayer:
     def _anchor(self, stamp_ns: int) -> None:
         self._anchor_s, self._anchor_ns = self._now_s(), stamp_ns
 
-    def _send_latched_before(self, begin_ns: int, send: Callable[[BagMessage], None]) -> None:
+    def _send_latched_before(self, send: Callable[[BagMessage], None]) -> None:
         """Send the state at the end of the skipped part: the last value of each latched topic, and all transforms."""
         latched = {topic.topic for topic in self.topics if topic.qos.latched}
-        if begin_ns == self._reader.start_ns or not latched:
+        if self.start_ns == self._reader.start_ns or not latched:
             return
         values = LatchedValues()
-        for message in self._messages(latched, None, begin_ns):
+        for message in self._messages(latched, None, self.start_ns):
             values.put(message)
         for value in values.values():
-            send(replace(value, stamp_ns=begin_ns))
+            send(replace(value, stamp_ns=self.start_ns))

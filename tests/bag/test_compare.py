@@ -44,8 +44,6 @@ def test_largest_difference_of_a_field(tmp_path: Path) -> None:
     [
         (Tolerance(atol=0.5), 0),
         (Tolerance(atol=0.49), 1),
-        (Tolerance(rtol=0.25), 0),  # 0.5 of 2, 0.25 of 3, 0.125 of 1
-        (Tolerance(rtol=0.2), 1),
         (Tolerance(fields={"ranges": 0.5}), 0),
         (Tolerance(fields={"/scan:ranges": 0.5}), 0),
         (Tolerance(fields={"/other:ranges": 0.5}), 2),
@@ -134,7 +132,7 @@ def test_topics_by_pattern(tmp_path: Path) -> None:
     assert compare(a, tmp_path / "more")[0].first == "1 and 0 messages"
 
 
-@pytest.mark.parametrize("bad", [{"atol": -1.0}, {"rtol": math.nan}, {"stamp_s": -0.1}, {"fields": {"a": -1.0}}])
+@pytest.mark.parametrize("bad", [{"atol": math.nan}, {"stamp_s": -0.1}, {"fields": {"a": -1.0}}])
 def test_bad_tolerance_is_told(bad: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="must be >= 0"):
         Tolerance(**bad)  # type: ignore[arg-type]

@@ -184,16 +184,6 @@ def test_rate_changes_while_it_plays(bag: Path) -> None:
             run.player.set_rate(bad)
 
 
-def test_seek_forward_and_back(bag: Path) -> None:
-    jumps: dict[float, Callable[[BagPlayer], None]] = {
-        0.2: lambda player: player.seek(1.5), 0.6: lambda player: player.seek(0.0),
-    }  # fmt: skip
-    run = steered(bag, jumps)
-    assert [value for _, value in run.sent] == [0, 3, 0, 1, 2, 3, 4] and run.finished
-    with pytest.raises(ValueError, match=r"offset_s must lie in 0\.\.2\.000 \(got 9"):
-        run.player.seek(9.0)
-
-
 def test_of_a_topic_with_two_types_one_is_played(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/a", TF, b"tf", 1, SENSOR)

@@ -349,7 +349,7 @@ def test_bag_is_on_the_disk_itself_at_its_end_and_meanwhile(tmp_path: Path, monk
     recorder = make(bag)
     recorder.take("/scan", BOOL, b"1" * 100, S)
     wait_for(lambda: len(on_the_disk(bag)) == 1 and syncs.hold(bag / "bag.mcap"), "the message on the disk")
-    assert syncs.hold(bag)  # the folder knows the file
+    wait_for(lambda: syncs.hold(bag), "the folder that knows the file")
     recorder.take("/scan", BOOL, b"2" * 100, 2 * S)
     recorder.close()
     assert all(syncs.hold(path) for path in (bag, bag / "bag.mcap", bag / "metadata.yaml"))

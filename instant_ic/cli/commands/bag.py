@@ -8,8 +8,8 @@ from typing import Any
 from instant_ic.cli.arguments import group, verb
 from instant_ic.cli.errors import UserError
 
-COMMANDS = ("pause", "resume", "toggle", "step", "rate", "seek", "record", "stop", "status")
-_VALUES = {"step": "count", "rate": "rate", "seek": "offset_s"}
+COMMANDS = ("pause", "resume", "step", "rate", "record", "stop", "status")
+_VALUES = {"step": "count", "rate": "rate"}
 
 
 def add_parser(subparsers: Any) -> None:
@@ -103,7 +103,7 @@ def _add_control(verbs: Any) -> None:
         verbs, "control", "control a running recorder or player", "bag_run.control", "ic bag control rate 0.5"
     )
     steering.add_argument("command", choices=COMMANDS)
-    steering.add_argument("value", nargs="?", type=float, help="for step (messages), rate, seek (seconds)")
+    steering.add_argument("value", nargs="?", type=float, help="for step (messages) and rate")
     steering.add_argument("--node", default="", help="recorder or player to use if several are running")
 
 
@@ -113,7 +113,6 @@ def tolerances(parser: argparse.ArgumentParser) -> None:
     many: dict[str, Any] = {"action": "append", "default": []}
     add("--ignore", **many, metavar="TOPIC", help="topics to ignore: name or pattern")
     add("--atol", type=_seconds, default=0.0, metavar="X", help="absolute tolerance of numbers")
-    add("--rtol", type=_seconds, default=0.0, metavar="X", help="relative tolerance of numbers")
     text = "absolute tolerance of a field: ranges=0.01, /pose:pose.covariance=1e-6; repeatable"
     add("--tolerance", **many, metavar="FIELD=X", help=text)
     add("--ignore-field", **many, metavar="FIELD", help="for example header.stamp; repeatable")
