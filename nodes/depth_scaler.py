@@ -8,7 +8,6 @@ from typing import Any
 
 from instant_ic.adapters.depth import held_image, keyframe_message, revolution_of
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, NodeError, main
-from instant_ic.control.states import Mode
 from instant_ic.depth.chain import DepthChain
 from instant_ic.depth.inference import Floats, Inference
 from instant_ic.depth.inputs import HeldImage
@@ -18,7 +17,6 @@ from instant_ic.depth.sources import DepthResult, complete
 from instant_ic.mapping.local_model import warm_up
 from instant_ic.msg import (
     CompressedImage,
-    ControlState,
     DepthModelInfo,
     Header,
     Image,
@@ -31,14 +29,11 @@ from instant_ic.msg import (
 )
 
 _LOCAL_MAP_S = 2.0
-_STATE_S = 1.0  # an older /ic/state does not count
-_VIRTUAL = (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
 
 
 class DepthScalerNode(Node[DepthScalerConfig]):
     """``/camera/image/compressed``, ``/tf`` → ``/depth/request``; with ``/depth/raw`` and ``/lidar/points`` →
-    ``/depth/scaled``, ``/keyframe``, and the local 3D model as ``/map/local`` where someone subscribes. ``/ic/state``
-    says whether the operator sees the virtual space.
+    ``/depth/scaled``, ``/keyframe``, and the local 3D model as ``/map/local`` where someone subscribes.
     """
 
     name = "depth_scaler"
@@ -65,7 +60,6 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.worker = self.background(self.corrected, self.publish_depth)
         self.local_map = self.publisher("/map/local", PointCloud2, qos=SENSOR)
         self.timer(_LOCAL_MAP_S, self.on_local_map)
-        self.state = self.latest("/ic/state", ControlState, _STATE_S, qos=LATCHED)
         self.subscribe("/depth/model", DepthModelInfo, lambda m: self.chain.adopt(m.name, m.output_kind), qos=LATCHED)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_image, qos=SENSOR)
         self.subscribe("/lidar/points", PointCloud2, self.on_cloud, qos=SENSOR)
@@ -87,8 +81,6 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         image = held_image(message)
         if (back_s := self.chain.add_image(image, message)) > 0:
             self.log.warning("time went back by %.1f s: restarting", back_s)
-        state = self.state.message
-        self.chain.selector.virtual = state is not None and state.mode in _VIRTUAL
         due = self.chain.due(image)
         if due and self.config.source == "lidar":
             self.handle(self.chain.hold(image))

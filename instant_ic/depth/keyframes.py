@@ -17,15 +17,12 @@ class KeyframeSelectionConfig(Checked):
 
     Attributes:
         distance_m: metres of motion to a new keyframe; smaller renews the virtual space more often.
-        virtual_distance_m: the same while the operator sees the virtual space, where it is below ``distance_m``: the
-            r-bot's images on its way round are then newer; smaller costs CPU time.
         angle_deg: degrees of rotation to a new keyframe.
         refresh_s: seconds after which the keyframe of a standing robot is taken again, for what has moved around it.
         unfit_after_s: seconds that a due keyframe waits for depth that can be scaled.
     """
 
     distance_m: Positive = 0.6
-    virtual_distance_m: Positive = 0.6
     angle_deg: Positive = 45.0
     refresh_s: Positive = 30.0
     unfit_after_s: NotNegative = 5.0
@@ -36,12 +33,11 @@ class KeyframeSelector:
 
     Attributes:
         count: number of keyframes.
-        virtual: the operator sees the virtual space.
     """
 
     def __init__(self, config: KeyframeSelectionConfig | None = None) -> None:
         self.config = config or KeyframeSelectionConfig()
-        self.count, self.virtual = 0, False
+        self.count = 0
         self._pose: NDArray[np.float64] | None = None
         self._fit = False
         self._taken_ns = 0
@@ -68,12 +64,6 @@ class KeyframeSelector:
         self.count += 1
         return True
 
-    @property
-    def distance_m(self) -> float:
-        """Metres of motion to a new keyframe at present."""
-        config = self.config
-        return min(config.distance_m, config.virtual_distance_m) if self.virtual else config.distance_m
-
     def restart(self) -> None:
         """Forget the last keyframe: the next fit image becomes one. The count goes on."""
         self._pose, self._fit, self._due_since_ns = None, False, None
@@ -85,7 +75,7 @@ class KeyframeSelector:
         if fit and stamp_ns - self._taken_ns >= self.config.refresh_s * 1e9:
             return True
         moved = float(np.linalg.norm(map_from_camera[:3, 3] - self._pose[:3, 3]))
-        if moved >= self.distance_m:
+        if moved >= self.config.distance_m:
             return True
         cosine = (np.trace(self._pose[:3, :3].T @ map_from_camera[:3, :3]) - 1) / 2
         return math.degrees(math.acos(float(np.clip(cosine, -1, 1)))) >= self.config.angle_deg

@@ -336,7 +336,7 @@ class SimulatedStack:
         while self._drawn and now_ns - next(iter(self._drawn)) > wait_ns:  # not used
             del self._drawn[next(iter(self._drawn))]
         selector = self.nodes["depth_scaler"].chain.selector
-        distance_m, angle_rad = selector.distance_m + 0.01, math.radians(selector.config.angle_deg + 0.5)
+        distance_m, angle_rad = selector.config.distance_m + 0.01, math.radians(selector.config.angle_deg + 0.5)
         places = [*self._drawn.values(), *([] if self._keyframe_at is None else [self._keyframe_at])]
         worth = all(_moved(self.robot, place, distance_m, angle_rad) for place in places)
         if worth:

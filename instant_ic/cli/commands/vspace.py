@@ -70,10 +70,6 @@ def _add_train(verbs: Any) -> None:
     depth.add_argument("--model", type=Path, metavar="M", help=text)
     text = f"(default: {GIVEN_SIGMA:g} with --depth, {MODEL_SIGMA:g} without)"
     add("--depth-sigma", type=positive, metavar="SHARE", help=f"relative standard deviation of depth {text}")
-    text = "height of the camera above the floor; the estimate is scaled to it (default: the model's metres)"
-    add("--camera-height", type=positive, metavar="M", help=text)
-    text = "use the model's depth unchanged; otherwise nearly level floors and ceilings and nearly upright walls are "
-    add("--as-estimated", action="store_true", help=f"{text}straightened")
     add("--iterations", type=positive_int, default=600, metavar="N", help="length of the training (%(default)s)")
     add("--device", default="auto", choices=DEVICES, help="(%(default)s)")
     add("-o", "--out", type=Path, required=True, metavar="DIR", help="output folder, created if missing")
@@ -140,18 +136,10 @@ def _keyframe(args: argparse.Namespace) -> tuple[NDArray[np.uint8], NDArray[np.f
     """Load the panorama, and load or estimate its depth in metres and the depth's relative standard deviation."""
     from instant_ic.depth.files import load_depth, load_picture
 
-    if args.camera_height and (args.depth or args.as_estimated):
-        other = "--depth" if args.depth else "--as-estimated"
-        raise UserError(
-            f"--camera-height scales an estimate, but {other} uses the depth unchanged: omit one of them", 2
-        )
     rgb = load_picture(args.panorama)
     if args.depth:
         return rgb, load_depth(args.depth), args.depth_sigma or GIVEN_SIGMA
-    depth = estimated_depth(args.model, rgb)
-    if not args.as_estimated:
-        depth = _tidied(depth, args.camera_height, args.panorama)
-    return rgb, depth, args.depth_sigma or MODEL_SIGMA
+    return rgb, estimated_depth(args.model, rgb), args.depth_sigma or MODEL_SIGMA
 
 
 def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -167,23 +155,6 @@ def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.fl
         )
     print(f"no --depth: the scale is an estimate of {loaded.manifest.name}, not measured", file=sys.stderr)
     return loaded.estimate(rgb)
-
-
-def _tidied(depth: NDArray[np.float32], camera_height_m: float | None, panorama: Path) -> NDArray[np.float32]:
-    """Straighten floor, ceiling and walls of estimated depth; print where floor and ceiling are."""
-    from instant_ic.depth.tidy import tidy
-
-    try:
-        room = tidy(depth, camera_height_m)
-    except ValueError as error:
-        raise UserError(f"{panorama}: {error}") from error
-    found = [
-        f"{name} {'not found' if away is None else f'{away:.2f} m {where} the camera'}"
-        for name, away, where in (("floor", room.floor_m, "under"), ("ceiling", room.ceiling_m, "over"))
-    ]
-    scaled = f"; estimate scaled by {room.scale:.2f}" if camera_height_m else ""
-    print(", ".join(found) + scaled, file=sys.stderr)
-    return room.depth_m
 
 
 def render(args: argparse.Namespace) -> int:
