@@ -13,7 +13,6 @@ import tiny_onnx
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.depth.manifest import InferenceError, ModelManifest, save_manifest
 from instant_ic.msg import compressed_image_message, image_array
-from instant_ic.util.jpeg import JpegError
 from instant_ic.util.limits import decode_rgb
 from nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
 
@@ -63,15 +62,6 @@ def test_tells_what_its_numbers_are(config: DepthEstimatorConfig) -> None:
         (depth,) = bus.messages("/depth/raw")
     assert (info.name, info.licence, info.output_kind, info.provider) == ("tiny", "MIT", "relative", "cpu")
     np.testing.assert_allclose(image_array(depth), 128 / 255, rtol=0.02)
-
-
-def test_what_is_no_panorama_is_told(config: DepthEstimatorConfig) -> None:
-    square = cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes()
-    with LockstepBus(START) as bus:
-        node = bus.add(DepthEstimatorNode, config)
-        bus.publish(TOPIC, compressed_image_message(square, "camera", START), stamp_ns=START)
-        assert node.diagnoses()["depth"][:2] == (2, "a panorama is twice as wide as high (got 64 x 64)")
-        assert bus.messages("/depth/raw") == []
 
 
 def test_failing_gpu_is_left_for_the_cpu(config: DepthEstimatorConfig) -> None:
@@ -142,19 +132,8 @@ def test_a_hanging_inference_ends_the_process(
         hanging.go_on.set()
 
 
-def test_unknown_provider_is_refused() -> None:
-    with pytest.raises(ValueError, match="provider must be one of auto, tensorrt, cuda, cpu"):
-        DepthEstimatorConfig(provider="gpu")
-
-
-@pytest.mark.parametrize(("need", "rows"), [(512, 512), (256, 256), (200, 256), (128, 128), (64, 64), (16, 64)])
+@pytest.mark.parametrize(("need", "rows"), [(512, 512), (200, 256), (16, 64)])
 def test_decoding_to_what_is_needed(need: int, rows: int) -> None:
     rgb = decode_rgb(picture(height=512), 2 * need, need)
     assert rgb.shape == (rows, 2 * rows, 3)
     np.testing.assert_allclose(rgb[0, 0], (128, 0, 0), atol=3)
-
-
-def test_what_cannot_be_decoded() -> None:
-    for data in (b"", b"\xff\xd8", b"no picture"):
-        with pytest.raises(JpegError, match="cannot be decoded"):
-            decode_rgb(data, 16, 8)

@@ -42,20 +42,6 @@ def test_unusable_prediction_is_a_full_error() -> None:
     assert got.delta3 == pytest.approx(0.25)
 
 
-def test_valid_mask_counts() -> None:
-    got = depth_metrics(np.array([1.0, 9.0]), np.array([1.0, 1.0]), np.array([True, False]))
-    assert (got.mae_m, got.pixels) == (0.0, 1)
-
-
-def test_metrics_refuse_nothing_and_other_shapes() -> None:
-    with pytest.raises(ValueError, match="no valid pixel"):
-        depth_metrics(np.ones((2, 2)), np.zeros((2, 2)))
-    with pytest.raises(ValueError, match="shapes differ"):
-        depth_metrics(np.ones((2, 2)), np.ones((2, 3)))
-    with pytest.raises(ValueError, match="no metrics"):
-        mean_metrics([])
-
-
 def test_mean_counts_every_map_the_same() -> None:
     a = DepthMetrics(0.1, 1.0, 2.0, 0.5, 0.6, 0.7, 0.02, 10)
     b = DepthMetrics(0.3, 3.0, 4.0, 0.7, 0.8, 0.9, 0.04, 990)

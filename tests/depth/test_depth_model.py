@@ -84,16 +84,6 @@ def test_exposure_is_brought_to_the_trainings(plain: Path, tmp_path: Path) -> No
     np.testing.assert_allclose(model.prepare(np.full_like(picture, 240)) * 255, 120, atol=0.5)
 
 
-def test_metric_depth_is_cut_to_its_range(plain: Path, tmp_path: Path) -> None:
-    cut = load_with(plain, tmp_path, min_range_m=0.2, max_range_m=0.3).estimate(panorama(64))
-    assert cut.min() >= np.float32(0.2) and cut.max() <= np.float32(0.3)
-
-
-def test_picture_of_another_type_is_refused(plain: Path) -> None:
-    with pytest.raises(ValueError, match="uint8"):
-        DepthModel.load(plain).estimate(np.zeros((64, 128, 3), np.float32))
-
-
 def write_manifest(folder: Path, **changes: object) -> Path:
     values = {"model": "m.onnx", "name": "m", "licence": "x", "input_height": 64, "input_width": 128, **changes}
     path = folder / "m.yaml"
@@ -106,14 +96,8 @@ def write_manifest(folder: Path, **changes: object) -> Path:
     [
         ({"colour": "rgb"}, "unknown parameter"),
         ({"input_height": None}, "missing key input_height"),
-        ({"input_height": "much"}, "input_height must be"),
         ({"input_width": 64}, "input_width must be twice input_height"),
-        ({"output_kind": "metres"}, "output_kind must be one of"),
-        ({"mean": [0.0, 1.0]}, "mean must have 3 values"),
-        ({"std": [1.0, 0.0, 1.0]}, "std"),
-        ({"brightness": 300}, "brightness must lie in"),
         ({"max_range_m": 0.05}, "max_range_m must be above min_range_m"),
-        ({"name": ""}, "name must be not empty"),
         ({"prior_input": "prior"}, "prior_input must be given together with sigma_output"),
         ({"sha256": "abc"}, "sha256 must be 64 digits"),
     ],
@@ -134,7 +118,7 @@ def test_the_line_of_a_fault(tmp_path: Path) -> None:
             load_manifest(path)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.text(max_size=60) | st.dictionaries(st.sampled_from([f.name for f in fields(ModelManifest)]), st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.lists(st.integers(), max_size=3)
 )).map(yaml.safe_dump))  # fmt: skip
@@ -157,12 +141,6 @@ def test_missing_and_unreadable_manifests(tmp_path: Path) -> None:
     (tmp_path / "m.yaml").write_text("- a")
     with pytest.raises(ManifestError, match="keys and values"):
         load_manifest(tmp_path / "m.yaml")
-
-
-def test_manifest_round_trip(tmp_path: Path) -> None:
-    manifest = ModelManifest("a.onnx", "a", "MIT", 64, 128, mean=(0.1, 0.2, 0.3), output_kind="disparity")
-    save_manifest(manifest, tmp_path / "a.yaml")
-    assert load_manifest(tmp_path / "a.yaml") == manifest
 
 
 def test_model_that_does_not_fit_its_manifest(plain: Path, tmp_path: Path) -> None:

@@ -14,11 +14,10 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.depth.keyframes import KeyframeSelectionConfig, KeyframeSelector, decode_sigma, encode_sigma
 from instant_ic.depth.lidar_depth import LidarDepthConfig
 from instant_ic.depth.scaler import ScalerConfig
-from instant_ic.geometry.poses import inverse, pose_matrix, transform_points
+from instant_ic.geometry.poses import inverse, pose_matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.lidar.decode import POINT_DTYPE
 from instant_ic.msg import (
-    ControlState,
     DepthModelInfo,
     PointCloud2,
     TFMessage,
@@ -29,10 +28,8 @@ from instant_ic.msg import (
     image_array,
     image_message,
     matrix_from_pose,
-    pose_message,
     stamp_ns,
     transform_message,
-    twist_message,
 )
 from instant_ic.training.completion import CompletionConfig, CompletionNet
 from instant_ic.training.export import export_model
@@ -234,15 +231,6 @@ def test_scaler_scales_and_makes_keyframes() -> None:
         assert float(np.median(sigma)) == pytest.approx(k.relative_sigma, rel=0.3)
 
 
-def test_network_alone_is_scaled_exactly_and_the_robot_is_taken_off_the_floor() -> None:
-    with LockstepBus(START) as bus:
-        bus.add(DepthScalerNode, DepthScalerConfig(source="network", body_elevation_deg=-60.0))
-        drive(bus, 0.5, body=True)
-        (message,) = bus.messages("/depth/scaled")
-    # 0.3 m of robot under the camera, from 60 degrees down: floor again. The sectors follow a sampled room within 3 %.
-    assert far_off(image_array(message), stamp_ns(message)).max() < 0.03
-
-
 def test_lidar_alone_needs_no_network() -> None:
     with LockstepBus(START) as bus:
         config = LidarDepthConfig(ceiling_height_m=2.6)
@@ -364,44 +352,6 @@ def test_a_standing_robot_needs_one_depth_and_a_moving_one_at_once(model_file: P
         assert estimator.diagnoses()["depth"][0] == 0
 
 
-def control_state(mode: int, stamp: int) -> ControlState:
-    """A state of which only the mode counts."""
-    pose, still = pose_message(np.eye(4)), twist_message()
-    fields = dict.fromkeys(("robot_pose", "vbot_start", "vbot_pose", "vbot_target"), pose)
-    fields |= dict.fromkeys(("operator_command", "applied_command", "robot_twist"), still)
-    fields |= dict.fromkeys(("pose_gap_m", "yaw_gap_rad", "time_to_obstacle_s", "vbot_limit_m_s"), 0.0)
-    fields |= dict.fromkeys(("estop", "blocked"), False)
-    fields |= dict.fromkeys(("transitions", "shown", "vbot_action", "reason_code"), 0)
-    return ControlState(header=header("map", stamp), mode=mode, reason="", holder="", **fields)
-
-
-def test_only_a_recent_state_in_which_the_virtual_space_is_shown_brings_keyframes_closer() -> None:
-    depth = room_depth(BASE_FROM_CAMERA)
-    closer = KeyframeSelectionConfig(virtual_distance_m=0.3)
-    with LockstepBus(START) as bus:
-        bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated"), keyframes=closer))
-        publish_mounts(bus)
-
-        def taken(x: float, second: int, mode: int | None = None) -> bool:
-            begin = START + second * S
-            if mode is not None:
-                bus.publish("/ic/state", control_state(mode, begin), stamp_ns=begin)
-            keyframes = len(bus.messages("/keyframe"))
-            (stamp,) = images(bus, [x], begin)
-            bus.publish("/depth/raw", image_message(depth, "32FC1", "camera", stamp), stamp_ns=stamp + 1)
-            return len(bus.messages("/keyframe")) > keyframes
-
-        assert taken(0.0, 1)
-        assert not taken(0.4, 2)
-        assert not taken(0.4, 3, ControlState.REAL)
-        assert not taken(0.4, 4, ControlState.STOPPED)
-        assert not taken(0.4, 5, 250)  # no mode
-        assert taken(0.4, 6, ControlState.VIRTUAL)
-        assert taken(0.8, 7, ControlState.ENTERING)
-        assert taken(1.2, 8, ControlState.RETURNING)
-        assert not taken(1.6, 11)  # the state is 3 s old
-
-
 def test_a_request_is_repeated_until_depth_arrives() -> None:
     with LockstepBus(START) as bus:
         bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig("as_estimated")))
@@ -413,17 +363,6 @@ def test_a_request_is_repeated_until_depth_arrives() -> None:
         assert [stamp_ns(k) for k in bus.messages("/keyframe")] == [stamps[10]]
         images(bus, [0.0] * 16, START + 4 * S)
         assert len(bus.messages("/depth/request")) == 3
-
-
-def test_without_poses_one_depth_is_computed(model_file: Path) -> None:
-    """The estimator waits for requests as soon as there is someone who requests."""
-    with LockstepBus(START) as bus:
-        bus.add(DepthEstimatorNode, DepthEstimatorConfig(model=str(model_file)))
-        bus.add(DepthScalerNode)
-        for number in range(20):
-            stamp = START + number * S // 5
-            bus.publish("/camera/image/compressed", compressed_image_message(jpeg(1), "camera", stamp), stamp_ns=stamp)
-        assert len(bus.messages("/depth/raw")) == 1
 
 
 def test_time_that_goes_back_makes_a_new_keyframe() -> None:
@@ -456,16 +395,6 @@ def test_the_models_own_word_of_its_output_counts() -> None:
     assert np.quantile(far_off(image_array(message), stamp_ns(message)), 0.95) < 0.03
 
 
-def test_points_under_the_floor_make_no_fit_keyframe() -> None:
-    """The camera's mount says 0.7 m, it hangs at 1.2 m: the LiDAR sees a floor where there cannot be one."""
-    with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode, DepthScalerConfig(source="lidar", max_rate_hz=10.0))
-        drive(bus, 0.6, network=False, base_from_floor=pose_matrix(0, 0, 0.5))
-        assert bus.messages("/depth/scaled") == []
-        severity, words = level(node, "scale")
-    assert severity == 1 and "lie under the floor" in words
-
-
 def test_sigma_in_bytes_by_hand() -> None:
     sigma = np.array([[np.inf, 0.0, 0.002, 1.0, 7.0, np.nan]])
     code = encode_sigma(sigma)
@@ -473,19 +402,6 @@ def test_sigma_in_bytes_by_hand() -> None:
     np.testing.assert_allclose(decode_sigma(code), [[np.inf, 0.002, 0.002, 1.0, 1.0, np.inf]], rtol=1e-6)
     between = np.geomspace(0.002, 1.0, 77)[None]
     np.testing.assert_allclose(decode_sigma(encode_sigma(between)), between, rtol=0.0125)
-
-
-def test_motion_is_compensated() -> None:
-    with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode)
-        drive(bus, 1.0)
-        stamp = START + S // 5
-        points = node.chain.metric.points_in_camera("camera", stamp)
-    assert points is not None
-    in_map = transform_points(base_at(stamp) @ BASE_FROM_CAMERA, points)
-    # Every point lies on a wall, floor or ceiling of the room again.
-    to_wall = np.minimum(np.abs(in_map - LOW), np.abs(in_map - HIGH)).min(axis=1)
-    assert np.quantile(to_wall, 0.99) < 0.01
 
 
 def test_two_runs_are_the_same_bits(model_file: Path) -> None:
@@ -509,19 +425,6 @@ def test_no_lidar_is_told_and_no_keyframe_at_once(source: str) -> None:
         drive(bus, 1.0, network=source != "lidar", lidar=False)
         assert bus.messages("/depth/scaled") == [] and bus.messages("/keyframe") == []
         assert level(node, "scale") == (1, "no LiDAR revolution within 0.3 s")
-
-
-def test_depth_as_estimated_makes_keyframes_that_say_so() -> None:
-    with LockstepBus(START) as bus:
-        node = bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig(method="as_estimated")))
-        drive(bus, 1.0, lidar=False)
-        scaled, (keyframe,) = bus.messages("/depth/scaled"), bus.messages("/keyframe")
-        assert level(node, "scale")[0] == 0
-    truth = room_depth(base_at(START + S // 5) @ BASE_FROM_CAMERA)
-    np.testing.assert_allclose(image_array(scaled[0]), truth / 2, rtol=1e-5)  # as it came, a factor of 2 too near
-    assert keyframe.fit and keyframe.scale == 1.0 and keyframe.quality == 0.0
-    assert keyframe.relative_sigma == pytest.approx(0.2)
-    assert "LiDAR was not asked" in keyframe.message
 
 
 def test_unfit_keyframe_goes_out_marked_after_waiting_and_a_fit_one_replaces_it(
@@ -641,24 +544,3 @@ def test_selector_by_hand() -> None:
     selector.restart()
     assert selector.take(away, True, 15 * S)
     assert selector.count == 6
-
-
-def test_keyframes_are_closer_together_while_the_operator_sees_the_virtual_space() -> None:
-    near, far = pose_matrix(0.29), pose_matrix(0.31)
-    for virtual_m, (in_real, in_virtual) in {0.3: (False, True), 0.6: (False, False), 2.0: (False, False)}.items():
-        selector = KeyframeSelector(KeyframeSelectionConfig(distance_m=0.6, virtual_distance_m=virtual_m))
-        assert selector.take(np.eye(4), True, 0)
-        assert selector.due(far, S) is in_real
-        selector.virtual = True
-        assert not selector.due(near, S)
-        assert selector.due(far, S) is in_virtual
-        assert selector.due(pose_matrix(0.61), S)  # never farther apart than in the real space
-
-
-def test_shipped_configuration_is_the_default() -> None:
-    from instant_ic.config.params import build, load_file
-    from instant_ic.util.paths import shipped_file
-
-    path = shipped_file("config", "depth.yaml")
-    assert build(DepthEstimatorConfig, load_file(path, "depth_estimator")) == DepthEstimatorConfig()
-    assert build(DepthScalerConfig, load_file(path, "depth_scaler")) == DepthScalerConfig()

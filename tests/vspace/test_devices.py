@@ -75,21 +75,6 @@ def test_kernels_that_are_right_are_taken(gpu, name):
     assert not warning
 
 
-def test_plain_torch_can_be_asked_for(gpu):
-    device, warning = make_device(with_device("torch-cuda"))
-    assert not isinstance(device, gpu)
-    assert not warning
-
-
-def test_density_is_for_plain_torch(gpu):
-    config = with_device("auto")
-    device, warning = make_device(
-        dataclasses.replace(config, field=dataclasses.replace(config.field, geometry="density"))
-    )
-    assert not isinstance(device, gpu)
-    assert not warning
-
-
 @pytest.mark.parametrize(
     ("fault", "words"),
     [

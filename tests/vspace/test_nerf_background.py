@@ -8,12 +8,12 @@ from scipy.ndimage import binary_erosion
 
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.vspace import KeyframeError, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.background import Background, level_planes
 from instant_ic.vspace.background_kernels import in_front
 from instant_ic.vspace.composition import ComposedView, filled_image
 from instant_ic.vspace.config import GeometryConfig
-from instant_ic.vspace.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
+from instant_ic.vspace.prior import ROBOT, ROOM, SKY, prepare, sky_region
 from instant_ic.vspace.view import perspective_rays
 
 H, W = 64, 128
@@ -207,16 +207,6 @@ def test_the_robot_is_not_shown_and_not_learnt():
     assert down.rgb[20:44, 20:44].max() < 200
     assert np.median(np.abs(down.depth_m[20:44, 20:44] - 4.0)) < 0.3
     assert space.render(pose_matrix(yaw=2.0), 64, 48, 1.0).confidence.min() == 1
-
-
-def test_the_robots_mask_is_scaled_to_the_depth():
-    mask = np.zeros((16, 32), bool)
-    mask[12:, :4] = True
-    region = robot_region(H, -90, mask)
-    assert region[48:, :16].all()
-    assert region.sum() == 16 * 16
-    with pytest.raises(KeyframeError, match="twice as wide"):
-        robot_region(H, -90, np.zeros((16, 16), bool))
 
 
 def test_the_sky_is_endlessly_far_and_known():

@@ -1,6 +1,5 @@
 """Warp or field: gain and hysteresis by hand, and the choice of a space on its older keyframes."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -119,11 +118,3 @@ def test_what_is_shown_survives_saving(tmp_path):
     assert loaded.status.shows_field
     views = [one.render(pose_matrix(0.3), 48, 27, 1.5).rgb for one in (space, loaded)]
     assert np.array_equal(*views)
-
-
-def test_the_field_alone_is_not_measured():
-    space = VirtualSpace(dataclasses.replace(CONFIG, picture=dataclasses.replace(CONFIG.picture, field_alone=True)))
-    for x in (0.0, 0.5):
-        image = box_room.panorama(pose_matrix(x), 96)
-        space.set_keyframe(image.rgb, image.depth_m, pose_matrix(x), 0.02)
-    assert space.trials == () and space.status.shows_field

@@ -196,29 +196,6 @@ def test_rays_of_several_keyframes(two_keyframes):
     assert colour.mean(axis=0) == pytest.approx(even, abs=0.02)
 
 
-def test_half_of_the_rays_are_the_newests():
-    counts = np.zeros((20, 3))
-    for step in range(1, 21):
-        sources = ray_sources(3, 64, step)
-        counts[step - 1] = np.bincount(sources, minlength=3) / 64
-    assert counts.mean(axis=0) == pytest.approx([0.5, 0.25, 0.25], abs=0.01)
-    assert counts.min() > 0.1
-    # Each tile is looked at from each keyframe within few steps.
-    seen = np.stack([ray_sources(3, 64, step) for step in range(1, 21)])
-    assert all(set(seen[:, tile]) == {0, 1, 2} for tile in range(64))
-    assert not ray_sources(1, 64, 5).any()
-
-
-def test_a_scene_checks_its_keyframes(scene, two_keyframes):
-    lattice, grid = scene.lattice, scene.occupancy
-    with pytest.raises(ValueError, match="needs a keyframe"):
-        TrainingScene((), lattice, grid)
-    with pytest.raises(ValueError, match="one size"):
-        TrainingScene((scene.prior, two_keyframes.prior), lattice, grid)
-    with pytest.raises(ValueError, match=r"\(1, 3\)"):
-        TrainingScene((scene.prior,), lattice, grid, np.ones((2, 3), F))
-
-
 def test_a_point_belongs_to_the_keyframe_that_sees_it(two_keyframes):
     # On a surface of either keyframe the distance is 0 and it agrees; half way to it nothing does.
     priors = torch_priors(two_keyframes, "cpu")

@@ -121,17 +121,6 @@ def test_the_first_view_comes_before_any_training(bus):
     assert "shown: the warped panorama" in status.message
 
 
-def test_auto_trains_nothing_on_a_cpu():
-    with LockstepBus(start_ns=10 * S) as bus:
-        node = bus.add(NerfNode, NerfConfig(space=dataclasses.replace(SPACE, source="auto")))
-        bus.publish("/keyframe", keyframe_message(number=4), latched=True)
-        bus.advance(1.0)
-        status = bus.last("/vspace/status")
-        assert (status.state, status.keyframe_id, status.iterations) == (READY, 4, 0)
-        assert "source: warp" in status.message
-        assert node.work.space.scene is None  # not even an occupancy grid
-
-
 def test_a_view_is_rendered_again_only_when_it_would_differ():
     with LockstepBus(start_ns=10 * S) as bus:
         node = bus.add(NerfNode, NerfConfig(space=dataclasses.replace(SPACE, source="warp")))
@@ -217,23 +206,6 @@ def test_a_gpu_without_memory_is_told_and_the_next_keyframe_recovers(bus):
     bus.publish("/keyframe", keyframe_message(2), latched=True)
     bus.advance(2.0)
     assert bus.last("/vspace/status").state == READY
-
-
-def test_a_new_keyframe_is_shown_at_once_and_learnt_behind(bus):
-    bus.publish("/keyframe", keyframe_message(1), latched=True)
-    bus.advance(2.0)
-    assert bus.last("/vspace/status").state == READY
-    bus.publish("/keyframe", keyframe_message(2), latched=True)
-    status = bus.last("/vspace/status")
-    assert (status.state, status.keyframe_id) == (READY, 2)
-    assert status.ready_seconds == 0  # nothing takes time in lockstep: it came, and was shown
-    bus.advance(0.55)
-    assert bus.last("/vspace/status").iterations == 20  # a training run of its own
-    bus.advance(3.0)
-    assert all(s.state == READY for s in bus.messages("/vspace/status") if s.keyframe_id == 2)
-    assert "idle" in bus.last("/vspace/status").message
-    bus.publish("/view/request", request_message(5))
-    assert bus.last("/vspace/view").keyframe_id == 2
 
 
 def test_of_waiting_keyframes_and_views_the_newest_is_taken():

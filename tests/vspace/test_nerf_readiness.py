@@ -83,13 +83,3 @@ def test_expectation_follows_the_measured_psnr():
             expected.append(space.expected_psnr_db(pose))
     assert np.corrcoef(measured, expected)[0, 1] > 0.8
     assert np.abs(np.array(measured) - expected).mean() < 4
-
-
-def test_a_pose_that_is_none():
-    space = VirtualSpace(WARP)
-    picture = box_room.panorama(np.eye(4), 64)
-    space.set_keyframe(picture.rgb, picture.depth_m, np.eye(4), 0.02)
-    with pytest.raises(ValueError, match="pose"):
-        space.expected_psnr_db(np.full((4, 4), np.nan))
-    far = space.expected_psnr_db(pose_matrix(x=1e4))
-    assert far < space.expected_psnr_db(np.eye(4)) - 8

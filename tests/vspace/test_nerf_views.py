@@ -7,7 +7,7 @@ import pytest
 
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.vspace import FieldConfig, NotReadyError, TrainConfig, View, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace import FieldConfig, TrainConfig, View, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.view import continue_unseen, equirect_rays
 from tests import box_room
 
@@ -92,11 +92,3 @@ def test_sizes_of_panoramas(space, width, words):
         return
     with pytest.raises(ValueError, match=words):
         space.render_equirect(CAMERA, width)
-
-
-def test_no_picture_of_nothing_and_none_from_nowhere(space):
-    empty = VirtualSpace(CONFIG)
-    with pytest.raises(NotReadyError):
-        empty.render_equirect(CAMERA, 64)
-    with pytest.raises(ValueError, match="pose"):
-        space.render_equirect(np.full((4, 4), np.nan), 64)

@@ -73,9 +73,7 @@ def test_losses_by_hand():
     assert [float(a) for a in losses] == pytest.approx([0.03, 0.03125, 0.0, 0.25 / 3], abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    "losses", [(0.0, 0.0, 0.0), (0.7, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.3), (0.3, 0.2, 0.1)]
-)
+@pytest.mark.parametrize("losses", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.1)])
 def test_gradient_agrees_with_autograd(scene, losses):
     p = random_parameters()
     rng = np.random.default_rng(0)

@@ -68,23 +68,18 @@ def test_a_panorama(folder, tmp_path):
 
 def bad_inputs(folder):
     picture = box_room.panorama(np.eye(4), 32)
-    files = {"wide.png": picture.rgb[:, :50], "black.png": np.zeros((32, 64, 3), np.uint8), "good.png": picture.rgb}
+    files = {"wide.png": picture.rgb[:, :50], "good.png": picture.rgb}
     for name, rgb in files.items():
         write_rgb(folder / name, rgb)
     np.save(folder / "nan.npy", np.full((32, 64), np.nan))
     np.save(folder / "patchy.npy", np.where(np.arange(64) < 20, picture.depth_m, np.nan))
-    np.save(folder / "square.npy", np.ones((32, 32)))
     np.save(folder / "fine.npy", picture.depth_m)
 
 
 BAD = {
     "picture of another shape": (["wide.png", "--depth", "fine.npy"], "twice as wide"),
-    "black picture": (["black.png", "--depth", "fine.npy"], "one colour"),
-    "no picture": (["none.png"], "No such file"),
     "depth not finite": (["good.png", "--depth", "nan.npy"], "no known depth"),
     "depth hardly known": (["good.png", "--depth", "patchy.npy"], "known in 31%"),
-    "depth of a cube's face": (["good.png", "--depth", "square.npy"], "depth must be"),
-    "no depth file": (["good.png", "--depth", "none.npy"], "No such file"),
     "no model": (["good.png", "--model", "none.onnx"], "none"),
     "no gpu": (["good.png", "--depth", "fine.npy", "--device", "cuda"], "CUDA"),
 }
@@ -106,34 +101,13 @@ def test_bad_inputs_are_named(name, tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "out" / "space.npz").exists()
 
 
-def test_a_patch_without_depth_is_filled_and_said(tmp_path, capsys):
-    picture = box_room.panorama(np.eye(4), 32)
-    picture.depth_m[:, :16] = np.nan
-    write_rgb(tmp_path / "p.png", picture.rgb)
-    np.savez(tmp_path / "d.npz", depth=picture.depth_m)
-    words = [
-        str(tmp_path / "p.png"),
-        "--depth",
-        str(tmp_path / "d.npz"),
-        "--iterations",
-        "2",
-        "-o",
-        str(tmp_path / "s"),
-    ]
-    assert main(["vspace", "train", *words]) == 0
-    assert "known in 75%" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("verb", "words", "status", "said"),
     [
         ("render", ["--pose", "1,2,3", "-o", "a.png"], 2, "x,y,z,yaw"),
-        ("render", ["--pose", "1,2,3,nan", "-o", "a.png"], 2, "x,y,z,yaw"),
         ("render", ["--size", "4x4", "-o", "a.png"], 2, "16 to 4096"),
         ("render", ["--size", "100x40", "--projection", "equirect", "-o", "a.png"], 2, "twice as wide"),
-        ("render", ["--fov", "180", "-o", "a.png"], 2, "1..170"),
         ("render", ["--size", "32x32", "-o", "a.bin"], 2, "must end in .png"),
-        ("render", ["--size", "32x32", "-o", "none/a.png"], 1, "No such file"),
         ("render", ["--size", "32x32", "-o", "a.png", "--depth", "d.exr"], 2, "depth file must end in"),
     ],
 )
@@ -152,8 +126,3 @@ def test_a_view_from_far_off_is_drawn_with_a_warning(folder, tmp_path, capsys):
     said = capsys.readouterr()
     assert "has seen little" in said.err
     assert "0% of the image is known" in said.out
-
-
-def test_a_folder_without_a_space(tmp_path, capsys):
-    assert main(["vspace", "info", str(tmp_path)]) == 1
-    assert "ic vspace train" in capsys.readouterr().err

@@ -1,12 +1,11 @@
-"""Compiles the Triton kernels for some compute capabilities, which needs no GPU: ``python triton_compile.py 89 90``.
+"""Compiles the Triton kernels for compute capabilities without a GPU: ``python triton_compile.py 89 90``.
 
-All but ``draw`` wholly for the default field and the newest capability; ``gradient``, whose products depend on the GPU,
-up to the stage that has refused some: for every corner of ``FieldConfig``, and for the older capabilities.
+The default field is compiled wholly for the newest capability. ``gradient``, whose products depend on the GPU, is also
+lowered to the stage that has refused some: for the default field on the older capabilities, and for the largest and
+the smallest field on the newest.
 """
 
-import itertools
 import sys
-from contextlib import suppress
 
 import triton
 from triton._C.libtriton import ir
@@ -19,12 +18,12 @@ from instant_ic.vspace.nerf import triton_kernels
 from instant_ic.vspace.nerf.triton_device import ENTRIES, TILE, TRAIN_BLOCK, kernel_shape
 
 FIELD = kernel_shape(FieldConfig())
-KERNELS = [
+SMALLEST, LARGEST = FieldConfig(levels=1, hidden=4), FieldConfig(levels=16, hidden=32)
+WHOLE = [
     (triton_kernels.sample_rays, {"B": TILE}),
     (triton_kernels.gradient, {**FIELD, "B": TRAIN_BLOCK}),
     (triton_kernels.adam_table, {"F": 4, "B": ENTRIES}),
     (triton_kernels.adam_network, {"COUNT": 1188, "B": 2048}),
-    (triton_kernels.draw, {**FIELD, "B": TILE}),
 ]
 NUMBERS = {
     "i32": "columns rows width height w h keyframes count size nx ny nz",
@@ -55,19 +54,6 @@ def source_of(kernel, constants):
     return ASTSource(fn=kernel, signature=signature, constexprs=constants, attrs=attributes)
 
 
-def corners():
-    """Smallest and largest sizes that ``FieldConfig`` allows, found by asking it."""
-    for features in (2, 4):
-        allowed = []
-        for levels, hidden in itertools.product(range(1, 65), range(4, 257, 4)):
-            with suppress(ValueError):
-                allowed.append(FieldConfig(levels=levels, features=features, hidden=hidden))
-        levels = {end(field.levels for field in allowed) for end in (min, max)}
-        hidden = {end(field.hidden for field in allowed) for end in (min, max)}
-        for pair in itertools.product(levels, hidden):
-            yield FieldConfig(levels=pair[0], features=features, hidden=pair[1])
-
-
 def lower(source, target):
     """Compile up to the GPU's dialect, where layouts for the tensor cores are chosen: a third of the whole."""
     backend = make_backend(target)
@@ -84,22 +70,16 @@ def lower(source, target):
 
 
 def main(capabilities):
-    targets = {capability: GPUTarget("cuda", capability, 32) for capability in capabilities}
-    newest = capabilities[-1]
-    # Every corner for the newest, which alone has refused some; the default field for all.
-    for capability, fields in {**{one: [FieldConfig()] for one in capabilities}, newest: corners()}.items():
-        for field in fields:
-            source = source_of(triton_kernels.gradient, {**kernel_shape(field), "B": TRAIN_BLOCK})
-            lower(source, targets[capability])
-            sys.stdout.write(f"ttgir gradient {capability} {field.levels} {field.features} {field.hidden}\n")
-    for kernel, constants in KERNELS:
-        source = source_of(kernel, constants)
-        if kernel is triton_kernels.draw:  # takes 20 s to the end and has no product that `gradient` has not
-            lower(source, targets[newest])
-            sys.stdout.write(f"ttgir draw {newest}\n")
-        else:
-            made = triton.compile(source, target=targets[newest], options={"num_warps": 4})
-            sys.stdout.write(f"cubin {kernel.fn.__name__} {newest} {len(made.asm['cubin'])}\n")
+    targets = [GPUTarget("cuda", capability, 32) for capability in capabilities]
+    fields = [*((FieldConfig(), target) for target in targets[:-1]), (SMALLEST, targets[-1]), (LARGEST, targets[-1])]
+    for field, target in fields:
+        lower(source_of(triton_kernels.gradient, {**kernel_shape(field), "B": TRAIN_BLOCK}), target)
+        sys.stdout.write(f"ttgir gradient {target.arch} {field.levels}\n")
+    lower(source_of(triton_kernels.draw, {**FIELD, "B": TILE}), targets[-1])  # 20 s to the end
+    sys.stdout.write(f"ttgir draw {targets[-1].arch}\n")
+    for kernel, constants in WHOLE:
+        made = triton.compile(source_of(kernel, constants), target=targets[-1], options={"num_warps": 4})
+        sys.stdout.write(f"cubin {kernel.fn.__name__} {len(made.asm['cubin'])}\n")
 
 
 if __name__ == "__main__":
