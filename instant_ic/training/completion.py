@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from instant_ic.training.slicenet import CheckpointError, check_state, read_checkpoint
+from instant_ic.training.slicenet import CheckpointError, load_state, read_checkpoint
 
 GEOMETRY_CHANNELS = 8
 MIN_DEPTH_M, MAX_DEPTH_M = 0.1, 40.0
@@ -64,10 +64,6 @@ class CompletionConfig:
         object.__setattr__(self, "decoder", tuple(self.decoder))
         if self.height < 64 or self.height % 32:
             raise ValueError(f"height must be a multiple of 32, 64 or more (got {self.height})")
-        if len(self.decoder) != 3 or min(self.decoder) < 4:
-            raise ValueError(f"decoder must be three numbers of 4 or more (got {self.decoder})")
-        if self.slices < 0:
-            raise ValueError(f"slices must be 0 or more (got {self.slices})")
 
     @property
     def width(self) -> int:
@@ -250,13 +246,10 @@ def load_encoder(model: CompletionNet, path: str | Path) -> None:
         CheckpointError: the file is missing, damaged or of another network.
     """
     state = read_checkpoint(Path(path))
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+    if not isinstance(state, dict):
         raise CheckpointError(f"{path}: does not hold tensors by name; give the package's .pth file")
     renamed = {_own_name(key): value for key, value in state.items() if not key.startswith(_PUBLISHED_REST)}
-    own = model.encoder.state_dict()
-    expected = {key: tuple(value.shape) for key, value in own.items()}
-    check_state(f"{path}: not the weights of EfficientNet-lite0", renamed, expected)
-    model.encoder.load_state_dict(renamed, strict=True)
+    load_state(model.encoder, renamed, path)
 
 
 def _own_name(key: str) -> str:
@@ -278,11 +271,8 @@ def load_completion(path: str | Path) -> CompletionNet:
     """
     payload = read_checkpoint(Path(path))
     try:
-        config = CompletionConfig(**payload["config"])
-        state = payload["state_dict"]
+        model = CompletionNet(CompletionConfig(**payload["config"]))
+        load_state(model, payload["state_dict"], path)
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: not a checkpoint of a completion network ({error})") from error
-    model = CompletionNet(config)
-    check_state(f"{path}: does not fit {config}", state, {k: tuple(v.shape) for k, v in model.state_dict().items()})
-    model.load_state_dict(state, strict=True)
     return model.eval()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import tempfile
@@ -18,13 +17,13 @@ from numpy.typing import NDArray
 from instant_ic.depth.completion import PRIOR_CHANNELS
 from instant_ic.depth.manifest import ModelManifest, manifest_path, save_manifest
 from instant_ic.training.completion import CompletionNet
-from instant_ic.training.folding import fold_upsampling
 from instant_ic.training.slicenet import SliceNet
 from instant_ic.util.files import replacing
 
 OPSET = 17
 HALF_PRECISION_MIN_ELEMENTS = 256
-MAX_RELATIVE_DIFFERENCE = 1e-5
+MAX_RELATIVE_DIFFERENCE = 1e-3
+"""Above the rounding errors that weights amplify, far below those of a wrong operator."""
 MAX_HALF_DIFFERENCE = 2e-2
 
 
@@ -40,7 +39,7 @@ def export_onnx(
 ) -> dict[str, float]:
     """Export the network as ONNX of fixed shape and compare it with torch on a random image.
 
-    SliceNet's decoder is folded (:mod:`.folding`), and batch norms are folded into the convolutions before them.
+    Batch norms are folded into the convolutions before them.
 
     Args:
         model: the network; switched to evaluation mode.
@@ -49,12 +48,11 @@ def export_onnx(
         report: receives a line before each step that takes time.
 
     Returns:
-        ``difference``: largest |onnx - torch| over the largest |torch|, with float32 weights; ``rounding``: the same
-        for torch in float32 against float64, if the first is not below 1e-5; ``half_difference``: the same for the file
-        with float16 weights, if those are written.
+        ``difference``: largest |onnx - torch| over the largest |torch|, with float32 weights; ``half_difference``: the
+        same for the file with float16 weights, if those are written.
 
     Raises:
-        ExportError: a difference exceeds what rounding explains, or the network's output is not finite.
+        ExportError: a difference is too large, or the network's output is not finite.
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -72,12 +70,15 @@ def export_onnx(
             # The tracing exporter is the fast one here; its successor handles the LSTM no better.
             warnings.simplefilter("ignore")
             torch.onnx.export(
-                fold_upsampling(model) if isinstance(model, SliceNet) else model, tuple(inputs.values()), str(plain),
-                dynamo=False, opset_version=OPSET, input_names=list(inputs),
-                output_names=["depth", "sigma"][: len(inputs)],
+                model, tuple(inputs.values()), str(plain), dynamo=False, opset_version=OPSET,
+                input_names=list(inputs), output_names=["depth", "sigma"][: len(inputs)],
             )  # fmt: skip
         report("running the network in onnxruntime")
-        result = _compare(model, inputs, expected, _run(plain, inputs), report)
+        result = {"difference": _difference(_run(plain, inputs), expected)}
+        text = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
+        if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
+            raise ExportError(text)
+        report(text)
         if half_weights:
             report("converting the weights to float16 and running again")
             plain.write_bytes(_halve_weights(plain.read_bytes()))
@@ -87,33 +88,6 @@ def export_onnx(
             report(f"float16 weights change the depth by {result['half_difference']:.1e}")
         with replacing(path) as file:
             file.write(plain.read_bytes())
-    return result
-
-
-def _compare(
-    model: SliceNet | CompletionNet,
-    inputs: dict[str, torch.Tensor],
-    expected: NDArray[np.floating],
-    got: NDArray[np.floating],
-    report: Callable[[str], None],
-) -> dict[str, float]:
-    """Compare the depth of ONNX with that of torch.
-
-    Raises:
-        ExportError: the difference exceeds what rounding explains.
-    """
-    result = {"difference": _difference(got, expected)}
-    text = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
-    if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
-        # Weights may amplify rounding beyond any fixed bound; a float64 run then shows which side is wrong.
-        report(f"{text}; running torch in float64")
-        with torch.inference_mode():
-            exact = _depth(copy.deepcopy(model).double()(*(value.double() for value in inputs.values())))
-        result["rounding"] = _difference(expected, exact)
-        if not _difference(got, exact) < max(2 * result["rounding"], MAX_RELATIVE_DIFFERENCE):
-            raise ExportError(f"{text}, {_difference(got, exact):.1e} to float64")
-        text += f", while float32 alone costs torch {result['rounding']:.1e} with these weights"
-    report(text)
     return result
 
 

@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
 import torch
 
@@ -17,8 +16,7 @@ from instant_ic.depth.manifest import load_manifest
 from instant_ic.depth.model import DepthModel
 from instant_ic.training import export
 from instant_ic.training.export import ExportError, export_onnx
-from instant_ic.training.folding import fold_kernel, fold_upsampling
-from instant_ic.training.slicenet import ConvStage, SliceNet, SliceNetConfig
+from instant_ic.training.slicenet import SliceNet, SliceNetConfig
 
 torch.set_num_threads(1)
 TINY = SliceNetConfig(
@@ -49,26 +47,6 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("weights") / "tiny.pt"
     torch.save({"config": asdict(TINY), "state_dict": random_network().state_dict(), "record": {"steps": 3}}, path)
     return path
-
-
-@pytest.mark.parametrize("upscale", [(2, 1), (2, 2)])
-def test_folded_stage_by_definition(upscale: tuple[int, int]) -> None:
-    torch.manual_seed(1)
-    stage = ConvStage(6, 5, upscale=upscale).eval()
-    torch.nn.init.normal_(stage.layers[1].running_mean)
-    torch.nn.init.uniform_(stage.layers[2].weight)
-    x = torch.randn(2, 6, 4, 8)
-    holder = SliceNet(SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8))
-    holder.decoder = torch.nn.ModuleList([stage])
-    (folded,) = fold_upsampling(holder).decoder
-    with torch.inference_mode():
-        torch.testing.assert_close(folded(x), stage(x), rtol=1e-5, atol=1e-5)
-
-
-def test_folded_kernel_by_hand() -> None:
-    kernel = torch.tensor([1.0, 2.0, 4.0]).view(1, 1, 3, 1).expand(1, 1, 3, 3)
-    even, odd = fold_kernel(kernel, (2, 1))[:, 0, :, 0].tolist()
-    assert (even, odd) == ([1, 6, 0], [0, 3, 4])  # (w0, w1 + w2, 0) and (0, w0 + w1, w2)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +85,7 @@ def test_convert_writes_model_manifest_and_record(converted: Path) -> None:
     assert [p.name for p in sorted(output.parent.iterdir())] == ["tiny.json", "tiny.onnx", "tiny.yaml"]
 
     # float16 weights: about half of what the network's numbers take in float32.
-    floats = sum(value.numel() for value in fold_upsampling(random_network()).state_dict().values())
+    floats = sum(value.numel() for value in random_network().state_dict().values())
     assert output.stat().st_size < 0.75 * 4 * floats
 
     picture = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
@@ -118,17 +96,10 @@ def test_convert_writes_model_manifest_and_record(converted: Path) -> None:
     np.testing.assert_allclose(depth, expected.clip(0.1, 12.0), atol=2e-2 * np.abs(expected).max())
 
 
-def test_folded_file_has_no_norms_and_fewer_enlargements(converted: Path) -> None:
-    operators = [node.op_type for node in onnx.load(str(converted)).graph.node]
-    assert operators.count("LSTM") == 2
-    assert "BatchNormalization" not in operators
-    assert operators.count("Resize") == 4  # those of the contractions; the decoder's six are folded
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["absent.pt"], "absent.pt: no such file"),
+        (["absent.pt"], "absent.pt: cannot be read: No such file"),
         (["absent.pt", "-o", "model.bin"], "the name must end in .onnx"),
         (["{checkpoint}", "-o", "/proc/nowhere/x.onnx"], "/proc/nowhere"),
     ],
@@ -153,23 +124,11 @@ def test_what_onnx_computes_otherwise_is_not_written(tmp_path: Path, monkeypatch
     path = tmp_path / "m.onnx"
     path.write_bytes(b"the model before")
     honest = export._run
-    monkeypatch.setattr(export, "_run", lambda *args: honest(*args) * np.float32(1.0001))
-    with pytest.raises(ExportError, match=r"difference to torch: (9\.\de-05|1\.[0-2]e-04) .* to float64"):
+    monkeypatch.setattr(export, "_run", lambda *args: honest(*args) * np.float32(1.01))
+    with pytest.raises(ExportError, match=r"difference to torch: (9\.\de-03|1\.[0-2]e-02)"):
         export_onnx(random_network(), path)
     assert path.read_bytes() == b"the model before"
     assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.usefixtures("ready")
-def test_weights_that_amplify_rounding_are_held_against_float64(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # A bound that no float32 keeps stands for weights that no float32 keeps the real bound with.
-    monkeypatch.setattr(export, "MAX_RELATIVE_DIFFERENCE", 1e-9)
-    lines: list[str] = []
-    result = export_onnx(random_network(), tmp_path / "m.onnx", report=lines.append)
-    assert 1e-9 < result["rounding"] < 1e-5 and 1e-9 < result["difference"] < 1e-5
-    assert any("float32 alone costs torch" in line for line in lines)
 
 
 def test_a_network_that_says_nothing_is_refused(tmp_path: Path) -> None:

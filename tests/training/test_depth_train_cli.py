@@ -101,10 +101,10 @@ def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
     ("words", "error", "message"),
     [
         (("--height", "100"), UserError, "multiple of 32"),
-        (("--encoder", "/absent.pth"), CheckpointError, "no such file"),
+        (("--encoder", "/absent.pth"), CheckpointError, "No such file"),
         (("--device", "tpu9"), UserError, "device 'tpu9'"),
         (("--data", "/absent"), DatasetError, "no rendered panoramas"),
-        (("--init", "/absent.pt"), CheckpointError, "no such file"),
+        (("--init", "/absent.pt"), CheckpointError, "No such file"),
         (("--checkpoint", "/tmp"), UserError, "is a folder"),
     ],
 )

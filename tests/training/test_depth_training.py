@@ -114,8 +114,8 @@ def test_only_a_run_of_this_network_is_taken_up(tmp_path: Path) -> None:
     run = trainer(tmp_path / "x.pt", 1)
     torch.save({"config": CompletionConfig().as_dict(), "state_dict": {}, "resume": {}}, tmp_path / "other.pt")
     (tmp_path / "broken.pt").write_bytes(b"no checkpoint")
-    for name, words in (("other", "not a checkpoint of a run"), ("broken", "not a torch checkpoint"),
-                        ("absent", "no such file")):  # fmt: skip
+    for name, words in (("other", "not a checkpoint of a run"), ("broken", "damaged"),
+                        ("absent", "No such file")):  # fmt: skip
         with pytest.raises(CheckpointError, match=words):
             run.resume(tmp_path / f"{name}.pt")
     run.close()
