@@ -122,6 +122,6 @@ def evaluate_round_trip(trip: RoundTrip, use_wheel_odom: bool = True) -> tuple[d
         "final_mean_error_deg": float(final_deg.mean()),
         "wheels_end_error_m": float(wheels_m[-1]),
         "wheels_end_error_deg": float(wheels_deg[-1]),
-        "turn_factor": result.slam.motion.turn_factor,
+        "turn_factor": result.slam.turn_factor.value,
         **result.report(),
     }, result

@@ -43,30 +43,17 @@ class MatchConfig(Checked):
 
 
 @dataclass(frozen=True)
-class LoopConfig:
-    """Loop closure and pose graph.
-
-    Attributes:
-        enabled: false: scan matching without loop closure.
-    """
-
-    enabled: bool = True
-
-
-@dataclass(frozen=True)
 class MapConfig:
     """Occupancy grid, built by ray casting from the keyframes.
 
     Attributes:
         resolution_m: cell size of /map.
         max_range_m: maximum length of a ray entered into the map.
-        no_return_clear_m: length cleared by a beam without return; 0: none (glass, black walls).
         max_size_m: maximum side length of the map, centred on the start.
     """
 
     resolution_m: Positive = 0.05
     max_range_m: Positive = 20.0
-    no_return_clear_m: NotNegative = 0.0
     max_size_m: Positive = 400.0
 
     def __post_init__(self) -> None:
@@ -81,7 +68,6 @@ class SlamConfig:
 
     field: LikelihoodFieldConfig = dataclasses.field(default_factory=LikelihoodFieldConfig)
     match: MatchConfig = dataclasses.field(default_factory=MatchConfig)
-    loop: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
 
 

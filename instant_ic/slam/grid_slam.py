@@ -33,11 +33,11 @@ from instant_ic.slam.keyframes import LOCAL_KEYFRAMES, ScanKeyframe
 from instant_ic.slam.localization import FoundPlace, SavedMap
 from instant_ic.slam.loop_closure import QUERY_KEYFRAMES, LoopClosure, LoopOutcome, correction
 from instant_ic.slam.map_files import save_graph, save_grid
-from instant_ic.slam.motion import MotionMonitor
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.pose_graph import Edge
 from instant_ic.slam.relocalization import Relocalization
 from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
+from instant_ic.slam.turn_factor import TurnFactor
 
 PROVISIONAL_KEYFRAMES = 8
 """Number of keyframes after a sign of a loss that are provisional. Over a longer way a right pose drifts, too."""
@@ -106,8 +106,8 @@ class GridSlam:
         frames: poses in the map and in odometry.
         front_end: matches scans and makes keyframes.
         loop_closure: finds loops and optimises the keyframes' poses.
-        motion: compares wheel odometry with scan matching.
-        contradiction: whether the two contradict each other.
+        turn_factor: encoder yaw over true yaw.
+        contradiction: whether wheel odometry and scan matching contradict each other.
         monitor: probability of being lost.
     """
 
@@ -117,7 +117,7 @@ class GridSlam:
         self.loop_closure = LoopClosure(self.config)
         self.map = OccupancyMap(self.config.map)
         self.frames = BaseFrames()
-        self.motion = MotionMonitor()
+        self.turn_factor = TurnFactor()
         self.contradiction = ContradictionMonitor()
         self.monitor = IntegrityMonitor()
         self.in_map_frame = saved is None
@@ -148,7 +148,7 @@ class GridSlam:
         odometry = None if odom_pose is None else np.asarray(odom_pose, dtype=np.float64)
         if odometry is not None and not np.isfinite(odometry).all():
             raise ValueError(f"odometry at {scan.stamp_ns} ns is not finite: {odometry}")
-        points = scan_points(scan, np.asarray(base_from_laser, dtype=np.float64), self.config.map.no_return_clear_m)
+        points = scan_points(scan, np.asarray(base_from_laser, dtype=np.float64))
         self._points = points
         guess = self.frames.predict(self.front_end, odometry, scan.stamp_ns)
         if len(points.points) >= MIN_POINTS:
@@ -200,7 +200,8 @@ class GridSlam:
         step = self.frames.follow(track.pose, matched, odometry, stamp_ns)
         self._covariance = track.covariance
         if step is not None and step.wheels is not None:
-            self.motion.update(step.wheels, step.motion, step.elapsed_s, matched)
+            if matched:
+                self.turn_factor.update(float(step.wheels[2]), float(step.motion[2]))
             self.contradiction.update(step.wheels, step.motion, step.elapsed_s, track.scan_sigma)
 
     def _result(self, track: Track) -> SlamResult:
@@ -310,7 +311,7 @@ class GridSlam:
             recent = self.front_end.trajectory[-QUERY_KEYFRAMES:]
             if self._points is not None and self.frames.stamp_ns is not None:
                 job = self._relocalization.search_job(recent, self.map_from_base, self._points, self.frames.stamp_ns)
-        elif self.config.loop.enabled and not self._broken and not self.front_end.in_known_map:
+        elif not self._broken and not self.front_end.in_known_map:
             new = self.front_end.trajectory[self._handed_over :]
             self._handed_over += len(new)
             job = (lambda: self.loop_closure.update(new)) if new else None
@@ -344,7 +345,7 @@ class GridSlam:
             return
         self._settle()
         new = self.front_end.trajectory[self._handed_over :]
-        if self.config.loop.enabled and self.front_end.trajectory:
+        if self.front_end.trajectory:
             self._handed_over += len(new)
             self.take_over(self.loop_closure.update(new, last=True))
 

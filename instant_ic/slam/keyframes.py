@@ -12,7 +12,7 @@ from instant_ic.slam.scan import FloatArray, ScanPoints
 
 LOCAL_KEYFRAMES = 40
 """Number of recent keyframes in the local map; more reduce drift and cost more."""
-NO_SCAN = ScanPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.bool_), np.zeros(2), np.zeros((0, 2)))
+NO_SCAN = ScanPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.bool_), np.zeros(2))
 """Empty scan of a removed keyframe."""
 
 

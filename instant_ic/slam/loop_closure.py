@@ -168,7 +168,7 @@ class LoopClosure:
         for keyframe in new:
             self._add(keyframe)
             here = len(self._keyframes) - 1
-            if self.config.loop.enabled and self._travelled[here] - self._searched_at_m >= SPACING_M:
+            if self._travelled[here] - self._searched_at_m >= SPACING_M:
                 self._searched_at_m = self._travelled[here]
                 changed |= self._close(here)
             self._thin_out(here - LOCAL_KEYFRAMES - 2 * QUERY_KEYFRAMES)
@@ -361,9 +361,9 @@ class LoopClosure:
                 loops += 1
                 if loops > MAX_LOOPS_OF_ONE:
                     continue
-            outward = edge if edge.a == k else _reversed(edge)
+            outward = edge if edge.a == k else reversed_edge(edge)
             if outward.b != heir:
-                kept.append(_chained(step, outward))
+                kept.append(chained(step, outward))
         self.edges = kept
         self._alive[k] = False
         self._merged.append((k, heir, relative2(self._poses[heir], self._poses[k])))
@@ -415,7 +415,7 @@ def _loop_covariance(covariance: FloatArray, yaw: float) -> FloatArray:
     return turned(covariance, -yaw) + np.diag(np.square([LOOP_SIGMA_M, LOOP_SIGMA_M, LOOP_SIGMA_RAD]))
 
 
-def _reversed(edge: Edge) -> Edge:
+def reversed_edge(edge: Edge) -> Edge:
     """Return the same edge seen from its other end."""
     b_from_a = inverse2(edge.a_from_b)
     carry = np.eye(3)
@@ -424,7 +424,7 @@ def _reversed(edge: Edge) -> Edge:
     return Edge(edge.b, edge.a, b_from_a, covariance, edge.robust)
 
 
-def _chained(first: Edge, second: Edge) -> Edge:
+def chained(first: Edge, second: Edge) -> Edge:
     """Compose two edges: from the start of the first to the end of the second, which starts where the first ends."""
     a_from_c = compose2(first.a_from_b, second.a_from_b)
     way = a_from_c[:2] - first.a_from_b[:2]

@@ -178,8 +178,6 @@ def save_graph(stem: Path, keyframes: Sequence[ScanKeyframe], edges: Sequence[Ed
         "points": np.concatenate([np.zeros((0, 2)), *(k.scan.points for k in keyframes)]).astype(np.float32),
         "joined": np.concatenate([np.zeros(0, dtype=np.bool_), *(k.scan.joined for k in keyframes)]),
         "point_counts": np.array([len(k.scan.points) for k in keyframes], dtype=np.int64),
-        "clear_ends": np.concatenate([np.zeros((0, 2)), *(k.scan.clear_ends for k in keyframes)]).astype(np.float32),
-        "clear_counts": np.array([len(k.scan.clear_ends) for k in keyframes], dtype=np.int64),
         "origins": np.array([k.scan.origin for k in keyframes]).reshape(-1, 2),
         "edge_ends": np.array([(e.a, e.b) for e in edges], dtype=np.int64).reshape(-1, 2),
         "edge_poses": np.array([e.a_from_b for e in edges]).reshape(-1, 3),
@@ -217,11 +215,10 @@ def load_graph(stem: Path) -> tuple[list[ScanKeyframe], list[Edge]]:
         cuts = np.cumsum(data["point_counts"])[:-1]
         points = np.split(data["points"].astype(np.float64), cuts)
         joined = np.split(data["joined"], cuts)
-        clear = np.split(data["clear_ends"].astype(np.float64), np.cumsum(data["clear_counts"])[:-1])
         keyframes = [
             ScanKeyframe(
                 int(data["stamps"][k]), data["map_from_base"][k],
-                ScanPoints(points[k], joined[k], data["origins"][k], clear[k]),
+                ScanPoints(points[k], joined[k], data["origins"][k]),
                 data["step"][k], data["step_covariance"][k], data["drift"][k],
             )
             for k in range(len(data["stamps"]))

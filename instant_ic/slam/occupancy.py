@@ -75,7 +75,7 @@ def _cast(cells, seen, mark, x0, y0, x1, y1):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def cast_scan(  # type: ignore[no-untyped-def]
-    cells, seen, mark, origin, resolution, pose, laser, points, clear_ends, max_range
+    cells, seen, mark, origin, resolution, pose, laser, points, max_range
 ):
     """Add one scan to log-odds ``cells`` float32 (H, W).
 
@@ -88,7 +88,6 @@ def cast_scan(  # type: ignore[no-untyped-def]
         pose: map_from_base (3,).
         laser: (2,) the laser's centre in the base frame.
         points: (n, 2) hits in the base frame.
-        clear_ends: (m, 2) ends of free rays in the base frame.
         max_range: metres; a farther hit only clears the cells up to it.
     """
     height, width = cells.shape
@@ -96,28 +95,22 @@ def cast_scan(  # type: ignore[no-untyped-def]
     laser_x = (pose[0] + cos_yaw * laser[0] - sin_yaw * laser[1] - origin[0]) / resolution
     laser_y = (pose[1] + sin_yaw * laser[0] + cos_yaw * laser[1] - origin[1]) / resolution
     reach = max_range / resolution
-    n = points.shape[0]
-    m = clear_ends.shape[0]
-    ends = np.empty((n + m, 2))
-    for i in range(n + m):
-        if i < n:
-            px, py = points[i, 0], points[i, 1]
-        else:
-            px, py = clear_ends[i - n, 0], clear_ends[i - n, 1]
-        x = (pose[0] + cos_yaw * px - sin_yaw * py - origin[0]) / resolution
-        y = (pose[1] + sin_yaw * px + cos_yaw * py - origin[1]) / resolution
+    ends = np.empty_like(points)
+    for i in range(points.shape[0]):
+        x = (pose[0] + cos_yaw * points[i, 0] - sin_yaw * points[i, 1] - origin[0]) / resolution
+        y = (pose[1] + sin_yaw * points[i, 0] + cos_yaw * points[i, 1] - origin[1]) / resolution
         length = math.hypot(x - laser_x, y - laser_y)
         if length > reach:
             x = laser_x + (x - laser_x) * reach / length
             y = laser_y + (y - laser_y) * reach / length
-        elif i < n:
+        else:
             ix, iy = math.floor(x), math.floor(y)
             if 0 <= ix < width and 0 <= iy < height and seen[iy, ix] != mark:
                 seen[iy, ix] = mark
                 cells[iy, ix] = min(cells[iy, ix] + HIT, HIGH)
         ends[i, 0] = x
         ends[i, 1] = y
-    for i in range(n + m):
+    for i in range(points.shape[0]):
         _cast(cells, seen, mark, laser_x, laser_y, ends[i, 0], ends[i, 1])
 
 
@@ -164,7 +157,7 @@ class OccupancyMap:
         self._mark += 1
         cast_scan(
             self._cells, self._seen, self._mark, self.origin, self.config.resolution_m, map_from_base, scan.origin,
-            scan.points, scan.clear_ends, self.config.max_range_m,
+            scan.points, self.config.max_range_m,
         )  # fmt: skip
         self.version += 1
 
@@ -196,7 +189,7 @@ class OccupancyMap:
         """Extend the grid to cover the scan, in steps of GROW_CELLS, up to ``max_size_m`` about the first pose."""
         cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
         rotation = np.array([[cos_yaw, -sin_yaw], [sin_yaw, cos_yaw]])
-        rays = np.concatenate([scan.points, scan.clear_ends, scan.origin[None]]) - scan.origin
+        rays = np.concatenate([scan.points, scan.origin[None]]) - scan.origin
         length = np.sqrt((rays**2).sum(axis=1, keepdims=True))
         rays *= np.minimum(1.0, self.config.max_range_m / np.maximum(length, 1e-9))
         places = (rays + scan.origin) @ rotation.T + pose[:2]

@@ -8,7 +8,6 @@ import numpy as np
 
 from instant_ic.slam.front_end import SlamStatus
 from instant_ic.slam.grid_slam import GridSlam, SlamResult
-from instant_ic.slam.motion import MotionState
 from instant_ic.util.diagnosis import Diagnosis, Level
 
 _STATUSES = {
@@ -19,14 +18,6 @@ _STATUSES = {
     SlamStatus.RESTARTED: (Level.ERROR, "the robot is lost; it maps apart from its map until its place is recognized"),
     SlamStatus.NO_POINTS: (Level.WARN, "the scan has too few points; going on by odometry"),
     SlamStatus.TIME_BACKWARDS: (Level.WARN, "the scan is not newer than the one before and is ignored"),
-}
-
-_MOTIONS = {
-    MotionState.NORMAL: (Level.OK, "the robot moves as its tracks do"),
-    MotionState.SLIPPING: (Level.WARN, "the tracks slip"),
-    MotionState.STUCK: (Level.ERROR, "the tracks turn and the robot stands: it is stuck"),
-    MotionState.PUSHED: (Level.WARN, "the robot moves and its tracks stand: somebody pushes it"),
-    MotionState.CARRIED: (Level.ERROR, "the tracks stand and the place is another one: the robot is being carried"),
 }
 
 
@@ -57,17 +48,16 @@ def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel
         yield Diagnosis("place", Level.WARN, text)
     elif slam.saved is not None:
         yield Diagnosis("place", Level.OK, "found in the saved map")
-    motion = slam.motion
-    level, text = _MOTIONS[motion.state] if with_odometry else (Level.OK, "no wheels to compare with")
+    level = Level.OK
+    text = "the robot moves as its tracks do" if with_odometry else "no wheels to compare with"
     if slam.contradiction.state:
         level, text = Level.ERROR, slam.contradiction.state.text
-    factor = {
-        "slip": round(motion.slip, 2),
-        "turn_factor": round(motion.turn_factor, 3),
-        "turn_factor_sigma": round(min(motion.turn_factor_sigma, 9.999), 3),
+    figures = {
+        "turn_factor": round(slam.turn_factor.value, 3),
+        "turn_factor_sigma": round(min(slam.turn_factor.sigma, 9.999), 3),
         "contradictions": slam.contradiction.count,
     }
-    yield Diagnosis("motion", level, text, factor)
+    yield Diagnosis("motion", level, text, figures)
     if with_odometry:
         correction_m = round(float(np.hypot(*slam.map_from_odom[:2])), 3)
         yield Diagnosis("odometry", Level.OK, "wheel odometry", {"correction_m": correction_m})

@@ -42,13 +42,11 @@ class ScanPoints:
         points: hits in beam order, (n, 2).
         joined: (n,) whether point ``i`` continues the surface of point ``i - 1``.
         origin: the laser's centre, (2,).
-        clear_ends: ends of the rays without return, (m, 2).
     """
 
     points: FloatArray
     joined: NDArray[np.bool_]
     origin: FloatArray
-    clear_ends: FloatArray
 
 
 JOIN_GAP_M = 0.3
@@ -86,11 +84,10 @@ def _joined(points: FloatArray, beams: NDArray[np.intp]) -> NDArray[np.bool_]:
     return joined
 
 
-def scan_points(scan: Scan, base_from_laser: FloatArray, clear_m: float) -> ScanPoints:
-    """Return hits and free rays of ``scan``; a range is a hit if ``range_min <= r <= range_max`` (REP-117).
+def scan_points(scan: Scan, base_from_laser: FloatArray) -> ScanPoints:
+    """Return the hits of ``scan``; a range is a hit if ``range_min <= r <= range_max`` (REP-117).
 
-    Neighbouring beams whose hits lie no more than `JOIN_GAP_M` apart, or in a line, are one surface. A ray of +inf is
-    free for ``clear_m`` metres (0: unknown).
+    Neighbouring beams whose hits lie no more than `JOIN_GAP_M` apart, or in a line, are one surface.
     """
     ranges = np.asarray(scan.ranges, dtype=np.float64)
     angles = scan.angle_min + scan.angle_increment * np.arange(ranges.size) + base_from_laser[2]
@@ -100,9 +97,7 @@ def scan_points(scan: Scan, base_from_laser: FloatArray, clear_m: float) -> Scan
     beams = np.flatnonzero(hit)
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = origin + ranges[beams, None] * directions[beams]
-    joined = _joined(points, beams)
-    free = np.isposinf(ranges) if clear_m > 0 else np.zeros(ranges.size, dtype=np.bool_)
-    return ScanPoints(points, joined, origin, origin + clear_m * directions[free])
+    return ScanPoints(points, _joined(points, beams), origin)
 
 
 def thin(points: FloatArray, joined: NDArray[np.bool_], max_points: int) -> FloatArray:

@@ -10,11 +10,11 @@ import pytest
 from slam_planar_world import PlanarWorld, rectangle
 
 from instant_ic.experiments.slam import trajectory_errors
-from instant_ic.experiments.slam_worlds import LASERS, Drive, Laser, cells, drive
+from instant_ic.experiments.slam_worlds import Drive, Laser, cells, drive
 from instant_ic.geometry.poses import compose2, relative2
-from instant_ic.slam import GridSlam, SlamConfig, SlamResult
+from instant_ic.slam import GridSlam, SlamResult
 from instant_ic.slam.likelihood_field import FieldSurface, LikelihoodField
-from instant_ic.slam.loop_closure import LoopClosure, _Candidate, _chained, _reversed
+from instant_ic.slam.loop_closure import chained, reversed_edge
 from instant_ic.slam.loop_search import find_place, peaks, pool, score_volume, spread
 from instant_ic.slam.pose_graph import Edge
 
@@ -56,7 +56,7 @@ def ring_world() -> tuple[list[tuple[float, float, float, float]], list[tuple[fl
 @pytest.fixture(scope="module")
 def ring() -> tuple[Drive, GridSlam, list[SlamResult]]:
     walls, way = ring_world()
-    journey = drive(walls, way, COARSE, 1)
+    journey = drive(walls, way, COARSE, 1, step_m=0.15, step_rad=0.15)
     return journey, *run(journey)
 
 
@@ -89,7 +89,7 @@ def test_the_same_scans_give_the_same_map(ring: tuple[Drive, GridSlam, list[Slam
 
 
 def test_rooms_that_look_alike_are_not_taken_for_each_other() -> None:
-    walls, way = cells(rooms=4)
+    walls, way = cells(rooms=3)
     journey = drive(walls, way, COARSE, 2, step_m=0.15, step_rad=0.15)
     slam, results = run(journey)
     assert loop_errors(slam, journey).max(initial=0.0) < 0.3
@@ -100,18 +100,18 @@ def test_rooms_that_look_alike_are_not_taken_for_each_other() -> None:
 def test_a_bare_corridor_closes_no_false_loop() -> None:
     # To and fro between bare walls that end out of sight: nothing tells how far along the robot is.
     walls = [(-60.0, -1.0, 60.0, -1.0), (-60.0, 1.0, 60.0, 1.0)]
-    journey = drive(walls, [(0.0, 0.0), (18.0, 0.0), (0.0, 0.0), (18.0, 0.0)], COARSE, 3, step_m=0.2)
+    journey = drive(walls, [(0.0, 0.0), (18.0, 0.0), (0.0, 0.0)], COARSE, 3, step_m=0.25)
     slam, _ = run(journey)
-    assert len(slam.front_end.trajectory) > 100
+    assert len(slam.front_end.trajectory) > 60
     assert slam.loop_closure.closed == 0
 
 
 def test_staying_in_one_room_does_not_add_keyframes_for_ever() -> None:
     walls = [*rectangle(-3, -3, 3, 3), *rectangle(2.0, 1.5, 2.6, 2.2)]
     square = [(-1.5, -1.5), (1.2, -1.5), (1.2, 1.2), (-1.5, 1.2)]
-    journey = drive(walls, [*(square * 8), square[0]], COARSE, 4, step_m=0.2, step_rad=0.2)
+    journey = drive(walls, [*(square * 6), square[0]], COARSE, 4, step_m=0.25, step_rad=0.3)
     slam, results, counts = GridSlam(), [], []
-    half = len(journey.entries) // 2  # four of the eight rounds
+    half = len(journey.entries) // 2  # three of the six rounds
     for part in (journey.entries[:half], journey.entries[half:]):
         results += run(replace(journey, entries=part), slam)[1]
         counts.append(int(slam.figures()["keyframes"]))
@@ -120,24 +120,6 @@ def test_staying_in_one_room_does_not_add_keyframes_for_ever() -> None:
     assert metres.max() < 0.1
     added = counts[1] - counts[0]
     assert added < 0.5 * counts[0]
-
-
-def test_a_loop_that_waits_does_not_outlive_its_keyframe() -> None:
-    # A keyframe may be merged into another while a loop to it waits for others that agree.
-    loop_closure = LoopClosure(SlamConfig())
-    slam, _ = run(drive(rectangle(-3, -3, 3, 3), [(0.0, 0.0), (2.0, 0.0)], COARSE, 0))
-    loop_closure.update(slam.front_end.trajectory)
-    here = len(loop_closure) - 1
-    edges = [
-        Edge(a, here - a, relative2(loop_closure.poses[a], loop_closure.poses[here - a]), np.eye(3), True)
-        for a in (1, 2)
-    ]
-    for edge in edges:
-        assert loop_closure._confirm(_Candidate(edge, 0.0)) == []
-    loop_closure._alive[1] = False
-    last = Edge(0, here, relative2(loop_closure.poses[0], loop_closure.poses[here]), np.eye(3), True)
-    assert loop_closure._confirm(_Candidate(last, 50.0)) == []  # of three, one is gone
-    assert [c.edge for c in loop_closure._pending] == [edges[1], last]
 
 
 def field_of(walls: PlanarWorld, poses: list[tuple[float, float, float]]) -> LikelihoodField:
@@ -210,20 +192,11 @@ def test_edges_are_turned_and_chained_right() -> None:
     # Oracle: 40000 draws of noise on both edges.
     noise = rng.multivariate_normal(np.zeros(3), covariance, (40_000, 2))
     draws = np.array([compose2(ab + one, bc + two) for one, two in noise])
-    chained = _chained(first, second)
-    assert (chained.a, chained.b) == (1, 3)
-    assert chained.a_from_b == pytest.approx(compose2(ab, bc))
-    assert np.abs(np.cov(draws.T) - chained.covariance).max() < 0.05 * np.abs(chained.covariance).max()
+    both = chained(first, second)
+    assert (both.a, both.b) == (1, 3)
+    assert both.a_from_b == pytest.approx(compose2(ab, bc))
+    assert np.abs(np.cov(draws.T) - both.covariance).max() < 0.05 * np.abs(both.covariance).max()
     back = np.array([relative2(ab + one, np.zeros(3)) for one in noise[:, 0]])
-    turned = _reversed(first)
+    turned = reversed_edge(first)
     assert turned.a_from_b == pytest.approx(relative2(ab, np.zeros(3)))
     assert np.abs(np.cov(back.T) - turned.covariance).max() < 0.05 * np.abs(turned.covariance).max()
-
-
-def test_loops_can_be_switched_off() -> None:
-    from dataclasses import replace
-
-    config = SlamConfig(loop=replace(SlamConfig().loop, enabled=False))
-    journey = drive(rectangle(-3, -3, 3, 3), [(0.0, 0.0), (1.0, 0.0)], LASERS["vlp16"], 0)
-    slam, _ = run(journey, GridSlam(config))
-    assert slam.loop_closure.closed == 0 and len(slam.loop_closure) == 0

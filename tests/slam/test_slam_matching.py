@@ -17,7 +17,7 @@ WIDE = np.array([0.3, 0.3, 0.3])
 
 
 def points_at(world: PlanarWorld, pose: list[float], noise_m: float = 0.0, stamp: int = 1) -> ScanPoints:
-    return scan_points(world.scan(np.array(pose), stamp, noise_m=noise_m), np.zeros(3), 0.0)
+    return scan_points(world.scan(np.array(pose), stamp, noise_m=noise_m), np.zeros(3))
 
 
 def field_of(world: PlanarWorld, *poses: list[float], noise_m: float = 0.0) -> LikelihoodField:
@@ -56,9 +56,7 @@ def test_noisy_hits_are_averaged_to_one_surface() -> None:
         assert value_at(field, 3.90, y) < 0.40  # 0.25 by the formula; 0.64 where the nearest stray hit counts
 
 
-@pytest.mark.parametrize(
-    "moved", [[0.0, 0.0, 0.0], [0.2, -0.15, 0.1], [-0.13, 0.21, -0.23], [0.0, 0.0, 0.3], [0.28, 0.28, 0.0]]
-)
+@pytest.mark.parametrize("moved", [[0.0, 0.0, 0.0], [-0.13, 0.21, -0.23], [0.28, 0.28, 0.0]])
 def test_a_scan_moved_and_turned_by_known_amounts_is_found(moved: list[float]) -> None:
     room = box_room()
     field = field_of(room, [0.0, 0.0, 0.0])

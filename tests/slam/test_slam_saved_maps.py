@@ -101,12 +101,9 @@ def test_modes_of_map_server(tmp_path: Path, text: str, expected: list[int]) -> 
         ("image: p.pgm\nresolution: 0\norigin: [0, 0, 0]\n", "resolution must be > 0"),
         ("image: p.pgm\nresolution: x\norigin: [0, 0, 0]\n", "resolution must be a number"),
         ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0.5]\n", "rotated map"),
-        ("image: p.pgm\nresolution: .1\norigin: here\n", "origin must be"),
-        ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0]\nmode: best\n", "mode must be"),
         ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0]\nfree_thresh: 0.9\n", "free_thresh < occupied_thresh"),
         ("image: none.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "does not exist"),
         ("image: bad.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "cannot be decoded"),
-        ("a: [\n", "cannot be read"),
     ],
 )
 def test_a_bad_map_is_told(tmp_path: Path, text: str, what: str) -> None:
@@ -220,6 +217,7 @@ def test_a_symmetric_map_gives_no_answer_until_told(tmp_path: Path) -> None:
     assert not slam.process(Scan(np.full(9, np.inf), 0.0, 0.1, 0.1, 9.0, 0)).localized  # an empty first scan
     results = feed(slam, drive(walls, [(0.0, -0.5), (0.0, 0.9)], LASER, 1))
     assert not any(result.localized for result in results)  # four headings fit equally well
+    assert slam.saved is not None and slam.saved.ambiguous
     # The drive began in map coordinates (0.5, −0.5), looking along +y, and went 1.4 m: told within 0.3 m and 15°.
     slam.set_pose([0.7, 0.7, math.pi / 2 + 0.25])
     last = drive(walls, [(0.0, -0.5), (0.0, 0.9)], LASER, 1).entries[-1]
@@ -281,7 +279,7 @@ def test_a_lower_floor_continues_the_sums_of_a_higher_one() -> None:
     np.testing.assert_array_equal(sums, at_once)
 
 
-def test_a_place_needs_a_second_scan_and_an_ambiguous_one_is_named(made: tuple[Path, GridSlam], tmp_path: Path) -> None:
+def test_a_place_needs_a_second_scan(made: tuple[Path, GridSlam]) -> None:
     stem, _ = made
     journey, _ = elsewhere()
     slam = make_slam(SlamConfig(), stem, True)
@@ -295,10 +293,3 @@ def test_a_place_needs_a_second_scan_and_an_ambiguous_one_is_named(made: tuple[P
         slam.take_over(job())
         states.append((result.localized, slam.localized))
     assert states == [(False, False), (False, True)]
-    walls = rectangle(-2.0, -2.0, 2.0, 2.0)
-    maker = GridSlam()
-    feed(maker, drive(walls, [(-0.5, 0.0), (0.5, 0.0)], LASER, 0))
-    maker.save(tmp_path / "square")
-    slam = make_slam(SlamConfig(), tmp_path / "square", True)
-    feed(slam, drive(walls, [(0.0, -0.5), (0.0, 0.5)], LASER, 1))
-    assert slam.saved is not None and slam.saved.ambiguous and not slam.localized

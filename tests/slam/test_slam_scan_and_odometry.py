@@ -19,20 +19,15 @@ def make_scan(ranges: list[float], angle_min: float = 0.0, increment: float = ma
 
 def test_points_follow_rep_117() -> None:
     # 0° at 2 m, 90° too near, 180° erroneous, 270° nothing met, 360° beyond the maximum.
-    points = scan_points(make_scan([2.0, -math.inf, math.nan, math.inf, 10.5]), np.zeros(3), 0.0)
+    points = scan_points(make_scan([2.0, -math.inf, math.nan, math.inf, 10.5]), np.zeros(3))
     assert np.allclose(points.points, [[2.0, 0.0]])
-    assert len(points.clear_ends) == 0
-
-
-def test_limits_of_range_count_as_hits_and_free_rays_reach_as_far_as_told() -> None:
-    points = scan_points(make_scan([0.5, 10.0, math.inf]), np.zeros(3), 3.0)
-    assert np.allclose(points.points, [[0.5, 0.0], [0.0, 10.0]], atol=1e-12)
-    assert np.allclose(points.clear_ends, [[-3.0, 0.0]], atol=1e-12)
+    limits = scan_points(make_scan([0.5, 10.0]), np.zeros(3))
+    assert np.allclose(limits.points, [[0.5, 0.0], [0.0, 10.0]], atol=1e-12)
 
 
 def test_mount_moves_points_into_the_base_frame() -> None:
     # The laser stands 0.2 m ahead and looks left: its x is the base's y.
-    points = scan_points(make_scan([2.0]), np.array([0.2, 0.0, math.pi / 2]), 0.0)
+    points = scan_points(make_scan([2.0]), np.array([0.2, 0.0, math.pi / 2]))
     assert np.allclose(points.points, [[0.2, 2.0]], atol=1e-12)
     assert np.allclose(points.origin, [0.2, 0.0])
 
@@ -40,7 +35,7 @@ def test_mount_moves_points_into_the_base_frame() -> None:
 def test_neighbouring_hits_join_into_surfaces() -> None:
     # Three hits on a wall 5 cm apart, then a jump of 4 m to something behind, then a missing beam.
     scan = Scan(np.array([2.0, 2.0, 2.0, 6.0, np.nan, 6.0]), 0.0, 0.025, 0.5, 10.0, 1)
-    joined = scan_points(scan, np.zeros(3), 0.0).joined
+    joined = scan_points(scan, np.zeros(3)).joined
     assert joined.tolist() == [False, True, True, False, False]
 
 
@@ -48,7 +43,7 @@ def test_a_wall_seen_at_a_grazing_angle_stays_one_surface() -> None:
     # Wall y = 1, beams 1° apart from 8° on: hits up to 0.9 m apart, all in one line.
     angles = np.radians(np.arange(8, 30))
     scan = Scan(1.0 / np.sin(angles), float(angles[0]), math.radians(1.0), 0.5, 10.0, 1)
-    points = scan_points(scan, np.zeros(3), 0.0)
+    points = scan_points(scan, np.zeros(3))
     assert np.hypot(*(points.points[1] - points.points[0])) > 0.5
     assert points.joined[1:].all()
 
