@@ -195,7 +195,7 @@ def test_intel_start_beats_its_odometry(mark: None) -> None:
     relations = read_relations(DATA / "intel.relations").at_stamps(read_stamps(DATA / "intel.exact_stamps"))
     report, result = evaluate_log(entries, relations)
     odometry = np.array([[e.scan.stamp_ns * 1e-9, *e.odom_pose] for e in entries])
-    assert report["relations"] > 15
+    assert report["relations"] > 5
     assert report["translation_mean_m"] < 0.06
     assert report["rotation_mean_deg"] < 1.5
     assert report["translation_mean_m"] < 0.5 * relation_error(odometry, relations)["translation_mean_m"]
