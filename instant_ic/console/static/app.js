@@ -187,7 +187,6 @@ const SHORTCUTS = {
   KeyM: () => screen.enlargeMap(),
   KeyR: () => recording.toggle(),
   KeyB: () => recording.mark(),
-  KeyP: () => screen.save(),
   KeyF: fullScreen,
   KeyH: help,
   KeyV: glide,
@@ -204,14 +203,12 @@ window.addEventListener("keydown", (event) => {
 const CLICKS = {
   take: () => lease.takeOver(),
   yield: () => lease.handOver(),
-  compass: () => look.centre(),
   "map-size": SHORTCUTS.KeyM,
   "map-canvas": SHORTCUTS.KeyM,
   fullscreen: fullScreen,
   "fullscreen-more": fullScreen,
   "help-open": help,
   "help-more": help,
-  "save-view": SHORTCUTS.KeyP,
 };
 for (const [id, action] of Object.entries(CLICKS)) byId(id).addEventListener("click", action);
 for (const button of document.querySelectorAll("#more button")) {

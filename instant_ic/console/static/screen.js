@@ -1,5 +1,5 @@
 // @ts-check
-// Renders main image, trajectory, compass and map, each only if it has changed. Frames follow each other while something
+// Renders main image, trajectory and map, each only if it has changed. Frames follow each other while something
 // moves; otherwise a message, an image or an input requests the next one.
 
 /** @import { Settings } from "./settings.js" */
@@ -12,12 +12,11 @@
 /** @import { GlViewer } from "./viewer.js" */
 import { byId, elementOf, mark } from "./dom.js";
 import { FrameRate } from "./framerate.js";
-import { drawCompass, drawGuide } from "./guide.js";
+import { drawGuide } from "./guide.js";
 import { showLatency } from "./hud.js";
 import { shows } from "./images.js";
 import { radians, transpose } from "./math.js";
 import { MiniMap } from "./minimap.js";
-import { saveView } from "./save.js";
 import { DEFAULTS } from "./settings.js";
 
 const LOOK_MS = 100; // shortest interval between two look messages
@@ -47,7 +46,6 @@ export class Screen {
     /** @type {Settings} */
     this.settings = DEFAULTS;
     this._guide = elementOf("guide", HTMLCanvasElement);
-    this._compass = elementOf("compass-tape", HTMLCanvasElement);
     this._rate = new FrameRate();
     this._frameAt = this._viewAt = this._steppedAt = performance.now();
     this._requested = this._wanted = false;
@@ -155,14 +153,6 @@ export class Screen {
     this.wake();
   }
 
-  /** Saves the shown view as a file. */
-  save() {
-    const render = () => this.viewer.render(this.images.scene(this.state, this.look, this._tanHalf(), 0));
-    saveView(this.viewer.canvas, render);
-    this._viewKey = "";
-    this.wake();
-  }
-
   /** Tangents of half the shown field of view: horizontal, vertical. @returns {[number, number]} */
   _tanHalf() {
     const { clientWidth, clientHeight } = this.viewer.canvas, tanV = Math.tan(this.look.vfov / 2);
@@ -212,16 +202,15 @@ export class Screen {
 
   /** @param {Scene} scene @param {[number, number]} tanHalf */
   _drawOverlay(scene, tanHalf) {
-    const { look } = this, position = this._cameraPosition(), colour = COLOURS[this.state?.mode ?? "none"];
+    const position = this._cameraPosition(), colour = COLOURS[this.state?.mode ?? "none"];
     const trajectory = position && this.link.connected ? this.plan.trajectory : [];
     // Without a trajectory nothing in the overlay can move.
     const place = trajectory.length && position ? rounded([...scene.mapFromLook, ...position], 3) + trajectory.join() : "";
-    const key = [place, colour, rounded([look.yaw, look.vfov, ...tanHalf], 3)].join();
-    if (!fit(this._compass) && key === this._guideKey) return;
+    const key = [place, colour, rounded(tanHalf, 3)].join();
+    if (key === this._guideKey) return;
     this._guideKey = key;
     const camera = { lookFromMap: transpose(scene.mapFromLook), position: position ?? [0, 0, 0] };
     drawGuide(this._guide, trajectory, camera, tanHalf, this.settings.footprint[1] / 2, colour);
-    drawCompass(this._compass, look.yaw, colour);
   }
 
   /** @param {[number, number]} tanHalf @param {number} now */
