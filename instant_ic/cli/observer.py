@@ -10,16 +10,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from instant_ic.bus import RELIABLE, registry
-from instant_ic.bus.clock import Clock, ManualClock, SystemClock
+from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.transport import RawSubscription, Received
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.names import absolute, unknown_topic
-from instant_ic.msg import deserialize, stamp_ns
 from instant_ic.util import pace, paths
 from instant_ic.util.closing import Closing
-
-_CLOCK = "/clock"
 
 
 class TopicObserver(Closing):
@@ -27,13 +24,12 @@ class TopicObserver(Closing):
 
     Args:
         topics: one or several names, with or without the leading slash.
-        use_sim_time: take arrival times and :attr:`clock` from ``/clock``.
 
     Raises:
         RegistryError: the run directory cannot be used, or a name is invalid.
     """
 
-    def __init__(self, topics: str | Sequence[str], use_sim_time: bool = False, run_dir: Path | None = None) -> None:
+    def __init__(self, topics: str | Sequence[str], run_dir: Path | None = None) -> None:
         names = [topics] if isinstance(topics, str) else list(topics)
         self.topics = list(dict.fromkeys(absolute(name) for name in names))
         self._run_dir = run_dir or paths.run_dir()
@@ -42,14 +38,13 @@ class TopicObserver(Closing):
             pace.use(pace.read(self._run_dir))
         except pace.PaceError as error:
             raise registry.RegistryError(str(error)) from error
-        self.clock: Clock = ManualClock() if use_sim_time else SystemClock()
+        self.clock = SystemClock()
         self.received = 0
         """Messages yielded by :meth:`batches`."""
         self._ready = threading.Event()
         self.transport = LocalTransport(self._run_dir, f"ic_{os.getpid()}", self.clock.now_ns)
         try:
             self.subscriptions = {topic: self._subscribe(topic) for topic in self.topics}
-            self._sim_clock = self._subscribe(_CLOCK) if use_sim_time else None
         except registry.RegistryError:
             self.transport.close()
             raise
@@ -70,16 +65,9 @@ class TopicObserver(Closing):
         while (left_s := end_s - time.monotonic()) > 0:
             self._ready.wait(min(period_s, left_s))
             self._ready.clear()
-            self.follow_clock()
             batch = [received for topic in self.topics for received in self.subscriptions[topic].take()]
             self.received += len(batch)
             yield batch
-
-    def follow_clock(self) -> None:
-        """Set the clock to the newest ``/clock`` message where simulated time is used."""
-        for received in self._sim_clock.take() if self._sim_clock is not None else ():
-            assert isinstance(self.clock, ManualClock)
-            self.clock.set(stamp_ns(deserialize(received.payload, received.type_name).clock))
 
     def hint(self) -> None:
         """Print to standard error which of the topics have no publisher yet."""
@@ -95,8 +83,6 @@ class TopicObserver(Closing):
         silent = [topic for topic in self.topics if topic in known]
         why = [unknown_topic(topic, known) for topic in missing]
         if self.received:
-            if self._sim_clock is not None and not self.clock.now_ns():
-                why.append(f"no message on {_CLOCK}: leave out --use-sim-time")
             plural = "s" * (self.received > 1)
             return UserError("; ".join([f"only {self.received} message{plural} received in {seconds:.0f} s", *why]))
         if silent:

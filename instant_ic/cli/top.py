@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 import os
 import sys
 import time
@@ -71,19 +69,6 @@ def table(rows: Sequence[NodeRow], sort: str) -> Group:
         style="bold",
     )
     return Group(head, node_table(sorted(rows, key=SORT_KEYS[sort])))
-
-
-def as_json(rows: Sequence[NodeRow]) -> list[dict[str, Any]]:
-    """Return rows as plain values; unknown values are null."""
-
-    def clean(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: clean(inner) for key, inner in value.items()}
-        if isinstance(value, list):
-            return [clean(inner) for inner in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return [clean(dataclasses.asdict(row)) for row in rows]
 
 
 def show_live(rows: Callable[[float], list[NodeRow]], period_s: float, sort: str) -> None:

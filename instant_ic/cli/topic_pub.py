@@ -35,15 +35,12 @@ def publish(args: argparse.Namespace) -> int:
         )
     wanted = 1 if args.once else args.times
     readers = args.readers if args.readers is not None else int(wanted > 0)
-    with TopicObserver([], args.use_sim_time) as observer:
+    with TopicObserver([]) as observer:
         transport = observer.transport
-        if args.use_sim_time:
-            _wait_for_clock(observer, args.max_wait_time_secs)
         publisher = Publisher(transport.advertise(topic, full, _QOS[args.qos]))
         _wait_for_readers(publisher, readers, args.max_wait_time_secs)
         next_s = time.monotonic()
         for count in itertools.count(1):
-            observer.follow_clock()
             message = build(full, values, observer.clock.now_ns())
             publisher.publish(message)
             print(f"publishing #{count}: {full}\n{describe(message)}\n", flush=True)
@@ -76,15 +73,6 @@ def _check_topic(topic: str, full: str, force: bool) -> None:
         )
     beside = f" beside {writers}" if writers else ""
     print(f"ic: {topic} moves the robot ({readers}){beside}: keep the emergency stop within reach", file=sys.stderr)
-
-
-def _wait_for_clock(observer: TopicObserver, seconds: float) -> None:
-    deadline_s = time.monotonic() + seconds
-    while observer.clock.now_ns() == 0:
-        if time.monotonic() > deadline_s:
-            raise UserError(f"no /clock within {seconds:g} s: omit --use-sim-time, or start the node that publishes it")
-        time.sleep(0.01)
-        observer.follow_clock()
 
 
 def _wait_for_readers(publisher: Publisher, wanted: int, seconds: float) -> None:

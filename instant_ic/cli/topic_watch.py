@@ -117,8 +117,7 @@ class Delay:
             stamp = stamp_ns(message)
         except MessageError:
             raise UserError(f"{received.topic}: {received.type_name} has no stamp, so its age is unknown", 2) from None
-        if received.received_ns:  # simulated time has started
-            self._ages_s.append((received.received_ns - stamp) / 1e9)
+        self._ages_s.append((received.received_ns - stamp) / 1e9)
 
     def line(self) -> str:
         """Return mean and spread of the ages."""
@@ -127,7 +126,7 @@ class Delay:
 
 def rate(args: argparse.Namespace) -> int:
     """Print rates once a second."""
-    return _watch(args, Rate, args.use_sim_time)
+    return _watch(args, Rate)
 
 
 def bandwidth(args: argparse.Namespace) -> int:
@@ -137,12 +136,12 @@ def bandwidth(args: argparse.Namespace) -> int:
 
 def delay(args: argparse.Namespace) -> int:
     """Print ages of messages once a second."""
-    return _watch(args, Delay, args.use_sim_time)
+    return _watch(args, Delay)
 
 
-def _watch(args: argparse.Namespace, kind: type[Rate | Bandwidth | Delay], use_sim_time: bool = False) -> int:
+def _watch(args: argparse.Namespace, kind: type[Rate | Bandwidth | Delay]) -> int:
     """Print a line per topic each second and at the end."""
-    with TopicObserver(args.topic, use_sim_time) as observer:
+    with TopicObserver(args.topic) as observer:
         watched: dict[str, TopicStatistics] = {topic: kind(args.window) for topic in observer.topics}
         width = max(map(len, watched)) if len(watched) > 1 else 0
 

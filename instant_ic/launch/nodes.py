@@ -15,7 +15,7 @@ import yaml
 from instant_ic.config.scalars import Scalar, is_null
 from instant_ic.config.yaml_text import one_line, read_spelled
 from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
-from instant_ic.launch.source import YamlPlace, load
+from instant_ic.launch.source import YamlPlace
 from instant_ic.launch.substitutions import MOST_TEXT, LaunchContext, SubstitutionError, substitute, truth
 from instant_ic.util import paths
 
@@ -138,9 +138,6 @@ def parameter_file(value: YamlPlace, scope: Scope) -> list[str]:
     path = scope.context.launch_file.parent / scope.text(value)  # an absolute path replaces the folder
     if not paths.is_file(path):
         raise value.problem(f"parameter file {path} does not exist")
-    for node_name, section in load(path).fields().items():
-        if "ros__parameters" not in section.fields():
-            raise section.problem(f"section {node_name!r} has no ros__parameters: key")
     return ["--params-file", str(path)]
 
 

@@ -1,7 +1,6 @@
 """``ic depth`` as a person calls it."""
 
 import argparse
-import json
 from pathlib import Path
 
 import cv2
@@ -45,18 +44,6 @@ def test_estimate(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "runs on cpu: cuda does not work here" in capsys.readouterr().err
 
 
-def test_check(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert ic("check", str(tiny), "--threads", "1") == 0
-    told = capsys.readouterr().out
-    for part in ("licence  MIT", "image: tensor(float) [1, 3, 64, 128]", "cpu, CPU threads: 1", "s per panorama"):
-        assert part in told
-    assert ic("check", str(tiny.with_suffix(".yaml")), "--json", "--runs", "1") == 0
-    record = json.loads(capsys.readouterr().out)
-    assert record["manifest"]["name"] == "tiny" and record["provider"] == "cpu"
-    assert record["depth_shape"] == [64, 128] and 0 < record["depth_range"][1] <= 1.0
-    assert 0 < record["seconds"] < 60
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -64,7 +51,6 @@ def test_check(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (("estimate", "{pano}", "--model", "absent.onnx"), "absent.yaml: no manifest"),
         (("estimate", "{pano}", "--model", "{tiny}", "-o", "/proc/nowhere/x.png"), "/proc/nowhere"),
         (("estimate", "{square}", "--model", "{tiny}"), "square.png: a panorama is twice as wide as high"),
-        (("check", "absent.onnx"), "absent.yaml: no manifest"),
     ],
 )
 def test_faults_are_told(tiny: Path, tmp_path: Path, words: tuple[str, ...], message: str) -> None:

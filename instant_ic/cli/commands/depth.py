@@ -1,9 +1,8 @@
-"""``ic depth``: train, convert, check and run depth models."""
+"""``ic depth``: train, convert and run depth models."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
@@ -22,8 +21,8 @@ PROVIDERS = ("auto", "tensorrt", "cuda", "cpu")
 
 def add_parser(subparsers: Any) -> None:
     commands = group(
-        subparsers, "depth", "train, convert, check and run 360° depth models",
-        "Train, convert, check and run 360° depth models (docs/depth.md).",
+        subparsers, "depth", "train, convert and run 360° depth models",
+        "Train, convert and run 360° depth models (docs/depth.md).",
         "ic depth estimate panorama.jpg --output depth.png",
     )  # fmt: skip
     depth_train.add_parser(commands)
@@ -52,30 +51,16 @@ def add_parser(subparsers: Any) -> None:
     add("--name", help="name in the manifest (default: the file's name)")
     add("--licence", help="licence in the manifest (default: unknown; Apache-2.0 for our own)")
     add = verb(
-        commands, "check", "check a model file and its manifest, and time it", check,
-        "ic depth check models/da2.onnx --provider cuda",
-        "Load a model as the node does and print its manifest, inputs, outputs, execution provider and "
-        "the time per panorama.",
-    ).add_argument  # fmt: skip
-    add("model", type=Path, nargs="?", help="ONNX file or its manifest (default: the shipped one)")
-    _add_model(add)
-    add("--runs", type=positive_int, default=3, metavar="N", help="timed runs (%(default)s)")
-    add("--json", action="store_true", help="print JSON")
-    add = verb(
         commands, "estimate", "estimate the depth of one panorama as a coloured image", estimate,
         "ic depth estimate panorama.jpg --output depth.png --npy depth.npy",
         "Estimate the depth of one equirectangular image; write a coloured PNG and optionally the values.",
     ).add_argument  # fmt: skip
     add("image", type=Path, help="equirectangular image")
     add("--model", type=Path, help="ONNX file with a manifest beside it (default: the shipped one)")
-    _add_model(add)
-    add("-o", "--output", type=Path, default=Path("depth.png"), help="coloured depth (%(default)s)")
-    add("--npy", type=Path, help="also write the depth as a float32 array")
-
-
-def _add_model(add: Any) -> None:
     add("--provider", choices=PROVIDERS, default="auto", help="execution provider (%(default)s)")
     add("--threads", type=positive_int, default=2, help="CPU threads (%(default)s)")
+    add("-o", "--output", type=Path, default=Path("depth.png"), help="coloured depth (%(default)s)")
+    add("--npy", type=Path, help="also write the depth as a float32 array")
 
 
 def textures(args: argparse.Namespace) -> int:
@@ -125,45 +110,6 @@ def _load(args: argparse.Namespace) -> DepthModel:
         print(f"runs on {model.provider}: {args.provider} does not work here (pip install onnxruntime-gpu?)",
               file=sys.stderr)  # fmt: skip
     return model
-
-
-def check(args: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
-    import numpy as np
-
-    begin = time.perf_counter()
-    model = _load(args)
-    took = [time.perf_counter() - begin]
-    manifest = model.manifest
-    # Random colour blocks: an image of one colour would not reveal a constant output.
-    coarse = np.random.default_rng(0).integers(0, 256, (8, 16, 3), np.uint8)
-    picture = coarse.repeat(max(1, manifest.input_height // 8), 0).repeat(max(1, manifest.input_width // 16), 1)
-    for _ in range(1 + args.runs):
-        begin = time.perf_counter()
-        depth = model.estimate(picture)
-        took.append(time.perf_counter() - begin)
-    load_s, first_s, seconds = took[0], took[1], float(np.median(took[2:]))
-    known = depth[depth > 0]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-    if args.json:
-        summary = {
-            "manifest": asdict(manifest), "provider": model.provider, "threads": args.threads,
-            "inputs": model.inputs, "outputs": model.outputs, "depth_shape": depth.shape, "depth_range": [low, high],
-            "known": known.size / depth.size, "load_s": load_s, "first_s": first_s, "seconds": seconds,
-        }  # fmt: skip
-        print(json.dumps(summary, indent=1))
-        return 0
-    for key, value in asdict(manifest).items():
-        print(f"{key:>14}  {value if value != '' else '-'}")
-    for kind, ends in (("input", model.inputs), ("output", model.outputs)):
-        for name, dtype, shape in ends:
-            print(f"{kind:>14}  {name}: {dtype} {shape}")
-    print(f"{'runs on':>14}  {model.provider}, CPU threads: {args.threads}")
-    print(f"{'output depth':>14}  {depth.shape[1]} x {depth.shape[0]}, {low:.3g} to {high:.3g}, "
-          f"{known.size / depth.size:.0%} known (on a random test image)")  # fmt: skip
-    print(f"{'time':>14}  {seconds:.3f} s per panorama (first run {first_s:.3f} s, loading {load_s:.2f} s)")
-    return 0
 
 
 def estimate(args: argparse.Namespace) -> int:

@@ -21,7 +21,6 @@ def add_parser(subparsers: Any) -> None:
         "Show CPU, memory, rates (measured/nominal) and losses of every node, once a second.",
     ).add_argument  # fmt: skip
     add("--once", action="store_true", help="print one table and exit (default without a terminal)")
-    add("--json", action="store_true", help="print one table as JSON and exit")
     add("--sort", choices=("cpu", "memory", "name", "lost"), default="cpu", help="default: %(default)s")
     add("-d", "--delay", type=positive, default=1.0, metavar="S", help="update period (default: 1)")
 
@@ -41,7 +40,6 @@ def _ask(row: NodeRow, run_dir: Path) -> None:
 
 def show(args: argparse.Namespace) -> int:
     """Show the table, live or once."""
-    import json
     import sys
 
     from rich.console import Console
@@ -50,7 +48,7 @@ def show(args: argparse.Namespace) -> int:
     from instant_ic.cli.errors import UserError
     from instant_ic.cli.heartbeats import Heartbeats
     from instant_ic.cli.names import nobody_runs
-    from instant_ic.cli.top import SORT_KEYS, as_json, make_rows, show_live, table
+    from instant_ic.cli.top import make_rows, show_live, table
     from instant_ic.util import paths
     from instant_ic.util.safe_text import direct
 
@@ -68,13 +66,10 @@ def show(args: argparse.Namespace) -> int:
                     _ask(row, run_dir)
             return made
 
-        if sys.stdin.isatty() and sys.stdout.isatty() and not (args.once or args.json):
+        if sys.stdin.isatty() and sys.stdout.isatty() and not args.once:
             show_live(rows, args.delay, args.sort)
             return 0
         newest = rows(1.5, until_all=True)
-    if args.json:
-        print(json.dumps(as_json(sorted(newest, key=SORT_KEYS[args.sort]))))
-    else:
-        width = None if sys.stdout.isatty() else _PIPE_WIDTH
-        Console(file=direct(sys.stdout), width=width).print(table(newest, args.sort))
+    width = None if sys.stdout.isatty() else _PIPE_WIDTH
+    Console(file=direct(sys.stdout), width=width).print(table(newest, args.sort))
     return 0

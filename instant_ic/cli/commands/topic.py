@@ -56,8 +56,6 @@ def _add_watching(verbs: Any) -> None:
         add("-w", "--window", type=positive_int, default=window, metavar="N", help=text)
         text = "stop after this time (default: never)"
         add("--duration", type=positive, default=float("inf"), metavar="S", help=text)
-        if name != "bw":
-            add("--use-sim-time", action="store_true", help="measure in the time of /clock")
 
 
 def _add_publishing(verbs: Any) -> None:
@@ -75,7 +73,6 @@ def _add_publishing(verbs: Any) -> None:
     text = "longest wait for subscribers (default: %(default)s)"
     add("--max-wait-time-secs", type=positive, default=10.0, metavar="S", help=text)
     add("--qos", choices=("sensor", "reliable", "latched"), default="reliable", help="default: reliable")
-    add("--use-sim-time", action="store_true", help="stamp messages with the time of /clock")
     add("--force", action="store_true", help="publish even where a node commands the robot on this topic")
 
 
