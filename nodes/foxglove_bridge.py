@@ -12,7 +12,6 @@ from instant_ic.util.diagnosis import RecentCount
 from instant_ic.util.paths import sign_in_file
 from instant_ic.util.web_access import AccessError, is_loopback, offer_sign_in
 
-_TIME_S = 0.05
 _LEAST_S = 0.02
 REFUSED_S = 10.0  # a refusal is a warning for this long
 
@@ -29,7 +28,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             raise NodeError("the bridge needs the real bus: it cannot run in lockstep")
         self._watch = TopicWatch(self.run_dir)
         try:
-            self.server = FoxgloveServer(self, self.run_dir, config, self.use_sim_time)
+            self.server = FoxgloveServer(self, self.run_dir, config)
         except FoxgloveError as error:
             raise NodeError(str(error)) from None
         address = f"ws://{config.host}:{self.server.port}"
@@ -54,7 +53,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
 
     def _look(self) -> None:
         assert self.server is not None
-        next_s, sent_ns = 0.0, 0
+        next_s = 0.0
         while not self.stopping:
             now_s = time.monotonic()
             if now_s >= next_s or self.server.wake.is_set():
@@ -62,10 +61,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
                 self.server.wake.clear()
                 self.call_soon(self.reconcile)
                 time.sleep(_LEAST_S)  # limits the cost of a viewer that connects and disconnects without end
-            if self.use_sim_time and (now_ns := self.clock.now_ns()) != sent_ns:
-                sent_ns = now_ns
-                self.server.send_time(now_ns)
-            self.server.wake.wait(_TIME_S if self.use_sim_time else max(next_s - time.monotonic(), 0.0))
+            self.server.wake.wait(max(next_s - time.monotonic(), 0.0))
 
     def reconcile(self) -> None:
         """Update the offered topics to the present topics and viewers."""

@@ -15,7 +15,6 @@ WARNING, ERROR = 1, 2
 """Levels of a status message."""
 
 _MESSAGE_DATA = struct.Struct("<BIQ")
-_TIME = struct.Struct("<BQ")
 _MAX_NUMBER = (1 << 32) - 1
 
 
@@ -40,11 +39,6 @@ def status(level: int, message: str) -> str:
 def message_data(subscription: int, log_ns: int, payload: bytes | memoryview) -> bytes:
     """Return a channel's message for one subscription."""
     return _MESSAGE_DATA.pack(1, subscription, log_ns) + payload
-
-
-def time_data(now_ns: int) -> bytes:
-    """Return the frame that sets the clients' clock."""
-    return _TIME.pack(2, now_ns)
 
 
 def parameters(values: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -94,7 +94,6 @@ class FoxgloveServer:
         node: the bridge's node, on whose bus the server subscribes.
         run_dir: run directory whose nodes' parameters are served.
         config: parameters of the bridge.
-        server_time: whether the clients' clock is set by :meth:`send_time` (for simulated time).
 
     Attributes:
         count, bytes: messages of the bus that were passed to viewers, and their size.
@@ -107,11 +106,10 @@ class FoxgloveServer:
         FoxgloveError: the server cannot start.
     """
 
-    def __init__(self, node: Node[Any], run_dir: Path, config: FoxgloveBridgeConfig, server_time: bool = False) -> None:
+    def __init__(self, node: Node[Any], run_dir: Path, config: FoxgloveBridgeConfig) -> None:
         self._node = node
         self._run_dir = run_dir
         self._config = config
-        self._server_time = server_time
         self._choice = TopicChoice(config.topics, config.exclude)
         self._lock = threading.Lock()  # guards channels, watchers, viewers and their queues; held only briefly
         self._channels: dict[str, _Channel] = {}
@@ -119,7 +117,6 @@ class FoxgloveServer:
         self._viewers: list[_Viewer] = []
         self._dropped_before = 0
         self._newcomers: set[str] = set()
-        self._time: bytes | None = None
         self._flush_due = False
         self.wake = threading.Event()
         self.count = self.bytes = self.refused = 0
@@ -219,14 +216,6 @@ class FoxgloveServer:
 
     # -- from any thread -------------------------------------------------------------------------
 
-    def send_time(self, now_ns: int) -> None:
-        """Send the simulated time to the viewers."""
-        with self._lock:
-            self._time = protocol.time_data(now_ns)
-            for viewer in self._viewers:
-                viewer.time = self._time
-            self._flush_soon()
-
     def _to_all(self, text: str) -> None:
         """Queue a text for all viewers. The caller holds the lock."""
         for viewer in self._viewers:
@@ -307,8 +296,8 @@ class FoxgloveServer:
         viewer = _Viewer(socket, request, self._config.backlog)
         with self._lock:
             channels = [channel.advertisement for channel in self._channels.values()]
-            viewer.texts += (self._server_info(), protocol.text("advertise", channels=channels))
-            viewer.time = self._time
+            info = {"name": "Instant IC", "capabilities": ["parameters"], "metadata": {}, "sessionId": str(id(self))}
+            viewer.texts += (protocol.text("serverInfo", **info), protocol.text("advertise", channels=channels))
             self._viewers.append(viewer)
         viewer.awake.set()
         sender = asyncio.create_task(self._send(viewer))
@@ -323,11 +312,6 @@ class FoxgloveServer:
                     viewer.unsubscribe(subscription)
             self.wake.set()
         return socket
-
-    def _server_info(self) -> str:
-        capabilities = ["parameters"] + ["time"] * self._server_time
-        session = str(id(self))
-        return protocol.text("serverInfo", name="Instant IC", capabilities=capabilities, metadata={}, sessionId=session)
 
     async def _send(self, viewer: _Viewer) -> None:
         """Send a viewer's queued frames as they come."""
@@ -348,14 +332,9 @@ class FoxgloveServer:
             viewer.abort()
 
     def _next_frame(self, viewer: _Viewer) -> str | bytes | None:
-        """Take the next frame to send: texts first, then the time, then messages."""
+        """Take the next frame to send: texts first, then messages."""
         with self._lock:
-            if viewer.texts:
-                return viewer.texts.popleft()
-            if viewer.time is not None:
-                frame, viewer.time = viewer.time, None
-                return frame
-            return viewer.take()
+            return viewer.texts.popleft() if viewer.texts else viewer.take()
 
     async def _receive(self, viewer: _Viewer) -> None:
         """Answer a viewer's messages until it leaves. A viewer that does not read its answers is not served further."""
@@ -426,7 +405,6 @@ class _Viewer:
         self.socket = socket
         self.awake = asyncio.Event()
         self.texts: deque[str] = deque()
-        self.time: bytes | None = None
         self.subscriptions: dict[int, _Channel] = {}
         self.dropped = 0
         self._transport = request.transport

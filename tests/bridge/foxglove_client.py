@@ -27,7 +27,6 @@ class Client:
         self.channels = {}
         self.messages = deque()
         self.texts = deque()
-        self.times = []
         self.info = self.until(lambda: self.text("serverInfo"), "serverInfo")
 
     def send(self, **content):
@@ -41,8 +40,6 @@ class Client:
                 if frame[0] == 1:
                     subscription, log_time = struct.unpack_from("<IQ", frame, 1)
                     self.messages.append((subscription, log_time, frame[13:]))
-                elif frame[0] == 2:
-                    self.times.append(struct.unpack_from("<Q", frame, 1)[0])
                 return
             content = json.loads(frame)
             if content["op"] == "advertise":
@@ -108,9 +105,9 @@ class FoxgloveWorld:
         self._open.callback(thing.close)
         return thing
 
-    def bridge(self, sim_time=False, **parameters):
+    def bridge(self, **parameters):
         config = FoxgloveBridgeConfig(port=0, discovery_period_s=0.05, **{"simulated": True, **parameters})
-        self.live = self.keep(LiveNode(self.run_dir, FoxgloveBridgeNode, config, "foxglove_bridge", sim_time))
+        self.live = self.keep(LiveNode(self.run_dir, FoxgloveBridgeNode, config, "foxglove_bridge"))
         return self.live.node
 
     def client(self, **options):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bus import RELIABLE, Node
-from instant_ic.bus.clock import ManualClock, SystemClock
+from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.msg import serialize, type_name
 
@@ -26,10 +26,10 @@ def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = 30.0) -
 class LiveNode:
     """A node that spins on a thread of its own."""
 
-    def __init__(self, run_dir: Path, node_class: type[Node[Any]], config: Any, name: str, sim_time: bool = False):
-        clock = ManualClock() if sim_time else SystemClock()
+    def __init__(self, run_dir: Path, node_class: type[Node[Any]], config: Any, name: str):
+        clock = SystemClock()
         transport = LocalTransport(run_dir, name, clock.now_ns)
-        self.node = node_class(config, transport, clock, name, use_sim_time=sim_time)
+        self.node = node_class(config, transport, clock, name)
         try:
             self.node.start()
         except BaseException:

@@ -16,14 +16,12 @@ from instant_ic.bridge import foxglove_protocol
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
 from instant_ic.experiments.stack import free_port
 from instant_ic.msg import (
-    Clock,
     ControlState,
     String,
     TFMessage,
     compressed_image_message,
     deserialize,
     message_type,
-    to_time,
     transform_message,
 )
 from instant_ic.util.paths import sign_in_file
@@ -138,16 +136,6 @@ def test_no_flood_of_old_messages_after_a_stall(world):
     # The server's queue and what the kernel's buffers held when it filled (4 MB by default), not the 100 sent.
     assert len(numbers) <= 32 + 16
     assert numbers == sorted(numbers)
-
-
-def test_simulated_time_is_sent_also_before_topics_flow(world):
-    world.bridge(sim_time=True)
-    clock = world.neighbour("player").publisher("/clock", Clock)
-    client = world.client()
-    assert "time" in client.info["capabilities"]
-    client.until(lambda: "/clock" in client.channels, "topics before the first /clock")
-    client.until(lambda: clock.publish(Clock(to_time(7_000_000_000))) or client.times, "the time")
-    assert set(client.times) == {7_000_000_000}
 
 
 # -- parameters --------------------------------------------------------------------------------------
