@@ -13,15 +13,17 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from reporting import note, parser_for, report
+from slam_worlds import LASERS, cells, drive, ring
 
 from instant_ic.experiments.slam import (
     Relations,
     evaluate_log,
-    perturb_odometry,
     read_relations,
     read_stamps,
     trajectory_errors,
@@ -29,8 +31,7 @@ from instant_ic.experiments.slam import (
 from instant_ic.experiments.slam_faults import FAULTS, evaluate_faults
 from instant_ic.experiments.slam_logs import LogEntry, read_log
 from instant_ic.experiments.slam_sim import round_trip
-from instant_ic.experiments.slam_worlds import LASERS, cells, drive, ring
-from instant_ic.geometry.poses import compose2
+from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.sim.worlds import make_world
 from instant_ic.slam import GridSlam, Scan
 from instant_ic.slam.scan import FloatArray
@@ -87,6 +88,30 @@ def ranges_to_walls(pose: FloatArray) -> FloatArray:
     return np.minimum(along_x, along_y)
 
 
+def perturb_odometry(entries: Iterable[LogEntry], seed: int) -> Iterator[LogEntry]:
+    """Degrade a log's odometry: Gaussian noise of 5 % of each step's size, plus a scale error of 2 %.
+
+    Translation and rotation are each too long or too short; the seed decides which.
+    """
+    rng = np.random.default_rng(seed)
+    signs = rng.choice([-1.0, 1.0], 2)
+    factor = 1.0 + 0.02 * np.array([signs[0], signs[0], signs[1]])
+    last: FloatArray | None = None
+    pose = np.zeros(3)
+    for entry in entries:
+        if entry.odom_pose is None:
+            yield entry
+            continue
+        if last is None:
+            pose = entry.odom_pose
+        else:
+            step = relative2(last, entry.odom_pose)
+            size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
+            pose = compose2(pose, factor * step + 0.05 * size * rng.standard_normal(3))
+        last = entry.odom_pose
+        yield replace(entry, odom_pose=pose)
+
+
 def intel(entries: list[LogEntry], relations: Relations, seed: int | None = None) -> dict[str, object]:
     """Evaluate the Intel log; ``seed`` degrades its odometry."""
     source = entries if seed is None else perturb_odometry(entries, seed)
@@ -99,9 +124,7 @@ def worlds() -> dict[str, object]:
     out: dict[str, object] = {}
     for name, made, laser, seed in (
         ("ring of corridors, 210 m, twice and back, SICK 180°", ring(0), "sick180", 0),
-        ("ring of corridors, SICK 361 beams", ring(1), "sick361", 1),
         ("rooms that look alike, VLP-16", cells(), "vlp16", 0),
-        ("ring of corridors, SICK 8 m", ring(4), "sick8m", 4),
     ):
         journey = drive(*made, LASERS[laser], seed)
         report, run = evaluate_log(journey.entries)

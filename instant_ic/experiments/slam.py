@@ -10,7 +10,6 @@ in the last optimisation. The poses published online are kept beside it.
 
 from __future__ import annotations
 
-import math
 import resource
 import time
 from collections import Counter
@@ -256,30 +255,6 @@ def from_anchor(result: SlamResult) -> tuple[ScanKeyframe | None, FloatArray]:
 def final_poses(anchored: Iterable[tuple[ScanKeyframe | None, FloatArray]]) -> FloatArray:
     """Return the poses (n, 3) of ``from_anchor`` after the last optimisation."""
     return np.array([there if anchor is None else compose2(anchor.pose(), there) for anchor, there in anchored])
-
-
-def perturb_odometry(entries: Iterable[LogEntry], seed: int) -> Iterator[LogEntry]:
-    """Degrade a log's odometry: Gaussian noise of 5 % of each step's size, plus a scale error of 2 %.
-
-    Translation and rotation are each too long or too short; the seed decides which.
-    """
-    rng = np.random.default_rng(seed)
-    signs = rng.choice([-1.0, 1.0], 2)
-    factor = 1.0 + 0.02 * np.array([signs[0], signs[0], signs[1]])
-    last: FloatArray | None = None
-    pose = np.zeros(3)
-    for entry in entries:
-        if entry.odom_pose is None:
-            yield entry
-            continue
-        if last is None:
-            pose = entry.odom_pose
-        else:
-            step = relative2(last, entry.odom_pose)
-            size = np.array([math.hypot(step[0], step[1])] * 2 + [abs(step[2])])
-            pose = compose2(pose, factor * step + 0.05 * size * rng.standard_normal(3))
-        last = entry.odom_pose
-        yield replace(entry, odom_pose=pose)
 
 
 def evaluate_log(

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from slam_planar_world import rectangle
 
+from benchmarks.slam_worlds import Drive, Laser, drive
 from instant_ic.bag import BagWriter
 from instant_ic.cli.main import main
 from instant_ic.experiments.slam_logs import read_bag
 from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip
-from instant_ic.experiments.slam_worlds import Drive, Laser, drive
 from instant_ic.geometry.poses import compose2, matrix_from_pose2, pose_matrix, relative2
 from instant_ic.msg import TFMessage, odometry_message, scan_message, serialize, transform_message, type_name
 

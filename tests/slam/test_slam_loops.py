@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from slam_planar_world import PlanarWorld, rectangle
 
+from benchmarks.slam_worlds import Drive, Laser, cells, drive
 from instant_ic.experiments.slam import trajectory_errors
-from instant_ic.experiments.slam_worlds import Drive, Laser, cells, drive
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, SlamResult
 from instant_ic.slam.likelihood_field import FieldSurface, LikelihoodField

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from slam_planar_world import rectangle
 
-from instant_ic.experiments.slam_worlds import Drive, Laser, drive
+from benchmarks.slam_worlds import Drive, Laser, drive
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, OccupancyGrid, Scan, SlamConfig, SlamResult, SlamStatus
 from instant_ic.slam.localization import bound_nodes
