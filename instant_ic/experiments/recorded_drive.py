@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ from instant_ic.slam.occupancy import OccupancyGrid
 STATE, MAP, CAMERA, KEYFRAME = "/ic/state", "/map", "/camera/image/compressed", "/keyframe"
 TYPES = {STATE: ("ControlState",), MAP: ("OccupancyGrid",), CAMERA: ("CompressedImage",), KEYFRAME: ("Keyframe",)}
 SIZE = (320, 180)
-AROUND_S, MOST_S = 2.0, 60.0
-"""Images begin and end this long before and after the virtual space, and span no more than the second value."""
+_BESIDE_S = 1.0
+"""The first and the last still are this long before and after the virtual space."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class RecordedDrive:
 
     Attributes:
         drive: figures, as of a simulated one; the r-bot's pose is the stack's estimate.
-        moments: before, during and after the first passage through the virtual space; else of the first minute.
+        moments: stills of ``still_times``.
         plot, modes: PNG of both trajectories on the map, and of the arbiter's mode over time.
     """
 
@@ -51,8 +51,8 @@ class RecordedDrive:
     modes: bytes
 
 
-def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
-    """Read a drive; images every ``frame_s``. Views of the virtual space are rendered again from the keyframes.
+def read_drive(bag: Path) -> RecordedDrive:
+    """Read a drive. Views of the virtual space are rendered again from the keyframes.
 
     Raises:
         ValueError: no bag, or a topic is missing; names it.
@@ -78,12 +78,11 @@ def read_drive(bag: Path, frame_s: float) -> RecordedDrive:
         if len(states) < 2:
             raise ValueError(f"{bag}: {len(states)} messages on {STATE}, 2 are needed")
         log = as_log(states, len(keyframes))
-        times = moment_times(log, frame_s)
-        photos: list[tuple[float, bytes]] = []  # the newest image at each time
+        times = still_times(log)
+        photos: dict[float, bytes] = {}  # the newest image at each time
         for one in reader.messages([CAMERA]):
-            time_s = (one.stamp_ns - begin_ns) / 1e9
-            if times[0] - 1.0 <= time_s <= times[-1] and (not photos or time_s >= photos[-1][0] + 0.5 * frame_s):
-                photos.append((time_s, bytes(deserialize(one.payload, one.type_name).data)))
+            photo = bytes(deserialize(one.payload, one.type_name).data)
+            photos |= {at: photo for at in times if (one.stamp_ns - begin_ns) / 1e9 <= at}
     drive = TeleopDrive(0, "ic", True, seconds=log.time_s[-1] - log.time_s[0])
     judge(drive, log, np.empty((0, 2)))
     return RecordedDrive(drive, _moments(log, times, photos, keyframes), _plot(drive, grid), _modes(drive))
@@ -121,22 +120,30 @@ def as_log(states: Sequence[tuple[float, Any]], keyframes: int = 0) -> DriveLog:
     )
 
 
-def moment_times(log: DriveLog, frame_s: float) -> NDArray[np.float64]:
-    """Return times around the first passage through the virtual space, or of the first minute without one."""
+def still_times(log: DriveLog) -> list[float]:
+    """Return times as in Fig. 9: before, first, middle and last in the virtual space, and after it.
+
+    They are of the first passage; without one, the drive's first time.
+    """
     times, virtual = np.array(log.time_s), np.array(log.virtual)
-    begin, end = times[0], times[-1]
-    if virtual.any():
-        first = int(np.argmax(virtual))
-        length = int(np.argmin(virtual[first:])) or len(virtual) - first
-        begin, end = times[first] - AROUND_S, times[first + length - 1] + AROUND_S
-    begin, end = max(begin, times[0]), min(end, times[-1], begin + MOST_S)
-    return np.arange(begin, end + 1e-9, frame_s)
+    if not virtual.any():
+        return [float(times[0])]
+    first = int(np.argmax(virtual))
+    last = first + (int(np.argmin(virtual[first:])) or len(virtual) - first) - 1
+    begin, end = float(times[first]), float(times[last])
+    return [
+        max(begin - _BESIDE_S, float(times[0])),
+        begin,
+        (begin + end) / 2,
+        end,
+        min(end + _BESIDE_S, float(times[-1])),
+    ]
 
 
 def _moments(
     log: DriveLog,
-    times: NDArray[np.float64],
-    photos: Sequence[tuple[float, bytes]],
+    times: Sequence[float],
+    photos: Mapping[float, bytes],
     keyframes: Sequence[tuple[float, Any]],
 ) -> list[Moment]:
     from instant_ic.msg import image_array, matrix_from_pose
@@ -167,9 +174,8 @@ def _moments(
             view = space.render(pose_matrix(x, y, yaw=yaw) @ base_from_camera, *SIZE, math.pi / 2)
             found.append(Moment(float(time_s), True, view.softened()))
             continue
-        taken = [jpeg for at, jpeg in photos if at <= time_s]
-        if taken:
-            rgb = decode_panorama(np.frombuffer(taken[-1], np.uint8))
+        if time_s in photos:
+            rgb = decode_panorama(np.frombuffer(photos[time_s], np.uint8))
             found.append(Moment(float(time_s), False, perspective_crop(rgb, np.eye(3), *SIZE, math.pi / 2)))
     return found
 

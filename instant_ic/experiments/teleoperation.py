@@ -6,7 +6,6 @@ import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,12 @@ from instant_ic.experiments.compared import command_of
 from instant_ic.experiments.illusion_stack import SOURCES, FilmedStack
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.plots import jpeg
-from instant_ic.experiments.recorded_drive import SIZE, Moment, read_drive
+from instant_ic.experiments.recorded_drive import SIZE, Moment, read_drive, still_times
 from instant_ic.experiments.report import Answer, Figure, Part, Section, Table, Text, image_address
 from instant_ic.experiments.teleop import TeleopSettings, decode, photograph, run_episode
 from instant_ic.experiments.teleop_plot import save_plot
 
 _FRAME_S = 0.25
-_BESIDE_S = 1.0
-"""Stills 1 and 5 are this long before and after the virtual space."""
 
 
 class _Recorded(FilmedStack):
@@ -77,7 +74,8 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
     images = {}
     frames = stacks[0].frames
     if arguments["images"] and frames:
-        images = _shown(frames)
+        times = still_times(stacks[0].log)
+        images = _numbered([min(frames, key=lambda frame: abs(frame.time_s - at)) for at in times])
         plot = io.BytesIO()
         save_plot(plot, [drive], settings)
         images["Trajectories of r-bot and v-bot, state over time"] = image_address(plot.getvalue(), "image/png")
@@ -87,34 +85,21 @@ def measure(arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 def _recorded(bag: Path) -> dict[str, Any]:
-    found = read_drive(bag, _FRAME_S)
-    images = _shown(found.moments) if found.moments else {}
+    found = read_drive(bag)
+    images = _numbered(found.moments)
     images["Trajectories of r-bot and v-bot"] = image_address(found.plot, "image/png")
     images["State over time"] = image_address(found.modes, "image/png")
     row = {key: value for key, value in asdict(found.drive).items() if key != "tracks"}
     return {"drive": row | {"contacts": None}, "views": {}, "images": images}
 
 
-def _shown(frames: Sequence[Moment]) -> dict[str, str]:
-    """Return numbered stills."""
+def _numbered(stills: Sequence[Moment]) -> dict[str, str]:
+    """Return the images of numbered stills."""
     images = {}
-    for number, frame in enumerate(stills(frames), 1):
+    for number, frame in enumerate(stills, 1):
         what = "virtual" if frame.virtual else "real"
         images[f"{number}: {frame.time_s:.1f} s, {what}"] = image_address(jpeg(frame.image))
     return images
-
-
-def stills(frames: Sequence[Moment]) -> list[Moment]:
-    """Choose five frames as in Fig. 9: before, first, middle and last in the virtual space, and after it."""
-    shown = [frame for frame in frames if frame.virtual]
-    if not shown:
-        return list(frames[:1])
-    ends = [at for at, (frame, after) in enumerate(pairwise(frames)) if frame.virtual and not after.virtual]
-    first = next(at for at, frame in enumerate(frames) if frame.virtual)
-    last = ends[0] if ends else len(frames) - 1
-    beside = math.ceil(_BESIDE_S / _FRAME_S)
-    chosen = (max(first - beside, 0), first, (first + last) // 2, last, min(last + beside, len(frames) - 1))
-    return [frames[at] for at in chosen]
 
 
 def section(results: Sequence[Result], options: Options) -> Section:

@@ -28,7 +28,7 @@ from instant_ic.experiments import (
 from instant_ic.experiments.depth_lidar import measure_world
 from instant_ic.experiments.lab import Options, Result, Unit
 from instant_ic.experiments.plots import curves_svg, image_strip
-from instant_ic.experiments.recorded_drive import Moment
+from instant_ic.experiments.recorded_drive import still_times
 from instant_ic.experiments.scan import (
     ScanQuality,
     Station,
@@ -38,7 +38,7 @@ from instant_ic.experiments.scan import (
     scan_world,
     station_places,
 )
-from instant_ic.experiments.teleoperation import stills
+from instant_ic.experiments.teleop_figures import DriveLog
 from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.experiments.worlds import moved_by, named_world, things
 from instant_ic.geometry.image_quality import psnr_db
@@ -463,10 +463,10 @@ def test_a_recording_shows_what_later_panoramas_saw(tmp_path) -> None:
 
 
 def test_stills_are_before_first_middle_last_and_after() -> None:
-    shown = [False] * 10 + [True] * 21 + [False] * 3
-    frames = [Moment(0.25 * k, virtual, np.zeros((2, 2, 3), np.uint8)) for k, virtual in enumerate(shown)]
-    assert [frame.time_s / 0.25 for frame in stills(frames)] == [6, 10, 20, 30, 33]
-    assert stills(frames[:3]) == frames[:1]
+    shown = [False] * 40 + [True] * 21 + [False] * 10
+    log = DriveLog(time_s=[0.05 * k for k in range(len(shown))], virtual=shown)
+    assert [round(time_s / 0.05) for time_s in still_times(log)] == [20, 40, 50, 60, 70]
+    assert still_times(DriveLog(time_s=[3.0, 3.05], virtual=[False, False])) == [3.0]
 
 
 def test_a_claim_is_not_decided_by_two_units() -> None:
