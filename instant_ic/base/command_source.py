@@ -49,14 +49,9 @@ class CommandSource:
         return False
 
     def admit(self, v: float, w: float, stamp_ns: int, received_ns: int, steady_ns: int) -> bool:
-        """Return whether a command of the driving node is obeyed.
+        """Return whether a command of the driving node (m/s, rad/s) is obeyed.
 
-        Args:
-            v: speed along x in m/s.
-            w: turn rate in rad/s.
-            stamp_ns: stamp of the message; 0 without one.
-            received_ns: arrival on the same clock.
-            steady_ns: present steady time.
+        ``stamp_ns`` is 0 without a stamp; ``received_ns`` is the arrival on the same clock.
         """
         refusal = self._gate.admit(v, w, (received_ns - stamp_ns) / 1e9 if stamp_ns else None)
         if refusal is not None:

@@ -135,14 +135,9 @@ ESTOP_BITS = {4: 0x0001, 2: 0x0004}
 
 
 def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str]]:
-    """Return the texts of the faults and warnings in a status.
+    """Return the texts of the faults and of the warnings in a status of 2 or 4 bytes (command 90).
 
-    Args:
-        status: value of command 90.
-        status_bytes: length of the reply, 2 or 4; the two lengths define different bits.
-
-    Returns:
-        (faults, warnings); with a fault the motors do not run, or not reliably.
+    With a fault the motors do not run, or not reliably.
     """
     if status_bytes == 2:
         named = [(bit, text) for bit, text in STATUS_FAULTS_2_BYTES.items() if status & bit]
@@ -158,9 +153,6 @@ def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str
 def latches(mode: int, pin: str, status_bytes: int) -> bool:
     """Return whether a mode of command 75 makes a pin a latching emergency stop.
 
-    Args:
-        mode: function of the pin.
-        pin: S3, S4 or S5. In the packet serial modes, S3 is a latching emergency stop by default.
-        status_bytes: length of the status; firmware with the short one numbers the modes in another way.
+    In the packet serial modes, S3 is one by default. Firmware with a short status numbers the modes in another way.
     """
     return mode == (0x81 if status_bytes == 4 else 0x01) or (mode == 0 and pin == "S3")

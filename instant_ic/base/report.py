@@ -43,7 +43,6 @@ class BaseReport:
             "repeated": counters.retries,
             "timeouts": counters.timeouts,
             "crc_errors": counters.crc_errors,
-            "transactions": counters.transactions,
             "stops": counters.stops,
         }
         text = f"{repeated} commands repeated in {recent}" if repeated else "no command had to be repeated"

@@ -84,14 +84,12 @@ class LinkCounters:
     """Link statistics since the driver was created.
 
     Attributes:
-        transactions: commands sent, without repeats.
         retries: repeated commands.
         timeouts: missing or incomplete replies.
         crc_errors: damaged replies.
         stops: stops of the motors because of a missing reply.
     """
 
-    transactions: int = 0
     retries: int = 0
     timeouts: int = 0
     crc_errors: int = 0
@@ -385,7 +383,6 @@ class Roboclaw:
             raise LinkError(f"{self.config.port}: not connected; call connect() first")
         # One write call per frame: the controller drops a frame with gaps between its bytes.
         sent = frame or read_request(self.config.address, command)
-        self.counters.transactions += 1
         failure, silent = "", False
         for attempt in range(self.config.retries + 1):
             if attempt:

@@ -141,12 +141,7 @@ class CommandRules:
 
 
 def why_stopped(s: Snapshot, stopped_by: Notice) -> Notice:
-    """Return the reason that keeps the robot in STOPPED.
-
-    Args:
-        s: present state of all inputs.
-        stopped_by: reason that led there.
-    """
+    """Return the reason that keeps the robot in STOPPED, to which ``stopped_by`` led."""
     inputs = s.inputs
     if inputs.estop_button:
         text = "emergency stop button is pressed: release it, then release the stop here"

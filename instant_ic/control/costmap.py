@@ -194,15 +194,7 @@ def scan_rays(
     """Return the measured beams of a scan in the map frame (REP-117).
 
     A beam without a return neither marks nor clears: a VLP-16 returns nothing from nearer than 0.4 m either.
-
-    Args:
-        ranges: (N,) metres.
-        angle_min: of the first beam, radians.
-        angle_increment: radians.
-        range_min: metres.
-        range_max: metres.
-        map_from_lidar: (4, 4) at the stamp of the scan.
-        config: ranges for marking and clearing.
+    ``ranges`` is (N,) in metres, angles are radians; ``map_from_lidar`` is (4, 4) at the stamp of the scan.
     """
     r = np.asarray(ranges, dtype=np.float64)
     angle = angle_min + angle_increment * np.arange(r.size)

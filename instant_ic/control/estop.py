@@ -48,7 +48,7 @@ class EstopLatch:
 
     @property
     def diagnosis(self) -> Diagnosis:
-        """True if the emergency stop is latched, by whom, and how to release it."""
+        """The state of the latch: who pressed the emergency stop, and how to release it."""
         if not self.stopped:
             return Diagnosis("emergency stop", Level.OK, "released")
         by = "the robot (its button, or a fault of its motor controller)" if self.button else self.publisher

@@ -25,16 +25,9 @@ class Interruptions:
     def step(
         self, steady_ns: int, suspended_ns: int, instances: Mapping[tuple[str, str], bytes], longest_s: float
     ) -> Notice | None:
-        """Note a step of the arbiter.
+        """Note a step of the arbiter; return what has happened since the one before, None for nothing.
 
-        Args:
-            steady_ns: steady time.
-            suspended_ns: time for which the machine was suspended since its start.
-            instances: publishers of the sources, as in ``ArbiterInputs``.
-            longest_s: a longer gap is an interruption.
-
-        Returns:
-            What has happened since the step before; None for nothing.
+        ``suspended_ns`` and ``instances`` are as in ``ArbiterInputs``; a gap above ``longest_s`` is an interruption.
         """
         self.gap_s = self.gap.step(steady_ns, suspended_ns)
         new = [key for key, instance in instances.items() if self._instances.get(key, instance) != instance]

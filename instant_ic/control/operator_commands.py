@@ -44,17 +44,9 @@ class OperatorCommands:
     def step(
         self, inputs: ArbiterInputs, fresh: bool, limits: MotionLimits, longest_s: float, now_ns: int
     ) -> Notice | None:
-        """Note the command of a step.
+        """Note the command of a step, if it is ``fresh``; return why the controls must be released first, or None.
 
-        Args:
-            inputs: inputs of the step.
-            fresh: whether the command counts.
-            limits: limits of the command.
-            longest_s: seconds of silence after which a held control must be released.
-            now_ns: steady time.
-
-        Returns:
-            Why the controls must be released first; None if they need not.
+        A held control must be released after a silence of ``longest_s``.
         """
         self.fresh, self.command = fresh, limits.clip(*inputs.operator_command) if fresh else NO_MOTION
         if self._driven_ns is None:

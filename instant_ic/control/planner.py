@@ -113,8 +113,6 @@ class Plan:
     """Length to the goal, including the part through unknown space; inf when there is no way."""
     reverse: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     """(N,) whether the robot reaches a pose backwards."""
-    iterations: int = 0
-    """Number of poses that the search expanded."""
 
 
 def no_plan(reason: str) -> Plan:
@@ -147,11 +145,7 @@ class HybridPlanner:
     ) -> Plan:
         """Plan a path from pose ``start`` to pose ``goal`` (3,), or to the nearest reachable place.
 
-        Args:
-            costmap: costs around the robot.
-            start: pose of the robot, (3,).
-            goal: where to, (3,).
-            before: previous plan.
+        A way along the plan ``before`` is a little cheaper.
         """
         start, goal = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
         height, width = costmap.costs.shape
@@ -180,16 +174,16 @@ class HybridPlanner:
         cut = _before_unknown(costmap, poses)
         if cut is not None:
             reason = "the way leads through space not seen yet"
-            return Plan(poses[cut], False, reason, length if found else math.inf, reverse[cut], opened)
+            return Plan(poses[cut], False, reason, length if found else math.inf, reverse[cut])
         if reachable and found:
-            return Plan(poses, True, "", length, reverse, opened)
+            return Plan(poses, True, "", length, reverse)
         gap = float(np.linalg.norm(poses[-1, :2] - goal[:2]))
         on_obstacle = taken and not outside and gap <= TOLERANCE_M
         if on_obstacle:
             reason = f"the goal is on an obstacle; the path ends {gap:.1f} m from it"
         else:
             reason = self._why_short(gap, opened, outside=outside, reachable=reachable)
-        return Plan(poses, False, reason, length if on_obstacle else math.inf, reverse, opened)
+        return Plan(poses, False, reason, length if on_obstacle else math.inf, reverse)
 
     def _why_short(self, gap_m: float, opened: int, *, outside: bool, reachable: bool) -> str:
         """Return why a path ends ``gap_m`` metres before the goal."""

@@ -68,13 +68,9 @@ class Lease:
         self._held: dict[str, int] = {}  # sender -> time of its last motion that was refused
 
     def refusal(self, sender: str, moves: bool, now_ns: int, stands: bool = True) -> Refusal | None:
-        """Note a command and return why its sender may not drive by it; None if it may (:meth:`grant`).
+        """Note a command, which ``moves`` or is zero; return why its sender may not drive, None if he may (`grant`).
 
-        Args:
-            sender: name of the sender.
-            moves: whether the command is not zero.
-            now_ns: present time.
-            stands: whether the robot stands; only then does the lease pass to another sender.
+        The lease passes to another sender only while the robot ``stands``.
         """
         since_ns = now_ns - round(self.silent_s * 1e9)
         self._held = {other: held_ns for other, held_ns in self._held.items() if held_ns >= since_ns}
@@ -128,11 +124,9 @@ class Lease:
 
 
 def may_release_estop(publisher: str, holder: str) -> str:
-    """Return why a node may not release the emergency stop; empty if it may: its client has the robot's lease.
+    """Return why the node ``publisher`` may not release the emergency stop.
 
-    Args:
-        publisher: name of the node that publishes the release.
-        holder: who has the lease, ``node/client``; empty: nobody.
+    Empty if it may: one of its clients is ``holder`` of the robot's lease (``node/client``; empty: nobody).
     """
     if holder.startswith(f"{publisher}/"):
         return ""

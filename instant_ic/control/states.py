@@ -1,4 +1,4 @@
-"""The state machine of illusory control as data (paper, III.A): states, guards, actions, sources, reasons.
+"""The state machine of illusory control as data (paper, III.A): modes, guards, actions, sources, reasons.
 
 ``arbiter.py`` runs these tables with the guards of ``guards.py``; ``tests/control/diagram.py`` prints them for docs.
 """
@@ -92,36 +92,9 @@ class Reason(IntEnum):
     OPERATOR_LOST = 79
 
     @property
-    def label(self) -> str:
-        """Name in reports."""
-        return self.name.lower().replace("_", " ")
-
-    @property
     def holds(self) -> bool:
         """True if nothing may move."""
         return self >= Reason.ESTOP
-
-
-@dataclass(frozen=True)
-class State:
-    """Meaning of a mode: which robot the operator drives, what is shown, what the other robot does."""
-
-    driven: str
-    shown: str
-    other: str
-
-
-STATES: dict[Mode, State] = {
-    Mode.REAL: State("r-bot", "camera", "the v-bot moves with the r-bot"),
-    Mode.ENTERING: State(
-        "r-bot, slowing to a stand within enter_timeout_s",
-        "camera",
-        "the v-bot waits for its first view where the shown image was taken",
-    ),
-    Mode.VIRTUAL: State("v-bot", "virtual space", "the r-bot drives to the subgoal"),
-    Mode.RETURNING: State("r-bot", "virtual space", "the v-bot moves as the r-bot and is eased onto it"),
-    Mode.STOPPED: State("nobody", "camera", "both stand"),
-}
 
 
 @dataclass(frozen=True)
@@ -134,35 +107,22 @@ class Transition:
     action: str
 
 
+def _stops(source: Mode, *more: str) -> tuple[Transition, ...]:
+    guards = ("estop_pressed", "interrupted", "source_lost", "pose_lost", "contradicted", *more)
+    return tuple(Transition(source, Mode.STOPPED, guard, "stop") for guard in guards)
+
+
 TRANSITIONS: tuple[Transition, ...] = (
-    Transition(Mode.REAL, Mode.STOPPED, "estop_pressed", "stop"),
-    Transition(Mode.REAL, Mode.STOPPED, "interrupted", "stop"),
-    Transition(Mode.REAL, Mode.STOPPED, "source_lost", "stop"),
-    Transition(Mode.REAL, Mode.STOPPED, "pose_lost", "stop"),
-    Transition(Mode.REAL, Mode.STOPPED, "contradicted", "stop"),
+    *_stops(Mode.REAL),
     Transition(Mode.REAL, Mode.ENTERING, "obstacle_and_ready", "call_vbot"),
-    Transition(Mode.ENTERING, Mode.STOPPED, "estop_pressed", "stop"),
-    Transition(Mode.ENTERING, Mode.STOPPED, "interrupted", "stop"),
-    Transition(Mode.ENTERING, Mode.STOPPED, "source_lost", "stop"),
-    Transition(Mode.ENTERING, Mode.STOPPED, "pose_lost", "stop"),
-    Transition(Mode.ENTERING, Mode.STOPPED, "contradicted", "stop"),
+    *_stops(Mode.ENTERING),
     Transition(Mode.ENTERING, Mode.REAL, "vspace_not_ready", "hand_back"),
     Transition(Mode.ENTERING, Mode.REAL, "no_view_in_time", "abandon_entry"),
     Transition(Mode.ENTERING, Mode.REAL, "way_free", "hand_back"),
     Transition(Mode.ENTERING, Mode.VIRTUAL, "view_fits", "place_vbot"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "estop_pressed", "stop"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "interrupted", "stop"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "source_lost", "stop"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "pose_lost", "stop"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "contradicted", "stop"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "vspace_lost", "stop"),
+    *_stops(Mode.VIRTUAL, "vspace_lost"),
     Transition(Mode.VIRTUAL, Mode.RETURNING, "rejoined", "ease_vbot"),
-    Transition(Mode.RETURNING, Mode.STOPPED, "estop_pressed", "stop"),
-    Transition(Mode.RETURNING, Mode.STOPPED, "interrupted", "stop"),
-    Transition(Mode.RETURNING, Mode.STOPPED, "source_lost", "stop"),
-    Transition(Mode.RETURNING, Mode.STOPPED, "pose_lost", "stop"),
-    Transition(Mode.RETURNING, Mode.STOPPED, "contradicted", "stop"),
-    Transition(Mode.RETURNING, Mode.STOPPED, "vspace_lost", "stop"),
+    *_stops(Mode.RETURNING, "vspace_lost"),
     Transition(Mode.RETURNING, Mode.VIRTUAL, "unsafe_again", "drive_vbot_on"),
     Transition(Mode.RETURNING, Mode.REAL, "image_fits", "hand_back"),
     Transition(Mode.STOPPED, Mode.REAL, "may_resume", "hand_back"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import groupby
 
 from instant_ic.control.freshness import TimeoutConfig
-from instant_ic.control.states import ACTIONS, GUARDS, SOURCES, STATES, TRANSITIONS, Mode
+from instant_ic.control.states import ACTIONS, GUARDS, SOURCES, TRANSITIONS, Mode
 
 
 def state_diagram() -> str:
@@ -15,13 +15,6 @@ def state_diagram() -> str:
         guards = ", ".join(row.guard for row in rows)
         lines.append(f"    {source.name} --> {target.name}: {guards} / {action}")
     return "\n".join(lines)
-
-
-def state_table() -> str:
-    """The states and their meaning, as a Markdown table."""
-    rows = ["| State | Driven by the operator | Shown | Meanwhile |", "|---|---|---|---|"]
-    rows += [f"| {mode.name} | {state.driven} | {state.shown} | {state.other} |" for mode, state in STATES.items()]
-    return "\n".join(rows)
 
 
 def guard_table() -> str:
@@ -39,7 +32,7 @@ def source_table(timeouts: TimeoutConfig | None = None) -> str:
         "|---|---|---|---|",
     ]
     for source in SOURCES:
-        unused = set(STATES) - set(source.modes)
+        unused = set(Mode) - set(source.modes)
         modes = "all but STOPPED" if unused == {Mode.STOPPED} else ", ".join(mode.name for mode in source.modes)
         timeout = getattr(timeouts, source.key)
         zero = f"{timeout:g} s" + (", longer at low rates" if source.steady else "") if timeout else "never by default"
