@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.protocol import (
     ACKNOWLEDGE,
-    ESTOP_BITS,
     INTER_BYTE_GAP_S,
     MOTORS_OFF,
     PINS,
@@ -64,11 +63,6 @@ class ControllerStatus:
 
     value: int
     size: int
-
-    @property
-    def estop(self) -> bool:
-        """True if the controller's emergency stop input is active."""
-        return bool(self.value & ESTOP_BITS[self.size])
 
     @property
     def faults(self) -> list[str]:

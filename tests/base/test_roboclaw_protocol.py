@@ -22,7 +22,7 @@ from instant_ic.base.protocol import (
     read_request,
     write_frame,
 )
-from instant_ic.base.roboclaw import ControllerStatus, LinkError, Roboclaw
+from instant_ic.base.roboclaw import LinkError, Roboclaw
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
 
@@ -62,11 +62,6 @@ def test_status_bits_differ_between_old_and_new_firmware() -> None:
     assert describe_status(0x0001, 2) == ([], ["over-current warning M1"])
     assert describe_status(0x2000 | 0x10000, 4) == (["over-current M2"], ["warning bits 0x00010000"])
     assert describe_status(0, 4) == ([], [])
-
-
-@pytest.mark.parametrize(("value", "size", "pressed"), [(1, 4, True), (4, 4, False), (4, 2, True), (1, 2, False)])
-def test_the_emergency_stop_input_has_another_bit_in_a_short_status(value, size, pressed):
-    assert ControllerStatus(value, size).estop is pressed
 
 
 def test_emulator_waits_for_a_whole_frame_and_drops_it_after_a_gap() -> None:
