@@ -13,13 +13,6 @@ from instant_ic.config.params import ParameterError, yaml_value
 from instant_ic.config.scalars import READERS, Scalar, to_whole_number
 from instant_ic.msg import message_type, to_time, type_name, typestore
 
-_INTEGERS = {
-    name: (np.iinfo(kind).min, np.iinfo(kind).max)
-    for name, kind in {
-        **{f"{sign}int{bits}": np.dtype(f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)},
-        **dict.fromkeys(("byte", "char", "octet"), np.dtype("uint8")),
-    }.items()
-}
 _FLOATS = ("float32", "float64")
 _NOT_FINITE = tuple(f"{sign}{word}" for sign in ("", "+", "-") for word in (".inf", ".nan", "inf", "nan"))
 _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
@@ -151,7 +144,7 @@ def _scalar(base: str, most: int, value: Any, path: str) -> Any:
     if kind is str and most and len(found) > most:
         raise UserError(f"{path} must have at most {most} characters (got {len(found)})", 2)
     if kind is int:
-        low, high = _INTEGERS[base]
-        if not low <= found <= high:
-            raise _misfit(path, f"{base}, {low}..{high}", value)
+        limits = np.iinfo(_dtype(base))
+        if not limits.min <= found <= limits.max:
+            raise _misfit(path, f"{base}, {limits.min}..{limits.max}", value)
     return found

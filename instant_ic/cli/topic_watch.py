@@ -7,7 +7,6 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from statistics import fmean, pstdev
-from typing import Protocol
 
 from instant_ic.bus.transport import Received
 from instant_ic.cli.errors import UserError
@@ -36,16 +35,6 @@ def echo(args: argparse.Namespace) -> int:
         if count < max(wanted, 1):
             raise observer.too_few(args.timeout)
     return 0
-
-
-class TopicStatistics(Protocol):
-    """Statistics over the newest messages of a topic."""
-
-    def add(self, received: Received) -> None:
-        """Take a message."""
-
-    def line(self) -> str:
-        """Return the statistics as text; empty without enough messages."""
 
 
 class Rate:
@@ -142,7 +131,7 @@ def delay(args: argparse.Namespace) -> int:
 def _watch(args: argparse.Namespace, kind: type[Rate | Bandwidth | Delay]) -> int:
     """Print a line per topic each second and at the end."""
     with TopicObserver(args.topic) as observer:
-        watched: dict[str, TopicStatistics] = {topic: kind(args.window) for topic in observer.topics}
+        watched = {topic: kind(args.window) for topic in observer.topics}
         width = max(map(len, watched)) if len(watched) > 1 else 0
 
         def print_lines() -> None:

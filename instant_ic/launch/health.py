@@ -14,7 +14,7 @@ from instant_ic.bus import RELIABLE, SENSOR, registry
 from instant_ic.bus.diagnostics import ERROR, OK, WARN
 from instant_ic.bus.heartbeat import EVERY_NODES, TYPE, Heartbeat, from_message
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.launch.topics import nominal_rate
+from instant_ic.launch.topics import expected_rate
 from instant_ic.msg import MessageError, deserialize, header, message_type, serialize
 from instant_ic.util.paths import sign_in_file
 
@@ -186,7 +186,7 @@ class HealthMonitor:
             if health is None or health.silent or not health.up:
                 continue
             for topic, flow in health.outputs.items():
-                expected = nominal_rate(topic, spec.namespace)
+                expected = expected_rate(topic)
                 if expected is None or topic.endswith(EVERY_NODES):
                     continue
                 key = spec.label, topic

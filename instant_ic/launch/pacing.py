@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+
 from instant_ic.launch.health import HealthMonitor
 from instant_ic.util.pace import SLOWEST_CHOSEN as SLOWEST
 from instant_ic.util.pace import PaceFiles, describe
@@ -142,27 +144,20 @@ def pace_of(cores: int, loops_per_s: float, load: float) -> float:
 
 
 class CoreLoad:
-    """How many cores of the machine are idle.
+    """How many cores of the machine are idle."""
 
-    Args:
-        file: the kernel's counters.
-    """
-
-    def __init__(self, file: Path = Path("/proc/stat")) -> None:
-        self._file = file
-        self._ticks_per_s = os.sysconf("SC_CLK_TCK")
+    def __init__(self) -> None:
         self._before = self._look()
 
     def idle_cores(self) -> float:
         """Return the mean number of idle cores since the last call."""
         before, self._before = self._before, self._look()
         seconds = self._before[0] - before[0]
-        return max(0.0, self._before[1] - before[1]) / self._ticks_per_s / seconds if seconds > 0 else 0.0
+        return max(0.0, self._before[1] - before[1]) / seconds if seconds > 0 else 0.0
 
-    def _look(self) -> tuple[float, int]:
-        with self._file.open(encoding="ascii") as stat:
-            fields = stat.readline().split()
-        return time.monotonic(), int(fields[4]) + int(fields[5])  # idle, and waiting for a disk
+    def _look(self) -> tuple[float, float]:
+        times = psutil.cpu_times()
+        return time.monotonic(), times.idle + times.iowait  # iowait: idle, and waiting for a disk
 
 
 class Pacing:

@@ -63,7 +63,7 @@ def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
 
     Programs given by path are not checked.
     """
-    shipped = [spec for spec in nodes if str(paths.node_file(spec.exec)) in spec.command]
+    shipped = _shipped(nodes)
     shared = _shared(shipped)
     robots: dict[str, dict[str, list[Driving]]] = {}
     problems: list[str] = []
@@ -90,6 +90,8 @@ def check_parameters_apart(nodes: Sequence[NodeSpec]) -> list[str]:
     Raises:
         ParameterCheckError: the check did not finish.
     """
+    if not _shipped(nodes):
+        return []
     command = [sys.executable, "-m", "instant_ic.launch.parameters"]
     try:
         done = subprocess.run(command, input=pickle.dumps(list(nodes)), capture_output=True, timeout=CHECK_TIMEOUT_S)
@@ -115,6 +117,10 @@ def existing_bags(nodes: Sequence[NodeSpec]) -> list[str]:
             if path.exists():
                 problems.append(f"{path} exists: record into a new folder (node {spec.label})")
     return problems
+
+
+def _shipped(nodes: Sequence[NodeSpec]) -> list[NodeSpec]:
+    return [spec for spec in nodes if str(paths.node_file(spec.exec)) in spec.command]
 
 
 def _words(spec: NodeSpec) -> tuple[str, ...]:

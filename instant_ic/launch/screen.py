@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import timedelta
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -201,10 +202,6 @@ class StackScreen:
             text.append(" · ").append(self._page, style="bold underline")
         if view.pace:
             text.append(f" · {view.pace}", style="yellow")
-        text.append(f" · {_duration(time.monotonic() - self._started_s)} · Ctrl-C stops the stack", style="dim")
+        runs = timedelta(seconds=int(time.monotonic() - self._started_s))
+        text.append(f" · {runs} · Ctrl-C stops the stack", style="dim")
         return text
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(int(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

@@ -59,20 +59,7 @@ def topic_rates() -> dict[str, TopicRate]:
     return {topic: TopicRate(**entry) for topic, entry in table.items()}
 
 
-def nominal_rate(topic: str, namespace: str = "") -> TopicRate | None:
-    """Return the expected rate of a topic, or None if the table does not have it.
-
-    Args:
-        topic: full name, ``/left/scan``.
-        namespace: namespace of the publishing node, ``left``; the table lists topics without it.
-    """
-    rates = topic_rates()
-    prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else ""
-    if topic in rates:
-        return rates[topic]
-    return rates.get(topic[len(prefix) - 1 :]) if prefix and topic.startswith(prefix) else None
-
-
 def expected_rate(topic: str) -> TopicRate | None:
-    """Return the expected rate of a topic whose namespace, if any, is its first part; None where unknown."""
-    return nominal_rate(topic, topic.split("/")[1])
+    """Return the expected rate of a topic, whose first part may be a namespace; None if the table does not have it."""
+    rates = topic_rates()
+    return rates.get(topic) or rates.get(f"/{topic.lstrip('/').partition('/')[2]}")

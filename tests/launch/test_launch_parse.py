@@ -265,13 +265,6 @@ def test_a_list_of_aliases_to_a_long_text_is_refused_before_it_is_expanded(tmp_p
     assert "8: its texts have more than 131072 characters" in problem
 
 
-def test_problem_is_printed_as_file_and_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    file = write(tmp_path, "launch:\n- node: {exec: warp}\n")
-    with pytest.raises(LaunchFileError, match=r"^stack\.yaml:2: unknown exec 'warp'"):
-        read_launch_file(file)
-
-
 # -- arguments with types ------------------------------------------------------------------------
 
 TYPED = """launch:

@@ -2,6 +2,7 @@
 
 import itertools
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -120,16 +121,15 @@ def test_first_pace_from_cores_speed_and_load():
     assert pace_of(1, 1e6, 20.0) == SLOWEST
 
 
-def test_idle_cores_from_the_kernels_counters(tmp_path, monkeypatch):
-    stat, now = tmp_path / "stat", [5.0]
+def test_idle_cores_from_the_kernels_counters(monkeypatch):
+    counters, now = SimpleNamespace(idle=10.0, iowait=0.5), [5.0]
     monkeypatch.setattr(pacing.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(pacing.os, "sysconf", lambda name: 100)
-    stat.write_text("cpu  10 0 10 1000 50 0 0 0 0 0\ncpu0 1 2 3\n")
-    load = CoreLoad(stat)
+    monkeypatch.setattr(pacing.psutil, "cpu_times", lambda: SimpleNamespace(**vars(counters)))
+    load = CoreLoad()
     assert load.idle_cores() == 0.0  # no time has passed
     now[0] += 2.0
-    stat.write_text("cpu  99 9 99 1240 70 0 0 0 0 0\n")
-    assert load.idle_cores() == pytest.approx(1.3)  # 260 ticks of 10 ms in 2 s
+    counters.idle, counters.iowait = 12.4, 0.7
+    assert load.idle_cores() == pytest.approx(1.3)  # 2.6 s in 2 s
 
 
 class Stack:

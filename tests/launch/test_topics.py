@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from instant_ic.console.drive import DriveConfig
-from instant_ic.launch.topics import TopicRate, nominal_rate, topic_rates
+from instant_ic.launch.topics import TopicRate, expected_rate, topic_rates
 from nodes.navigator import PRESENT_S
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,8 +36,8 @@ def test_fault(expected: TopicRate, rate_hz: float, age_s: float, words: str) ->
 
 
 def test_namespace_of_the_sender_is_left_out() -> None:
-    assert nominal_rate("/scan") == TopicRate(10.0) == nominal_rate("/left/scan", "left")
-    assert nominal_rate("/left/scan") is None and nominal_rate("/leftscan", "left") is None
+    assert expected_rate("/scan") == TopicRate(10.0) == expected_rate("/left/scan")
+    assert expected_rate("/leftscan") is None
 
 
 def test_commands_of_an_operator_who_commands_nothing_are_not_too_slow() -> None:
