@@ -38,7 +38,6 @@ SKY = -1
 _SAMPLES = 8
 _SAMPLE_ROWS = (np.arange(_SAMPLES, dtype=np.float32) + np.float32(0.5)) / 8 - np.float32(0.5)
 _SAMPLE_COLUMNS = (np.arange(0, 3 * _SAMPLES, 3, dtype=np.float32) % 8 + np.float32(0.5)) / 8 - np.float32(0.5)
-SUBPIXELS: F32 = np.stack([_SAMPLE_ROWS, _SAMPLE_COLUMNS], axis=1).astype(np.float32)
 
 
 class Projection(NamedTuple):
@@ -528,25 +527,6 @@ def _sample(row: int, first: int, dr: Scalar, dc: Scalar, projection: Projection
     return part * x, part * y, part * z
 
 
-@_jit
-def edge_rays(surface: I32, projection: Projection, subpixels: F32, forms: F32, owns: I64, out: F32) -> int:
-    """Enter the directions (N, 3) of the samples of all edge pixels, in the order of ``compose``; return N.
-
-    Nothing is written beyond the end of ``out``.
-    """
-    near = np.empty(_MOST, np.int32)
-    count = 0
-    for row in range(surface.shape[0]):
-        stride = projection.strides[row]
-        for first in range((surface.shape[1] + stride - 1) // stride):
-            if _around(surface, row, first, projection, forms, owns, near)[1]:
-                for n in range(subpixels.shape[0]):
-                    if count < out.shape[0]:
-                        out[count] = _sample(row, first, subpixels[n, 0], subpixels[n, 1], projection)
-                    count += 1
-    return count
-
-
 @_bare
 def _cover(
     row: int, first: int, projection: Projection, forms: F32, near: I32, known: int, inverse: F32, shown: I32
@@ -633,14 +613,14 @@ class Work(NamedTuple):
 
 @_jit
 def compose(
-    surface: I32, projection: Projection, subpixels: F32, sampled: I32, adjoining: I32, footprint: Scalar,
-    edge_footprint: Scalar, scene: Scene, tone: U8, out: U8,
+    surface: I32, projection: Projection, adjoining: I32, footprint: Scalar, edge_footprint: Scalar, scene: Scene,
+    tone: U8, out: U8,
 ) -> None:  # fmt: skip
     """Shade the image (H, W, 3), sRGB, with anti-aliased edges.
 
     In a row with a stride only every stride-th pixel is shaded; the pixels in between are interpolated. A sample of an
-    edge pixel shows its surface in ``sampled`` (N,), or if that is empty the nearest of the surfaces that the pixels
-    around it show and of those that adjoin them (``adjoining``, (S, 4)).
+    edge pixel shows the nearest of the surfaces that the pixels around it show and of those that adjoin them
+    (``adjoining``, (S, 4)).
     """
     width = surface.shape[1]
     work = Work(
@@ -655,18 +635,9 @@ def compose(
         np.empty(_SAMPLES, np.float32),
         np.empty(_SAMPLES, np.int32),
     )
-    _compose(surface, projection, (subpixels, sampled, adjoining, edge_footprint), footprint, scene, tone, out, work)
-
-
-@_bare
-def _compose(
-    surface: I32, projection: Projection, edges: tuple[F32, I32, I32, Scalar], footprint: Scalar, scene: Scene,
-    tone: U8, out: U8, work: Work,
-) -> None:  # fmt: skip
-    taken = 0
     for row in range(surface.shape[0]):
         _read_row(surface, row, projection, work)
-        taken = _shade_row(surface, row, projection, edges, footprint, scene, work, taken)
+        _shade_row(surface, row, projection, adjoining, edge_footprint, footprint, scene, work)
         _write_row(out[row], projection.strides[row], work.root, tone)
 
 
@@ -712,12 +683,11 @@ def _read_row(surface: I32, row: int, projection: Projection, work: Work) -> Non
 
 @_inlined
 def _shade_row(
-    surface: I32, row: int, projection: Projection, edges: tuple[F32, I32, I32, Scalar], footprint: Scalar,
-    scene: Scene, work: Work, taken: int,
-) -> int:  # fmt: skip
-    """Shade a row: runs of one surface at once, edge pixels by their samples. Return the samples taken so far."""
-    subpixels, sampled, adjoining, edge_footprint = edges
-    line, differs, near, shown = work.line, work.differs, work.near, work.shown
+    surface: I32, row: int, projection: Projection, adjoining: I32, edge_footprint: Scalar, footprint: Scalar,
+    scene: Scene, work: Work,
+) -> None:  # fmt: skip
+    """Shade a row: runs of one surface at once, edge pixels by their samples."""
+    line, differs, near = work.line, work.differs, work.near
     forms, owns = scene.forms, scene.owns
     stride = projection.strides[row]
     count = (surface.shape[1] + stride - 1) // stride
@@ -734,37 +704,25 @@ def _shade_row(
             _shade(s, first, end, work.ray, footprint, scene, work.values, work.root)
             first = end
             continue
-        if sampled.shape[0]:
-            for n in range(subpixels.shape[0]):
-                best = 0
-                while best < known and near[best] != sampled[taken]:
-                    best += 1
-                near[best] = sampled[taken]
-                known = max(known, best + 1)
-                shown[n] = best
-                taken += 1
-        else:
-            known = _add_adjoining(forms, adjoining, near, known)
-            _cover(row, first, projection, forms, near, known, work.inverse, shown)
-        _shade_edge(row, first, projection, subpixels, known, edge_footprint, scene, work)
+        known = _add_adjoining(forms, adjoining, near, known)
+        _cover(row, first, projection, forms, near, known, work.inverse, work.shown)
+        _shade_edge(row, first, projection, known, edge_footprint, scene, work)
         first += 1
-    return taken
 
 
 @_inlined
 def _shade_edge(
-    row: int, first: int, projection: Projection, subpixels: F32, known: int, footprint: Scalar, scene: Scene,
-    work: Work,
-) -> None:  # fmt: skip
+    row: int, first: int, projection: Projection, known: int, footprint: Scalar, scene: Scene, work: Work
+) -> None:
     """Shade an edge pixel: the mean of its surfaces, weighted by their samples and taken at the samples' centre."""
     near, weight, shift, shown, root = work.near, work.weight, work.shift, work.shown, work.root
-    samples, one = subpixels.shape[0], np.float32(1)
+    one = np.float32(1)
     for m in range(known):
         weight[m] = shift[m, 0] = shift[m, 1] = np.float32(0)
-    for n in range(samples):
+    for n in range(_SAMPLES):
         weight[shown[n]] += one
-        shift[shown[n], 0] += subpixels[n, 0]
-        shift[shown[n], 1] += subpixels[n, 1]
+        shift[shown[n], 0] += _SAMPLE_ROWS[n]
+        shift[shown[n], 1] += _SAMPLE_COLUMNS[n]
     red = green = blue = np.float32(0)
     for m in range(known):
         if weight[m] == 0:
@@ -773,7 +731,7 @@ def _shade_edge(
         x, y, z = _sample(row, first, part * shift[m, 0], part * shift[m, 1], projection)
         r, g, b = _point(near[m], footprint, x, y, z, scene)
         r, g, b = min(r, _WHITE), min(g, _WHITE), min(b, _WHITE)
-        part = weight[m] / np.float32(samples)
+        part = weight[m] / np.float32(_SAMPLES)
         red, green, blue = red + part * r * r, green + part * g * g, blue + part * b * b
     root[0, first], root[1, first], root[2, first] = np.sqrt(red), np.sqrt(green), np.sqrt(blue)
 

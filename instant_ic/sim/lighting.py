@@ -191,7 +191,7 @@ def bake(world: World, rays: int = 48) -> None:
         rays: rays per texel for bounce and occlusion.
     """
     fields: list[npt.NDArray[np.generic]] = [value for value in vars(world).values() if isinstance(value, np.ndarray)]
-    parts: list[str | npt.NDArray[np.generic]] = [*fields, world.textures.mean, f"{rays} {world.two_sided}"]
+    parts: list[str | npt.NDArray[np.generic]] = [*fields, world.textures.mean, str(rays)]
     world.light[:] = kept("light", parts, lambda: {"light": _baked(world, rays)})["light"]
 
 

@@ -111,5 +111,4 @@ def _world(name: str, joined: dict[str, npt.NDArray[Any]], sources: list[str | n
         light_uv=np.zeros((count, 2, 4), np.float32),
         light_linear=np.tile(np.asarray([0, 0, 0, 1], np.float32), (count, 1)),
         light=np.ones((1, 3), np.float32),
-        two_sided=True,
     )

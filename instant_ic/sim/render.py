@@ -13,9 +13,6 @@ from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.floating]
 
-#: Samples of the edge pixels of a mesh file (rows, columns, pixels from the centre), whose rays are cast.
-_CAST_SUBPIXELS = np.asarray([(-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125)], np.float32)
-
 #: Share of a pixel over which a texture is averaged, in pixels on one surface and for the samples of edge pixels.
 #: It is below 1 because bilinear lookup also blurs.
 _FOOTPRINT = 0.65
@@ -178,20 +175,10 @@ class EquirectRenderer:
         depth = np.empty((lens.height, lens.width), np.float32)
         kernels.ranges(surface, *tables, forms, depth)
         projection = kernels.Projection(*tables, _strides(lens), lens.hfov_rad is None)
-        subpixels, sampled = kernels.SUBPIXELS, np.empty(0, np.int32)
-        if world.two_sided:
-            # The triangles of a mesh file can be smaller than a pixel: those in an edge pixel must be cast.
-            subpixels = _CAST_SUBPIXELS
-            view = (surface, projection, subpixels, forms, self._scene[1])
-            count = kernels.edge_rays(*view, np.empty((0, 3), np.float32))
-            rays = np.empty((count, 3), np.float32)
-            kernels.edge_rays(*view, rays)
-            sampled = self._caster.cast(origin, rays)[1]
-            kernels.place(sampled, np.arange(count), sampled, world.face_surface)
         footprint, edge_footprint = (np.float32(part * lens.pixel_rad) for part in (_FOOTPRINT, _EDGE_FOOTPRINT))
         kernels.compose(
-            surface, projection, subpixels, sampled, world.adjoining, footprint, edge_footprint,
-            kernels.Scene(forms, *self._scene), _tone_table()[0], rgb,
+            surface, projection, world.adjoining, footprint, edge_footprint, kernels.Scene(forms, *self._scene),
+            _tone_table()[0], rgb,
         )  # fmt: skip
         return RenderedFrame(rgb, depth)
 

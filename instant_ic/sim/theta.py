@@ -86,12 +86,6 @@ def panorama_file(path: str | Path) -> PictureSource:
     return source
 
 
-class _ApiError(Exception):
-    def __init__(self, status: int, code: str, message: str) -> None:
-        super().__init__(message)
-        self.status, self.code = status, code
-
-
 class ThetaServer:
     """Camera with its Web API; it renders images only while a client reads the preview.
 
@@ -121,7 +115,6 @@ class ThetaServer:
         # As the driver left them when it last ran: a camera that stays on keeps its options.
         self._options.set({"sleepDelay": NEVER, "offDelay": NEVER})
         self._options_set_s = -1e9
-        self._began_s = time.monotonic()
         self._frame: bytes | None = None
         self._number = 0
         self._viewers = 0
@@ -247,46 +240,21 @@ class ThetaServer:
             "model": "RICOH THETA Z1",
             "serialNumber": "YN10000000",
             "firmwareVersion": FORMATS_FIRMWARE,
-            "supportUrl": "https://theta360.com/en/support/",
-            "gps": False,
-            "gyro": True,
-            "endpoints": {"httpPort": 80, "httpUpdatesPort": 80},
             "apiLevel": [2],
-            "api": [
-                "/osc/info", "/osc/state", "/osc/checkForUpdates", "/osc/commands/execute", "/osc/commands/status",
-            ],
-            "uptime": int(time.monotonic() - self._began_s),
-        }  # fmt: skip
+        }
 
     def state(self) -> dict[str, Any]:
         """Reply to POST /osc/state."""
-        return {
-            "fingerprint": f"FIG_{self._viewers:04d}",
-            "state": {
-                "batteryLevel": 0.8,
-                "storageUri": f"http://{self.config.host}:{self.port}/files/thetasd/",
-                "_apiVersion": 2,
-                "_batteryState": "disconnect",
-                "_batteryTemp": 31,
-                "_boardTemp": 44,
-                "_cameraError": [],
-                "_captureStatus": "idle",
-                "_captureMode": self._options.values["captureMode"],
-            },
-        }
+        return {"state": {"batteryLevel": 0.8, "_batteryTemp": 31, "_boardTemp": 44, "_cameraError": []}}
 
-    def execute(self, request: Any) -> dict[str, Any]:
+    def execute(self, name: str, parameters: Any) -> dict[str, Any]:
         """Reply to a command other than the live preview.
 
         Raises:
-            _ApiError, OptionError: the command is refused.
+            OptionError: the command is refused.
         """
-        name = request.get("name") if isinstance(request, dict) else None
-        parameters = request.get("parameters", {}) if isinstance(request, dict) else {}
-        if name is None:
-            raise _ApiError(400, "missingParameter", "name is missing")
         if not isinstance(parameters, dict):
-            raise _ApiError(400, "invalidParameterValue", "parameters must be an object")
+            raise OptionError("invalidParameterValue", "parameters must be an object")
         if name == "camera.setOptions":
             with self._changed:
                 self._options.set(parameters.get("options"))
@@ -295,18 +263,18 @@ class ThetaServer:
         if name == "camera.getOptions":
             wanted = parameters.get("optionNames")
             if not isinstance(wanted, list):
-                raise _ApiError(400, "missingParameter", "optionNames is missing")
+                raise OptionError("missingParameter", "optionNames is missing")
             return {"name": name, "state": "done", "results": {"options": self._options.get(wanted)}}
-        raise _ApiError(400, "unknownCommand", f"command {name} is not known")
+        raise OptionError("unknownCommand", f"command {name} is not known")
 
     def open_preview(self) -> int:
         """Add a viewer and return the number of the newest image, which this viewer does not get.
 
         Raises:
-            _ApiError: the camera is not ready after a change of options.
+            OptionError: the camera is not ready after a change of options.
         """
         if time.monotonic() - self._options_set_s < SETTLE_S:
-            raise _ApiError(503, "serviceUnavailable", "the camera is changing its settings")
+            raise OptionError("serviceUnavailable", "the camera is changing its settings", 503)
         with self._changed:
             self._viewers += 1
             self._changed.notify_all()
@@ -334,41 +302,35 @@ class _Handler(BaseHTTPRequestHandler):
         if self.path == "/osc/info":
             self._reply(200, self.camera.info())
         else:
-            self._refuse(_ApiError(404, "invalidParameterValue", f"{self.path} does not exist"))
+            self._refuse(OptionError("invalidParameterValue", f"{self.path} does not exist", 404))
 
     def do_POST(self) -> None:
         """Reply to POST requests: state and commands."""
         length = int(self.headers.get("Content-Length") or 0)
         body = self.rfile.read(length) if 0 <= length < 1_000_000 else b""
-        try:
-            request = json.loads(body) if body.strip() else {}
-        except ValueError:
-            self._refuse(_ApiError(400, "invalidParameterValue", "the body is not JSON"))
-            return
+        name = ""
         try:
             if self.path == "/osc/state":
                 self._reply(200, self.camera.state())
-            elif self.path == "/osc/checkForUpdates":
-                self._reply(200, {"stateFingerprint": self.camera.state()["fingerprint"], "throttleTimeout": 1})
-            elif self.path == "/osc/commands/execute":
-                if isinstance(request, dict) and request.get("name") == "camera.getLivePreview":
-                    self._preview()
-                else:
-                    self._reply(200, self.camera.execute(request))
-            elif self.path == "/osc/commands/status":
-                raise _ApiError(400, "invalidParameterValue", "no command with this id is running")
+                return
+            if self.path != "/osc/commands/execute":
+                raise OptionError("invalidParameterValue", f"{self.path} does not exist", 404)
+            request = json.loads(body)
+            if not isinstance(request, dict) or not isinstance(request.get("name"), str):
+                raise OptionError("missingParameter", "name is missing")
+            name = request["name"]
+            if name == "camera.getLivePreview":
+                self._preview()
             else:
-                raise _ApiError(404, "invalidParameterValue", f"{self.path} does not exist")
+                self._reply(200, self.camera.execute(name, request.get("parameters", {})))
         except OptionError as error:
-            self._refuse(_ApiError(400, error.code, str(error)), request.get("name", ""))
-        except _ApiError as error:
-            self._refuse(error, request.get("name", "") if isinstance(request, dict) else "")
+            self._refuse(error, name)
+        except ValueError:
+            self._refuse(OptionError("invalidParameterValue", "the body is not JSON"))
 
-    def _refuse(self, error: _ApiError, name: str = "") -> None:
-        self._reply(
-            error.status,
-            {"name": name, "state": "error", "error": {"code": error.code, "message": str(error)}},
-        )
+    def _refuse(self, error: OptionError, name: str = "") -> None:
+        value = {"name": name, "state": "error", "error": {"code": error.code, "message": str(error)}}
+        self._reply(error.status, value)
 
     def _reply(self, status: int, value: Any) -> None:
         body = json.dumps(value).encode()

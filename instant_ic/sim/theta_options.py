@@ -15,15 +15,16 @@ NEVER = 65535
 
 
 class OptionError(ValueError):
-    """The camera refuses an option.
+    """The camera refuses a request.
 
     Attributes:
         code: error code of the API.
+        status: HTTP status.
     """
 
-    def __init__(self, code: str, text: str) -> None:
+    def __init__(self, code: str, text: str, status: int = 400) -> None:
         super().__init__(text)
-        self.code = code
+        self.code, self.status = code, status
 
 
 class ThetaOptions:

@@ -31,7 +31,6 @@ class World:
         texture: (S,) int32, index into ``textures``.
         tint: (S, 3) float32, factor of the texture's albedo.
         emission: (S,) float32; a surface with a value above 0 emits this radiance and ignores light.
-        two_sided: whether surfaces are visible (and lit) from both sides.
         light_at: (S, 3) int64: first texel, width and height in ``light``; width 0 selects ``light_linear``.
         light_uv: (S, 2, 4) float32; maps a point to light texel coordinates.
         light_linear: (S, 4) float32; light of a point on a surface without a light map (meshes from files).
@@ -56,7 +55,6 @@ class World:
     light_linear: npt.NDArray[np.float32]
     light: npt.NDArray[np.float32]
     spawn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    two_sided: bool = False
     zones: list[tuple[float, float, float, float, float]] = field(default_factory=list)
 
     @cached_property

@@ -18,7 +18,6 @@ import serial
 
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.roboclaw import Roboclaw
-from instant_ic.camera.preview import PreviewParser
 from instant_ic.sim.real_time import SimulatedDevices, SimulatorConfig
 from instant_ic.sim.roboclaw import RoboClawServer
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
@@ -92,19 +91,6 @@ def test_preview_has_the_cameras_own_boundary_and_lengths(camera: ThetaServer) -
         assert np.abs(image[..., ::-1].astype(int) - grey_ramp(640, 320)).mean() < 4
 
 
-def test_the_stacks_parser_reads_the_preview(camera: ThetaServer) -> None:
-    response = requests.post(
-        url(camera) + "/osc/commands/execute", json={"name": "camera.getLivePreview"}, stream=True, timeout=TIMEOUT_S
-    )
-    parser, frames = PreviewParser(), []
-    for data in response.iter_content(4096):
-        frames += parser.feed(data)
-        if len(frames) >= 4:
-            break
-    response.close()
-    assert all(frame[:2] == b"\xff\xd8" and frame[-2:] == b"\xff\xd9" for frame in frames)
-
-
 def test_pictures_are_made_only_while_somebody_watches(camera: ThetaServer) -> None:
     assert camera.frames == 0 and not camera.watched
     raw_preview(camera, 1)
@@ -119,8 +105,8 @@ def test_fault_the_image_of_a_standing_robot_comes_again_so_that_its_camera_seem
     config = SimThetaConfig(port=0, width=640, height=320, rate=30.0, latency_s=0.0)
     server = ThetaServer(config, lambda width, height: view)
     try:
-        images = [jpeg for _, jpeg in raw_preview(server, 60)[1]]
-        assert len(set(images)) == 60
+        images = [jpeg for _, jpeg in raw_preview(server, 20)[1]]
+        assert len(set(images)) == 20
         decoded = cv2.imdecode(np.frombuffer(images[0], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
         assert 0.3 < (decoded.astype(float) - view).std() < 2.0
     finally:
@@ -156,10 +142,6 @@ def test_state_and_info(camera: ThetaServer) -> None:
     assert info["model"] == "RICOH THETA Z1" and 2 in info["apiLevel"]
     state = requests.post(url(camera) + "/osc/state", json={}, timeout=TIMEOUT_S).json()
     assert 0 <= state["state"]["batteryLevel"] <= 1 and state["state"]["_cameraError"] == []
-    updates = requests.post(
-        url(camera) + "/osc/checkForUpdates", json={"stateFingerprint": state["fingerprint"]}, timeout=TIMEOUT_S
-    ).json()
-    assert updates["stateFingerprint"] == state["fingerprint"]
 
 
 def test_options_change_the_preview_after_a_moment(camera: ThetaServer) -> None:
@@ -201,10 +183,8 @@ def _ready(camera: ThetaServer) -> bool:
             {"name": "camera.setOptions", "parameters": {"options": {"previewFormat": {"width": 7}}}},
             "invalidParameterValue",
         ),
-        ({"name": "camera.setOptions", "parameters": {"options": {"colour": 1}}}, "invalidParameterName"),
         ({"name": "camera.getOptions", "parameters": {"optionNames": ["colour"]}}, "invalidParameterName"),
         ({"name": "camera.setOptions", "parameters": {"options": {"sleepDelay": 59}}}, "invalidParameterValue"),
-        ({"name": "camera.setOptions", "parameters": {"options": {"offDelay": 601}}}, "invalidParameterValue"),
         ({"name": "camera.getOptions", "parameters": 3}, "invalidParameterValue"),
     ],
 )
@@ -234,12 +214,6 @@ def test_a_panorama_file_is_area_averaged(tmp_path: Path) -> None:
         panorama_file(tmp_path / "none.png")
 
 
-@pytest.mark.parametrize(("key", "value"), [("rate", 0.0), ("width", 800), ("port", 70000)])
-def test_bad_camera_parameters_are_named(key: str, value: float) -> None:
-    with pytest.raises(ValueError, match=key):
-        SimThetaConfig(**{key: value})
-
-
 # --- RoboClaw ---------------------------------------------------------------------------------------------------------
 
 
@@ -267,16 +241,11 @@ def test_the_terminal_answers_the_vectors(controller: tuple[RoboclawEmulator, Ro
         assert port.read(4) == bytes.fromhex("00f1c8c4")
         port.write(bytes.fromhex("804e"))
         assert port.read(10) == bytes.fromhex("000003e8ffffff00 b864")
-    assert emulator.target_speed_pps.tolist() == [1000, -1000]
-
-
-def test_every_byte_comes_through_raw(controller: tuple[RoboclawEmulator, RoboClawServer]) -> None:
-    # 0x11, 0x13 (flow control), 0x0a, 0x0d (line ends), 0x03 (interrupt) must not be eaten by the terminal.
-    emulator, server = controller
-    emulator.encoder[:] = (0x0D0A1113, 0x03041A7F)
-    with serial.Serial(server.device, 115200, timeout=TIMEOUT_S) as port:
+        # Flow control, line ends and interrupt must not be eaten by the terminal.
+        emulator.encoder[:] = (0x0D0A1113, 0x03041A7F)
         port.write(bytes.fromhex("804e"))
         assert port.read(10)[:8] == bytes.fromhex("0d0a111303041a7f")
+    assert emulator.target_speed_pps.tolist() == [1000, -1000]
 
 
 def test_a_driver_can_come_back(controller: tuple[RoboclawEmulator, RoboClawServer]) -> None:

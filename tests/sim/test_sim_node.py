@@ -13,15 +13,10 @@ import pytest
 
 from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.config.params import build, load_file
 from instant_ic.util.paths import node_file
 from nodes.simulator import SimulatorConfig, SimulatorNode
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "sim.yaml"
-
-
-def test_the_shipped_parameters_are_the_defaults() -> None:
-    assert build(SimulatorConfig, load_file(CONFIG, "simulator")) == SimulatorConfig()
 
 
 def test_lockstep_is_refused() -> None:

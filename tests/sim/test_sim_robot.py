@@ -92,22 +92,6 @@ def test_no_start_inside_a_wall(box_room: World) -> None:
         TrackedRobot(EXACT, box_room.occupied(0.03, 0.9, 0.01), (2.9, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(("key", "value"), [("slip", 0.6), ("motor_lag_s", -1.0)])
-def test_bad_parameters_are_named(key: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"{key}.*got"):
-        RobotConfig(**{key: value})
-
-
-def test_driving_straight_at_the_obstacle_touches_it(corridor: World) -> None:
-    simulation = Simulation(SimulationConfig(robot=EXACT), world=corridor)
-    simulation.drive(0.4, 0.0)
-    simulation.step(12.0)
-    # Its front is at x = 4.
-    assert simulation.robot.contacts == 1
-    assert 3.68 < simulation.robot.pose[0] <= 3.70
-    assert simulation.time_s == pytest.approx(12.0)
-
-
 def test_the_watchdog_of_the_controller_stops_the_robot(corridor: World) -> None:
     simulation = Simulation(SimulationConfig(robot=EXACT), world=corridor)
     simulation.controller.timeout_s = 0.5

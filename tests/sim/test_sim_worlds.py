@@ -52,13 +52,7 @@ def test_every_room_of_the_corridor_can_be_driven_into(corridor: World) -> None:
         assert np.hypot(reached[:, 0] - x, reached[:, 1] - y).min() < 0.3, name
 
 
-def test_corridor_seed_changes_pictures_only() -> None:
-    one, two = corridor_world(1, light_cell_m=0.5), corridor_world(2, light_cell_m=0.5)
-    assert one.zones == two.zones
-    assert len(one.textures.texels) != len(two.textures.texels) or (one.textures.texels != two.textures.texels).any()
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_random_interiors_are_closed_and_their_free_poses_are_free(seed: int) -> None:
     world = random_world(seed, light_cell_m=0.6, rays=4)
     poses = world.sample_free_poses(np.random.default_rng(seed), 12, clearance_m=0.35)
